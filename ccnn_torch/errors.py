@@ -1,0 +1,19 @@
+"""Typed errors. Each carries one clear sentence that names the file, row, column or key, and what would be right."""
+
+from __future__ import annotations
+
+
+class CcnnError(Exception):
+    """Anything this package raises on purpose."""
+
+
+class InputError(CcnnError):
+    """Bad input from outside: records, a config, a mechanism file. The command line shows it and exits with 2."""
+
+
+class ModelFileError(InputError):
+    """A model file or its card is damaged, foreign, tampered with, or made for another mechanism."""
+
+
+class MethodFailedError(CcnnError):
+    """A learner could not be trained on this data; a run notes the sentence in its results and goes on."""

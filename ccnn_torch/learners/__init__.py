@@ -1,0 +1,4 @@
+"""Learners: what the trainer drives. Protocol in `_protocol.py`, one file a learner."""
+
+from ccnn_torch.learners._protocol import Learner as Learner
+from ccnn_torch.learners._protocol import TrainingData as TrainingData

@@ -1,0 +1,70 @@
+"""What the trainer drives. A new learner is one file that fills in these verbs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from torch import Tensor, nn
+
+__all__ = ["Learner", "TrainingData"]
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Scaled data of `r` repeats at once; a repeat with fewer rows than another is padded with weight 0.
+
+    Attributes:
+        inputs: features in about [-1, 1], `r x s x i` [1].
+        targets: outputs standardised by the training rows (mean 0, unit deviation), `r x s x o` [1].
+        weights: row weights, `r x s` [1]; 0 marks a padded row.
+        seeds: one seed a repeat, `r`, int64.
+        validation: rows held out from training for early stopping and model choice, or None.
+    """
+
+    inputs: Tensor
+    targets: Tensor
+    weights: Tensor
+    seeds: Tensor
+    validation: TrainingData | None = None
+
+
+@runtime_checkable
+class Learner(Protocol):
+    """`start`, then `step` until `finished`; `predict` and `network` at any time after `start`.
+
+    All repeats advance together in one call, as the leading dimension of every tensor. Two learners started on the
+    same data with the same seeds give the same tensors; a learner whose state was saved and loaded goes on to the same
+    result, bit by bit. No global random state is read or set.
+    """
+
+    name: str
+
+    def start(self, data: TrainingData) -> None:
+        """Take the data and make the initial state."""
+
+    def step(self) -> dict[str, Tensor]:
+        """One generation, iteration or candidate step; metrics by name, each `r` or `r x k`."""
+
+    @property
+    def finished(self) -> bool:
+        """True when a further step would change nothing or the budget is spent."""
+
+    @property
+    def steps(self) -> int:
+        """Steps planned in all, for the progress bar (an upper bound)."""
+
+    def predict(self, inputs: Tensor) -> Tensor:
+        """Current best model. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that changes in `step`, flat, as tensors (a counter is a 0-d int64 tensor)."""
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take back a state; call `start` with the same data first."""
+
+    def network(self, repeat: int) -> nn.Module:
+        """The current best model of one repeat as a plain module, `... x i` -> `... x o`, float64.
+
+        Only operators that ONNX Runtime has in double (matmul, add, mul, sigmoid, tanh, relu, exp, sin, cos, where).
+        """

@@ -1,0 +1,3 @@
+"""One trainer for every learner: scaling, loop, callbacks, checkpoints, metrics."""
+
+from ccnn_torch.training._scaling import Scaling as Scaling

@@ -1,0 +1,107 @@
+"""From SI inputs to features in [-1, 1], and from standardised outputs back to SI (DESIGN section 3)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["Scaling"]
+
+
+class Scaling(nn.Module):
+    """Input and output scaling of `r` repeats (or of none: every buffer then lacks the leading dimension).
+
+    A linear input x becomes (x - centre) / half_range; a periodic one (a revolute joint that turns far) becomes the two
+    features sin x and cos x, so that a full turn is no jump. Features stand in the order: linear inputs, then the sines,
+    then the cosines of the periodic ones.
+
+    Attributes:
+        linear, periodic: indices of the inputs of either kind, int64.
+        centre, half_range: `[r x] len(linear)` [the input's SI unit].
+        mean, deviation: `[r x] o` [the output's SI unit].
+    """
+
+    linear: Tensor
+    periodic: Tensor
+    centre: Tensor
+    half_range: Tensor
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(
+        self, linear: Tensor, periodic: Tensor, centre: Tensor, half_range: Tensor, mean: Tensor, deviation: Tensor
+    ) -> None:
+        super().__init__()
+        self.register_buffer("linear", linear)
+        self.register_buffer("periodic", periodic)
+        self.register_buffer("centre", centre)
+        self.register_buffer("half_range", half_range)
+        self.register_buffer("mean", mean)
+        self.register_buffer("deviation", deviation)
+
+    @classmethod
+    def fit(cls, inputs: Tensor, targets: Tensor, weights: Tensor, periodic: Tensor) -> Scaling:
+        """Fit to training rows.
+
+        Args:
+            inputs: `r x s x i` [SI].
+            targets: `r x s x o` [SI].
+            weights: `r x s` [1]; rows of weight 0 are ignored.
+            periodic: `i`, bool, which inputs are angles to be fed as sine and cosine.
+        """
+        there = (weights > 0).unsqueeze(-1)
+        linear = torch.nonzero(~periodic).squeeze(-1)
+        values = inputs[..., linear]
+        low = values.masked_fill(~there, torch.inf).amin(-2)
+        high = values.masked_fill(~there, -torch.inf).amax(-2)
+        half = (high - low) / 2
+        total = weights.sum(-1, keepdim=True)
+        mean = (targets * weights.unsqueeze(-1)).sum(-2) / total
+        variance = ((targets - mean.unsqueeze(-2)).square() * weights.unsqueeze(-1)).sum(-2) / total
+        deviation = variance.sqrt()
+        # A constant output keeps scale 1: its standardised value is then exactly 0 and is learned as such.
+        return cls(
+            linear,
+            torch.nonzero(periodic).squeeze(-1),
+            (high + low) / 2,
+            torch.where(half > 0, half, torch.ones_like(half)),
+            mean,
+            torch.where(deviation > 0, deviation, torch.ones_like(deviation)),
+        )
+
+    @property
+    def feature_count(self) -> int:
+        """Number of features that a learner sees."""
+        return len(self.linear) + 2 * len(self.periodic)
+
+    def repeat(self, index: int) -> Scaling:
+        """The scaling of one repeat, without the leading dimension."""
+        return Scaling(
+            self.linear.clone(),
+            self.periodic.clone(),
+            *(b[index].clone() for b in (self.centre, self.half_range, self.mean, self.deviation)),
+        )
+
+    def features(self, inputs: Tensor) -> Tensor:
+        """inputs: `[r x] ... x i` [SI]; returns `[r x] ... x feature_count` [1]."""
+        scaled = (inputs[..., self.linear] - _align(self.centre, inputs)) / _align(self.half_range, inputs)
+        if len(self.periodic) == 0:
+            return scaled
+        angles = inputs[..., self.periodic]
+        return torch.cat([scaled, torch.sin(angles), torch.cos(angles)], dim=-1)
+
+    def standardise(self, targets: Tensor) -> Tensor:
+        """targets: `[r x] ... x o` [SI]; returns the same shape [1]."""
+        return (targets - _align(self.mean, targets)) / _align(self.deviation, targets)
+
+    def restore(self, outputs: Tensor) -> Tensor:
+        """Inverse of `standardise`."""
+        return outputs * _align(self.deviation, outputs) + _align(self.mean, outputs)
+
+
+def _align(buffer: Tensor, like: Tensor) -> Tensor:
+    """View a buffer `[r x] k` so that it broadcasts against `[r x] ... x k`."""
+    missing = like.dim() - buffer.dim()
+    if buffer.dim() == 1 or missing <= 0:
+        return buffer
+    return buffer.view(buffer.shape[0], *([1] * missing), buffer.shape[-1])
