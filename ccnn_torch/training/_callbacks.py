@@ -12,7 +12,7 @@ __all__ = ["Callback"]
 
 
 class Callback(Protocol):
-    """Called by `train` in the order given; a callback may add metrics for those after it, and must not change state."""
+    """Called by `train` in the order given; may add metrics for those after it, must not change the learner."""
 
     def on_start(self, learner: Learner, data: TrainingData, step: int) -> None:
         """step: steps already done, more than 0 when a training was resumed."""

@@ -26,7 +26,7 @@ class Training:
     Attributes:
         step: steps done.
         best_step: the step whose state each repeat was left in, `r` int64.
-        best_validation: validation error of that state, `r` (mean squared, standardised outputs); inf without validation.
+        best_validation: validation error of that state, `r` (mean square of standardised outputs); inf without any.
         history: metrics by name, `steps x r [x k]`.
         seconds: time spent inside the learner.
     """
@@ -135,6 +135,9 @@ class _Run:
             error = weighted_mse(self.learner.predict(held.inputs), held.targets, held.weights)
             metrics["error_validation"] = error
             improved = error < self.best_validation
+            if self.patience is not None:
+                # A repeat that would have stopped by itself takes nothing more, whatever runs beside it.
+                improved &= self.step - self.best_step <= self.patience
             self.best_validation = torch.where(improved, error, self.best_validation)
         if improved is not None and bool(improved.any()):
             self._keep(improved)
