@@ -51,8 +51,8 @@ def jacobian_of(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Te
     points = point.detach().expand(k, *point.shape).clone()
     directions = torch.eye(k, dtype=point.dtype, device=point.device)
     directions = directions.view(k, *([1] * (point.dim() - 1)), k).expand_as(points).clone()
-    value, slopes = torch.func.jvp(function, (points,), (directions,))
-    return value[0], slopes.movedim(0, -1)
+    outcome = torch.func.jvp(function, (points,), (directions,))
+    return outcome[0][0], outcome[1].movedim(0, -1)
 
 
 def levenberg_marquardt(
@@ -139,7 +139,7 @@ def levenberg_marquardt(
 
 
 def _damped_step(j: Tensor, r: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
-    """j: `b x c x k`, r: `b x c`, lam: `b`; returns the step `b x k` and the decrease that the linear model promises."""
+    """j: `b x c x k`, r: `b x c`, lam: `b`; returns the step `b x k` and the decrease it promises, `b`."""
     c, k = j.shape[-2:]
     normal = j.mT @ j if k <= c else j @ j.mT
     scale = normal.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-100)  # a zero Jacobian gives a zero step

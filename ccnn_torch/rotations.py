@@ -75,7 +75,7 @@ def skew(vector: Tensor) -> Tensor:
     """Matrix of the cross product: vector `... x 3`; returns `... x 3 x 3` with `skew(a) @ b = a x b`."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*vector.shape, 3)
 
 
 def vee(matrix: Tensor) -> Tensor:

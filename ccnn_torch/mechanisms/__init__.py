@@ -1,4 +1,4 @@
-"""Batched differentiable kinematics: the base class, the paper's two machines, serial arms, and the way to load them."""
+"""Batched differentiable kinematics: base class, the paper's two machines, serial arms, and how to load them."""
 
 from ccnn_torch.mechanisms._mechanism import InverseKinematics as InverseKinematics
 from ccnn_torch.mechanisms._mechanism import Mechanism as Mechanism

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ccnn_torch.batching import expand_leading
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import _numeric
 from ccnn_torch.mechanisms._pose import PoseError, frame_from_coordinates, frame_jacobian, pose_error
 from ccnn_torch.rotations import wrap_angle
@@ -198,8 +198,9 @@ class Mechanism(nn.Module):
             `... x 6 x n` ([m] above [rad], per joint unit), or `... x 3 x n` without orientation.
         """
         parameters = self.resolve(parameters)
-        joints = joints.expand(*torch.broadcast_shapes(joints.shape[:-1], parameters.shape[:-1]), joints.shape[-1])
-        return frame_jacobian(lambda q: self.frame(self.forward_kinematics(q, parameters, guess)), joints)
+        return frame_jacobian(
+            lambda q: self.frame(self.forward_kinematics(q, parameters, guess)), expand_leading(joints, parameters)
+        )
 
     def condition_number(
         self,

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from ccnn_torch.batching import leading_shape
 from ccnn_torch.least_squares import jacobian_of, levenberg_marquardt
 
 __all__ = ["solve"]
@@ -27,7 +28,7 @@ def solve(closure: Callable[..., Tensor], start: Tensor, data: tuple[Tensor, ...
         `... x k`; NaN in rows without a root. Differentiable in the data by the implicit function theorem (first
         derivatives, forward and reverse mode).
     """
-    lead = torch.broadcast_shapes(start.shape[:-1], *(d.shape[:-1] for d in data))
+    lead = leading_shape(start, *data)
     plain = tuple(d.detach() for d in data)
     found = levenberg_marquardt(closure, start.detach().expand(*lead, start.shape[-1]), data=plain)
     root = (2 * found.cost).sqrt() <= _ROOT

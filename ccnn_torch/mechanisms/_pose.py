@@ -44,7 +44,7 @@ def frame_from_coordinates(pose: Tensor, coordinates: tuple[Coordinate, ...], na
     strange = [a for a in angles if a not in ("rx", "ry", "rz")]
     if strange:
         raise InputError(
-            f"mechanism '{name}' has the pose angle '{strange[0]}': override frame(pose) to say how it turns the platform"
+            f"mechanism '{name}' has the pose angle '{strange[0]}': override frame(pose) to say how it turns"
         )
     zero = torch.zeros_like(pose[..., 0])
     position = torch.stack([columns.get(c, zero) for c in ("x", "y", "z")], dim=-1)
@@ -71,7 +71,8 @@ def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor) -> Tensor
     value, slope = jacobian_of(flat, point)
     if value.shape[-1] == 3:
         return slope
-    rotation = value[..., 3:].unflatten(-1, (3, 3))
+    rotation = value[..., 3:].reshape(*value.shape[:-1], 3, 3)
     # dR Rᵀ is the skew matrix of the rotation vector's rate.
-    rate = slope[..., 3:, :].movedim(-1, -2).unflatten(-1, (3, 3)) @ rotation.mT.unsqueeze(-3)
-    return torch.cat([slope[..., :3, :], vee(rate).movedim(-1, -2)], dim=-2)
+    turning = slope[..., 3:, :].mT
+    rate = turning.reshape(*turning.shape[:-1], 3, 3) @ rotation.mT.unsqueeze(-3)
+    return torch.cat([slope[..., :3, :], vee(rate).mT], dim=-2)

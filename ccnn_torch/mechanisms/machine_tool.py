@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from ccnn_torch.batching import stack_last
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.mechanisms._mechanism import Mechanism
 
@@ -51,14 +52,10 @@ class MachineTool(Mechanism):
         l_e, l_b, z_0, l, gamma = (v[..., None] for v in values[..., :5].unbind(-1))
         alpha, beta = values[..., 5:8], values[..., 8:11]
         position, rotation = self.frame(pose)
-        joint = torch.stack(torch.broadcast_tensors(l_e * torch.cos(beta), l_e * torch.sin(beta), z_0), dim=-1)
-        foot = torch.stack(
-            torch.broadcast_tensors(l_b * torch.cos(alpha), l_b * torch.sin(alpha), torch.zeros_like(l_b)), dim=-1
-        )
+        joint = stack_last(l_e * torch.cos(beta), l_e * torch.sin(beta), z_0)
+        foot = stack_last(l_b * torch.cos(alpha), l_b * torch.sin(alpha), torch.zeros_like(l_b))
         slide = torch.cos(gamma)
-        along = torch.stack(
-            torch.broadcast_tensors(-slide * torch.cos(alpha), -slide * torch.sin(alpha), torch.sin(gamma)), dim=-1
-        )
+        along = stack_last(-slide * torch.cos(alpha), -slide * torch.sin(alpha), torch.sin(gamma))
         c = position[..., None, :] + (rotation[..., None, :, :] @ joint[..., None])[..., 0] - foot
         middle = (c * along).sum(-1)
         return middle - torch.sqrt(middle**2 - (c**2).sum(-1) + l**2)
@@ -69,4 +66,4 @@ class MachineTool(Mechanism):
         zero = torch.zeros_like(z)
         sx, cx, sy, cy = torch.sin(theta_x), torch.cos(theta_x), torch.sin(theta_y), torch.cos(theta_y)
         rows = [cy, zero, sy, sx * sy, cx, -sx * cy, -cx * sy, sx, cx * cy]
-        return torch.stack([zero, zero, z], dim=-1), torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+        return torch.stack([zero, zero, z], dim=-1), torch.stack(rows, dim=-1).reshape(*z.shape, 3, 3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ccnn_torch.batching import expand_leading, stack_last
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms._mechanism import Mechanism
@@ -40,20 +41,27 @@ class Tripod(Mechanism):
         rho1 = torch.sqrt(length**2 - y**2 - (z + up) ** 2) + out
         rho2 = torch.sqrt(length**2 - y**2 - (z - up) ** 2) + out
         rho3 = torch.sqrt(length**2 - z**2) + y + radius
-        return torch.stack(torch.broadcast_tensors(rho1, rho2, rho3), dim=-1)
+        return stack_last(rho1, rho2, rho3)
+
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """Newton on eq. 15; NaN where it leaves the assembly mode (beyond the edge of the workspace)."""
+        pose = super().forward_kinematics(joints, parameters, guess)
+        return torch.where(self.reachable(pose.detach(), parameters)[..., None], pose, torch.nan)
 
     def frame(self, pose: Tensor) -> tuple[Tensor, Tensor | None]:
         """Centre of the platform (0, y, z) and its rotation about -y by phi."""
         y, z, phi = pose.unbind(-1)
         zero, one = torch.zeros_like(phi), torch.ones_like(phi)
         s, c = torch.sin(phi), torch.cos(phi)
-        rotation = torch.stack([c, zero, -s, zero, one, zero, s, zero, c], dim=-1).unflatten(-1, (3, 3))
+        rotation = torch.stack([c, zero, -s, zero, one, zero, s, zero, c], dim=-1).reshape(*phi.shape, 3, 3)
         return torch.stack([zero, y, z], dim=-1), rotation
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Real roots, and det(∂ρ/∂X) < 0: the assembly mode of the machine as built."""
         parameters = self.resolve(parameters)
-        pose = pose.expand(*torch.broadcast_shapes(pose.shape[:-1], parameters.shape[:-1]), pose.shape[-1])
-        joints, slope = jacobian_of(lambda x: self.solve_inverse(x, parameters), pose)
+        joints, slope = jacobian_of(lambda x: self.solve_inverse(x, parameters), expand_leading(pose, parameters))
         real = torch.isfinite(joints).all(-1)
-        return real & (torch.linalg.det(torch.where(real[..., None, None], slope, 0.0)) < 0)
+        determinant: Tensor = torch.linalg.det(torch.where(real[..., None, None], slope, 0.0))
+        return real & (determinant < 0)
