@@ -4,7 +4,7 @@ Slips in the print, kept here as they stand:
 
 * Table I: with the errors of eq. 17 the rows of ρ1 and ρ3 are swapped (the formulas give means of -0.950e-4, 0.919e-4
   and 1.489e-4 m for ρ1, ρ2, ρ3).
-* Table II: the last column of ENN does not follow from its joints (their mean mse is 1.778e-10, their mean mae 1.0675e-5).
+* Table II: the last column of ENN does not follow from its joints (their mean mse is 1.778e-10 m²).
 * Table III: its spread does not follow from the printed deviations of eq. 19 (2e-5, 5e-4, 2.5e-5 m) but from about
   4e-6, 2.1e-5 and 3.6e-6 m; that is our variant `tabulated`.
 * Table IV: the row GRNN repeats for u2 the digits of ρ2 in Table II, and CCNN lies below the noise floor of the printed
