@@ -17,3 +17,7 @@ class ModelFileError(InputError):
 
 class MethodFailedError(CcnnError):
     """A learner could not be trained on this data; a run notes the sentence in its results and goes on."""
+
+
+class OutsideDomainWarning(UserWarning):
+    """A command lies outside the domain that a compensator was trained on; the safe correction is used there."""

@@ -1,0 +1,8 @@
+"""Compensator (guard, limit, fixed point), its hook on inverse kinematics, and model files."""
+
+from ccnn_torch.compensation._compensator import Compensator as Compensator
+from ccnn_torch.compensation._compensator import Solution as Solution
+from ccnn_torch.compensation._compensator import fit_compensator as fit_compensator
+from ccnn_torch.compensation._domain import Domain as Domain
+from ccnn_torch.compensation._networks import network_from_description as network_from_description
+from ccnn_torch.compensation._networks import register_network as register_network

@@ -84,7 +84,9 @@ class Scaling(nn.Module):
 
     def features(self, inputs: Tensor) -> Tensor:
         """inputs: `[r x] ... x i` [SI]; returns `[r x] ... x feature_count` [1]."""
-        scaled = (inputs[..., self.linear] - _align(self.centre, inputs)) / _align(self.half_range, inputs)
+        # Without a periodic input nothing is picked: exported graphs stay free of gather.
+        linear = inputs[..., self.linear] if len(self.periodic) else inputs
+        scaled = (linear - _align(self.centre, inputs)) / _align(self.half_range, inputs)
         if len(self.periodic) == 0:
             return scaled
         angles = inputs[..., self.periodic]

@@ -1,0 +1,263 @@
+"""From ideal joints to commands that make the machine reach them, and back."""
+
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ccnn_torch.compensation._contraction import STEEPEST_DEVIATION, iterations_needed, steepest
+from ccnn_torch.compensation._domain import Domain
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError, MethodFailedError, OutsideDomainWarning
+from ccnn_torch.training import Scaling
+
+__all__ = ["Compensator", "Solution", "fit_compensator"]
+
+Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
+
+
+class Solution(NamedTuple):
+    """Both directions at once, since the first step of the one is the other.
+
+    Attributes:
+        command: joints to command for the ideal joints given, `... x n` [SI].
+        deviation: δ at that command, `... x n` [SI].
+        inside_domain: whether that command is inside the domain, `...`, bool.
+        ideal: ideal joints, were the joints given a command, `... x n` [SI].
+        ideal_inside_domain: whether the joints given are inside the domain, `...`, bool.
+    """
+
+    command: Tensor
+    deviation: Tensor
+    inside_domain: Tensor
+    ideal: Tensor
+    ideal_inside_domain: Tensor
+
+
+class _Deviation(NamedTuple):
+    """δ `... x n` [SI]; its weight against the safe correction, and the guard's excess, `... x 1` [1] each."""
+
+    value: Tensor
+    weight: Tensor
+    excess: Tensor
+
+    @property
+    def inside(self) -> Tensor:
+        """Whether inside the domain, `...`, bool."""
+        return self.excess.squeeze(-1) <= 0
+
+
+class Compensator(nn.Module):
+    """A learned deviation δ(q) of commanded joints, guarded and limited, with the command that undoes it.
+
+    Sign: δ is what the machine does beyond the command, ideal = q + δ(q); the command for ideal joints q* solves
+    q + δ(q) = q* by `iterations` steps of q ← q* - δ(q) from q*. δ is `scaling.restore(network(features))` clamped to
+    ± `limit`, faded by the domain's guard into the constant `safe`. Inputs that are no number give the command of the
+    domain's centre, infinite ones that of its edge, both with `safe` and outside the domain.
+
+    Attributes:
+        network: features -> standardised deviation; operators that ONNX Runtime has in double.
+        scaling: of one repeat.
+        limit: hard limit of |δ|, `n` [SI].
+        safe: correction outside the domain, `n` [SI].
+        joints, covariates: coordinates in order.
+        lipschitz: bound of |∂δ/∂q| with joints in units of their limits (maximum row sum), 1.
+        iterations: smallest k with lipschitzᵏ · max|δ| below 1e-12 of the limit.
+    """
+
+    limit: Tensor
+    safe: Tensor
+
+    def __init__(
+        self,
+        network: nn.Module,
+        scaling: Scaling,
+        domain: Domain,
+        limit: Tensor,
+        safe: Tensor,
+        joints: Sequence[Coordinate],
+        covariates: Sequence[Coordinate],
+        lipschitz: float,
+        iterations: int,
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.scaling = scaling
+        self.domain = domain
+        self.register_buffer("limit", limit)
+        self.register_buffer("safe", safe)
+        self.joints = tuple(joints)
+        self.covariates = tuple(covariates)
+        self.lipschitz = lipschitz
+        self.iterations = iterations
+
+    def forward(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Command, δ at the command `... x n` [SI] each, and whether it is inside the domain `...`.
+
+        Args:
+            joints: ideal joints, `... x n` [SI].
+            covariates: `... x m` [SI], in the order of `covariates`; None where there are none.
+
+        Raises:
+            InputError: covariates are missing, or a last dimension is wrong.
+        """
+        return self.solve(joints, covariates)[:3]
+
+    def deviation(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
+        """Guarded and limited δ at *commanded* joints, `... x n` [SI]; arguments and errors as `forward`."""
+        joints, covariates, strange = self._inputs(joints, covariates)
+        return self._deviation(joints, covariates, strange).value
+
+    def back(self, command: Tensor, covariates: Tensor | None = None) -> Tensor:
+        """Ideal joints of a command (or of the joints fed back), `... x n` [SI]; arguments and errors as `forward`."""
+        command, covariates, strange = self._inputs(command, covariates)
+        return command + self._deviation(command, covariates, strange).value
+
+    def solve(self, joints: Tensor, covariates: Tensor | None = None) -> Solution:
+        """Command of ideal joints, and the ideal joints were they a command; arguments and errors as `forward`."""
+        joints, covariates, strange = self._inputs(joints, covariates)
+        first = last = self._deviation(joints, covariates, strange)
+        command = joints
+        for _ in range(self.iterations):
+            command = joints - last.value
+            last = self._deviation(command, covariates, strange)
+        return Solution(command, last.value, last.inside, joints + first.value, first.inside)
+
+    def guarded(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As `solve`, told by deviations and weights instead of joints, which single precision cannot hold.
+
+        Returns:
+            δ at the command `... x n` [SI], its weight `... x 1` [1] (1 inside the domain); δ and weight were the
+            joints given a command.
+        """
+        joints, covariates, strange = self._inputs(joints, covariates)
+        first = last = self._deviation(joints, covariates, strange)
+        for _ in range(self.iterations):
+            last = self._deviation(joints - last.value, covariates, strange)
+        return last.value, last.weight, first.value, first.weight
+
+    def hook(self, warn: bool = True) -> Hook:
+        """For `mechanism.inverse_kinematics.register_forward_hook(compensator.hook(), with_kwargs=True)`.
+
+        Covariates travel as the keyword `covariates` of the call, `... x m`. A pose without inverse kinematics stays
+        NaN, since no correction makes it reachable.
+
+        Args:
+            warn: warn once with `OutsideDomainWarning` when a command is outside the domain; False inside torch.func
+                transforms, where nothing can be asked of a value.
+        """
+        told = not warn
+
+        def compensate(module: nn.Module, args: tuple[Any, ...], kwargs: Mapping[str, Any], output: Tensor) -> Tensor:
+            nonlocal told
+            covariates = kwargs.get("covariates")
+            if covariates is not None:
+                covariates = covariates.expand(*output.shape[:-1], covariates.shape[-1])
+            command, _, inside = self(output, covariates)
+            solved = torch.isfinite(output).all(-1)
+            if not told and bool((solved & ~inside).any()):
+                told = True
+                warnings.warn(
+                    "a command is outside the domain that the compensator was trained on, where it falls back to the "
+                    "mean training deviation; this is said once",
+                    OutsideDomainWarning,
+                    stacklevel=2,
+                )
+            return torch.where(solved.unsqueeze(-1), command, output)
+
+        return compensate
+
+    def _inputs(self, joints: Tensor, covariates: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Finite joints and covariates, and how many inputs were not finite, `... x 1`."""
+        n, m = len(self.joints), len(self.covariates)
+        if joints.shape[-1] != n:
+            names = ", ".join(c.header for c in self.joints)
+            raise InputError(f"the compensator takes the {n} joints {names}; got {joints.shape[-1]}")
+        if m == 0:
+            finite = self.domain.clean(joints)
+            return finite.inputs, joints.new_zeros(*joints.shape[:-1], 0), finite.strange
+        names = ", ".join(c.header for c in self.covariates)
+        if covariates is None:
+            raise InputError(f"the compensator needs the covariates {names}; give covariates=… with {m} columns")
+        if covariates.shape[-1] != m:
+            raise InputError(f"the compensator needs the covariates {names}; got {covariates.shape[-1]} columns")
+        finite = self.domain.clean(torch.cat([joints, covariates.to(joints.dtype)], -1))
+        return finite.inputs[..., :n], finite.inputs[..., n:], finite.strange
+
+    def _deviation(self, joints: Tensor, covariates: Tensor, strange: Tensor) -> _Deviation:
+        """δ at commanded, finite joints."""
+        inputs = torch.cat([joints, covariates], -1) if self.covariates else joints
+        caged = self.domain.cage(inputs)
+        raw = self.scaling.restore(self.network(self.scaling.features(caged)))
+        excess = self.domain.excess(caged) + strange
+        fade = torch.relu(1 - excess)
+        weight = fade * fade
+        # Two products instead of safe + weight · (limited - safe): each end is then exact.
+        return _Deviation(self._limited(weight * self._limited(raw) + (1 - weight) * self.safe), weight, excess)
+
+    def _limited(self, deviation: Tensor) -> Tensor:
+        return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)
+
+
+def fit_compensator(
+    network: nn.Module,
+    scaling: Scaling,
+    inputs: Tensor,
+    deviations: Tensor,
+    joints: Sequence[Coordinate],
+    covariates: Sequence[Coordinate] = (),
+    limit: Tensor | None = None,
+    margin: float = 0.1,
+    transition: float = 0.5,
+) -> Compensator:
+    """Put guard, limit and fixed point around a trained network.
+
+    Args:
+        network: features -> standardised deviation, of one repeat.
+        scaling: of that repeat, without the leading dimension.
+        inputs: training inputs, commanded joints and then covariates, `s x (n + m)` [SI].
+        deviations: training deviations, `s x n` [SI]; their mean is the safe correction outside the domain.
+        joints, covariates: coordinates in the order of the inputs.
+        limit: hard limit of |δ|, `n` [SI]; 1.5 times the largest training deviation of each joint when None.
+        margin: how far beyond the training inputs δ is trusted, as a share of their half range.
+        transition: width over which it then fades into the safe correction, as a share of the half range.
+
+    Raises:
+        InputError: shapes do not fit together, or a limit is not positive.
+        MethodFailedError: δ is so steep that the command cannot be solved for.
+    """
+    n = len(joints)
+    if inputs.shape[-1] != n + len(covariates) or deviations.shape != (len(inputs), n):
+        raise InputError(
+            f"training inputs {tuple(inputs.shape)} and deviations {tuple(deviations.shape)} do not fit "
+            f"{n} joints and {len(covariates)} covariates"
+        )
+    inputs, deviations = inputs.detach(), deviations.detach()
+    largest = deviations.abs().amax(0)
+    limit = 1.5 * largest if limit is None else limit.detach()
+    if limit.shape != (n,) or not bool((limit >= 0).all() & torch.isfinite(limit).all()):
+        raise InputError(f"limit must be one finite number of at least 0 for each of the {n} joints")
+    safe = torch.minimum(torch.maximum(deviations.mean(0), -limit), limit)
+    reach = torch.cat([limit, limit.new_zeros(len(covariates))])
+    domain = Domain.fit(inputs, reach, margin, transition)
+    # A copy: what is compensated with does not change when the learner trains on.
+    frozen = copy.deepcopy(network).requires_grad_(False)
+    compensator = Compensator(frozen, scaling, domain, limit, safe, joints, covariates, 0.0, 1)
+    found = steepest(compensator.deviation, inputs, domain, limit)
+    if not math.isfinite(found.lipschitz):
+        raise MethodFailedError("the trained network gives values that are not finite within its domain")
+    if found.lipschitz > STEEPEST_DEVIATION:
+        raise MethodFailedError(
+            f"the learned deviation changes by up to {found.lipschitz:.2g} of a joint's motion, and above "
+            f"{STEEPEST_DEVIATION:g} the command cannot be solved for safely; train with more rows, fewer nodes or "
+            "regularisation, and leave out rows near singular poses (max_condition)"
+        )
+    compensator.lipschitz = found.lipschitz
+    compensator.iterations = iterations_needed(found)
+    return compensator
