@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.errors import ModelFileError
 
-__all__ = ["METADATA_KEY", "OUTPUTS", "Array", "open_onnx", "open_pt2", "run_onnx", "run_pt2"]
+__all__ = ["METADATA_KEY", "OUTPUTS", "Array", "open_onnx", "open_pt2", "read_pt2_text", "run_onnx", "run_pt2"]
 
 Array = NDArray[Any]
 
@@ -46,10 +46,24 @@ def open_pt2(content: bytes) -> Callable[..., tuple[Tensor, ...]]:
     Raises:
         ModelFileError: something in it would go through pickle; our own files hold nothing of the kind.
     """
-    _refuse_pickle(content)
+    with _archive(content) as archive:
+        _refuse_pickle(archive)
     program = torch.export.load(io.BytesIO(content))
     module: nn.Module = program.module()
     return module
+
+
+def read_pt2_text(content: bytes) -> str | None:
+    """Our JSON in a `.pt2` file, None where there is none.
+
+    Raises:
+        ModelFileError: it is no such file, or damaged.
+    """
+    with _archive(content) as archive:
+        for name in archive.namelist():
+            if name.endswith(f"/extra/{METADATA_KEY}"):
+                return archive.read(name).decode()
+    return None
 
 
 def run_pt2(
@@ -61,19 +75,25 @@ def run_pt2(
         return {name: value.numpy() for name, value in zip(OUTPUTS, module(*inputs), strict=True)}
 
 
-def _refuse_pickle(content: bytes) -> None:
+def _archive(content: bytes) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(io.BytesIO(content))
+    except zipfile.BadZipFile:
+        raise ModelFileError("it is damaged, or no .pt2 file") from None
+
+
+def _refuse_pickle(archive: zipfile.ZipFile) -> None:
     """torch.export.load unpickles example inputs, custom objects and tensors marked so; refuse a file that has any."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        for name in archive.namelist():
-            inner = name.split("/", 1)[-1]
-            pickled = inner.startswith("data/sample_inputs/") and archive.getinfo(name).file_size > 0
-            if inner.endswith("_config.json"):
-                entries = json.loads(archive.read(name))["config"].values()
-                pickled = any(e["use_pickle"] or not _plain(e["path_name"]) for e in entries)
-            elif inner.startswith(("data/weights/", "data/constants/")):
-                pickled = not _plain(inner.rsplit("/", 1)[-1])
-            if pickled:
-                raise ModelFileError(f"the .pt2 file holds pickled data ({inner}), which is never loaded")
+    for name in archive.namelist():
+        inner = name.split("/", 1)[-1]
+        pickled = inner.startswith("data/sample_inputs/") and archive.getinfo(name).file_size > 0
+        if inner.endswith("_config.json"):
+            entries = json.loads(archive.read(name))["config"].values()
+            pickled = any(e["use_pickle"] or not _plain(e["path_name"]) for e in entries)
+        elif inner.startswith(("data/weights/", "data/constants/")):
+            pickled = not _plain(inner.rsplit("/", 1)[-1])
+        if pickled:
+            raise ModelFileError(f"it holds pickled data ({inner}), which is never loaded")
 
 
 def _plain(name: str) -> bool:

@@ -1,0 +1,105 @@
+"""What a model file says about itself: one JSON text, the same in the master and in every export."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+from torch import Tensor
+
+from ccnn_torch.compensation._compensator import Compensator
+from ccnn_torch.compensation._networks import describe_network
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError, ModelFileError
+from ccnn_torch.training import tensor_digest
+
+__all__ = ["FORMAT", "check_keys", "check_tensors", "coordinates", "facts_of", "to_json"]
+
+FORMAT = "ccnn_torch compensator 1"
+
+_REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
+_PACKAGES = ("ccnn-torch", "torch", "onnx", "onnxscript", "onnxruntime", "safetensors", "numpy")
+
+
+def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Everything a reader of the model needs beside its tensors; equal for equal model and fields.
+
+    Args:
+        fields: `mechanism` (its `describe()`), `metrics`, `data_sha256`, `seed`.
+
+    Raises:
+        InputError: a field is missing, or is no JSON.
+    """
+    missing = [key for key in _REQUIRED if key not in fields]
+    if missing:
+        raise InputError(f"a model's fields lack {', '.join(missing)}; needed are {', '.join(_REQUIRED)}")
+    mechanism = fields["mechanism"]
+    pose = mechanism.get("pose", []) if isinstance(mechanism, Mapping) else []
+    limits = compensator.limit.tolist(), compensator.safe.tolist()
+    facts: dict[str, Any] = {
+        "format": FORMAT,
+        **{key: fields[key] for key in _REQUIRED},
+        "joints": [_plain(c) for c in compensator.joints],
+        "covariates": [_plain(c) for c in compensator.covariates],
+        "pose": [dict(zip(("name", "unit"), header.rstrip("]").split("["), strict=True)) for header in pose],
+        "network": describe_network(compensator.network),
+        "domain": compensator.domain.describe(compensator.joints + compensator.covariates),
+        "limits": {
+            c.name: {"unit": c.unit, "limit": limit, "safe_correction": safe}
+            for c, limit, safe in zip(compensator.joints, *limits, strict=True)
+        },
+        "lipschitz": compensator.lipschitz,
+        "iterations": compensator.iterations,
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES},
+    }
+    tensors = tensor_digest(dict(compensator.state_dict()))
+    return facts | {"sha256": {"tensors": tensors, "keys": _digest(facts)}}
+
+
+def check_keys(facts: Any) -> dict[str, Any]:
+    """The facts, when they are ours and unchanged.
+
+    Raises:
+        ModelFileError: they are not.
+    """
+    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
+        raise ModelFileError(f"it says nothing of the form '{FORMAT}', so this package did not write it")
+    stated = facts.get("sha256")
+    if not isinstance(stated, dict) or stated.get("keys") != _digest({k: v for k, v in facts.items() if k != "sha256"}):
+        raise ModelFileError("what it says about itself was edited after it was written")
+    return facts
+
+
+def check_tensors(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
+    """Raise ModelFileError unless the tensors are those that the facts were written with."""
+    if facts["sha256"]["tensors"] != tensor_digest(tensors):
+        raise ModelFileError("its weights were altered after it was written")
+
+
+def coordinates(entries: list[dict[str, str]]) -> tuple[Coordinate, ...]:
+    """Inverse of how coordinates stand in the facts."""
+    return tuple(Coordinate(entry["name"], entry["unit"]) for entry in entries)
+
+
+def to_json(value: Mapping[str, Any], indent: int | None = None) -> str:
+    """Sorted JSON without NaN.
+
+    Raises:
+        InputError: something in it has no form in JSON.
+    """
+    try:
+        return json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False, indent=indent)
+    except (TypeError, ValueError) as problem:
+        raise InputError(f"a model's fields must be JSON: {problem}") from None
+
+
+def _digest(facts: Mapping[str, Any]) -> str:
+    return hashlib.sha256(to_json(facts).encode()).hexdigest()
+
+
+def _plain(coordinate: Coordinate) -> dict[str, str]:
+    return {"name": coordinate.name, "unit": coordinate.unit}
