@@ -83,6 +83,5 @@ def _least_norm_solve(slope: Tensor, right: Tensor) -> Tensor:
     ridge = torch.finfo(slope.dtype).eps * normal.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-100)
     normal = normal + torch.diag_embed(ridge[..., None].expand(normal.shape[:-1]))
     column = right[..., None]
-    if k <= c:
-        return (torch.linalg.solve_ex(normal, slope.mT @ column).result)[..., 0]
-    return (slope.mT @ torch.linalg.solve_ex(normal, column).result)[..., 0]
+    solved: Tensor = torch.linalg.solve_ex(normal, slope.mT @ column if k <= c else column).result
+    return (solved if k <= c else slope.mT @ solved)[..., 0]

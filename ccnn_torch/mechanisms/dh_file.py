@@ -25,10 +25,10 @@ _ANGLES = {"rad": 1.0, "deg": 0.017453292519943295, "mrad": 1e-3}
 def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
     """Read a serial arm; keys that this does not know are ignored.
 
-    Needed: `dof`, `convention` (starts with one of the two known), `units: {length, angle}`, `a`, `alpha`, `d`, `theta`.
-    Optional: `joint_types` (revolute), `joint_sign` (+1), `parallel_axes`, `base_frame` and `tool_frame` (a text that
-    starts with "unknown", "identity", or [x, y, z, rx, ry, rz]; unknown when missing), `tool_offset` ("unknown…" or
-    [x, y, z]; replaces the tool frame for records without orientation), `frame_per`, `tool_per`, `robot` (its name).
+    Needed: `dof`, `convention` (starts with one of the two known), `units: {length, angle}`, `a`, `alpha`, `d`,
+    `theta`. Optional: `joint_types` (revolute), `joint_sign` (+1), `parallel_axes`, `base_frame` and `tool_frame`
+    ("unknown…", "identity", or [x, y, z, rx, ry, rz]; unknown when missing), `tool_offset` ("unknown…" or [x, y, z];
+    replaces the tool frame for records without orientation), `frame_per`, `tool_per`, `robot` (its name).
 
     Args:
         path: the file.
@@ -121,7 +121,7 @@ class _Table:
     def unit(self, kind: str, known: Mapping[str, float]) -> float:
         units = self.need("units")
         name = units.get(kind) if isinstance(units, Mapping) else None
-        if name not in known:
+        if not isinstance(name, str) or name not in known:
             raise InputError(f"{self.path}: key 'units.{kind}' must be one of {', '.join(known)}, got {name!r}")
         return known[name]
 

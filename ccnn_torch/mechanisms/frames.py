@@ -164,12 +164,14 @@ def _base_by_relaxation(rotation: Tensor, position: Tensor, measured: Tensor, we
     design = torch.cat([matrix, -rotation, -eye.expand(s, 3, 3)], dim=-1)
     solved = _weighted_linear(design, position, weights)
     relaxed = solved[..., :9].reshape(*solved.shape[:-1], 3, 3)
-    return roma.special_procrustes(relaxed).mT
+    base: Tensor = roma.special_procrustes(relaxed).mT
+    return base
 
 
 def _weighted_linear(design: Tensor, right: Tensor, weights: Tensor) -> Tensor:
-    """Minimum-norm weighted least squares: design `s x 3 x m`, right `[...] x s x 3`, weights `... x s` -> `... x m`."""
+    """Minimum-norm weighted least squares: design `s x 3 x m`, right `... x s x 3`, weights `... x s` -> `... x m`."""
     m = design.shape[-1]
     normal = (weights @ (design.mT @ design).reshape(-1, m * m)).reshape(*weights.shape[:-1], m, m)
     moment = ((weights[..., None, None] * right[..., None]) * design).sum((-3, -2))
-    return (torch.linalg.pinv(normal, rtol=1e-12, hermitian=True) @ moment[..., None])[..., 0]
+    solved: Tensor = torch.linalg.pinv(normal, rtol=1e-12, hermitian=True) @ moment[..., None]
+    return solved[..., 0]

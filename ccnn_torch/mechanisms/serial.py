@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,7 +23,7 @@ _FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz
 
 
 class SerialArm(Mechanism):
-    """base · link 1 · … · link n · tool; pose x, y, z [m] and the rotation vector rx, ry, rz [rad] in the record's frame.
+    """base · link 1 · … · link n · tool; pose x, y, z [m] and rotation vector rx, ry, rz [rad] in the record's frame.
 
     Parameters in order: the base frame (6: position, rotation vector), each link's (DH: a, alpha, d, theta; URDF: x, y,
     z, roll, pitch, yaw), the tool frame (6). `solve_inverse` is damped Newton to the closest pose in
@@ -114,7 +113,7 @@ class SerialArm(Mechanism):
         self._choose_home()
 
     def _choose_home(self) -> None:
-        """The best-conditioned of 64 fixed draws: many arms are singular at zero. Sets the box of poses from the reach."""
+        """The best-conditioned of 64 fixed draws (many arms are singular at zero); the box of poses from the reach."""
         draws = self.sample_joints(64, torch.Generator().manual_seed(0))
         self.home_joints.copy_(draws[self.condition_number(draws, self.rotation_weight).argmin()])
         self.home_pose.copy_(self.forward_kinematics(self.home_joints))
@@ -122,14 +121,14 @@ class SerialArm(Mechanism):
 
     @property
     def reach(self) -> float:
-        """Sum of the link lengths, the tool's and the travel of prismatic joints [m]; nothing is farther from the base."""
+        """Sum of the lengths of links and tool and of prismatic travel [m]; nothing is farther from the base."""
         rows = self.nominal[6:-6].reshape(len(self.joints), -1)
         lengths = rows[:, :3] if self.convention == "urdf" else rows[:, (0, 2)]
         travel = self.limits.abs().amax(-1)[~self.revolute].sum()
         return float(lengths.norm(dim=-1).sum() + self.nominal[-6:-3].norm() + travel)
 
     def with_orientation(self, orientation: str) -> SerialArm:
-        """The same arm, nominal parameters included, for records of "rotation_vector" poses or of positions ("none")."""
+        """The same arm, nominal parameters included, for poses of another kind: "rotation_vector" or "none"."""
         twin = SerialArm(**{**self.recipe["keys"], "orientation": orientation})
         twin.nominal.copy_(self.nominal)
         return twin
@@ -146,7 +145,7 @@ class SerialArm(Mechanism):
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Positions no farther from the base than the reach: necessary, not sufficient; `...`, bool."""
         values = self.resolve(parameters)
-        distance = torch.linalg.vector_norm(pose[..., :3] - values[..., :3], dim=-1)
+        distance: Tensor = torch.linalg.vector_norm(pose[..., :3] - values[..., :3], dim=-1)
         return distance <= self.reach
 
     def chain(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -183,7 +182,7 @@ class SerialArm(Mechanism):
         swept = torch.linalg.cross(axes, tool[1][..., None, :] - points, dim=-1)
         turning = self.revolute[:, None]
         columns = torch.cat([torch.where(turning, swept, axes), axes * turning], dim=-1) * self.signs[:, None]
-        linear, angular = (base[..., None, :, :] @ columns.unflatten(-1, (2, 3)).mT).unbind(-1)
+        linear, angular = columns[..., :3] @ base.mT, columns[..., 3:] @ base.mT
         placed = compose((base, values[..., :3]), tool)
         return placed[1], placed[0], torch.cat([linear, angular], dim=-1).mT
 
@@ -214,7 +213,7 @@ class SerialArm(Mechanism):
         return torch.cat([placed[0] - position, weight * turn], dim=-1)
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
-        """Joints of the closest pose on the guess's branch; see `nearest_joints`. Never NaN: ask `pose_error` how close."""
+        """Joints of the closest pose, as `nearest_joints`. Never NaN: `pose_error` tells how close it comes."""
         x = self.nearest_joints(pose, parameters, guess, self.rotation_weight)
         values = self.resolve(parameters)
         position, rotation = self.frame(pose)
@@ -240,7 +239,7 @@ class SerialArm(Mechanism):
         start = expand_leading(start, position, values)
 
         def residual(q: Tensor, v: Tensor, x: Tensor, *turn: Tensor) -> Tensor:
-            return self._gap(q, x, turn[0].unflatten(-1, (3, 3)) if turn else None, v, rotation_weight)
+            return self._gap(q, x, turn[0].reshape(*x.shape, 3) if turn else None, v, rotation_weight)
 
         weights = self._weights(rotation_weight)
 
