@@ -78,7 +78,9 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
     if unknown:
         raise InputError(f"covariates: {unknown[0]!r} is no column of the case {config.case}; it has only 't'")
     chosen = [columns[name] for name in config.covariates or []]
-    covariates = torch.stack([values for values, _ in chosen], -1) if chosen else case.joints.new_zeros(len(case.time), 0)
+    covariates = (
+        torch.stack([values for values, _ in chosen], -1) if chosen else case.joints.new_zeros(len(case.time), 0)
+    )
     noise = case.noise(seeds)
     pose = case.measured(noise)
     deviations = joint_deviations(
@@ -155,13 +157,16 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
 
 def _splits(config: RunConfig, positions: Tensor, columns: dict[str, Tensor], seeds: list[int]) -> list[Split]:
     split = config.split
-    return [
-        split_rows(positions, split.kind, split.by, columns, split.test, split.validation, seed) for seed in seeds
-    ]
+    return [split_rows(positions, split.kind, split.by, columns, split.test, split.validation, seed) for seed in seeds]
 
 
 def _dataset(
-    mechanism: Mechanism, joints: Tensor, covariates: Tensor, deviations: Pseudoerror, splits: list[Split], seeds: list[int]
+    mechanism: Mechanism,
+    joints: Tensor,
+    covariates: Tensor,
+    deviations: Pseudoerror,
+    splits: list[Split],
+    seeds: list[int],
 ) -> Dataset:
     repeats, rows = len(seeds), len(joints)
     turning = [joint.unit == "rad" for joint in mechanism.joints] + [False] * covariates.shape[-1]
