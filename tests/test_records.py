@@ -118,7 +118,13 @@ def test_every_default_covariate_and_no_other(tmp_path: Path) -> None:
     records = load(tmp_path, columns, Slide())
     expected = {"temperature": "K"} | {h.partition("[")[0]: unit for h, unit in extra.items() if unit}
     assert {c.name: c.unit for c in records.covariate_coordinates} == expected
-    assert any("'times' looks like 'time'" in note for note in records.notes)
+    assert any("ignored columns: goal_y, row, loading, times, my_speed;" in note for note in records.notes)
+
+
+def test_misspelt_default_covariate_is_pointed_out(tmp_path: Path) -> None:
+    records = load(tmp_path, renamed(slide_columns(), "temperature[degC]", "temprature[degC]"), Slide())
+    assert records.covariates.shape == (ROWS, 0)
+    assert any("'temprature' looks like 'temperature'" in note for note in records.notes)
 
 
 @pytest.mark.parametrize(
