@@ -136,7 +136,7 @@ def test_global_random_state_is_left_alone() -> None:
         ({"validation": -0.1}, ("split.validation", "-0.1")),
         ({"kind": "group", "by": "one"}, ("1 groups are too few", "no training row")),
         ({"test": 0.999}, ("200 rows are too few", "no training row")),
-        ({"kind": "block", "by": "halves", "test": 0.4}, ("2 groups of 200 rows", "no validation row")),
+        ({"kind": "block", "by": "halves", "test": 0.4, "validation": 0.1}, ("2 groups of 200 rows", "no validation row")),
     ],
 )
 def test_bad_split(keys: dict[str, str | float | Sequence[str]], parts: tuple[str, ...]) -> None:
