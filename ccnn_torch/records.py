@@ -152,14 +152,15 @@ def load_records(path: str | Path, mechanism: HasCoordinates, covariates: Sequen
 def check_rows(records: Records, mechanism: HasCoordinates) -> None:
     """Refuse rows that the mechanism cannot have reached.
 
-    With known frames a row must be `mechanism.reachable(pose)`, where the mechanism has that method. With unknown
-    frames (`mechanism.frames_known` is False; an arm that does not say is taken for such) no position may be farther
-    from the median position than twice `mechanism.reach` [m] and the tool, for which a quarter of the reach is allowed.
+    With known frames a row must be `mechanism.reachable(pose)`, where the mechanism has that method. An arm with
+    `unknown_frames` can only be judged by its size: no position may be farther from the median position than twice
+    `mechanism.reach` [m], to which a quarter is added for the tool where that is unknown too.
 
     Raises:
         InputError: names the rows.
     """
-    if getattr(mechanism, "frames_known", not mechanism.orientations):
+    unknown: Sequence[str] = getattr(mechanism, "unknown_frames", ())
+    if not unknown:
         reachable = getattr(mechanism, "reachable", None)
         if reachable is None or len(records.pose_coordinates) != len(mechanism.pose):
             return
@@ -174,7 +175,7 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
     positions = records.positions.numpy()
     if reach is None or positions.shape[1] == 0:
         return
-    limit = 2 * float(reach) * (1 + _TOOL_ALLOWANCE)
+    limit = 2 * float(reach) * (1 + _TOOL_ALLOWANCE * ("tool" in unknown))
     distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     outside = np.flatnonzero(distance > limit)
     if len(outside):

@@ -3,9 +3,9 @@
 Three kinds, each a function of the rows and one seed:
 
 * ``random``: single rows at random. Rows of one target pose may stand on both sides, which flatters the figures.
-* ``group``: whole groups at random. `by` is a column, several columns (rows alike in all of them), or
-  ``position:5mm``, the default: rows whose measured positions round to the same cell of 5 mm share a target pose and
-  form a group. A column that is named counts alone: where many groups visit the same poses, joining them by pose too
+* ``group``: whole groups at random. `by` is a column or ``position:5mm``, the default: rows whose measured positions
+  round to the same cell of 5 mm share a target pose and form a group. Several entries make a group of the rows that are
+  alike in all. A column that is named counts alone: where many groups visit the same poses, joining them by pose too
   would leave a single group.
 * ``block``: whole groups (same `by`), sorted by their mean along the first principal direction of the positions; the
   far end is held out, so that the figures are those of extrapolation.
@@ -34,6 +34,7 @@ __all__ = ["DEFAULT_BY", "KINDS", "Split", "split_rows"]
 KINDS = ("random", "group", "block")
 DEFAULT_BY = "position:5mm"
 
+Column = NDArray[np.float64] | Tensor
 _Integers = NDArray[np.int64]
 
 
@@ -50,7 +51,7 @@ def split_rows(
     positions: Tensor,
     kind: str = "random",
     by: str | Sequence[str] | None = None,
-    columns: Mapping[str, NDArray[np.float64]] | None = None,
+    columns: Mapping[str, Column] | None = None,
     test: float = 0.3,
     validation: float = 0.2,
     seed: int = 0,
@@ -65,7 +66,7 @@ def split_rows(
     Args:
         positions: `rows x d` [m]; d may be 0 where `by` names columns.
         kind: ``random``, ``group`` or ``block``.
-        by: what makes a group, see above.
+        by: what makes a group, see above; one entry or several.
         columns: the columns that `by` may name, `rows` each.
         test: share of the rows (``group``: of the groups) that is held out, between 0 and 1.
         validation: share of the rest, from 0.
@@ -138,16 +139,17 @@ def _collect(part: _Integers, validation: float, stock: str) -> Split:
     return Split(train, chosen, test)
 
 
-def _groups(positions: Tensor, by: str | Sequence[str], columns: Mapping[str, NDArray[np.float64]]) -> _Integers:
-    """Number of each row's group, `rows`, from 0."""
-    if isinstance(by, str) and by.partition(":")[0] == "position":
-        if positions.shape[1] == 0:
-            raise InputError(f"split.by: '{by}' needs positions, and this pose has none; name a column instead")
-        keys = np.round(positions.numpy() / _cell(by))
-    else:
-        names = [by] if isinstance(by, str) else list(by)
-        keys = np.stack([_column(name, columns) for name in names], axis=1)
-    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+def _groups(positions: Tensor, by: str | Sequence[str], columns: Mapping[str, Column]) -> _Integers:
+    """Number of each row's group, `rows`, from 0: rows alike in every entry of `by` form a group."""
+    keys = []
+    for entry in [by] if isinstance(by, str) else by:
+        if entry.partition(":")[0] == "position":
+            if positions.shape[1] == 0:
+                raise InputError(f"split.by: '{entry}' needs positions, and this pose has none; name a column instead")
+            keys.append(np.round(positions.numpy() / _cell(entry)))
+        else:
+            keys.append(_column(entry, columns)[:, None])
+    return np.unique(np.concatenate(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
 def _cell(by: str) -> float:
@@ -158,12 +160,12 @@ def _cell(by: str) -> float:
     return float(to_si(float(match[1]), match[2].strip(), "m", f"split.by: the length in '{by}'", "position"))
 
 
-def _column(name: str, columns: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+def _column(name: str, columns: Mapping[str, Column]) -> NDArray[np.float64]:
     if name not in columns:
         near = nearest(name, [*columns, DEFAULT_BY])
         hint = f"did you mean '{near}'?" if near else f"write {DEFAULT_BY} or one of: {', '.join(columns) or '(none)'}"
         raise InputError(f"split.by: there is no column '{name}' to group by; {hint}")
-    values = columns[name]
+    values = np.asarray(columns[name], dtype=np.float64)
     missing = np.flatnonzero(np.isnan(values))
     if len(missing):
         raise InputError(

@@ -41,6 +41,7 @@ class Arm:
         *(Coordinate(name, "rad") for name in ("rx", "ry", "rz")),
     )
     orientations: tuple[str, ...] = ("rotation_vector", "quaternion", "none")
+    unknown_frames: tuple[str, ...] = ("base", "tool")
     reach: float = 1.0
 
 
@@ -301,6 +302,8 @@ def test_row_beyond_the_reach_of_an_arm_is_named(tmp_path: Path) -> None:
     columns["z[mm]"][4] += 4000.0
     text = fails(tmp_path, columns, Arm())
     assert "line 6 (row 5)" in text and "2.5 m" in text
+    assert "2 m" in fails(tmp_path, columns, Arm(unknown_frames=("base",)))
+    check_rows(load(tmp_path, columns, Arm(unknown_frames=())), Arm(unknown_frames=()))
     millimetres_called_metres = {h.replace("[mm]", "[m]"): v for h, v in arm_columns().items()}
     assert "check the units" in fails(tmp_path, millimetres_called_metres, Arm())
 

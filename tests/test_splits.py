@@ -64,6 +64,16 @@ def test_group_by_columns() -> None:
     assert len(both.test) == 10 and {len(set(zip(robot[p], placement[p], strict=True))) for p in both.test[None]} == {2}
 
 
+def test_group_by_column_and_cell() -> None:
+    where = positions()
+    turn = torch.arange(200, dtype=torch.float64) % 2
+    split = split_rows(where, "group", ["position:5mm", "turn"], {"turn": turn}, test=0.5, validation=0, seed=0)
+    cell = np.unique(np.round(where.numpy() * 200), axis=0, return_inverse=True)[1].reshape(-1)
+    key = cell * 2 + turn.numpy()
+    held = np.unique(key)[np.random.default_rng(0).permutation(len(np.unique(key)))[len(np.unique(key)) // 2 :]]
+    assert sets(split)[2] == set(np.flatnonzero(np.isin(key, held)))
+
+
 def test_block_is_the_far_end_of_the_principal_direction() -> None:
     where = positions()
     along = where.numpy() @ np.array([-1, -2, 3])  # the largest component counts as positive
@@ -136,7 +146,10 @@ def test_global_random_state_is_left_alone() -> None:
         ({"validation": -0.1}, ("split.validation", "-0.1")),
         ({"kind": "group", "by": "one"}, ("1 groups are too few", "no training row")),
         ({"test": 0.999}, ("200 rows are too few", "no training row")),
-        ({"kind": "block", "by": "halves", "test": 0.4, "validation": 0.1}, ("2 groups of 200 rows", "no validation row")),
+        (
+            {"kind": "block", "by": "halves", "test": 0.4, "validation": 0.1},
+            ("2 groups of 200 rows", "no validation row"),
+        ),
     ],
 )
 def test_bad_split(keys: dict[str, str | float | Sequence[str]], parts: tuple[str, ...]) -> None:
