@@ -1,0 +1,179 @@
+"""Outputs, gradient and Gauss-Newton matrix of masked sigmoid networks, in closed form.
+
+The derivative of output k with respect to weight (a, b) of layer l is a product, D[k, a] h[b], of what flows back to
+node a and what flows in from node b. The sum over samples of its outer products is therefore one matrix product of
+`samples x a a'` with `samples x b b'` for each pair of layers: the derivative of every sample and output with respect
+to every weight is never laid out, which saves a factor of the number of outputs in work and in memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+__all__ = ["Linearised", "Network", "dense_jacobian", "linearise", "network_of", "residual"]
+
+
+@dataclass(frozen=True)
+class Network:
+    """The fixed part of `b` masked networks of one shape.
+
+    Attributes:
+        masks: per layer `b x out x in`, float64, 1 where a connection counts.
+        alive: per hidden layer `b x 1 x out`, float64, 0 where a node is dead and its output forced to 0.
+        active: `b x k`, bool, the weights that take part: connected, and on a way from an input to an output.
+        bias: whether the last column of every weight matrix is a bias.
+    """
+
+    masks: list[Tensor]
+    alive: list[Tensor]
+    active: Tensor
+    bias: bool
+
+    def split(self, flat: Tensor) -> list[Tensor]:
+        """flat: `b x k`; returns the weights per layer, `b x out x in (+ 1)`."""
+        shapes = [(m.shape[-2], m.shape[-1] + int(self.bias)) for m in self.masks]
+        parts = flat.split([rows * columns for rows, columns in shapes], dim=-1)
+        return [p.unflatten(-1, shape) for p, shape in zip(parts, shapes, strict=True)]
+
+
+def network_of(masks: list[Tensor], bias: bool) -> Network:
+    """masks: per layer `b x out x in`, bool. A node without inputs (its bias not counted) or without outputs is dead."""
+    counts = [m.to(torch.float64) for m in masks]
+    fed = [torch.ones_like(counts[0][:, 0, :])]
+    for mask in counts:
+        fed.append(((mask @ fed[-1].unsqueeze(-1)).squeeze(-1) > 0).to(torch.float64))
+    used = [torch.ones_like(counts[-1][:, :, 0])]
+    for mask in reversed(counts):
+        used.insert(0, ((used[0].unsqueeze(-2) @ mask).squeeze(-2) > 0).to(torch.float64))
+    alive = [f * u for f, u in zip(fed, used, strict=True)]
+    alive[-1] = used[-1]  # an output without inputs keeps its bias: it is then a constant
+    effective = [
+        mask * alive[index + 1].unsqueeze(-1) * alive[index].unsqueeze(-2) for index, mask in enumerate(counts)
+    ]
+    columns = [
+        torch.cat([mask, node.unsqueeze(-1)], dim=-1) if bias else mask
+        for mask, node in zip(effective, alive[1:], strict=True)
+    ]
+    active = torch.cat([c.flatten(1) for c in columns], dim=-1) > 0
+    return Network(effective, [a.unsqueeze(1) for a in alive[1:-1]], active, bias)
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Half the weighted squared residual of `b` networks, to second order (Gauss-Newton) in their weights.
+
+    Attributes:
+        gradient: `b x k`.
+        matrix: `b x k x k`, sum over rows and channels of the outer product of the residual's derivative.
+    """
+
+    gradient: Tensor
+    matrix: Tensor
+
+
+def _activations(network: Network, flat: Tensor, inputs: Tensor) -> list[Tensor]:
+    """What flows into each layer, then the output: `b x s x nodes (+ 1)` each, the last without the constant 1."""
+    flows = []
+    signal = inputs
+    one = inputs.new_ones(inputs.shape[0], inputs.shape[1], 1)
+    weights = network.split(torch.where(network.active, flat, 0))
+    for index, weight in enumerate(weights):
+        if network.bias:
+            signal = torch.cat([signal, one], dim=-1)
+        flows.append(signal)
+        signal = signal @ weight.mT
+        if index < len(weights) - 1:
+            signal = torch.sigmoid(signal) * network.alive[index]
+    return [*flows, signal]
+
+
+def residual(network: Network, flat: Tensor, inputs: Tensor, targets: Tensor, factor: Tensor | None) -> Tensor:
+    """Output minus target, in the channels of `factor`.
+
+    Args:
+        network: `b` networks.
+        flat: weights, `b x k`.
+        inputs: `b x s x i`.
+        targets: `b x s x o`.
+        factor: `b x s x c x o`, or None for the outputs themselves (c = o).
+
+    Returns:
+        `b x s x c`.
+    """
+    error = _activations(network, flat, inputs)[-1] - targets
+    return error if factor is None else (factor @ error.unsqueeze(-1)).squeeze(-1)
+
+
+def _backward(network: Network, flat: Tensor, flows: list[Tensor], seed: Tensor) -> list[Tensor]:
+    """Derivative of `seed` times the output with respect to each layer's sums: `b x s x c x out` per layer."""
+    weights = network.split(torch.where(network.active, flat, 0))
+    back = [seed]
+    for index in range(len(weights) - 1, 0, -1):
+        count = weights[index].shape[-1] - int(network.bias)
+        signal = flows[index][..., :count]
+        slope = signal * (1 - signal)
+        back.insert(0, (back[0] @ weights[index][..., :count].unsqueeze(1)) * slope.unsqueeze(-2))
+    return back
+
+
+def _seed(targets: Tensor, factor: Tensor | None) -> Tensor:
+    outputs = targets.shape[-1]
+    identity = torch.eye(outputs, dtype=targets.dtype, device=targets.device)
+    return identity.expand(*targets.shape, outputs) if factor is None else factor
+
+
+def linearise(
+    network: Network,
+    flat: Tensor,
+    inputs: Tensor,
+    targets: Tensor,
+    factor: Tensor | None,
+    precision: Tensor,
+) -> Linearised:
+    """Gradient and Gauss-Newton matrix of half the sum over rows and channels of precision times squared residual.
+
+    Args:
+        network, flat, inputs, targets, factor: as in `residual`.
+        precision: weight of every squared residual, `b x s x c`; 0 leaves it out.
+    """
+    flows = _activations(network, flat, inputs)
+    error = flows[-1] - targets
+    if factor is not None:
+        error = (factor @ error.unsqueeze(-1)).squeeze(-1)
+    root = precision.sqrt()
+    back = _backward(network, flat, flows, _seed(targets, factor) * root.unsqueeze(-1))
+    error = (error * root).unsqueeze(-2)
+    gradient = torch.cat(
+        [((error @ b).squeeze(-2).mT @ f).flatten(1) for b, f in zip(back, flows[:-1], strict=True)], dim=-1
+    )
+    rows = []
+    for i, (back_i, flow_i) in enumerate(zip(back, flows[:-1], strict=True)):
+        blocks = []
+        for j, (back_j, flow_j) in enumerate(zip(back, flows[:-1], strict=True)):
+            if j < i:
+                blocks.append(rows[j][i].mT)
+                continue
+            nodes = (back_i.mT @ back_j).flatten(2)
+            signals = (flow_i.unsqueeze(-1) * flow_j.unsqueeze(-2)).flatten(2)
+            block = (nodes.mT @ signals).unflatten(1, (back_i.shape[-1], back_j.shape[-1]))
+            block = block.unflatten(-1, (flow_i.shape[-1], flow_j.shape[-1])).transpose(2, 3)
+            blocks.append(block.flatten(3).flatten(1, 2))
+        rows.append(blocks)
+    matrix = torch.cat([torch.cat(blocks, dim=-1) for blocks in rows], dim=-2)
+    active = network.active.to(flat.dtype)
+    return Linearised(gradient * active, matrix * active.unsqueeze(-1) * active.unsqueeze(-2))
+
+
+def dense_jacobian(
+    network: Network, flat: Tensor, inputs: Tensor, targets: Tensor, factor: Tensor | None = None
+) -> Tensor:
+    """Derivative of `residual` with respect to the weights, laid out in full: `b x s x c x k`. Costly; for checks."""
+    flows = _activations(network, flat, inputs)
+    back = _backward(network, flat, flows, _seed(targets, factor))
+    parts = [
+        (b.unsqueeze(-1) * f.unsqueeze(-2).unsqueeze(-2)).flatten(-2) for b, f in zip(back, flows[:-1], strict=True)
+    ]
+    return torch.cat(parts, dim=-1) * network.active.unsqueeze(1).unsqueeze(1)

@@ -1,0 +1,380 @@
+"""Levenberg-Marquardt on the weights of masked networks, with Bayesian regularisation.
+
+Half of a network's objective is the misfit, precision of the noise times squared residual; the other half the penalty,
+precision of the prior times squared weight. MacKay ("A practical Bayesian framework for backpropagation networks",
+Neural Computation 4, 1992) has both precisions from the data alone: of a group of k weights,
+gamma = k - alpha trace(H^-1) are determined by the data, and alpha = gamma / sum w^2, beta = (N - gamma) / sum e^2.
+Foresee and Hagan ("Gauss-Newton approximation to Bayesian learning", ICNN 1997) take H from the Levenberg-Marquardt
+step, as is done here. So a network generalises without rows held out for it.
+
+`refine` does all of it in one call; `pose_refinement`, `start_refinement`, `step_refinement` and `finish_refinement` do
+the same in steps, with everything that changes in a `RefinementState` of plain tensors.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.evolution._gauss_newton import Network, linearise, network_of, residual
+
+__all__ = [
+    "Refined",
+    "RefinementProblem",
+    "RefinementSettings",
+    "RefinementState",
+    "finish_refinement",
+    "pose_refinement",
+    "refine",
+    "start_refinement",
+    "step_refinement",
+]
+
+_PRECISION_RANGE = (1e-8, 1e12)
+_DAMPING_RANGE = (1e-12, 1e12)
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """How to refine.
+
+    Attributes:
+        iterations: Levenberg-Marquardt iterations.
+        bayesian: estimate the precisions of prior and noise; else `ridge` is the prior's and 1 the noise's.
+        ridge: precision of the prior where `bayesian` is off.
+        groups: which weights share a prior precision: all of the `network`; those of a `layer`, its biases apart; or
+            those of a `unit`: as `layer`, but one for each input of the network and one for each of its outputs. The
+            biases of the output are never held back: they are the mean.
+        noise: one noise precision for all channels (`shared`) or one for each (`channel`).
+        first_prior: prior precision before its first estimate.
+        warm_up: iterations before the first estimate of the precisions.
+        damping: first damping, relative to the diagonal of H.
+        trials: dampings tried in an iteration before it is given up.
+    """
+
+    iterations: int = 50
+    bayesian: bool = True
+    ridge: float = 1e-6
+    groups: Literal["network", "layer", "unit"] = "layer"
+    noise: Literal["shared", "channel"] = "channel"
+    first_prior: float = 0.1
+    warm_up: int = 3
+    damping: float = 1e-2
+    trials: int = 6
+
+
+@dataclass(frozen=True)
+class RefinementProblem:
+    """What stays fixed: `b` networks (the leading dimensions in one), their data and the settings.
+
+    Attributes:
+        network: masks of the `b` networks and what follows from them.
+        inputs: `b x s x i`.
+        targets: `b x s x o`.
+        rows: row weights, `b x s`.
+        metric: `b x s x c x o`, or None.
+        groups: prior group of every weight, `k`, int64; the last group is never held back.
+        leading: the leading dimensions as given.
+        group_count: number of prior groups, that last one included.
+        settings: as given.
+    """
+
+    network: Network
+    inputs: Tensor
+    targets: Tensor
+    rows: Tensor
+    metric: Tensor | None
+    groups: Tensor
+    leading: torch.Size
+    group_count: int
+    settings: RefinementSettings
+
+
+@dataclass(frozen=True)
+class RefinementState:
+    """What changes from iteration to iteration.
+
+    Attributes:
+        weights: `b x k`.
+        damping: `b`.
+        prior: precision of each prior group, `b x g`.
+        noise: precision of each channel's noise, `b x c`.
+        effective: weights determined by the data, per prior group, `b x g`.
+        iteration: iterations done, 0-d, int64.
+    """
+
+    weights: Tensor
+    damping: Tensor
+    prior: Tensor
+    noise: Tensor
+    effective: Tensor
+    iteration: Tensor
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    @classmethod
+    def from_state_dict(cls, state: dict[str, Tensor]) -> RefinementState:
+        """Inverse of `state_dict`."""
+        return cls(**{f.name: state[f.name] for f in fields(cls)})
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Refined networks.
+
+    Attributes:
+        weights: per layer `... x out x in (+ 1)`; those that take no part are as they were given.
+        error: weighted mean square of the residual in its channels, on the rows refined on, `...`.
+        objective: misfit and penalty under the last precisions, `...`.
+        effective_parameters: weights determined by the data, `...`.
+        noise: precision of each channel's noise, `... x c`.
+        log_evidence: logarithm of the probability of the targets given the masks and precisions, up to a constant of
+            the data (MacKay 1992, eq. 2.23); compares networks refined on the same rows. `...`.
+        iterations: iterations done.
+    """
+
+    weights: list[Tensor]
+    error: Tensor
+    objective: Tensor
+    effective_parameters: Tensor
+    noise: Tensor
+    log_evidence: Tensor
+    iterations: int
+
+
+def refine(
+    masks: list[Tensor],
+    weights: list[Tensor],
+    inputs: Tensor,
+    targets: Tensor,
+    row_weights: Tensor,
+    settings: RefinementSettings | None = None,
+    row_metric: Tensor | None = None,
+) -> Refined:
+    """Refine the weights of masked sigmoid networks with linear output; masks stay as they are.
+
+    Nothing is random; no result is NaN where the given networks' outputs are finite; the objective under the precisions
+    found in the end is never above that of the given weights.
+
+    Args:
+        masks: per layer `... x out x in`, bool.
+        weights: per layer `... x out x in + 1`, the last column a bias, always on; or all `... x out x in`.
+        inputs: `... x s x i`, about in [-1, 1].
+        targets: `... x s x o`, of about unit deviation.
+        row_weights: `... x s`; 0 leaves a row out, whatever stands in it.
+        settings: defaults where None.
+        row_metric: `... x s x c x o`: the residual of a row is this matrix times (output - target), so that errors
+            are judged in other channels than the outputs' own, as the pose error that joint deviations cause.
+
+    Leading dimensions of all arguments broadcast against each other.
+    """
+    problem = pose_refinement(masks, weights, inputs, targets, row_weights, settings, row_metric)
+    state = start = start_refinement(problem, weights)
+    for _ in range(problem.settings.iterations):
+        state = step_refinement(problem, state)
+    worse = ~(_objective(problem, state, state.weights) <= _objective(problem, state, start.weights))
+    state = replace(state, weights=torch.where(worse.unsqueeze(-1), start.weights, state.weights))
+    return finish_refinement(problem, state)
+
+
+def pose_refinement(
+    masks: list[Tensor],
+    weights: list[Tensor],
+    inputs: Tensor,
+    targets: Tensor,
+    row_weights: Tensor,
+    settings: RefinementSettings | None = None,
+    row_metric: Tensor | None = None,
+) -> RefinementProblem:
+    """The fixed part of a refinement; arguments as in `refine`."""
+    metrics = [] if row_metric is None else [row_metric.shape[:-3]]
+    leading = torch.broadcast_shapes(
+        *(m.shape[:-2] for m in masks),
+        *(w.shape[:-2] for w in weights),
+        inputs.shape[:-2],
+        targets.shape[:-2],
+        row_weights.shape[:-1],
+        *metrics,
+    )
+    settings = settings or RefinementSettings()
+    rows = _flatten(row_weights, leading, 1)
+    there = rows > 0
+    bias = weights[0].shape[-1] == masks[0].shape[-1] + 1
+    groups = _prior_groups([m.shape[-2:] for m in masks], bias, settings.groups)
+    flat_metric = None
+    if row_metric is not None:
+        flat_metric = _flatten(row_metric, leading, 3).masked_fill(~there[..., None, None], 0)
+    return RefinementProblem(
+        network=network_of([_flatten(m, leading, 2) for m in masks], bias),
+        inputs=_flatten(inputs, leading, 2).masked_fill(~there.unsqueeze(-1), 0),
+        targets=_flatten(targets, leading, 2).masked_fill(~there.unsqueeze(-1), 0),
+        rows=rows,
+        metric=flat_metric,
+        groups=groups.to(rows.device),
+        leading=leading,
+        group_count=int(groups.max()) + (1 if bias else 2),
+        settings=settings,
+    )
+
+
+def start_refinement(problem: RefinementProblem, weights: list[Tensor]) -> RefinementState:
+    """State before the first iteration. weights: per layer `... x out x in (+ 1)`."""
+    settings = problem.settings
+    flat = torch.cat([_flatten(w, problem.leading, 2).flatten(1) for w in weights], dim=-1)
+    batch = flat.shape[0]
+    group_count = problem.group_count
+    prior = flat.new_full((batch, group_count), settings.first_prior if settings.bayesian else settings.ridge)
+    prior[:, -1] = _PRECISION_RANGE[0]
+    channels = problem.targets.shape[-1] if problem.metric is None else problem.metric.shape[-2]
+    noise = flat.new_ones(batch, channels)
+    effective = flat.new_zeros(batch, group_count)
+    state = RefinementState(
+        weights=flat,
+        damping=flat.new_full((batch,), settings.damping),
+        prior=prior,
+        noise=noise,
+        effective=effective,
+        iteration=torch.zeros((), dtype=torch.int64, device=flat.device),
+    )
+    return replace(state, noise=_noise(problem, state)) if settings.bayesian else state
+
+
+def step_refinement(problem: RefinementProblem, state: RefinementState) -> RefinementState:
+    """One iteration: a damped step that lowers the objective, or none; then new precisions."""
+    gradient, matrix = _second_order(problem, state)
+    before = _objective(problem, state, state.weights)
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    weights, damping = state.weights, state.damping
+    done = torch.zeros_like(before, dtype=torch.bool)
+    for _ in range(problem.settings.trials):
+        damped = matrix + torch.diag_embed(diagonal * damping.unsqueeze(-1))
+        root, failed = torch.linalg.cholesky_ex(damped)
+        step = torch.cholesky_solve(gradient.unsqueeze(-1), root).squeeze(-1)
+        candidate = state.weights - step
+        after = _objective(problem, state, candidate)
+        good = (failed == 0) & (after < before) & ~done
+        weights = torch.where(good.unsqueeze(-1), candidate, weights)
+        damping = torch.where(good, damping / 10, torch.where(done, damping, damping * 10))
+        done = done | good
+        if bool(done.all()):
+            break
+    moved = replace(state, weights=weights, damping=damping.clamp(*_DAMPING_RANGE), iteration=state.iteration + 1)
+    if not problem.settings.bayesian or int(moved.iteration) <= problem.settings.warm_up:
+        return moved
+    return _estimate_precisions(problem, moved, matrix)
+
+
+def finish_refinement(problem: RefinementProblem, state: RefinementState) -> Refined:
+    """Weights in their layers and what is known of the fit."""
+    _, matrix = _second_order(problem, state)
+    objective = _objective(problem, state, state.weights)
+    root, _ = torch.linalg.cholesky_ex(matrix)
+    log_determinant = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    active = problem.network.active
+    counted = active & (problem.groups != state.prior.shape[-1] - 1)
+    log_prior = (state.prior.log()[:, problem.groups] * counted).sum(-1)
+    log_noise = (state.noise.log() * _row_count(problem).unsqueeze(-1)).sum(-1)
+    evidence = (log_prior + log_noise - log_determinant) / 2 - objective
+    squares = _squares(problem, state.weights)
+    leading = problem.leading
+    return Refined(
+        weights=[w.unflatten(0, leading) if leading else w[0] for w in problem.network.split(state.weights)],
+        error=(squares.sum(-1) / (_row_count(problem) * squares.shape[-1])).reshape(leading),
+        objective=objective.reshape(leading),
+        effective_parameters=state.effective.sum(-1).reshape(leading),
+        noise=state.noise.reshape(*leading, -1),
+        log_evidence=evidence.reshape(leading),
+        iterations=int(state.iteration),
+    )
+
+
+def _second_order(problem: RefinementProblem, state: RefinementState) -> tuple[Tensor, Tensor]:
+    """Gradient `b x k` and Gauss-Newton matrix `b x k x k` of the objective; 1 on the diagonal of an inactive weight."""
+    precision = problem.rows.unsqueeze(-1) * state.noise.unsqueeze(1)
+    local = linearise(problem.network, state.weights, problem.inputs, problem.targets, problem.metric, precision)
+    prior = state.prior[:, problem.groups]
+    active = problem.network.active
+    gradient = local.gradient + torch.where(active, prior * state.weights, 0)
+    return gradient, local.matrix + torch.diag_embed(torch.where(active, prior, 1))
+
+
+def _squares(problem: RefinementProblem, weights: Tensor) -> Tensor:
+    """Weighted sum of squared residuals per channel, `b x c`."""
+    error = residual(problem.network, weights, problem.inputs, problem.targets, problem.metric)
+    return (error.square() * problem.rows.unsqueeze(-1)).sum(1)
+
+
+def _group_sums(problem: RefinementProblem, values: Tensor, group_count: int) -> Tensor:
+    """Sum of `values` (`b x k`) over the active weights of each prior group, `b x g`."""
+    values = torch.where(problem.network.active, values, 0)
+    return values.new_zeros(values.shape[0], group_count).index_add(1, problem.groups, values)
+
+
+def _objective(problem: RefinementProblem, state: RefinementState, weights: Tensor) -> Tensor:
+    misfit = (_squares(problem, weights) * state.noise).sum(-1)
+    penalty = (_group_sums(problem, weights.square(), state.prior.shape[-1]) * state.prior).sum(-1)
+    return (misfit + penalty) / 2
+
+
+def _row_count(problem: RefinementProblem) -> Tensor:
+    return problem.rows.sum(-1)
+
+
+def _noise(problem: RefinementProblem, state: RefinementState) -> Tensor:
+    """Noise precision per channel given the effective weights, which the channels share alike."""
+    squares = _squares(problem, state.weights)
+    channels = squares.shape[-1]
+    count = _row_count(problem)
+    # More weights than rows may look determined at first; a channel keeps at least a tenth of its rows' freedom.
+    free = torch.maximum(count - state.effective.sum(-1) / channels, count / 10).unsqueeze(-1)
+    if problem.settings.noise == "shared":
+        squares = squares.mean(-1, keepdim=True).expand_as(squares)
+    return (free / squares.clamp_min(1e-300)).clamp(*_PRECISION_RANGE)
+
+
+def _estimate_precisions(problem: RefinementProblem, state: RefinementState, matrix: Tensor) -> RefinementState:
+    root, failed = torch.linalg.cholesky_ex(matrix)
+    identity = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device)
+    inverse_root = torch.linalg.solve_triangular(root, identity.expand_as(root), upper=False)
+    variance = inverse_root.square().sum(-2)
+    group_count = state.prior.shape[-1]
+    determined = 1 - state.prior[:, problem.groups] * variance
+    effective = _group_sums(problem, determined, group_count).clamp_min(0)
+    squares = _group_sums(problem, state.weights.square(), group_count)
+    tiny = 1e-12
+    prior = ((effective + tiny) / (squares + tiny)).clamp(*_PRECISION_RANGE)
+    prior[:, -1] = _PRECISION_RANGE[0]
+    usable = ((failed == 0) & effective.isfinite().all(-1)).unsqueeze(-1)
+    estimated = replace(
+        state,
+        prior=torch.where(usable, prior, state.prior),
+        effective=torch.where(usable, effective, state.effective),
+    )
+    return replace(estimated, noise=_noise(problem, estimated))
+
+
+def _prior_groups(shapes: list[torch.Size], bias: bool, kind: str) -> Tensor:
+    """Group of every weight in the flat order, `k`, int64; the last group holds the output's biases."""
+    last = len(shapes) - 1
+    labels: list[tuple[int, int, int]] = []
+    for layer, (outputs, inputs) in enumerate(shapes):
+        for row in range(outputs):
+            by_output = row if kind == "unit" and layer == last else 0
+            for column in range(inputs):
+                by_input = column if kind == "unit" and layer == 0 else 0
+                labels.append((0 if kind == "network" else 2 * layer, by_output, by_input))
+            if bias:
+                labels.append((-1, 0, 0) if layer == last else (0 if kind == "network" else 2 * layer + 1, 0, 0))
+    order = {label: index for index, label in enumerate(sorted(set(labels) - {(-1, 0, 0)}))}
+    return torch.tensor([order.get(label, len(order)) for label in labels])
+
+
+def _flatten(tensor: Tensor, leading: torch.Size, trailing: int) -> Tensor:
+    tail = tensor.shape[tensor.dim() - trailing :]
+    return tensor.expand(*leading, *tail).reshape(math.prod(leading), *tail)
