@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import difflib
+import hashlib
 import io
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,6 +49,13 @@ class Table:
     def __len__(self) -> int:
         return len(self.lines)
 
+    @property
+    def data_hash(self) -> str:
+        """SHA-256 (hex) of headers and values as read: the same for every separator, line end and way to write 1e-3."""
+        digest = hashlib.sha256(json.dumps(self.units).encode())
+        digest.update(self.values.astype("<f8").tobytes())
+        return digest.hexdigest()
+
     def raw(self, name: str) -> NDArray[np.float64]:
         """The column in its own unit, `rows`, NaN where a cell is empty or no number."""
         return self.values[:, self.names.index(name)]
@@ -84,10 +93,13 @@ class Table:
         return write_hint(name, si_unit)
 
 
-def nearest(name: str, candidates: Sequence[str]) -> str | None:
-    """The candidate that is most likely meant by a misspelt name, without regard to case; None if none is near."""
+def nearest(name: str, candidates: Sequence[str], cutoff: float = 0.6) -> str | None:
+    """The candidate that is most likely meant by a misspelt name, without regard to case; None if none is near.
+
+    `cutoff` is the least similarity, of difflib's 0 to 1.
+    """
     folded = {candidate.lower(): candidate for candidate in reversed(candidates)}
-    near = difflib.get_close_matches(name.lower(), folded, 1, 0.6)
+    near = difflib.get_close_matches(name.lower(), folded, 1, cutoff)
     return folded[near[0]] if near else None
 
 
@@ -103,11 +115,15 @@ def name_lines(lines: NDArray[np.int64], rows: Sequence[int] | NDArray[np.int64]
     return f"line{plural} {shown_lines} (row{plural} {shown_rows}){more}"
 
 
-def read_table(path: str | Path) -> Table:
+def read_table(path: str | Path, si_units: Mapping[str, str] | None = None) -> Table:
     """Read a CSV file whose headers are ``name[unit]``.
 
     The separator is a comma, a semicolon or a tab, as the header has it; with the latter two a decimal comma is
     understood. A byte-order mark, blank lines and lines of separators alone (left by spreadsheets) are passed over.
+
+    Args:
+        path: the file.
+        si_units: SI unit of the columns for which it is known, by name; sharpens the error for a missing unit.
 
     Raises:
         InputError: the file cannot be read or is empty, a header lacks its unit or stands twice, or a row has another
@@ -122,7 +138,7 @@ def read_table(path: str | Path) -> Table:
     separator = max(",;\t", key=header.count)
     units: dict[str, str] = {}
     for cell in next(csv.reader([header], delimiter=separator)):
-        name, unit = parse_header(cell, file)
+        name, unit = parse_header(cell, file, (si_units or {}).get(cell.strip()))
         if name in units:
             raise InputError(f"{file}: column '{name}' stands twice in the header; remove or rename one of them")
         units[name] = unit
@@ -153,8 +169,10 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
     Raises:
         InputError: a header is not of that form, columns differ in length, or the file cannot be written.
     """
-    for header in columns:
-        parse_header(header, str(path))
+    names = [parse_header(header, str(path))[0] for header in columns]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise InputError(f"{path}: column '{twice[0]}' would stand twice in the header")
     arrays = [np.asarray(values, dtype=np.float64) for values in columns.values()]
     if len({array.shape for array in arrays}) != 1 or arrays[0].ndim != 1:
         raise InputError(f"{path}: the columns to write must be one-dimensional and of one length")

@@ -130,6 +130,8 @@ def test_unreadable_files(tmp_path: Path) -> None:
 def test_write_refuses_what_could_not_be_read_back(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="column 'x' has no unit"):
         write_table(tmp_path / "t.csv", {"x": [1.0]})
+    with pytest.raises(InputError, match="column 'x' would stand twice"):
+        write_table(tmp_path / "t.csv", {"x[mm]": [1.0], "x[m]": [1.0]})
     with pytest.raises(InputError, match="one length"):
         write_table(tmp_path / "t.csv", {"x[mm]": [1.0], "y[mm]": [1.0, 2.0]})
     with pytest.raises(InputError, match="cannot be written"):

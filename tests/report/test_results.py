@@ -104,7 +104,9 @@ def test_before_is_signed_as_in_table_i() -> None:
 def test_floor_counts_the_unlearnable_part_only_where_asked(generator: np.random.Generator) -> None:
     noise, chirp = generator.normal(size=(2, 6, 40, 3)) * 1e-5
     found = floor_block(noise, None, JOINTS, np.full(3, 1e-10), unlearnable=chirp)
-    assert found["realised"]["all"]["mse"]["values"] == pytest.approx(list(np.square(noise).mean((1, 2))), rel=1e-9, abs=0)
+    assert found["realised"]["all"]["mse"]["values"] == pytest.approx(
+        list(np.square(noise).mean((1, 2))), rel=1e-9, abs=0
+    )
     assert found["expected"]["all"]["mse"]["values"] == pytest.approx([1e-10] * 6, rel=1e-9, abs=0)
     both = np.square(noise + chirp).mean((1, 2))
     assert found["with_unlearnable"]["all"]["mse"]["values"] == pytest.approx(list(both), rel=1e-9, abs=0)
