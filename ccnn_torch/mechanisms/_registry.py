@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib.util
 import inspect
 import sys
@@ -12,12 +13,17 @@ from typing import Any
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.mechanisms.dh_file import read_dh_file
 from ccnn_torch.mechanisms.machine_tool import MachineTool
+from ccnn_torch.mechanisms.serial import SerialArm
 from ccnn_torch.mechanisms.tripod import Tripod
+from ccnn_torch.mechanisms.urdf import read_urdf
 
 __all__ = ["REGISTRY", "load_mechanism", "mechanism_from_description"]
 
-REGISTRY: dict[str, Callable[..., Mechanism]] = {"tripod": Tripod, "machine_tool": MachineTool}
+REGISTRY: dict[str, Callable[..., Mechanism]] = {"tripod": Tripod, "machine_tool": MachineTool, "serial": SerialArm}
+
+_READERS: dict[str, Callable[..., Mechanism]] = {".yaml": read_dh_file, ".yml": read_dh_file, ".urdf": read_urdf}
 
 _FORMS = "a serial arm's geometry file (.yaml, .urdf), or your own class as path/to/file.py:Name"
 
@@ -64,6 +70,9 @@ def _maker(spec: str) -> Callable[..., Any]:
         return REGISTRY[spec]
     if _is_python(spec):
         return _from_python(spec)
+    reader = _READERS.get(Path(spec).suffix.lower())
+    if reader is not None:
+        return functools.partial(reader, spec)
     near = difflib.get_close_matches(spec, REGISTRY, 1)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(REGISTRY)}"
     raise InputError(f"unknown mechanism '{spec}'; {hint} Otherwise give {_FORMS}")

@@ -7,11 +7,11 @@
 | `commanded` | s x n | joint's SI unit |
 | `measured`, `predicted` | s x n | joint's SI unit; pseudoerror measured and by the model |
 | `noise` | s x n | joint's SI unit; the noise in `measured`, where it is known |
-| `position` | s x 3 | m |
+| `place` | s x d | SI; where in the workspace: the position x, y, z, or the pose itself where a machine mostly turns |
 | `position_before`, `position_after` | s | m; norm of the position error |
 | `rotation_before`, `rotation_after` | s | rad; geodesic angle, where there is an orientation |
 | `test` | s, bool | true = held out |
-| `map_position` | g x 3 | m; poses of a denser map of the workspace, where the machine is simulated |
+| `map_place` | g x d | SI; a denser map of the workspace, where the machine is simulated |
 | `map_before`, `map_after` | g | m |
 | `mask_0`, `mask_1` … | out x in, bool | connections of the network, layer by layer |
 | `weight_0`, `weight_1` … | out x (in + 1) | 1; last column = bias |
@@ -52,17 +52,19 @@ class RunArrays:
     measured: Array
     predicted: Array
     test: NDArray[np.bool_]
-    position: Array
+    place: Array
     position_before: Array
     position_after: Array
     rotation_before: Array | None = None
     rotation_after: Array | None = None
     noise: Array | None = None
-    map_position: Array | None = None
+    map_place: Array | None = None
     map_before: Array | None = None
     map_after: Array | None = None
     masks: tuple[NDArray[np.bool_], ...] = ()
     weights: tuple[Array, ...] = ()
+    axes: tuple[Coordinate, ...] = (Coordinate("x", "m"), Coordinate("y", "m"), Coordinate("z", "m"))
+    """Names and units of the `d` columns of `place`."""
     labels: dict[str, str] = field(default_factory=dict)
     """Words for the pictures, for example `{"method": "ccnn", "repeat": "3", "mechanism": "tripod"}`."""
 
@@ -73,7 +75,7 @@ class RunArrays:
             **dict.fromkeys(
                 ("test", "position_before", "position_after", "rotation_before", "rotation_after"), (rows,)
             ),
-            "position": (rows, 3),
+            "place": (rows, len(self.axes)),
         }
         for name, shape in wanted.items():
             value = getattr(self, name)
@@ -92,7 +94,11 @@ def save_arrays(folder: str | Path, arrays: RunArrays) -> Path:
             tensors[entry.name] = value
     tensors |= {f"mask_{i}": mask for i, mask in enumerate(arrays.masks)}
     tensors |= {f"weight_{i}": weight for i, weight in enumerate(arrays.weights)}
-    about = {"joints": [[j.name, j.unit] for j in arrays.joints], "labels": arrays.labels}
+    about = {
+        "axes": [[axis.name, axis.unit] for axis in arrays.axes],
+        "joints": [[joint.name, joint.unit] for joint in arrays.joints],
+        "labels": arrays.labels,
+    }
     path = Path(folder) / ARRAYS_FILE
     _save(path, tensors, about)
     return path
@@ -111,9 +117,9 @@ def load_arrays(folder: str | Path) -> RunArrays:
         name: value for name, value in tensors.items() if not name.startswith(("mask_", "weight_"))
     }
     known = {entry.name for entry in fields(RunArrays)}
-    needed = ("commanded", "measured", "predicted", "test", "position", "position_before", "position_after")
+    needed = ("commanded", "measured", "predicted", "test", "place", "position_before", "position_after")
     missing = [name for name in needed if name not in values]
-    if missing or "joints" not in about:
+    if missing or not {"axes", "joints"} <= about.keys():
         raise InputError(f"{path} lacks {', '.join(missing) or 'the joint names'}; it is not of a finished run.")
     try:
         masks = tuple(tensors[f"mask_{i}"].astype(bool) for i in layers)
@@ -122,6 +128,7 @@ def load_arrays(folder: str | Path) -> RunArrays:
         raise InputError(f"{path} lacks the array {error}.") from None
     return RunArrays(
         joints=tuple(Coordinate(str(name), str(unit)) for name, unit in about["joints"]),
+        axes=tuple(Coordinate(str(name), str(unit)) for name, unit in about["axes"]),
         masks=masks,
         weights=weights,
         labels={str(k): str(v) for k, v in about.get("labels", {}).items()},

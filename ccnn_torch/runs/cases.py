@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.mechanisms import Mechanism, PoseError, load_mechanism
 
 __all__ = ["CASES", "VARIANTS", "CaseStudy", "build_case"]
 
@@ -55,6 +55,12 @@ class CaseStudy:
         """Poses that the machine reaches with this noise. noise: `r x s x n` [m]; returns `r x s x p` [SI]."""
         joints = self.joints + self.learnable + self.unlearnable + noise
         return self.mechanism.forward_kinematics(joints, guess=self.pose.expand(*noise.shape[:-1], -1))
+
+    def pose_error(self, command: Tensor, noise: Tensor | float = 0.0) -> PoseError:
+        """Distance from the ideal poses to those that the machine reaches. command: `... x s x n` [m]; `... x s`."""
+        ideal = self.pose.expand(*command.shape[:-1], -1)
+        reached = self.mechanism.forward_kinematics(command + self.learnable + self.unlearnable + noise, guess=ideal)
+        return self.mechanism.pose_error(reached, ideal)
 
 
 def build_case(name: str, variant: str = "printed", order: Literal["raster", "shuffled"] = "raster") -> CaseStudy:

@@ -24,11 +24,13 @@ class Outcome:
     Attributes:
         deviation: predicted deviation at the commanded joints, `r x s x n` [SI].
         after: pose error with the correction, `r x s`.
+        after_systematic: the same without the machine's noise, where it is simulated.
     """
 
     fitted: Fitted
     deviation: Tensor
     after: PoseError
+    after_systematic: PoseError | None = None
 
 
 def pose_before(prepared: Prepared) -> PoseError:
@@ -60,9 +62,7 @@ def evaluate(prepared: Prepared, fitted: Fitted) -> Outcome:
     command = joints
     for _ in range(_COMMAND_ITERATIONS):
         command = joints - _deviation(prepared, fitted, command)
-    ideal = case.pose.expand(*joints.shape[:-1], -1)
-    reached = mechanism.forward_kinematics(command + case.learnable + case.unlearnable + noise, guess=ideal)
-    return Outcome(fitted, deviation, mechanism.pose_error(reached, ideal))
+    return Outcome(fitted, deviation, case.pose_error(command, noise), case.pose_error(command))
 
 
 def _joints(prepared: Prepared) -> Tensor:

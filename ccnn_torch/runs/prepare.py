@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.mechanisms.frames import fit_frames
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import check_rows, load_records
@@ -52,6 +52,13 @@ class Prepared:
     def simulated(self) -> bool:
         return self.case is not None
 
+    def set_aside(self) -> dict[str, int]:
+        """How many rows are not trained on in the first repeat, by reason."""
+        return {
+            reason: int(flags.expand(self.dataset.usable.shape)[0].sum())
+            for reason, flags in self.pseudoerror.reasons.items()
+        }
+
     def repeat_parameters(self, repeat: int) -> Tensor | None:
         """Geometry of one repeat, `k`, or None."""
         return None if self.parameters is None else self.parameters[repeat, 0]
@@ -92,7 +99,7 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
         max_deviation=config.max_deviation,
     )
     splits = _splits(config, mechanism.frame(case.pose)[0], {"t": case.time}, seeds)
-    notes = []
+    notes = deviations.notes()
     if config.covariates is None:
         notes.append("The time t is not given to the learner; covariates=[t] adds it.")
     return Prepared(
@@ -121,17 +128,19 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
     mechanism = load_mechanism(config.mechanism)
     records = load_records(config.records, mechanism, config.covariates)
     check_rows(records, mechanism)
-    mechanism = mechanism.for_pose(records.orientation) if hasattr(mechanism, "for_pose") else mechanism
+    arm = mechanism if isinstance(mechanism, SerialArm) else None
+    if arm is not None and records.orientation == "none":
+        mechanism = arm = arm.with_orientation("none")
     splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds)
     parameters = None
     notes = list(records.notes)
-    if mechanism.unknown_frames:
+    if arm is not None and arm.unknown_frames:
         rows = pad_rows([Dataset.part(split, "fit") for split in splits])
         weights = torch.zeros(len(seeds), len(records.joints), dtype=torch.float64)
         weights.scatter_add_(1, rows.index, rows.weights)
-        fitted = fit_frames(mechanism, records.joints, records.pose, weights, config.rotation_weight)
-        parameters = fitted.unsqueeze(-2)
-        notes.append("Base and tool frames are unknown; they were fitted first, on the training rows of each repeat.")
+        parameters = fit_frames(arm, records.joints, records.pose, weights).unsqueeze(-2)
+        frames = " and ".join(arm.unknown_frames)
+        notes.append(f"Frames fitted first, on the training rows of each repeat: {frames}.")
     deviations = joint_deviations(
         mechanism,
         records.joints,
@@ -141,6 +150,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         max_condition=config.max_condition,
         max_deviation=config.max_deviation,
     )
+    notes += deviations.notes()
     return Prepared(
         mechanism=mechanism,
         parameters=parameters,
