@@ -179,11 +179,17 @@ class Mechanism(nn.Module):
         return torch.where(revolute, wrap_angle(deviation), deviation)
 
     def nearest_joints(
-        self, pose: Tensor, parameters: Tensor | None, guess: Tensor | None, rotation_weight: float
+        self,
+        pose: Tensor,
+        parameters: Tensor | None,
+        guess: Tensor | None,
+        rotation_weight: float,
+        damping: float = 0.0,
     ) -> Tensor:
         """Joints whose pose is closest in (position, rotation_weight x rotation vector) [m].
 
-        The default is `solve_inverse`: a mechanism with as many pose coordinates as joints reaches every pose exactly.
+        The default is `solve_inverse`: a mechanism with as many pose coordinates as joints reaches every pose exactly,
+        and its joints are not damped.
         """
         return self.solve_inverse(pose, parameters, guess)
 

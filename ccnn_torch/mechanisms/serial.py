@@ -225,31 +225,39 @@ class SerialArm(Mechanism):
         )
 
     def nearest_joints(
-        self, pose: Tensor, parameters: Tensor | None, guess: Tensor | None, rotation_weight: float
+        self,
+        pose: Tensor,
+        parameters: Tensor | None,
+        guess: Tensor | None,
+        rotation_weight: float,
+        damping: float = 0.0,
     ) -> Tensor:
         """Joints whose pose is closest in (position, rotation_weight x rotation vector), by damped Newton from `guess`.
 
         Where joints are more than pose coordinates (redundant arms, poses without orientation) the deviation from the
-        guess has the least norm. No gradient flows through this; it does through `solve_inverse`.
+        guess has the least norm. With `damping` [m per joint unit] the squared deviation times damping² is part of what
+        is minimised, which bounds it near singularities. No gradient flows through this; it does through
+        `solve_inverse`.
         """
         values = self.resolve(parameters)
-        start = self.home_joints if guess is None else guess
         position, rotation = self.frame(pose)
         parts = (position,) if rotation is None else (position, rotation.flatten(-2))
-        start = expand_leading(start, position, values)
-
-        def residual(q: Tensor, v: Tensor, x: Tensor, *turn: Tensor) -> Tensor:
-            return self._gap(q, x, turn[0].reshape(*x.shape, 3) if turn else None, v, rotation_weight)
-
+        anchor = expand_leading(self.home_joints if guess is None else guess, position, values).detach()
         weights = self._weights(rotation_weight)
+        ridge = damping * torch.eye(len(self.joints), dtype=torch.float64)
 
-        def slope(q: Tensor, v: Tensor, *rest: Tensor) -> Tensor:
-            return self.jacobian(q, v) * weights
+        def residual(q: Tensor, start: Tensor, v: Tensor, x: Tensor, *turn: Tensor) -> Tensor:
+            gap = self._gap(q, x, turn[0].reshape(*x.shape, 3) if turn else None, v, rotation_weight)
+            return torch.cat([gap, damping * (q - start)], dim=-1) if damping else gap
 
-        plain = tuple(d.detach() for d in (values, *parts))
-        found = levenberg_marquardt(residual, start, slope, plain, damping=1e-8)
-        if len(self.joints) > len(weights):
-            return least_norm(residual, slope, found, start.detach(), plain)
+        def slope(q: Tensor, start: Tensor, v: Tensor, *rest: Tensor) -> Tensor:
+            rows = self.jacobian(q, v) * weights
+            return torch.cat([rows, ridge.expand(*q.shape[:-1], -1, -1)], dim=-2) if damping else rows
+
+        data = tuple(d.detach() for d in (anchor, values, *parts))
+        found = levenberg_marquardt(residual, anchor, slope, data, damping=1e-8)
+        if damping == 0 and len(self.joints) > len(weights):
+            return least_norm(residual, slope, found, anchor, data)
         return found.value
 
     def _weights(self, rotation_weight: float) -> Tensor:

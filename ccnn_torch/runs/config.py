@@ -80,6 +80,7 @@ class TrainingConfig(_Part):
         default=None, ge=1, description="steps without improvement after which that search ends; null = go to the end"
     )
     checkpoint_every: int = Field(default=20, ge=1, description="steps between two checkpoints")
+    log_every: int = Field(default=1, ge=1, description="steps between two points of the held-out curves")
 
 
 class CompensationConfig(_Part):
