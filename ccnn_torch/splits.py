@@ -4,9 +4,10 @@ Three kinds, each a function of the rows and one seed:
 
 * ``random``: single rows at random. Rows of one target pose may stand on both sides, which flatters the figures.
 * ``group``: whole groups at random. `by` is a column or ``position:5mm``, the default: rows whose measured positions
-  round to the same cell of 5 mm share a target pose and form a group. Several entries make a group of the rows that are
-  alike in all. A column that is named counts alone: where many groups visit the same poses, joining them by pose too
-  would leave a single group.
+  round to the same cell of 5 mm share a target pose and form a group. Several entries, or a pattern such as ``goal_*``,
+  make a group of the rows that are alike in all. A column that is named counts alone: where many groups visit the same
+  poses, joining them by pose too would leave a single group. Beware: measured positions scatter across the borders of
+  cells. Where the commanded target is recorded, grouping by its columns is the stricter split.
 * ``block``: whole groups (same `by`), sorted by their mean along the first principal direction of the positions; the
   far end is held out, so that the figures are those of extrapolation.
 
@@ -19,6 +20,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 
 import numpy as np
 import torch
@@ -148,7 +150,7 @@ def _groups(positions: Tensor, by: str | Sequence[str], columns: Mapping[str, Co
                 raise InputError(f"split.by: '{entry}' needs positions, and this pose has none; name a column instead")
             keys.append(np.round(positions.numpy() / _cell(entry)))
         else:
-            keys.append(_column(entry, columns)[:, None])
+            keys += [_column(name, columns)[:, None] for name in _matching(entry, columns)]
     return np.unique(np.concatenate(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
@@ -158,6 +160,11 @@ def _cell(by: str) -> float:
     if match is None or float(match[1]) == 0:
         raise InputError(f"split.by: '{by}' is not of the form position:LENGTH; write e.g. {DEFAULT_BY}")
     return float(to_si(float(match[1]), match[2].strip(), "m", f"split.by: the length in '{by}'", "position"))
+
+
+def _matching(entry: str, columns: Mapping[str, Column]) -> list[str]:
+    """The columns that a pattern such as ``goal_*`` names; a plain name stays itself."""
+    return [name for name in columns if fnmatchcase(name, entry)] or [entry]
 
 
 def _column(name: str, columns: Mapping[str, Column]) -> NDArray[np.float64]:

@@ -61,6 +61,10 @@ def test_group_by_columns() -> None:
     expected = (np.isin(robot, order[:1]), np.isin(robot, order[1:3]), np.isin(robot, order[3:]))
     assert sets(split) == tuple(set(np.flatnonzero(rows)) for rows in expected)
     both = split_rows(nowhere, "group", ["robot", "placement"], columns, test=0.25, validation=0.34, seed=1)
+    pattern = split_rows(
+        nowhere, "group", "goal_*", {"goal_x": robot, "row": np.arange(40.0), "goal_y": placement}, 0.25, 0.34, seed=1
+    )
+    assert sets(pattern) == sets(both)
     assert len(both.test) == 10 and {len(set(zip(robot[p], placement[p], strict=True))) for p in both.test[None]} == {2}
 
 

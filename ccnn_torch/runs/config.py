@@ -61,7 +61,7 @@ class SplitConfig(_Part):
     kind: Literal["random", "group", "block"] = Field(default="random", description="random, group or block")
     by: Names | None = Field(
         default=None,
-        description="what makes a group: a column, several, or position:5mm (the default of group and block)",
+        description="what makes a group: columns or patterns (goal_*), or position:5mm, the default",
     )
     test: float = Field(
         default=0.3, gt=0, lt=1, description="share of the rows (group: of the groups) that is held out"
