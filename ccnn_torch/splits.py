@@ -31,12 +31,13 @@ from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
 from ccnn_torch.units import to_si
 
-__all__ = ["DEFAULT_BY", "KINDS", "Split", "split_rows"]
+__all__ = ["DEFAULT_BY", "KINDS", "Column", "Split", "split_rows"]
 
 KINDS = ("random", "group", "block")
 DEFAULT_BY = "position:5mm"
 
 Column = NDArray[np.float64] | Tensor
+"""A column to group by, `rows`."""
 _Integers = NDArray[np.int64]
 
 
