@@ -63,7 +63,7 @@ def overview_plot(arrays: RunArrays, joint: int | None = None) -> Plot:
     shape = _shape(place, arrays.axes, planes[0]) if planes else 1.0
     # The maps take the width that their shape needs at this height; the joint's panel takes the rest.
     wide = float(np.clip(1 / shape, 0.7, 1.4))
-    figure = Figure(figsize=(6.0 + 5.6 * wide if planes else 8.2, 4.0), layout="constrained")
+    figure = Figure(figsize=(6.5 + 6.2 * wide if planes else 8.2, 4.0), layout="constrained")
     grid = figure.subplots(1, 3 if planes else 1, width_ratios=(1.8, wide, wide) if planes else (1,), squeeze=False)
     left = grid[0, 0]
     draw_joint_error(left, arrays, joint)
