@@ -1,3 +1,40 @@
-"""Neural compensation of robot kinematics: every source of error as one deviation of the actuated joints."""
+"""Neural compensation of robot kinematics: every source of error as one deviation of the actuated joints.
+
+The names below are loaded on first use, so that `ccnn --help` does not wait for torch.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ccnn_torch.compensation import Compensator as Compensator
+    from ccnn_torch.compensation import load_model as load_model
+    from ccnn_torch.compensation import save_model as save_model
+    from ccnn_torch.mechanisms import Mechanism as Mechanism
+    from ccnn_torch.mechanisms import load_mechanism as load_mechanism
+    from ccnn_torch.pseudoerror import joint_deviations as joint_deviations
+    from ccnn_torch.records import load_records as load_records
+    from ccnn_torch.runs.api import calibrate as calibrate
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "Compensator": "ccnn_torch.compensation",
+    "Mechanism": "ccnn_torch.mechanisms",
+    "calibrate": "ccnn_torch.runs.api",
+    "joint_deviations": "ccnn_torch.pseudoerror",
+    "load_mechanism": "ccnn_torch.mechanisms",
+    "load_model": "ccnn_torch.compensation",
+    "load_records": "ccnn_torch.records",
+    "save_model": "ccnn_torch.compensation",
+}
+
+__all__ = [*_HOMES, "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'ccnn_torch' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)

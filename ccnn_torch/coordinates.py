@@ -9,7 +9,7 @@ __all__ = ["Coordinate", "Parameter"]
 
 @dataclass(frozen=True)
 class Coordinate:
-    """A joint, a pose coordinate or a covariate: its name and its SI unit (``m``, ``rad``, ``s``, ``K``, ``N``, ``N*m``, ``1``)."""
+    """A joint, a pose coordinate or a covariate, with its SI unit (``m``, ``rad``, ``s``, ``K``, ``N*m``, ``1`` …)."""
 
     name: str
     unit: str

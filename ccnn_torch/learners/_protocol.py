@@ -58,7 +58,11 @@ class Learner(Protocol):
         """Current best model. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Everything that changes in `step`, flat, as tensors (a counter is a 0-d int64 tensor)."""
+        """Everything that changes in `step`, flat, as tensors.
+
+        A counter is a 0-d int64 tensor; every other tensor leads with the repeats, since early stopping puts together
+        the states of different steps, one a repeat.
+        """
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take back a state; call `start` with the same data first."""

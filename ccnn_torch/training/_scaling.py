@@ -11,9 +11,9 @@ __all__ = ["Scaling"]
 class Scaling(nn.Module):
     """Input and output scaling of `r` repeats (or of none: every buffer then lacks the leading dimension).
 
-    A linear input x becomes (x - centre) / half_range; a periodic one (a revolute joint that turns far) becomes the two
-    features sin x and cos x, so that a full turn is no jump. Features stand in the order: linear inputs, then the sines,
-    then the cosines of the periodic ones.
+    A linear input x becomes (x - centre) / half_range; a periodic one (a revolute joint that turns far) becomes the
+    two features sin x and cos x, so that a full turn is no jump. Features stand in the order: linear inputs, then the
+    sines, then the cosines of the periodic ones.
 
     Attributes:
         linear, periodic: indices of the inputs of either kind, int64.

@@ -1,0 +1,106 @@
+"""Which columns of a table become inputs beside the joints, and in which unit each of them must be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+
+from ccnn_torch._table import Table, nearest
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError
+from ccnn_torch.units import si_unit_of, to_si
+
+__all__ = ["DEFAULT_COVARIATES", "choose_covariates"]
+
+DEFAULT_COVARIATES = ("time", "temperature", "load_*", "direction*", "speed*")
+
+
+def choose_covariates(
+    table: Table, joints: Sequence[Coordinate], pose: Sequence[Coordinate], wanted: Sequence[str] | None
+) -> tuple[tuple[Coordinate, ...], list[str]]:
+    """Choose the covariates of a table.
+
+    Args:
+        table: the records.
+        joints, pose: the columns that are joints and pose; none of them may be a covariate.
+        wanted: names or patterns (``load_*``) instead of the default ones; None = the default ones that are there.
+
+    Returns:
+        Covariates in the file's order, constant ones left out, and notes on what was left out and why.
+
+    Raises:
+        InputError: a wanted column is missing, is a joint or a pose column, or a column has the wrong dimension.
+    """
+    taken = {coordinate.name for coordinate in (*joints, *pose)}
+    free = [name for name in table.names if name not in taken]
+    if wanted is None:
+        chosen = [name for name in free if _matches(name, DEFAULT_COVARIATES)]
+    else:
+        for pattern in wanted:
+            _check_wanted(pattern, free, table, joints, pose)
+        chosen = [name for name in free if _matches(name, wanted)]
+    pose_units = {coordinate.name: coordinate.unit for coordinate in pose}
+    covariates, notes = [], []
+    for name in chosen:
+        coordinate = Coordinate(name, _si_unit(name, table, pose_units))
+        values = table.column(name, coordinate.unit)
+        if values.min() == values.max():
+            notes.append(f"covariate '{name}' is constant ({table.raw(name)[0]:g} {table.units[name]}) and was dropped")
+        else:
+            covariates.append(coordinate)
+    ignored = [name for name in free if name not in chosen]
+    if ignored:
+        notes.append(f"ignored columns: {', '.join(ignored)}; name them in covariates to use them as inputs")
+    for name in ignored:
+        meant = nearest(name, [default for default in DEFAULT_COVARIATES if "*" not in default], 0.8)
+        if wanted is None and meant is not None and meant not in table:
+            notes.append(f"the ignored column '{name}' looks like '{meant}'; rename it if that is meant")
+    return tuple(covariates), notes
+
+
+def _matches(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _check_wanted(
+    pattern: str, free: list[str], table: Table, joints: Sequence[Coordinate], pose: Sequence[Coordinate]
+) -> None:
+    if _matches_any(pattern, free):
+        return
+    if pattern in {coordinate.name for coordinate in joints}:
+        raise InputError(f"covariates: '{pattern}' is a joint and an input already; remove it from the list")
+    if pattern in {coordinate.name for coordinate in pose}:
+        raise InputError(f"covariates: '{pattern}' is the measured pose, which no command can know; remove it")
+    near = nearest(pattern, free)
+    hint = f"did you mean '{near}'?" if near else f"the columns that could be are: {', '.join(free) or 'none'}"
+    raise InputError(f"covariates: {table.path} has no column '{pattern}'; {hint}")
+
+
+def _matches_any(pattern: str, names: list[str]) -> bool:
+    return any(fnmatchcase(name, pattern) for name in names)
+
+
+def _si_unit(name: str, table: Table, pose_units: dict[str, str]) -> str:
+    """SI unit of a covariate, whose dimension must fit a name that has a meaning."""
+    where = f"{table.path}: column '{name}'"
+    found = si_unit_of(table.units[name], where)
+    allowed = _allowed(name, pose_units)
+    if allowed and found not in allowed:
+        to_si([], table.units[name], allowed[0], where, name)
+    return found
+
+
+def _allowed(name: str, pose_units: dict[str, str]) -> tuple[str, ...]:
+    if name == "time":
+        return ("s",)
+    if name == "temperature":
+        return ("K",)
+    if name.startswith("load_"):
+        # A force along a length, a moment about an angle; for another name either.
+        unit = pose_units.get(name.removeprefix("load_"))
+        return {"m": ("N",), "rad": ("N*m",)}.get(unit or "", ("N", "N*m"))
+    if name.startswith("direction"):
+        return ("1",)
+    if name.startswith("speed"):
+        return ("rad/s", "m/s", "1")
+    return ()

@@ -1,0 +1,24 @@
+"""Leading batch dims: the two moves that recur wherever tensors of different batch shapes meet."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["expand_leading", "leading_shape", "stack_last"]
+
+
+def leading_shape(*tensors: Tensor) -> torch.Size:
+    """Common leading dims of tensors `... x d`, whatever their last dims."""
+    shape: torch.Size = torch.broadcast_shapes(*(t.shape[:-1] for t in tensors))  # type: ignore[no-untyped-call]
+    return shape
+
+
+def expand_leading(tensor: Tensor, *others: Tensor) -> Tensor:
+    """A tensor `... x d` with its leading dims expanded to those it has in common with the others."""
+    return tensor.expand(*leading_shape(tensor, *others), tensor.shape[-1])
+
+
+def stack_last(*scalars: Tensor) -> Tensor:
+    """Broadcast scalars `...` against each other and stack them; returns `... x len(scalars)`."""
+    return torch.stack(torch.broadcast_tensors(*scalars), dim=-1)  # type: ignore[no-untyped-call]

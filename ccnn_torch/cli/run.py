@@ -1,0 +1,49 @@
+"""`ccnn run`: train on a case study or on measured records, and write the run folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ccnn_torch.errors import InputError
+
+__all__ = ["run"]
+
+
+def run(
+    config: Annotated[Path | None, typer.Argument(help="A YAML config, for example experiments/tripod.yaml.")] = None,
+    overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
+    resume: Annotated[Path | None, typer.Option(help="Go on with the run in this folder.")] = None,
+    out: Annotated[str | None, typer.Option(help="Folder to write; the same as out=….")] = None,
+    seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no tables.")] = False,
+) -> None:
+    """Train on a case study or on measured records; write tables, curves, plots and model files into a run folder.
+
+    Examples:
+
+    ccnn run experiments/tripod.yaml
+
+    ccnn run experiments/tripod.yaml repeats=30 out=runs/tripod30
+
+    ccnn run experiments/machine_tool.yaml variant=tabulated ccnn.generations=240
+
+    ccnn run experiments/records.yaml records=my_robot.csv mechanism=my_robot.yaml
+
+    ccnn run --resume runs/tripod30
+    """
+    from ccnn_torch.runs import load_config, resume_run, start_run
+
+    if resume is not None:
+        if config is not None or overrides or out is not None or seed is not None:
+            raise InputError("--resume goes on with a run as it was; it takes the run's folder and nothing beside it")
+        resume_run(resume, quiet=quiet)
+        return
+    if config is None:
+        raise InputError("name a config, for example: ccnn run experiments/tripod.yaml (or --resume RUN_DIR)")
+    changes = list(overrides or [])
+    changes += [f"out={out}"] if out is not None else []
+    changes += [f"seed={seed}"] if seed is not None else []
+    start_run(load_config(config, changes), quiet=quiet)

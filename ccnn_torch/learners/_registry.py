@@ -1,0 +1,33 @@
+"""Learners by the names that configs use."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from typing import Any
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.learners._protocol import Learner
+from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.learners.constant import Constant
+
+__all__ = ["LEARNERS", "make_learner"]
+
+LEARNERS: dict[str, Callable[[dict[str, Any]], Learner]] = {
+    "ccnn": lambda settings: CCNN(CCNNSettings(**settings)),
+    "constant": lambda settings: Constant(),
+}
+"""Name -> maker from the settings of the config's section of that name."""
+
+
+def make_learner(name: str, settings: dict[str, Any] | None = None) -> Learner:
+    """A fresh learner.
+
+    Raises:
+        InputError: no learner has this name.
+    """
+    if name not in LEARNERS:
+        near = difflib.get_close_matches(name, LEARNERS, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise InputError(f"methods: {name!r} is no learner of this version, which has {', '.join(LEARNERS)}{hint}")
+    return LEARNERS[name](settings or {})

@@ -1,0 +1,285 @@
+"""What every mechanism is: named joints, pose coordinates and parameters, and batched differentiable kinematics."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ccnn_torch.batching import expand_leading
+from ccnn_torch.coordinates import Coordinate, Parameter
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import _numeric
+from ccnn_torch.mechanisms._pose import PoseError, frame_from_coordinates, frame_jacobian, pose_error
+from ccnn_torch.rotations import wrap_angle
+
+__all__ = ["InverseKinematics", "Mechanism"]
+
+
+class InverseKinematics(nn.Module):
+    """The module that torch forward hooks sit on; it only calls `mechanism.solve_inverse`."""
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        super().__init__()
+        # A bound method, not the module itself: a child that holds its parent as a submodule would never end.
+        self._solve = mechanism.solve_inverse
+
+    def forward(
+        self,
+        pose: Tensor,
+        parameters: Tensor | None = None,
+        guess: Tensor | None = None,
+        covariates: Tensor | None = None,
+        **ignored: object,
+    ) -> Tensor:
+        """Joints of a pose, as `Mechanism.solve_inverse`.
+
+        `covariates` and further keywords are there for the hooks: the nominal kinematics do not depend on them.
+        """
+        return self._solve(pose, parameters, guess)
+
+
+class Mechanism(nn.Module):
+    """Base class of mechanisms. A new one gives `closure` or `solve_inverse`; all else has a numerical default.
+
+    Everything is float64 and SI, broadcasts over leading dims, parameters included (`r x 1 x k` parameters and `s x n`
+    joints give `r x s x p` poses), and is differentiable in joints, pose and parameters. A row without a solution
+    comes back as NaN: ask `reachable` first.
+
+    Attributes:
+        name: name in configs and model cards.
+        joints, pose: coordinates in order, `n` and `p` of them.
+        geometry: the `k` parameters in order.
+        orientations: forms in which records may give the orientation; empty when the pose has its own coordinates.
+        nominal: nominal parameters, `k` [SI], buffer.
+        low, high: box of poses that `sample_workspace` draws from, `p` [SI], buffers.
+        home_pose, home_joints: a configuration on the nominal branch, `p` and `n` [SI], buffers; where Newton starts.
+        inverse_kinematics: child module around `solve_inverse`, the place for forward hooks.
+    """
+
+    nominal: Tensor
+    low: Tensor
+    high: Tensor
+    home_pose: Tensor
+    home_joints: Tensor
+    orientations: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        name: str,
+        joints: Sequence[Coordinate],
+        pose: Sequence[Coordinate],
+        geometry: Sequence[Parameter],
+        low: Sequence[float],
+        high: Sequence[float],
+        home_pose: Sequence[float] | None = None,
+        home_joints: Sequence[float] | None = None,
+    ) -> None:
+        """Name the parts; `home_pose` defaults to the middle of the box, `home_joints` to its inverse (from zeros)."""
+        super().__init__()
+        if all(getattr(type(self), verb) is getattr(Mechanism, verb) for verb in ("closure", "solve_inverse")):
+            raise InputError(
+                f"mechanism '{name}' must define closure(pose, joints, parameters) or solve_inverse(pose, …)"
+            )
+        self.name = name
+        self.joints = tuple(joints)
+        self.pose = tuple(pose)
+        self.geometry = tuple(geometry)
+        self.register_buffer("nominal", _tensor([g.nominal for g in self.geometry]))
+        self.register_buffer("low", _tensor(low))
+        self.register_buffer("high", _tensor(high))
+        middle = (self.low + self.high) / 2
+        self.register_buffer("home_pose", middle if home_pose is None else _tensor(home_pose))
+        self.register_buffer("home_joints", torch.zeros(len(self.joints), dtype=torch.float64))
+        self.home_joints.copy_(self.solve_inverse(self.home_pose) if home_joints is None else _tensor(home_joints))
+        self.inverse_kinematics = InverseKinematics(self)
+        # How to build it again; `load_mechanism` overwrites this with what it was asked for.
+        self.recipe: dict[str, Any] = {"spec": f"{inspect.getfile(type(self))}:{type(self).__qualname__}", "keys": {}}
+
+    # The maths: a mechanism overrides closure or solve_inverse, and what it has in closed form.
+
+    def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Loop closure, zero where pose and joints fit together.
+
+        Args:
+            pose: `... x p` [SI].
+            joints: `... x n` [SI].
+            parameters: `... x k` [SI], nominal when None.
+
+        Returns:
+            `... x c` [SI].
+        """
+        return self.wrap(self.solve_inverse(pose, parameters, joints) - joints)
+
+    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        """Joints of a pose, the plain function behind `inverse_kinematics`; no hook ever acts on it.
+
+        Args:
+            pose: `... x p` [SI].
+            parameters: `... x k` [SI], nominal when None.
+            guess: `... x n` [SI], joints on the wanted branch; `home_joints` when None. Closed forms ignore it.
+
+        Returns:
+            `... x n` [SI].
+        """
+        start = self.home_joints if guess is None else guess
+        return _numeric.solve(
+            lambda joints, pose, parameters: self.closure(pose, joints, parameters),
+            start,
+            (pose, self.resolve(parameters)),
+        )
+
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """Pose of the joints, on the nominal branch.
+
+        Args:
+            joints: `... x n` [SI].
+            parameters: `... x k` [SI], nominal when None.
+            guess: `... x p` [SI], a pose on the wanted branch; `home_pose` when None. Closed forms ignore it.
+
+        Returns:
+            `... x p` [SI].
+        """
+        start = self.home_pose if guess is None else guess
+        return _numeric.solve(
+            lambda pose, joints, parameters: self.closure(pose, joints, parameters),
+            start,
+            (joints, self.resolve(parameters)),
+        )
+
+    def frame(self, pose: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Position `... x 3` [m] and rotation matrix `... x 3 x 3` of the platform; None without orientation.
+
+        The default reads x, y, z and rx, ry, rz (a rotation vector) by name; what is not there is 0.
+
+        Raises:
+            InputError: the pose has another angle: a mechanism with one overrides this and says how it turns.
+        """
+        return frame_from_coordinates(pose, self.pose, self.name)
+
+    # Bookkeeping, the same for all.
+
+    def resolve(self, parameters: Tensor | None) -> Tensor:
+        """The parameters given, or the nominal ones."""
+        return self.nominal if parameters is None else parameters
+
+    def values(self, parameters: Tensor | None) -> tuple[Tensor, ...]:
+        """The parameters one by one in the order of `geometry`, each `...`."""
+        return self.resolve(parameters).unbind(-1)
+
+    def wrap(self, deviation: Tensor) -> Tensor:
+        """A difference of joints, `... x n` [SI], with revolute ones (unit rad) brought to [-pi, pi]."""
+        revolute = torch.tensor([j.unit == "rad" for j in self.joints], device=deviation.device)
+        return torch.where(revolute, wrap_angle(deviation), deviation)
+
+    def nearest_joints(
+        self,
+        pose: Tensor,
+        parameters: Tensor | None,
+        guess: Tensor | None,
+        rotation_weight: float,
+        damping: float = 0.0,
+    ) -> Tensor:
+        """Joints whose pose is closest in (position, rotation_weight x rotation vector) [m].
+
+        The default is `solve_inverse`: a mechanism with as many pose coordinates as joints reaches every pose exactly,
+        and its joints are not damped.
+        """
+        return self.solve_inverse(pose, parameters, guess)
+
+    def pose_error(self, measured: Tensor, reference: Tensor) -> PoseError:
+        """Distance [m] and geodesic angle [rad] between two poses, `... x p` each."""
+        return pose_error(self.frame(measured), self.frame(reference))
+
+    def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        """Derivative of position and (with orientation) rotation vector in the base frame; joints `... x n`.
+
+        Returns:
+            `... x 6 x n` ([m] above [rad], per joint unit), or `... x 3 x n` without orientation.
+        """
+        parameters = self.resolve(parameters)
+        return frame_jacobian(
+            lambda q: self.frame(self.forward_kinematics(q, parameters, guess)), expand_leading(joints, parameters)
+        )
+
+    def condition_number(
+        self,
+        joints: Tensor,
+        rotation_weight: float = 0.04,
+        parameters: Tensor | None = None,
+        guess: Tensor | None = None,
+    ) -> Tensor:
+        """Condition number of the Jacobian with its rotation rows times `rotation_weight` [m/rad]; `...` [1]."""
+        jacobian = self.jacobian(joints, parameters, guess).clone()
+        jacobian[..., 3:, :] *= rotation_weight
+        known = torch.isfinite(jacobian).all(-1).all(-1)
+        values = torch.linalg.svdvals(torch.where(known[..., None, None], jacobian, torch.zeros_like(jacobian)))
+        return torch.where(known & (values[..., -1] > 0), values[..., 0] / values[..., -1], torch.inf)
+
+    def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Which poses `... x p` have joints on the nominal branch; `...`, bool."""
+        return torch.isfinite(self.solve_inverse(pose, parameters)).all(-1)
+
+    @property
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Box of poses that samples are drawn from: low and high, `p` each [SI]."""
+        return self.low, self.high
+
+    def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
+        """Reachable poses, uniform in the box; `count x p` [SI].
+
+        Raises:
+            InputError: fewer than one pose in a hundred of the box is reachable.
+        """
+        found: list[Tensor] = []
+        for _ in range(100):
+            draw = torch.rand(count, len(self.pose), generator=generator, dtype=torch.float64)
+            pose = self.low + (self.high - self.low) * draw
+            found.append(pose[self.reachable(pose)])
+            if sum(map(len, found)) >= count:
+                return torch.cat(found)[:count]
+        raise InputError(f"mechanism '{self.name}' reaches hardly any pose of its sampling box; check low and high")
+
+    def sample_joints(self, count: int, generator: torch.Generator) -> Tensor:
+        """Joints of sampled poses, `count x n` [SI]."""
+        return self.solve_inverse(self.sample_workspace(count, generator))
+
+    def with_nominal(self, parameters: Tensor) -> Mechanism:
+        """A copy with other nominal parameters, `k` [SI] (fitted frames, identified geometry), without any hook."""
+        twin = copy.deepcopy(self)
+        twin.nominal.copy_(parameters)
+        twin.inverse_kinematics = InverseKinematics(twin)
+        return twin
+
+    def describe(self) -> dict[str, Any]:
+        """Everything `mechanism_from_description` needs, as JSON; floats survive it exactly."""
+        names = [g.name for g in self.geometry]
+        return {
+            "name": self.name,
+            **self.recipe,
+            "joints": [j.header for j in self.joints],
+            "pose": [c.header for c in self.pose],
+            "parameters": dict(zip(names, self.nominal.tolist(), strict=True)),
+        }
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Set nominal parameters by name [SI].
+
+        Raises:
+            InputError: a name that the mechanism does not have, or one that is missing.
+        """
+        names = [g.name for g in self.geometry]
+        wrong = sorted(set(values) ^ set(names))
+        if wrong:
+            raise InputError(f"mechanism '{self.name}' has the parameters {', '.join(names)}; check {', '.join(wrong)}")
+        self.nominal.copy_(_tensor([float(values[n]) for n in names]))
+
+
+def _tensor(values: Sequence[float]) -> Tensor:
+    return torch.tensor([float(v) for v in values], dtype=torch.float64)

@@ -1,0 +1,78 @@
+"""Poses as frames: position and rotation apart, whatever coordinates the mechanism has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError
+from ccnn_torch.least_squares import jacobian_of
+from ccnn_torch.rotations import geodesic_angle, rotation_vector_to_matrix, vee
+
+__all__ = ["Frame", "PoseError", "frame_from_coordinates", "frame_jacobian", "pose_error"]
+
+Frame = tuple[Tensor, Tensor | None]
+
+
+class PoseError(NamedTuple):
+    """Difference of two poses: `position`, `...` [m], and `rotation`, `...` [rad] (None without orientation)."""
+
+    position: Tensor
+    rotation: Tensor | None
+
+
+def pose_error(measured: Frame, reference: Frame) -> PoseError:
+    """Euclidean distance (eq. 6) and geodesic angle of two frames.
+
+    Eq. 7 of the paper takes the arccos of a sum of three products, which is undefined for small errors; the geodesic
+    angle is what it stands for.
+    """
+    position = torch.linalg.vector_norm(measured[0] - reference[0], dim=-1)
+    if measured[1] is None or reference[1] is None:
+        return PoseError(position, None)
+    return PoseError(position, geodesic_angle(measured[1], reference[1]))
+
+
+def frame_from_coordinates(pose: Tensor, coordinates: tuple[Coordinate, ...], name: str) -> Frame:
+    """Frame of a pose whose coordinates are named x, y, z and rx, ry, rz."""
+    columns = {c.name: pose[..., i] for i, c in enumerate(coordinates)}
+    angles = [c.name for c in coordinates if c.unit == "rad"]
+    strange = [a for a in angles if a not in ("rx", "ry", "rz")]
+    if strange:
+        raise InputError(
+            f"mechanism '{name}' has the pose angle '{strange[0]}': override frame(pose) to say how it turns"
+        )
+    zero = torch.zeros_like(pose[..., 0])
+    position = torch.stack([columns.get(c, zero) for c in ("x", "y", "z")], dim=-1)
+    if not angles:
+        return position, None
+    return position, rotation_vector_to_matrix(torch.stack([columns.get(c, zero) for c in ("rx", "ry", "rz")], dim=-1))
+
+
+def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor) -> Tensor:
+    """Jacobian of position and rotation vector (in the base frame) of a frame-valued function.
+
+    Args:
+        function: `... x n` -> position `... x 3`, rotation `... x 3 x 3` or None.
+        point: `... x n`.
+
+    Returns:
+        `... x 6 x n`, or `... x 3 x n` without rotation.
+    """
+
+    def flat(x: Tensor) -> Tensor:
+        position, rotation = function(x)
+        return position if rotation is None else torch.cat([position, rotation.flatten(-2)], dim=-1)
+
+    value, slope = jacobian_of(flat, point)
+    if value.shape[-1] == 3:
+        return slope
+    rotation = value[..., 3:].reshape(*value.shape[:-1], 3, 3)
+    # dR Rᵀ is the skew matrix of the rotation vector's rate.
+    turning = slope[..., 3:, :].mT
+    rate = turning.reshape(*turning.shape[:-1], 3, 3) @ rotation.mT.unsqueeze(-3)
+    return torch.cat([slope[..., :3, :], vee(rate).mT], dim=-2)

@@ -1,0 +1,112 @@
+"""From a name, a geometry file or a user's class to a mechanism, and from its description back."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.mechanisms.dh_file import read_dh_file
+from ccnn_torch.mechanisms.machine_tool import MachineTool
+from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.mechanisms.tripod import Tripod
+from ccnn_torch.mechanisms.urdf import read_urdf
+
+__all__ = ["REGISTRY", "load_mechanism", "mechanism_from_description"]
+
+REGISTRY: dict[str, Callable[..., Mechanism]] = {"tripod": Tripod, "machine_tool": MachineTool, "serial": SerialArm}
+
+_READERS: dict[str, Callable[..., Mechanism]] = {".yaml": read_dh_file, ".yml": read_dh_file, ".urdf": read_urdf}
+
+_FORMS = "a serial arm's geometry file (.yaml, .urdf), or your own class as path/to/file.py:Name"
+
+
+def load_mechanism(spec: str, **keys: Any) -> Mechanism:
+    """A mechanism by name, by geometry file, or from a user's Python file.
+
+    Args:
+        spec: `tripod`, `machine_tool`, a DH file (.yaml), a URDF (.urdf), or `path/to/file.py:Name`.
+        keys: keys of its constructor (tripod: L, r; DH file: orientation; URDF: base, tip, orientation; …).
+
+    Raises:
+        InputError: unknown name (with the nearest), missing or faulty file, or a key that the mechanism does not take.
+    """
+    mechanism = _call(spec, _maker(spec), keys)
+    if not isinstance(mechanism, Mechanism):
+        raise InputError(f"{spec}: is no mechanism; derive the class from ccnn_torch.mechanisms.Mechanism")
+    if spec in REGISTRY or _is_python(spec):
+        mechanism.recipe = {"spec": spec, "keys": keys}
+    return mechanism
+
+
+def mechanism_from_description(description: Mapping[str, Any]) -> Mechanism:
+    """The mechanism that `Mechanism.describe` described, parameters equal bit by bit.
+
+    Raises:
+        InputError: the description lacks something, or names a file that is not there.
+    """
+    try:
+        spec, keys, parameters = description["spec"], description["keys"], description["parameters"]
+    except KeyError as missing:
+        raise InputError(f"the mechanism's description lacks {missing}; write it with describe()") from None
+    mechanism = load_mechanism(spec, **keys)
+    mechanism.set_parameters(parameters)
+    return mechanism
+
+
+def _is_python(spec: str) -> bool:
+    return ".py:" in spec
+
+
+def _maker(spec: str) -> Callable[..., Any]:
+    if spec in REGISTRY:
+        return REGISTRY[spec]
+    if _is_python(spec):
+        return _from_python(spec)
+    reader = _READERS.get(Path(spec).suffix.lower())
+    if reader is not None:
+        return functools.partial(reader, spec)
+    near = difflib.get_close_matches(spec, REGISTRY, 1)
+    hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(REGISTRY)}"
+    raise InputError(f"unknown mechanism '{spec}'; {hint} Otherwise give {_FORMS}")
+
+
+def _from_python(spec: str) -> Callable[..., Any]:
+    file, _, name = spec.rpartition(":")
+    path = Path(file)
+    if not path.is_file():
+        raise InputError(f"{spec}: there is no file {file}")
+    module_spec = importlib.util.spec_from_file_location(path.stem, path)
+    if module_spec is None or module_spec.loader is None:
+        raise InputError(f"{spec}: {file} is no Python file")
+    module = importlib.util.module_from_spec(module_spec)
+    sys.modules.setdefault(module_spec.name, module)
+    try:
+        module_spec.loader.exec_module(module)
+    except SyntaxError as error:
+        raise InputError(f"{spec}: {file} line {error.lineno} is no valid Python: {error.msg}") from error
+    except ImportError as error:
+        raise InputError(f"{spec}: {file} imports something that is not installed: {error}") from error
+    found = getattr(module, name, None)
+    if not callable(found):
+        classes = [n for n, o in vars(module).items() if inspect.isclass(o) and o.__module__ == module.__name__]
+        raise InputError(f"{spec}: {file} has no class '{name}'; it has {', '.join(classes) or 'none'}")
+    return found  # type: ignore[no-any-return]
+
+
+def _call(spec: str, maker: Callable[..., Any], keys: Mapping[str, Any]) -> Any:
+    """Call with the keys; a key too many or missing becomes a sentence, an error inside stays what it is."""
+    signature = inspect.signature(maker)
+    try:
+        signature.bind(**keys)
+    except TypeError as error:
+        takes = ", ".join(signature.parameters) or "no keys"
+        raise InputError(f"mechanism '{spec}': {error}; it takes {takes}") from None
+    return maker(**keys)

@@ -1,0 +1,69 @@
+"""The parallel robotic machine tool of the paper's second case study (Zhang and Gao 2012, section IV-B)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.batching import stack_last
+from ccnn_torch.coordinates import Coordinate, Parameter
+from ccnn_torch.mechanisms._mechanism import Mechanism
+
+__all__ = ["MachineTool"]
+
+_ATTACHMENTS = tuple(math.radians(a) for a in (90.0, 210.0, 330.0))
+
+
+class MachineTool(Mechanism):
+    """Three legs on inclined guideways; joints q1..q3 [m] (u1..u3), pose theta_x, theta_y [rad], z [m].
+
+    Eq. 18 is a quadratic in u_i; the smaller root is the machine as built. The paper leaves the dimensions out: the
+    defaults are ours. The sampling box is theta ±15°, z 0.5..0.7 m.
+    """
+
+    def __init__(
+        self, l_e: float = 0.2, l_b: float = 0.7, z_0: float = 0.1, l: float = 0.6, gamma: float = math.radians(45.0)
+    ) -> None:
+        """Radii of platform and base, height of the spherical joints, leg length [m]; slope of the guideways [rad]."""
+        geometry = [
+            Parameter("l_e", "m", l_e),
+            Parameter("l_b", "m", l_b),
+            Parameter("z_0", "m", z_0),
+            Parameter("l", "m", l),
+            Parameter("gamma", "rad", gamma),
+        ]
+        for letter in ("alpha", "beta"):
+            geometry += [Parameter(f"{letter}{i + 1}", "rad", a, leg=i + 1) for i, a in enumerate(_ATTACHMENTS)]
+        tilt = math.radians(15.0)
+        super().__init__(
+            name="machine_tool",
+            joints=[Coordinate(q, "m") for q in ("q1", "q2", "q3")],
+            pose=[Coordinate("theta_x", "rad"), Coordinate("theta_y", "rad"), Coordinate("z", "m")],
+            geometry=geometry,
+            low=(-tilt, -tilt, 0.5),
+            high=(tilt, tilt, 0.7),
+        )
+
+    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        """Eq. 18: |c_i - u_i d_i| = l with d_i the guideway's direction; the smaller root, NaN where it is not real."""
+        values = self.resolve(parameters)
+        l_e, l_b, z_0, l, gamma = (v[..., None] for v in values[..., :5].unbind(-1))
+        alpha, beta = values[..., 5:8], values[..., 8:11]
+        position, rotation = self.frame(pose)
+        joint = stack_last(l_e * torch.cos(beta), l_e * torch.sin(beta), z_0)
+        foot = stack_last(l_b * torch.cos(alpha), l_b * torch.sin(alpha), torch.zeros_like(l_b))
+        slide = torch.cos(gamma)
+        along = stack_last(-slide * torch.cos(alpha), -slide * torch.sin(alpha), torch.sin(gamma))
+        c = position[..., None, :] + (rotation[..., None, :, :] @ joint[..., None])[..., 0] - foot
+        middle = (c * along).sum(-1)
+        return middle - torch.sqrt(middle**2 - (c**2).sum(-1) + l**2)
+
+    def frame(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Point (0, 0, z) on the axis and the rotation Rx(theta_x) Ry(theta_y) that eq. 18 spells out."""
+        theta_x, theta_y, z = pose.unbind(-1)
+        zero = torch.zeros_like(z)
+        sx, cx, sy, cy = torch.sin(theta_x), torch.cos(theta_x), torch.sin(theta_y), torch.cos(theta_y)
+        rows = [cy, zero, sy, sx * sy, cx, -sx * cy, -cx * sy, sx, cx * cy]
+        return torch.stack([zero, zero, z], dim=-1), torch.stack(rows, dim=-1).reshape(*z.shape, 3, 3)

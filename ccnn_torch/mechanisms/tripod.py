@@ -1,0 +1,67 @@
+"""The parallelogram-based 3-DOF tripod of the paper's first case study (Zhang and Gao 2012, section IV-A)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.batching import expand_leading, stack_last
+from ccnn_torch.coordinates import Coordinate, Parameter
+from ccnn_torch.least_squares import jacobian_of
+from ccnn_torch.mechanisms._mechanism import Mechanism
+
+__all__ = ["Tripod"]
+
+
+class Tripod(Mechanism):
+    """Two parallelogram legs along x, one bar along y; joints q1, q2, q3 [m] (ρ1..ρ3), pose y, z [m], phi [rad].
+
+    The printed eq. 15 has 15b twice; the first of the two is ρ2. The platform turns about -y by phi. The workspace is
+    the assembly mode det(∂ρ/∂X) < 0, which Newton from (0, 0.55 m, 0) does not leave; the sampling box is
+    y ±0.2 m, z 0.4..0.7 m, phi ±0.3 rad.
+    """
+
+    def __init__(self, L: float = 1.0, r: float = 0.3) -> None:
+        """L: length of the legs [m]; r: radius of the platform [m]."""
+        super().__init__(
+            name="tripod",
+            joints=[Coordinate(q, "m") for q in ("q1", "q2", "q3")],
+            pose=[Coordinate("y", "m"), Coordinate("z", "m"), Coordinate("phi", "rad")],
+            geometry=[Parameter("L", "m", L), Parameter("r", "m", r)],
+            low=(-0.2, 0.4, -0.3),
+            high=(0.2, 0.7, 0.3),
+            home_pose=(0.0, 0.55, 0.0),
+        )
+
+    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        """Eq. 15, closed form; NaN where a root is not real."""
+        length, radius = self.values(parameters)
+        y, z, phi = pose.unbind(-1)
+        up, out = radius * torch.sin(phi), radius * torch.cos(phi)
+        rho1 = torch.sqrt(length**2 - y**2 - (z + up) ** 2) + out
+        rho2 = torch.sqrt(length**2 - y**2 - (z - up) ** 2) + out
+        rho3 = torch.sqrt(length**2 - z**2) + y + radius
+        return stack_last(rho1, rho2, rho3)
+
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """Newton on eq. 15; NaN where it leaves the assembly mode (beyond the edge of the workspace)."""
+        pose = super().forward_kinematics(joints, parameters, guess)
+        return torch.where(self.reachable(pose.detach(), parameters)[..., None], pose, torch.nan)
+
+    def frame(self, pose: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Centre of the platform (0, y, z) and its rotation about -y by phi."""
+        y, z, phi = pose.unbind(-1)
+        zero, one = torch.zeros_like(phi), torch.ones_like(phi)
+        s, c = torch.sin(phi), torch.cos(phi)
+        rotation = torch.stack([c, zero, -s, zero, one, zero, s, zero, c], dim=-1).reshape(*phi.shape, 3, 3)
+        return torch.stack([zero, y, z], dim=-1), rotation
+
+    def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Real roots, and det(∂ρ/∂X) < 0: the assembly mode of the machine as built."""
+        parameters = self.resolve(parameters)
+        joints, slope = jacobian_of(lambda x: self.solve_inverse(x, parameters), expand_leading(pose, parameters))
+        real = torch.isfinite(joints).all(-1)
+        determinant: Tensor = torch.linalg.det(torch.where(real[..., None, None], slope, 0.0))
+        return real & (determinant < 0)

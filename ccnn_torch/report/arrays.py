@@ -1,0 +1,184 @@
+"""The arrays of a run that its pictures need, as safetensors files in the run folder.
+
+`arrays.safetensors` holds one repeat of the best method (the repeat that was exported):
+
+| name | shape | unit |
+| --- | --- | --- |
+| `commanded` | s x n | joint's SI unit |
+| `measured`, `predicted` | s x n | joint's SI unit; pseudoerror measured and by the model |
+| `noise` | s x n | joint's SI unit; the noise in `measured`, where it is known |
+| `place` | s x d | SI; where in the workspace: the position x, y, z, or the pose itself where a machine mostly turns |
+| `position_before`, `position_after` | s | m; norm of the position error |
+| `rotation_before`, `rotation_after` | s | rad; geodesic angle, where there is an orientation |
+| `test` | s, bool | true = held out |
+| `map_place` | g x d | SI; a denser map of the workspace, where the machine is simulated |
+| `map_before`, `map_after` | g | m |
+| `mask_0`, `mask_1` … | out x in, bool | connections of the network, layer by layer |
+| `weight_0`, `weight_1` … | out x (in + 1) | 1; last column = bias |
+
+Rows stand in the order of the records. `history-METHOD.safetensors` holds the training curves: `step` (t, int64), and
+every metric as t x r or t x r x k.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError
+
+__all__ = ["ARRAYS_FILE", "RunArrays", "load_arrays", "load_history", "save_arrays", "save_history"]
+
+ARRAYS_FILE = "arrays.safetensors"
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RunArrays:
+    """What the pictures of a run show; names, shapes and units as at the top of this file."""
+
+    joints: tuple[Coordinate, ...]
+    commanded: Array
+    measured: Array
+    predicted: Array
+    test: NDArray[np.bool_]
+    place: Array
+    position_before: Array
+    position_after: Array
+    rotation_before: Array | None = None
+    rotation_after: Array | None = None
+    noise: Array | None = None
+    map_place: Array | None = None
+    map_before: Array | None = None
+    map_after: Array | None = None
+    masks: tuple[NDArray[np.bool_], ...] = ()
+    weights: tuple[Array, ...] = ()
+    axes: tuple[Coordinate, ...] = (Coordinate("x", "m"), Coordinate("y", "m"), Coordinate("z", "m"))
+    """Names and units of the `d` columns of `place`."""
+    labels: dict[str, str] = field(default_factory=dict)
+    """Words for the pictures, for example `{"method": "ccnn", "repeat": "3", "mechanism": "tripod"}`."""
+
+    def __post_init__(self) -> None:
+        rows, joints = self.commanded.shape
+        wanted = {
+            **dict.fromkeys(("commanded", "measured", "predicted", "noise"), (rows, joints)),
+            **dict.fromkeys(
+                ("test", "position_before", "position_after", "rotation_before", "rotation_after"), (rows,)
+            ),
+            "place": (rows, len(self.axes)),
+        }
+        for name, shape in wanted.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise InputError(f"Array {name!r} must have the shape {shape}, not {value.shape}.")
+        if joints != len(self.joints):
+            raise InputError(f"{joints} columns of joints do not fit {len(self.joints)} named ones.")
+
+
+def save_arrays(folder: str | Path, arrays: RunArrays) -> Path:
+    """Write `arrays.safetensors` into a run folder; returns its path."""
+    tensors: dict[str, ArrayLike] = {}
+    for entry in fields(arrays):
+        value = getattr(arrays, entry.name)
+        if isinstance(value, np.ndarray):
+            tensors[entry.name] = value
+    tensors |= {f"mask_{i}": mask for i, mask in enumerate(arrays.masks)}
+    tensors |= {f"weight_{i}": weight for i, weight in enumerate(arrays.weights)}
+    about = {
+        "axes": [[axis.name, axis.unit] for axis in arrays.axes],
+        "joints": [[joint.name, joint.unit] for joint in arrays.joints],
+        "labels": arrays.labels,
+    }
+    path = Path(folder) / ARRAYS_FILE
+    _save(path, tensors, about)
+    return path
+
+
+def load_arrays(folder: str | Path) -> RunArrays:
+    """Read `arrays.safetensors` of a run folder.
+
+    Raises:
+        InputError: the file is not there, is damaged, or lacks an array.
+    """
+    path = Path(folder) / ARRAYS_FILE
+    tensors, about = _load(path)
+    layers = range(sum(name.startswith("mask_") for name in tensors))
+    values: dict[str, NDArray[np.generic]] = {
+        name: value for name, value in tensors.items() if not name.startswith(("mask_", "weight_"))
+    }
+    known = {entry.name for entry in fields(RunArrays)}
+    needed = ("commanded", "measured", "predicted", "test", "place", "position_before", "position_after")
+    missing = [name for name in needed if name not in values]
+    if missing or not {"axes", "joints"} <= about.keys():
+        raise InputError(f"{path} lacks {', '.join(missing) or 'the joint names'}; it is not of a finished run.")
+    try:
+        masks = tuple(tensors[f"mask_{i}"].astype(bool) for i in layers)
+        weights = tuple(tensors[f"weight_{i}"] for i in layers)
+    except KeyError as error:
+        raise InputError(f"{path} lacks the array {error}.") from None
+    return RunArrays(
+        joints=tuple(Coordinate(str(name), str(unit)) for name, unit in about["joints"]),
+        axes=tuple(Coordinate(str(name), str(unit)) for name, unit in about["axes"]),
+        masks=masks,
+        weights=weights,
+        labels={str(k): str(v) for k, v in about.get("labels", {}).items()},
+        **{name: value for name, value in values.items() if name in known},  # type: ignore[arg-type]
+    )
+
+
+def save_history(folder: str | Path, method: str, history: Mapping[str, ArrayLike]) -> Path:
+    """Write `history-METHOD.safetensors`.
+
+    Args:
+        folder: the run folder.
+        method: a learner's name.
+        history: `step`: `t`, and each metric `t x r` or `t x r x k`.
+    """
+    path = Path(folder) / f"history-{method}.safetensors"
+    _save(path, history, {})
+    return path
+
+
+def load_history(path: str | Path) -> dict[str, NDArray[np.float64]]:
+    """Read the training curves of one method.
+
+    Raises:
+        InputError: the file is not there or is damaged, or has no `step`.
+    """
+    tensors, _ = _load(Path(path))
+    if "step" not in tensors:
+        raise InputError(f"{path} holds no training curves: it lacks the array 'step'.")
+    return {name: value.astype(np.float64) for name, value in tensors.items()}
+
+
+def _save(path: Path, tensors: Mapping[str, ArrayLike], about: Mapping[str, object]) -> None:
+    arrays = {}
+    for name in sorted(tensors):
+        value = tensors[name]
+        if isinstance(value, torch.Tensor):
+            value = value.detach().cpu().numpy()
+        arrays[name] = np.ascontiguousarray(value)
+    part = path.with_name(path.name + ".part")
+    save_file(arrays, part, metadata={"about": json.dumps(about, sort_keys=True)})
+    part.replace(path)
+
+
+def _load(path: Path) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
+    if not path.is_file():
+        raise InputError(f"{path} is not there; give the folder of a finished run.")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            about = json.loads((file.metadata() or {}).get("about", "{}"))
+            return {name: file.get_tensor(name) for name in file.keys()}, about  # noqa: SIM118
+    except (SafetensorError, ValueError) as error:
+        raise InputError(f"{path} is damaged or no safetensors file: {error}.") from None

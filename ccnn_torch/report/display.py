@@ -1,0 +1,73 @@
+"""SI numbers as people read them: the unit that gives 1 to 999, four digits, a median with its interval."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+__all__ = ["count_text", "display_unit", "interval_text", "number_text", "removed_percent"]
+
+_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+
+
+def display_unit(unit: str, magnitude: float) -> tuple[float, str]:
+    """The prefixed unit for numbers of about this magnitude.
+
+    Args:
+        unit: `m` or `rad`; any other SI unit stays as it is.
+        magnitude: a typical number [unit]; 1e-3 and more is shown in mm or mrad, less in µm or µrad, less than 1e-7 in
+            nm or nrad.
+
+    Returns:
+        Divide a number by the first to have it in the second.
+    """
+    if unit not in ("m", "rad"):
+        return 1.0, unit
+    wanted = (10.0, 1e-3, 1e-7, 0.0)
+    scale, prefix = next(
+        entry for entry, least in zip(_PREFIXES, wanted, strict=True) if abs(magnitude) >= least or entry[1] == "n"
+    )
+    return scale, prefix + unit
+
+
+def number_text(value: float | None, digits: int = 4) -> str:
+    """A number to so many significant digits; `–` for None. Exponents are written as 1.234e-10."""
+    if value is None:
+        return "–"
+    if value == 0:
+        return "0"
+    if 1e-3 <= abs(value) < 1e5:
+        text = f"{value:#.{digits}g}"
+        return text.rstrip(".")
+    return f"{value:.{digits - 1}e}"
+
+
+def interval_text(spread: Mapping[str, Any] | None, scale: float = 1.0, digits: int = 4) -> str:
+    """A spread as `median [low, high]`, or as one number when there is one repeat; says how many repeats have none.
+
+    Args:
+        spread: a block of `results.json`, or None.
+        scale: the unit shown [SI].
+        digits: significant digits of the median; the interval has one less.
+    """
+    if spread is None or spread["median"] is None:
+        return "–"
+    text = number_text(spread["median"] / scale, digits)
+    values = spread["values"]
+    if len(values) > 1:
+        low, high = (number_text(spread[k] / scale, digits - 1) for k in ("low", "high"))
+        text += f" [{low}, {high}]"
+    there = sum(v is not None for v in values)
+    return text if there == len(values) else f"{text} ({there} of {len(values)})"
+
+
+def count_text(count: int, word: str) -> str:
+    """`1 repeat`, `30 repeats`."""
+    return f"{count} {word}" if count == 1 else f"{count} {word}s"
+
+
+def removed_percent(before: Mapping[str, Any], after: Mapping[str, Any]) -> float | None:
+    """Share of an error that was removed, from the medians [percent]; None where the error before is unknown or 0."""
+    if not before["median"] or after["median"] is None:
+        return None
+    return 100.0 * (1.0 - float(after["median"]) / float(before["median"]))

@@ -1,0 +1,78 @@
+"""JSON files that outsiders rely on: written whole or not at all, never with NaN, and each with a JSON Schema."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ccnn_torch.errors import InputError
+
+__all__ = ["load_schema", "plain", "read_json", "write_json"]
+
+
+def plain(value: Any) -> Any:
+    """The same value out of JSON's own types: arrays and tensors become lists, what is not finite becomes None.
+
+    Raises:
+        TypeError: a value that JSON has no form for.
+    """
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, torch.Tensor):
+        return plain(value.detach().cpu().numpy())
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    raise TypeError(f"JSON has no form for a {type(value).__name__}.")
+
+
+def write_json(path: str | Path, value: Mapping[str, Any]) -> None:
+    """Write a JSON file; a reader sees the old file or the new one, never half of one."""
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    part.write_text(json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+    os.replace(part, path)
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        InputError: there is no such file, or it holds no JSON object.
+    """
+    path = Path(path)
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path} is not there; give the folder of a finished run.") from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{path} is no JSON file: {error}.") from None
+    if not isinstance(value, dict):
+        raise InputError(f"{path} must hold one JSON object, not a {type(value).__name__}.")
+    return value
+
+
+def load_schema(name: str) -> dict[str, Any]:
+    """A JSON Schema (draft 2020-12) of this package.
+
+    Args:
+        name: `results` or `card`.
+    """
+    text = files("ccnn_torch.report").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
+    schema: dict[str, Any] = json.loads(text)
+    return schema

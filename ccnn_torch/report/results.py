@@ -1,0 +1,279 @@
+"""The blocks of `results.json`: error measures per joint, noise floor, pose error, each with its spread over repeats.
+
+Every number stands in SI (m, rad and their squares). A spread is `{"median", "low", "high", "values"}`: the median and
+the 5 % and 95 % quantiles over the repeats, and one value a repeat in the order of the seeds. A value that is not
+finite is written as null and left out of the median and the quantiles, so that a reader sees which repeat failed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError
+
+__all__ = [
+    "before_block",
+    "constant_errors",
+    "floor_block",
+    "joint_errors",
+    "pose_block",
+    "ratio_to_floor",
+    "share_unit",
+    "spread",
+]
+
+Block = dict[str, Any]
+
+
+def spread(values: ArrayLike) -> Block:
+    """Median, 5 % and 95 % quantile over repeats, and the values themselves.
+
+    Args:
+        values: `r`, one value a repeat; not finite means that the repeat has no such value.
+    """
+    array = _array(values).reshape(-1)
+    finite = array[np.isfinite(array)]
+    low, median, high = (
+        (float(q) for q in np.quantile(finite, [0.05, 0.5, 0.95])) if finite.size else (None, None, None)
+    )
+    return {
+        "median": median,
+        "low": low,
+        "high": high,
+        "values": [float(v) if np.isfinite(v) else None for v in array],
+    }
+
+
+def share_unit(joints: Sequence[Coordinate]) -> bool:
+    """Whether all joints share a unit, so that an error over all of them means something."""
+    return len({joint.unit for joint in joints}) == 1
+
+
+def joint_errors(
+    predicted: ArrayLike, measured: ArrayLike, weights: ArrayLike | None, joints: Sequence[Coordinate]
+) -> Block:
+    """Mean squared, mean absolute and summed squared error, as in Tables II and IV of paper 000.
+
+    A joint's mse and mae are means over the rows and its sse the sum. `all` holds the mean over rows and joints (mse,
+    mae) and the sum over both (sse): the paper's columns "All joints" are exactly that. `all` is left out when the
+    joints have different units.
+
+    Args:
+        predicted: deviations by the model, `r x s x n` [the joint's SI unit].
+        measured: deviations by measurement, the same shape; what has no leading `r` serves all repeats.
+        weights: row weights, `r x s` [1]; rows of weight 0 are ignored (padding). None = every row counts once.
+        joints: `n` coordinates.
+
+    Returns:
+        `{"all": {"mse": S, "mae": S, "sse": S}, JOINT: {…}}` with S a spread.
+
+    Raises:
+        InputError: the shapes do not fit together, or a repeat has no row.
+    """
+    error, weight = _rows(_array(predicted) - _array(measured), weights, joints)
+    total = weight.sum(1)
+    square = (np.square(error) * weight[..., None]).sum(1)
+    absolute = (np.abs(error) * weight[..., None]).sum(1)
+
+    def measures(squares: NDArray[np.float64], absolutes: NDArray[np.float64], count: NDArray[np.float64]) -> Block:
+        return {"mse": spread(squares / count), "mae": spread(absolutes / count), "sse": spread(squares)}
+
+    block: Block = {}
+    if share_unit(joints):
+        block["all"] = measures(square.sum(1), absolute.sum(1), total * len(joints))
+    for i, joint in enumerate(joints):
+        block[joint.name] = measures(square[:, i], absolute[:, i], total)
+    return block
+
+
+def constant_errors(
+    train: ArrayLike,
+    test: ArrayLike,
+    train_weights: ArrayLike | None,
+    test_weights: ArrayLike | None,
+    joints: Sequence[Coordinate],
+) -> Block:
+    """Errors on the test rows of the constant predictor: the mean deviation of each joint over the training rows.
+
+    Args:
+        train, test: measured deviations, `r x s x n` and `r x s' x n` [the joint's SI unit].
+        train_weights, test_weights: `r x s`, `r x s'` [1], or None.
+        joints: `n` coordinates.
+
+    Raises:
+        InputError: as `joint_errors`.
+    """
+    values, weight = _rows(_array(train), train_weights, joints)
+    mean = (values * weight[..., None]).sum(1, keepdims=True) / weight.sum(1)[:, None, None]
+    return joint_errors(mean, test, test_weights, joints)
+
+
+def before_block(deviations: ArrayLike, weights: ArrayLike | None, joints: Sequence[Coordinate]) -> Block:
+    """Mean and maximum of each joint's error before calibration (Tables I and III of paper 000).
+
+    Both are of the *signed* error: the paper's ρ3 has mean -9.36e-5 and maximum -6.68e-5, which only the algebraically
+    largest error can be. `max_abs` is the largest by absolute value, which is what a user fears.
+
+    Args:
+        deviations: pseudoerrors, `r x s x n` [the joint's SI unit].
+        weights: `r x s` [1] or None.
+        joints: `n` coordinates.
+
+    Returns:
+        `{JOINT: {"mean", "max", "max_abs", "spread": {"mean": S, "max": S, "max_abs": S}}}`; the plain numbers are the
+        medians over the repeats.
+
+    Raises:
+        InputError: as `joint_errors`.
+    """
+    values, weight = _rows(_array(deviations), weights, joints)
+    there = weight[..., None] > 0
+    found = {
+        "mean": (values * weight[..., None]).sum(1) / weight.sum(1)[:, None],
+        "max": np.where(there, values, -np.inf).max(1),
+        "max_abs": np.where(there, np.abs(values), -np.inf).max(1),
+    }
+    block: Block = {}
+    for i, joint in enumerate(joints):
+        spreads = {name: spread(value[:, i]) for name, value in found.items()}
+        block[joint.name] = {name: s["median"] for name, s in spreads.items()} | {"spread": spreads}
+    return block
+
+
+def floor_block(
+    noise: ArrayLike,
+    weights: ArrayLike | None,
+    joints: Sequence[Coordinate],
+    variance: ArrayLike,
+    unlearnable: ArrayLike | None = None,
+) -> Block:
+    """The error that no model can go below: the noise actually drawn in the test rows, and what is expected of it.
+
+    Args:
+        noise: noise in the test rows, `r x s x n` [the joint's SI unit].
+        weights: `r x s` [1] or None.
+        joints: `n` coordinates.
+        variance: variance of the noise, `n` [the square of it].
+        unlearnable: the part of the signal that the inputs do not determine, like `noise` (the chirp of eq. 19), or
+            None. It counts as signal in `realised` and as noise in `with_unlearnable`.
+
+    Returns:
+        `{"realised": {"all": {"mse": S}, JOINT: …}, "expected": …, "with_unlearnable": … or null}`.
+
+    Raises:
+        InputError: as `joint_errors`.
+    """
+    drawn = _array(noise)
+    repeats = drawn.shape[0] if drawn.ndim == 3 else 1
+    expected = np.broadcast_to(np.sqrt(_array(variance)), (repeats, 1, len(joints)))
+
+    def only_mse(error: NDArray[np.float64], weight: ArrayLike | None) -> Block:
+        errors = joint_errors(error, np.zeros_like(error), weight, joints)
+        return {name: {"mse": measures["mse"]} for name, measures in errors.items()}
+
+    return {
+        "realised": only_mse(drawn, weights),
+        "expected": only_mse(expected, None),
+        "with_unlearnable": None if unlearnable is None else only_mse(drawn + _array(unlearnable), weights),
+    }
+
+
+def ratio_to_floor(errors: Mapping[str, Any] | None, floor: Mapping[str, Any] | None) -> Block | None:
+    """Ratio of the `all` mse to the realised floor, repeat by repeat.
+
+    Args:
+        errors: a `joint_errors` block, or None (the method failed).
+        floor: a `floor_block`, or None (unknown).
+
+    Returns:
+        A spread; None where one of the two is unknown or has no `all`.
+    """
+    if errors is None or floor is None or "all" not in errors or "all" not in floor["realised"]:
+        return None
+    mse = np.array(errors["all"]["mse"]["values"], dtype=float)
+    noise = np.array(floor["realised"]["all"]["mse"]["values"], dtype=float)
+    return spread(np.divide(mse, noise, out=np.full_like(mse, np.nan), where=noise > 0))
+
+
+def pose_block(
+    position_before: ArrayLike,
+    position_after: ArrayLike,
+    weights: ArrayLike | None = None,
+    rotation_before: ArrayLike | None = None,
+    rotation_after: ArrayLike | None = None,
+    rotation_weight: float | None = None,
+    position_remainder: ArrayLike | None = None,
+    rotation_remainder: ArrayLike | None = None,
+) -> Block:
+    """Root mean square and maximum of the pose error over the held-out rows, before and after.
+
+    Args:
+        position_before, position_after: Euclidean position errors, `r x s` [m] (eq. 6).
+        weights: `r x s` [1], or None.
+        rotation_before, rotation_after: geodesic angles, `r x s` [rad], or None where there is no orientation.
+        rotation_weight: η of eq. 5 [m/rad]; adds `energy`, E = position error + η · rotation error, row by row [m].
+        position_remainder, rotation_remainder: what no joint deviation can explain, `r x s` [m], [rad]; adds
+            `not_compensable` beside `before` and `after`.
+
+    Returns:
+        `{"position": {"unit": "m", "before": {"rms": S, "max": S}, "after": …}, "rotation": {…} or null}`, and `energy`
+        where asked for.
+
+    Raises:
+        InputError: the shapes do not fit together, or a repeat has no row.
+    """
+
+    def quantity(unit: str, **errors: ArrayLike | None) -> Block:
+        return {"unit": unit} | {k: _rms_and_max(_array(v), weights) for k, v in errors.items() if v is not None}
+
+    block: Block = {
+        "position": quantity("m", before=position_before, after=position_after, not_compensable=position_remainder),
+        "rotation": None,
+    }
+    if rotation_before is None or rotation_after is None:
+        return block
+    block["rotation"] = quantity(
+        "rad", before=rotation_before, after=rotation_after, not_compensable=rotation_remainder
+    )
+    if rotation_weight is not None:
+        before = _array(position_before) + rotation_weight * _array(rotation_before)
+        after = _array(position_after) + rotation_weight * _array(rotation_after)
+        block["energy"] = quantity("m", before=before, after=after) | {"rotation_weight": rotation_weight}
+    return block
+
+
+def _rms_and_max(errors: NDArray[np.float64], weights: ArrayLike | None) -> Block:
+    values, weight = _rows(errors[..., None], weights, (Coordinate("error", "1"),))
+    values = values[..., 0]
+    rms = np.sqrt((np.square(values) * weight).sum(1) / weight.sum(1))
+    return {"rms": spread(rms), "max": spread(np.where(weight > 0, values, -np.inf).max(1))}
+
+
+def _rows(
+    values: NDArray[np.float64], weights: ArrayLike | None, joints: Sequence[Coordinate]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Values `r x s x n` and weights `r x s`, checked; values of rows of weight 0 are 0, whatever stood there."""
+    if values.ndim == 2:
+        values = values[None]
+    if values.ndim != 3 or values.shape[-1] != len(joints):
+        raise InputError(f"Errors must be repeats x rows x {len(joints)} joints, not of shape {values.shape}.")
+    weight = np.ones(values.shape[:2]) if weights is None else _array(weights)
+    if weight.shape[-1:] != values.shape[1:2]:
+        raise InputError(f"{weight.shape[-1]} row weights do not fit {values.shape[1]} rows.")
+    weight = np.broadcast_to(weight, values.shape[:2])
+    if not (weight.sum(1) > 0).all():
+        raise InputError("A repeat has no row to measure the error on; give it at least one test row.")
+    return np.where(weight[..., None] > 0, values, 0.0), weight
+
+
+def _array(values: ArrayLike) -> NDArray[np.float64]:
+    """A float64 array from a list, an array or a tensor on any device."""
+    if isinstance(values, torch.Tensor):
+        values = values.detach().cpu().numpy()
+    return np.asarray(values, dtype=np.float64)

@@ -1,0 +1,68 @@
+"""``key.sub=value`` from the command line over a config, and what a relative path in either is relative to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.runs._yaml import parse_yaml
+
+__all__ = ["apply_overrides", "resolve_paths"]
+
+# Keys whose value is text however it looks: a path may hold a colon, a name may be 2024.
+_TEXT = ("name", "out", "records", "mechanism")
+
+
+def apply_overrides(tree: dict[str, Any], overrides: Iterable[str], folder: Path) -> dict[str, str]:
+    """Write overrides into a tree, in place; relative paths in them start from `folder`.
+
+    Returns:
+        Key -> the override that set it, for messages.
+
+    Raises:
+        InputError: an override is not of the form ``key.sub=value``, or goes below a key that has a plain value.
+    """
+    given: dict[str, str] = {}
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        key = key.strip()
+        steps = key.split(".")
+        if not equals or not all(steps):
+            raise InputError(f"'{override}': write key=value, e.g. seed=1 or split.test=0.2")
+        value = parse_yaml(text, f"'{override}'") if key not in _TEXT or text in ("", "null", "~") else text
+        node = tree
+        for depth, step in enumerate(steps[:-1]):
+            if node.get(step) is None:
+                node[step] = {}
+            node = node[step]
+            if not isinstance(node, dict):
+                above = ".".join(steps[: depth + 1])
+                raise InputError(f"'{override}': {above} has a plain value ({node}) and no keys below it")
+        node[steps[-1]] = _resolve(key, value, folder)
+        given[key] = override
+    return given
+
+
+def resolve_paths(tree: dict[str, Any], folder: Path) -> None:
+    """Make the paths in a tree absolute, in place; relative ones start from `folder`."""
+    for key in tree:
+        tree[key] = _resolve(key, tree[key], folder)
+
+
+def _resolve(key: str, value: Any, folder: Path) -> Any:
+    if key == "methods" and isinstance(value, list):
+        return [_resolve("methods", entry, folder) for entry in value]
+    if not isinstance(value, str) or not _is_path(key, value):
+        return value
+    return os.path.abspath(folder / Path(value).expanduser())
+
+
+def _is_path(key: str, value: str) -> bool:
+    if key in ("out", "records"):
+        return value != ""
+    if key == "mechanism":
+        return ".py:" in value or Path(value).suffix.lower() in (".yaml", ".yml", ".urdf")
+    return key == "methods" and ".py:" in value

@@ -1,0 +1,150 @@
+"""Put the figures of a run together in the form of `results.json`; everything on held-out rows."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.report.results import (
+    before_block,
+    constant_errors,
+    floor_block,
+    joint_errors,
+    pose_block,
+    ratio_to_floor,
+    spread,
+)
+from ccnn_torch.runs.config import RunConfig
+from ccnn_torch.runs.dataset import Dataset, pad_rows
+from ccnn_torch.runs.evaluate import Outcome
+from ccnn_torch.runs.prepare import Prepared
+
+__all__ = ["assemble", "best_method", "versions"]
+
+_PACKAGES = ("ccnn-torch", "torch", "numpy", "scipy", "onnx", "onnxruntime", "safetensors")
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package and of those that decide its numbers."""
+    return {name: version(name) for name in _PACKAGES}
+
+
+def best_method(outcomes: dict[str, Outcome]) -> str:
+    """The method whose median score over the repeats is lowest (validation, or training where none was held out)."""
+    return min(outcomes, key=lambda name: float(outcomes[name].fitted.score.median()))
+
+
+def assemble(
+    config: RunConfig,
+    prepared: Prepared,
+    before: PoseError,
+    outcomes: dict[str, Outcome],
+    failed: dict[str, str],
+) -> dict[str, Any]:
+    """The content of `results.json`.
+
+    Args:
+        before: pose error without compensation, `r x s`.
+        outcomes: trained methods by name, at least one.
+        failed: sentence of each method that could not be trained.
+    """
+    dataset, joints = prepared.dataset, prepared.mechanism.joints
+    test, fit = dataset.usable_rows("test"), dataset.usable_rows("fit")
+    measured, learned = test.take(dataset.deviation), fit.take(dataset.deviation)
+    floor = None
+    if prepared.case is not None and prepared.noise is not None:
+        chirp = prepared.case.unlearnable
+        floor = floor_block(
+            test.take(prepared.noise),
+            test.weights,
+            joints,
+            prepared.case.sigma.square(),
+            test.take(chirp.expand(len(dataset.seeds), -1, -1)) if bool(chirp.any()) else None,
+        )
+    methods: dict[str, Any] = {name: {"test": None, "failed": sentence} for name, sentence in failed.items()}
+    for name, outcome in outcomes.items():
+        errors = joint_errors(test.take(outcome.deviation), measured, test.weights, joints)
+        each = outcome.fitted.seconds / len(dataset.seeds)
+        methods[name] = {
+            "test": errors,
+            "ratio_to_floor": ratio_to_floor(errors, floor),
+            "seconds": spread([each] * len(dataset.seeds)),
+        }
+    constant = constant_errors(learned, measured, fit.weights, test.weights, joints)
+    best = best_method(outcomes)
+    return {
+        "name": config.name,
+        "seed": config.seed,
+        "repeats": config.repeats,
+        "case": None if config.case is None else case_label(config),
+        "joints": [{"name": joint.name, "unit": joint.unit} for joint in joints],
+        "best_method": best,
+        "rows": row_counts(config, dataset),
+        "before": before_block(measured, test.weights, joints),
+        "before_train": before_block(learned, fit.weights, joints),
+        "methods": {name: methods[name] for name in [*outcomes, *failed]},
+        "constant": {"test": constant, "ratio_to_floor": ratio_to_floor(constant, floor)},
+        "floor": floor,
+        "pose": _pose(config, prepared, before, outcomes[best].after),
+        "records": None if prepared.simulated else _records(prepared),
+        "data_sha256": prepared.data_hash,
+        "notes": prepared.notes,
+        "versions": versions(),
+    }
+
+
+def case_label(config: RunConfig) -> str:
+    """`tripod`, or `machine_tool:VARIANT`."""
+    return f"{config.case}:{config.variant}" if config.case == "machine_tool" else str(config.case)
+
+
+def row_counts(config: RunConfig, dataset: Dataset) -> dict[str, int]:
+    """Rows of the first repeat's split; without early stopping the validation rows are trained on."""
+    split = dataset.splits[0]
+    held = len(split.validation) if config.training.early_stop else 0
+    return {
+        "train": len(split.train) + len(split.validation) - held,
+        "validation": held,
+        "test": len(split.test),
+        "not_trained_on": int((~dataset.usable[0]).sum()),
+    }
+
+
+def _pose(config: RunConfig, prepared: Prepared, before: PoseError, after: PoseError) -> dict[str, Any]:
+    """Over all test rows, those that were not fit to be trained on as well."""
+    rows = pad_rows([split.test for split in prepared.dataset.splits])
+    remainder = prepared.pseudoerror
+
+    def held_out(values: Tensor | None) -> Tensor | None:
+        return None if values is None else rows.take(values.expand(len(rows.index), -1))
+
+    position_before, position_after = held_out(before.position), held_out(after.position)
+    assert position_before is not None and position_after is not None
+    return pose_block(
+        position_before,
+        position_after,
+        rows.weights,
+        held_out(before.rotation),
+        held_out(after.rotation),
+        config.rotation_weight,
+        held_out(_finite(remainder.remainder_position)),
+        held_out(_finite(remainder.remainder_rotation)),
+    )
+
+
+def _finite(values: Tensor | None) -> Tensor | None:
+    return None if values is None else torch.nan_to_num(values, nan=0.0)
+
+
+def _records(prepared: Prepared) -> dict[str, Any]:
+    """What measured records have beside: rows set aside and the frames that were fitted."""
+    usable = prepared.dataset.usable[0]
+    return {
+        "rows": len(usable),
+        "rows_set_aside": torch.nonzero(~usable).squeeze(-1).tolist(),
+        "why_set_aside": prepared.set_aside(),
+    }

@@ -1,0 +1,139 @@
+"""The main job in memory: rows, learners, figures, and a compensator from the best repeat of the best method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ccnn_torch.compensation import Compensator, fit_compensator, save_model
+from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.learners import make_learner
+from ccnn_torch.mechanisms import Mechanism, PoseError
+from ccnn_torch.runs.assemble import assemble, best_method, versions
+from ccnn_torch.runs.config import RunConfig, method_names
+from ccnn_torch.runs.evaluate import Outcome, evaluate, pose_before
+from ccnn_torch.runs.fitting import Plan, fit_method
+from ccnn_torch.runs.folder import RunFolder
+from ccnn_torch.runs.prepare import Prepared, prepare
+from ccnn_torch.training import Callback, Scaling
+
+__all__ = ["Calibration", "Watch", "calibrate"]
+
+Watch = Callable[[Prepared, str, str, Scaling], list[Callback]]
+"""Callbacks of one training, given the rows, the method, the phase (`choose` or `fit`) and the phase's scaling."""
+
+
+@dataclass
+class Calibration:
+    """What a run found.
+
+    Attributes:
+        before: pose error without compensation, `r x s`.
+        outcomes: trained methods by name; `failed` has the sentence of each that could not be trained.
+        results: the content of `results.json`.
+    """
+
+    config: RunConfig
+    prepared: Prepared
+    before: PoseError
+    outcomes: dict[str, Outcome]
+    failed: dict[str, str]
+    results: dict[str, Any]
+
+    @property
+    def method(self) -> str:
+        """The best method."""
+        return best_method(self.outcomes)
+
+    def repeat(self, method: str | None = None) -> int:
+        """The repeat that is exported: that of the best validation."""
+        return int(self.outcomes[method or self.method].fitted.score.argmin())
+
+    def mechanism(self, method: str | None = None) -> Mechanism:
+        """The nominal machine, with the frames fitted in the exported repeat."""
+        parameters = self.prepared.repeat_parameters(self.repeat(method))
+        mechanism = self.prepared.mechanism
+        return mechanism if parameters is None else mechanism.with_nominal(parameters)
+
+    def compensator(self, method: str | None = None) -> Compensator:
+        """The compensator of a method's exported repeat."""
+        method = method or self.method
+        repeat, prepared = self.repeat(method), self.prepared
+        rows = prepared.dataset.usable_rows("fit")
+        there = rows.index[repeat][rows.weights[repeat] > 0]
+        fitted = self.outcomes[method].fitted
+        return fit_compensator(
+            fitted.learner.network(repeat).cpu(),
+            fitted.scaling.repeat(repeat),
+            prepared.dataset.inputs[there],
+            prepared.dataset.deviation[repeat, there],
+            prepared.mechanism.joints,
+            prepared.covariate_coordinates,
+            limit=self.config.compensation.limit,
+            margin=self.config.compensation.margin,
+        )
+
+    def save(self, folder: str | Path, method: str | None = None, name: str = "model") -> None:
+        """Write model files and card of a method's compensator."""
+        method = method or self.method
+        repeat = self.repeat(method)
+        about = {
+            "mechanism": self.mechanism(method).describe(),
+            "method": method,
+            "data_sha256": self.prepared.data_hash,
+            "seed": self.config.seed + repeat,
+            "metrics": _of_repeat(self.results["methods"][method], repeat),
+            "rotation_weight": self.config.rotation_weight,
+            "versions": versions(),
+        }
+        save_model(Path(folder), self.compensator(method), about, method=name)
+
+
+def calibrate(
+    config: RunConfig, folder: RunFolder | None = None, watch: Watch = lambda *_: [], prepared: Prepared | None = None
+) -> Calibration:
+    """Train the methods of a config and judge them on held-out rows.
+
+    Args:
+        folder: where checkpoints go; None = nowhere.
+        watch: makes the callbacks of every training.
+        prepared: the rows, where the caller has them already.
+
+    Raises:
+        InputError: the config or its data cannot be used.
+        MethodFailedError: no method could be trained.
+    """
+    prepared = prepared or prepare(config)
+    training = config.training
+    plan = Plan(training.early_stop, training.patience, training.checkpoint_every, config.device)
+    before = pose_before(prepared)
+    outcomes: dict[str, Outcome] = {}
+    failed: dict[str, str] = {}
+    for name in method_names(config):
+        try:
+            fitted = fit_method(
+                name,
+                lambda name=name: make_learner(name, config.settings(name)),
+                prepared.dataset,
+                plan,
+                folder,
+                lambda phase, scaling, name=name: watch(prepared, name, phase, scaling),
+            )
+        except MethodFailedError as problem:
+            failed[name] = str(problem)
+            continue
+        outcomes[name] = evaluate(prepared, fitted)
+    if not outcomes:
+        raise MethodFailedError("; ".join(f"{name}: {sentence}" for name, sentence in failed.items()))
+    return Calibration(config, prepared, before, outcomes, failed, assemble(config, prepared, before, outcomes, failed))
+
+
+def _of_repeat(block: Any, repeat: int) -> Any:
+    """The same figures for one repeat: every spread becomes its value there."""
+    if isinstance(block, dict):
+        if set(block) == {"median", "low", "high", "values"}:
+            return block["values"][repeat]
+        return {key: _of_repeat(value, repeat) for key, value in block.items()}
+    return block

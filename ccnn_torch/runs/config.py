@@ -1,0 +1,265 @@
+"""The config of a run: its keys, defaults and checks.
+
+Relative paths in a config file start from the file's folder, those on the command line from the current one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from ccnn_torch._table import nearest
+from ccnn_torch.errors import InputError
+from ccnn_torch.learners._registry import LEARNERS
+from ccnn_torch.learners.ccnn import CCNNSettings
+from ccnn_torch.runs._keys import explain, list_keys
+from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
+from ccnn_torch.runs._yaml import dump_yaml, read_yaml
+
+__all__ = [
+    "METHODS",
+    "CompensationConfig",
+    "RunConfig",
+    "SplitConfig",
+    "TrainingConfig",
+    "describe_keys",
+    "dump_config",
+    "key_table",
+    "load_config",
+    "make_config",
+    "method_names",
+]
+
+METHODS = ("ccnn", "bp_lm", "grnn", "enn", "constant", "gp")
+"""The learner names of the framework; `ccnn_torch.learners.LEARNERS` has those that this version can make."""
+
+
+def _listed(value: Any) -> Any:
+    """A single name, or several with commas as a shell would have them, as a list."""
+    return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+
+
+def _one(value: Any) -> Any:
+    return [value] if isinstance(value, int | float) else value
+
+
+Names = Annotated[list[str], BeforeValidator(_listed)]
+Numbers = Annotated[list[Annotated[float, Field(gt=0)]], BeforeValidator(_one)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True)
+
+
+class SplitConfig(_Part):
+    """Which rows are held out; see `ccnn_torch.splits`."""
+
+    kind: Literal["random", "group", "block"] = Field(default="random", description="random, group or block")
+    by: Names | None = Field(
+        default=None,
+        description="what makes a group: a column, several, or position:5mm (the default of group and block)",
+    )
+    test: float = Field(
+        default=0.3, gt=0, lt=1, description="share of the rows (group: of the groups) that is held out"
+    )
+    validation: float = Field(default=0.2, ge=0, lt=1, description="share of the rest that chooses the model")
+
+
+class TrainingConfig(_Part):
+    """How the trainer uses the validation rows and how often it saves."""
+
+    early_stop: bool = Field(
+        default=True,
+        description="find the best step on the validation rows, then refit on all training rows for so long",
+    )
+    patience: int | None = Field(
+        default=None, ge=1, description="steps without improvement after which that search ends; null = go to the end"
+    )
+    checkpoint_every: int = Field(default=20, ge=1, description="steps between two checkpoints")
+    log_every: int = Field(default=1, ge=1, description="steps between two points of the held-out curves")
+
+
+class CompensationConfig(_Part):
+    """Guard and limit of the compensator."""
+
+    margin: float = Field(
+        default=0.1,
+        ge=0,
+        description="how far beyond the training inputs the correction is trusted, as a share of their half range",
+    )
+    limit: Numbers | None = Field(
+        default=None,
+        min_length=1,
+        description="hard limit of the correction in SI, one number or one per joint; null = 1.5 times the largest "
+        "training deviation of each joint",
+    )
+
+
+class RunConfig(_Part):
+    """A run: data, split, methods and their settings."""
+
+    name: str = Field(default="run", min_length=1, description="name of the run; default: the config file's name")
+    seed: int = Field(default=0, ge=0, description="seed of the first repeat; repeat k has seed + k")
+    repeats: int = Field(
+        default=1, ge=1, description="independent repeats, side by side: new noise, split and start each"
+    )
+    out: str | None = Field(default=None, description="folder to write; default runs/NAME-STAMP")
+    methods: Names = Field(
+        default=["ccnn"],
+        min_length=1,
+        description=f"learners: a list of {', '.join(METHODS)}; all = these; auto = all that this version has",
+    )
+    device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?|mps)$", description="cpu, cuda, cuda:N or mps")
+    covariates: Names | None = Field(
+        default=None,
+        description="inputs beside the joints, names or patterns; null = time, temperature, load_*, direction*, "
+        "speed* where they are there; [] = none",
+    )
+    split: SplitConfig = Field(default_factory=SplitConfig)
+    case: Literal["tripod", "machine_tool"] | None = Field(
+        default=None, description="a case study of paper 000: tripod or machine_tool; or null and records instead"
+    )
+    variant: Literal["printed", "tabulated"] | None = Field(
+        default=None,
+        description="noise of the machine_tool case: printed (eq. 19) or tabulated (Table III); default printed",
+    )
+    order: Literal["raster", "shuffled"] | None = Field(
+        default=None, description="order in which a case visits its poses: raster or shuffled; default raster"
+    )
+    records: str | None = Field(default=None, description="measured records, a CSV file with headers name[unit]")
+    mechanism: str | None = Field(
+        default=None,
+        description="mechanism of the records: tripod, machine_tool, a DH file (.yaml), a URDF, or file.py:Name",
+    )
+    rotation_weight: float = Field(
+        default=0.04, gt=0, description="weight of orientation against position in m per rad (η of eq. 5)"
+    )
+    max_condition: float = Field(
+        default=50.0, gt=1, description="rows whose Jacobian is worse conditioned are not trained on, but still judged"
+    )
+    max_deviation: float | None = Field(
+        default=None, gt=0, description="rows with a larger joint deviation (SI) are not trained on; null = no bound"
+    )
+    gravity: list[float] = Field(
+        default=[0.0, 0.0, -9.81], min_length=3, max_length=3, description="gravity in the base frame in m/s^2"
+    )
+    training: TrainingConfig = Field(default_factory=TrainingConfig)
+    compensation: CompensationConfig = Field(default_factory=CompensationConfig)
+    save_models: bool = Field(default=True, description="write model files and their card")
+    ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill(cls, tree: Any) -> Any:
+        """An empty section is one of defaults; a case has its order and the machine tool its variant."""
+        if not isinstance(tree, dict):
+            return tree
+        sections = ("split", "training", "compensation", "ccnn")
+        tree = {key: value for key, value in tree.items() if value is not None or key not in sections}
+        if tree.get("case") is not None and tree.get("order") is None:
+            tree["order"] = "raster"
+        if tree.get("case") == "machine_tool" and tree.get("variant") is None:
+            tree["variant"] = "printed"
+        return tree
+
+    @field_validator("methods")
+    @classmethod
+    def _known(cls, methods: list[str]) -> list[str]:
+        choices = (*METHODS, "all", "auto")
+        for method in methods:
+            if method not in choices and ".py:" not in method:
+                near = nearest(method, choices)
+                hint = f"did you mean '{near}'?" if near else f"known are {', '.join(choices)} and file.py:Name"
+                raise ValueError(f"there is no method '{method}'; {hint}")
+            if methods.count(method) > 1:
+                raise ValueError(f"'{method}' stands twice")
+            if method in ("all", "auto") and len(methods) > 1:
+                raise ValueError(f"'{method}' stands alone; remove the other names or '{method}'")
+        return methods
+
+    @model_validator(mode="after")
+    def _one_source(self) -> RunConfig:
+        if (self.case is None) == (self.records is None):
+            both = "both case and records are given; remove one" if self.case else "no data is named"
+            raise ValueError(f"{both}: case=tripod, case=machine_tool, or records=FILE.csv with mechanism=…")
+        if self.records is not None and self.mechanism is None:
+            raise ValueError(
+                "mechanism: records need it; write mechanism=tripod, machine_tool, a DH file, a URDF or file.py:Name"
+            )
+        if self.case is not None and self.mechanism not in (None, self.case):
+            raise ValueError(f"mechanism: the case {self.case} brings its own; remove the key")
+        if self.variant is not None and self.case != "machine_tool":
+            raise ValueError("variant: only the case machine_tool has variants; remove the key")
+        if self.order is not None and self.case is None:
+            raise ValueError("order: records have the order in which they were measured; remove the key")
+        if self.training.early_stop and self.split.validation == 0:
+            raise ValueError(
+                "training.early_stop: it needs validation rows; write split.validation=0.2 or training.early_stop=false"
+            )
+        return self
+
+    def settings(self, method: str) -> dict[str, Any]:
+        """The settings of one method, from the section of its name; {} where it has none."""
+        section = getattr(self, method, None) if method in METHODS else None
+        return dataclasses.asdict(section) if section is not None else {}
+
+
+def load_config(path: str | Path, overrides: Iterable[str] = ()) -> RunConfig:
+    """Read a config file and put overrides ``key.sub=value`` over it.
+
+    Raises:
+        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
+    """
+    path = Path(path)
+    tree = read_yaml(path)
+    tree.setdefault("name", path.stem)
+    resolve_paths(tree, path.absolute().parent)
+    given = apply_overrides(tree, overrides, Path.cwd())
+    return _validate(tree, str(path), given)
+
+
+def make_config(**keys: Any) -> RunConfig:
+    """A config from keys, e.g. ``make_config(case="tripod", ccnn={"generations": 60})``; paths from the current folder.
+
+    Raises:
+        InputError: keys are wrong: one line that names them all.
+    """
+    tree = dict(keys)
+    resolve_paths(tree, Path.cwd())
+    return _validate(tree, "config", {})
+
+
+def _validate(tree: dict[str, Any], source: str, given: dict[str, str]) -> RunConfig:
+    try:
+        return RunConfig.model_validate(tree)
+    except ValidationError as error:
+        raise InputError(explain(error, RunConfig, source, given)) from None
+
+
+def dump_config(config: RunConfig) -> str:
+    """The resolved config as YAML, every key written out; `load_config` of it gives an equal config."""
+    return dump_yaml(config.model_dump(mode="json"))
+
+
+def method_names(config: RunConfig) -> list[str]:
+    """The methods to train: ``all`` and ``auto`` spelt out."""
+    if config.methods == ["all"]:
+        return list(METHODS)
+    if config.methods == ["auto"]:
+        return [method for method in METHODS if method in LEARNERS]
+    return list(config.methods)
+
+
+def describe_keys() -> list[tuple[str, str, str]]:
+    """Every key, dotted, with its default and what it means."""
+    return list(list_keys(RunConfig))
+
+
+def key_table() -> str:
+    """`describe_keys` as a Markdown table."""
+    rows = [f"| `{key}` | `{default}` | {description} |" for key, default, description in describe_keys()]
+    return "\n".join(["| key | default | meaning |", "| --- | --- | --- |", *rows]) + "\n"

@@ -1,0 +1,124 @@
+"""Rows of many repeats side by side: from splits to the padded tensors that a learner takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.learners import TrainingData
+from ccnn_torch.splits import Split
+from ccnn_torch.training import Scaling
+
+__all__ = ["Dataset", "Rows", "pad_rows"]
+
+_SMALLEST_TRAINING_SET = 8
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Row numbers of every repeat, padded to one length.
+
+    Attributes:
+        index: `r x t` int64.
+        weights: `r x t`, 1 for a row, 0 for padding.
+    """
+
+    index: Tensor
+    weights: Tensor
+
+    def take(self, values: Tensor) -> Tensor:
+        """values: `s x ...` (the same for all repeats) or `r x s x ...`; returns `r x t x ...`."""
+        repeats = torch.arange(len(self.index)).unsqueeze(-1)
+        return values[repeats, self.index]
+
+
+def pad_rows(rows: list[Tensor]) -> Rows:
+    """rows: one int64 index tensor a repeat, of any lengths."""
+    longest = max(len(one) for one in rows)
+    index = torch.zeros(len(rows), longest, dtype=torch.int64)
+    weights = torch.zeros(len(rows), longest, dtype=torch.float64)
+    for repeat, one in enumerate(rows):
+        index[repeat, : len(one)] = one
+        weights[repeat, : len(one)] = 1.0
+    return Rows(index, weights)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Commanded joints and covariates against joint deviations, with the splits of every repeat.
+
+    Attributes:
+        inputs: joints, then covariates, `s x i` [SI].
+        deviation: pseudoerror, `r x s x n` [SI].
+        usable: rows whose pseudoerror is well determined, `r x s` bool; only these are trained on and scored per joint.
+        splits: one a repeat.
+        seeds: one a repeat.
+        turning: which inputs are revolute joints, `i` bool.
+    """
+
+    inputs: Tensor
+    deviation: Tensor
+    usable: Tensor
+    splits: list[Split]
+    seeds: list[int]
+    turning: Tensor
+
+    def usable_rows(self, part: str) -> Rows:
+        """Usable rows of `train`, `validation`, `fit` (both) or `test`."""
+        chosen = [self.part(split, part) for split in self.splits]
+        rows = pad_rows([one[self.usable[k, one]] for k, one in enumerate(chosen)])
+        if rows.index.shape[1] == 0 or int(rows.weights.sum(-1).min()) == 0:
+            raise InputError(
+                f"no usable row is left in the {part} part of the split; measure more rows, away from singular "
+                "poses, or change split.test and split.validation"
+            )
+        return rows
+
+    @staticmethod
+    def part(split: Split, part: str) -> Tensor:
+        """Rows of one part of a split, in the order measured."""
+        if part == "fit":
+            return torch.cat([split.train, split.validation]).sort().values
+        rows: Tensor = getattr(split, part)
+        return rows.sort().values
+
+    def scaled(self, part: str, validate: bool) -> tuple[TrainingData, Scaling]:
+        """What a learner takes, scaled by its own training rows.
+
+        Args:
+            part: `train` (validation rows held out) or `fit` (both).
+            validate: give the learner the validation rows to look at.
+        """
+        rows = self.usable_rows(part)
+        fewest = int(rows.weights.sum(-1).min())
+        if fewest < _SMALLEST_TRAINING_SET:
+            raise InputError(
+                f"only {fewest} usable rows are left to train on; at least {_SMALLEST_TRAINING_SET} are needed: "
+                "measure more, or lower split.test and split.validation"
+            )
+        inputs, targets = rows.take(self._inputs()), rows.take(self.deviation)
+        scaling = Scaling.fit(inputs, targets, rows.weights, self.periodic())
+        held = None
+        if validate:
+            others = self.usable_rows("validation")
+            held = TrainingData(
+                scaling.features(others.take(self._inputs())),
+                scaling.standardise(others.take(self.deviation)),
+                others.weights,
+                torch.tensor(self.seeds),
+            )
+        data = TrainingData(
+            scaling.features(inputs), scaling.standardise(targets), rows.weights, torch.tensor(self.seeds), held
+        )
+        return data, scaling
+
+    def periodic(self) -> Tensor:
+        """Revolute joints that turn by more than a quarter: fed as sine and cosine. Returns `i` bool."""
+        span = self.inputs.amax(0) - self.inputs.amin(0)
+        return self.turning & (span > torch.pi / 2)
+
+    def _inputs(self) -> Tensor:
+        return self.inputs.expand(len(self.splits), -1, -1)

@@ -1,0 +1,68 @@
+"""`ccnn run`: a config to a finished run folder, and an unfinished folder to a finished one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ccnn_torch.report.tables import print_results
+from ccnn_torch.report.tensorboard import TensorBoard
+from ccnn_torch.runs.calibrate import Calibration, calibrate
+from ccnn_torch.runs.config import RunConfig, dump_config, load_config
+from ccnn_torch.runs.folder import RunFolder
+from ccnn_torch.runs.outputs import write_outputs
+from ccnn_torch.runs.prepare import Prepared, prepare
+from ccnn_torch.runs.screen import note, stdout
+from ccnn_torch.runs.watch import HeldOut, ProgressBar
+from ccnn_torch.training import Callback, Scaling
+
+__all__ = ["resume_run", "start_run"]
+
+
+def start_run(config: RunConfig, quiet: bool = False) -> RunFolder:
+    """Run a config into a fresh folder.
+
+    Raises:
+        InputError: the config or its data cannot be used, or the folder is taken.
+    """
+    prepared = prepare(config)
+    folder = RunFolder.create(config.out, config.name)
+    folder.write_text("config.yaml", dump_config(config))
+    _run(config, prepared, folder, quiet)
+    return folder
+
+
+def resume_run(path: Path, quiet: bool = False) -> RunFolder:
+    """Finish the run in a folder; the result is that of a run that was never stopped. A finished one stays as it is.
+
+    Raises:
+        InputError: there is no run in the folder, or its records or checkpoints were changed.
+    """
+    folder = RunFolder.existing(path)
+    if folder.finished:
+        note(f"{path} is finished; nothing to do", quiet)
+        return folder
+    config = load_config(folder.config, [])
+    _run(config, prepare(config), folder, quiet)
+    return folder
+
+
+def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool) -> None:
+    for sentence in prepared.notes:
+        note(sentence, quiet)
+
+    def watch(prepared: Prepared, method: str, phase: str, scaling: Scaling) -> list[Callback]:
+        joints = tuple(joint.name for joint in prepared.mechanism.joints)
+        label = f"{method}: {'choosing how long' if phase == 'choose' else 'training'}"
+        board = folder.tensorboard / (method if phase == "fit" else f"{method}-{phase}")
+        return [
+            HeldOut(prepared.dataset, scaling, joints, config.training.log_every),
+            TensorBoard(board),
+            ProgressBar(label, quiet),
+        ]
+
+    calibration: Calibration = calibrate(config, folder, watch, prepared)
+    note("writing model files, plots and tables …", quiet)
+    write_outputs(calibration, folder)
+    if not quiet:
+        print_results(calibration.results, stdout)
+        stdout.print(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")

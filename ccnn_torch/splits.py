@@ -1,0 +1,174 @@
+"""Rows for training, for choosing a model, and for the figures that are reported.
+
+Three kinds, each a function of the rows and one seed:
+
+* ``random``: single rows at random. Rows of one target pose may stand on both sides, which flatters the figures.
+* ``group``: whole groups at random. `by` is a column or ``position:5mm``, the default: rows whose measured positions
+  round to the same cell of 5 mm share a target pose and form a group. Several entries make a group of the rows that are
+  alike in all. A column that is named counts alone: where many groups visit the same poses, joining them by pose too
+  would leave a single group.
+* ``block``: whole groups (same `by`), sorted by their mean along the first principal direction of the positions; the
+  far end is held out, so that the figures are those of extrapolation.
+
+The training rows come first in the draw or along the direction, then the validation rows, last the test rows: a model
+is chosen on rows of the same kind as those it is judged on, in a block split on the block beside the test block.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ccnn_torch._table import nearest
+from ccnn_torch.errors import InputError
+from ccnn_torch.units import to_si
+
+__all__ = ["DEFAULT_BY", "KINDS", "Split", "split_rows"]
+
+KINDS = ("random", "group", "block")
+DEFAULT_BY = "position:5mm"
+
+Column = NDArray[np.float64] | Tensor
+_Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Split:
+    """Row indices, each ascending and int64; together every row once."""
+
+    train: Tensor
+    validation: Tensor
+    test: Tensor
+
+
+def split_rows(
+    positions: Tensor,
+    kind: str = "random",
+    by: str | Sequence[str] | None = None,
+    columns: Mapping[str, Column] | None = None,
+    test: float = 0.3,
+    validation: float = 0.2,
+    seed: int = 0,
+) -> Split:
+    """Split rows.
+
+    Of `k` rows (or groups) the first ``int((1 - test) * k)`` of ``numpy.random.default_rng(seed).permutation(k)`` are
+    not test rows; of these `k'` the first ``int((1 - validation) * k')`` are for training, the others for validation.
+    Groups are numbered as `numpy.unique` sorts their keys. A block split takes the same shares, of rows, along the
+    sorted groups; a group that stands across a border goes to the far side.
+
+    Args:
+        positions: `rows x d` [m]; d may be 0 where `by` names columns.
+        kind: ``random``, ``group`` or ``block``.
+        by: what makes a group, see above; one entry or several.
+        columns: the columns that `by` may name, `rows` each.
+        test: share of the rows (``group``: of the groups) that is held out, between 0 and 1.
+        validation: share of the rest, from 0.
+        seed: seed of the draw; a block split draws nothing.
+
+    Raises:
+        InputError: an unknown kind or column, a share out of range, or too few rows or groups for the shares.
+    """
+    rows = len(positions)
+    for key, share, low in (("test", test, 0.0), ("validation", validation, -1e-300)):
+        if not low < share < 1:
+            raise InputError(f"split.{key}: {share:g} is not a share; write a number between 0 and 1, e.g. 0.2")
+    if kind == "random":
+        if by is not None:
+            raise InputError(f"split.by: '{by}' has no meaning with split.kind=random; write split.kind=group")
+        return _draw(np.arange(rows), test, validation, seed, "rows")
+    if kind not in KINDS:
+        near = nearest(kind, KINDS)
+        raise InputError(f"split.kind: '{kind}' is not one of {', '.join(KINDS)}" + (f"; '{near}'?" if near else ""))
+    groups = _groups(positions, DEFAULT_BY if by is None else by, columns or {})
+    if kind == "group":
+        return _draw(groups, test, validation, seed, "groups")
+    return _block(positions.numpy(), groups, test, validation)
+
+
+def _draw(groups: _Integers, test: float, validation: float, seed: int, what: str) -> Split:
+    """Whole groups at random. groups: number of each row's group, `rows`."""
+    count = int(groups.max(initial=-1)) + 1
+    order = np.random.default_rng(seed).permutation(count)
+    kept = _first(1 - test, count)
+    trained = _first(1 - validation, kept)
+    part = np.empty(count, dtype=np.int64)
+    part[order[:trained]], part[order[trained:kept]], part[order[kept:]] = 0, 1, 2
+    return _collect(part[groups], validation, f"{count} {what}")
+
+
+def _block(positions: NDArray[np.float64], groups: _Integers, test: float, validation: float) -> Split:
+    """Whole groups along the first principal direction, whose largest component counts as positive."""
+    rows = len(positions)
+    if positions.shape[1] == 0:
+        raise InputError("split.kind: a block split needs positions, and this pose has none; write split.kind=group")
+    centred = positions - positions.mean(axis=0)
+    direction = np.linalg.svd(centred, full_matrices=False)[2][0]
+    direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
+    size = np.bincount(groups)
+    mean = np.bincount(groups, weights=centred @ direction) / size
+    order = np.argsort(mean, kind="stable")
+    reached = np.cumsum(size[order])
+    kept = _first(1 - test, rows)
+    trained = _first(1 - validation, kept)
+    part = np.empty(len(size), dtype=np.int64)
+    part[order] = np.where(reached <= trained, 0, np.where(reached <= kept, 1, 2))
+    return _collect(part[groups], validation, f"{len(size)} groups of {rows} rows")
+
+
+def _first(share: float, count: int) -> int:
+    """Whole number of items in a share, as `int(share * count)`, but 0.8 of 125 is 100 whatever the rounding."""
+    return int(share * count + 1e-9)
+
+
+def _collect(part: _Integers, validation: float, stock: str) -> Split:
+    train, chosen, test = (torch.from_numpy(np.flatnonzero(part == number)) for number in range(3))
+    for key, indices, wanted in (
+        ("training", train, True),
+        ("validation", chosen, validation > 0),
+        ("test", test, True),
+    ):
+        if wanted and len(indices) == 0:
+            raise InputError(f"split: {stock} are too few, no {key} row is left; record more or change the shares")
+    return Split(train, chosen, test)
+
+
+def _groups(positions: Tensor, by: str | Sequence[str], columns: Mapping[str, Column]) -> _Integers:
+    """Number of each row's group, `rows`, from 0: rows alike in every entry of `by` form a group."""
+    keys = []
+    for entry in [by] if isinstance(by, str) else by:
+        if entry.partition(":")[0] == "position":
+            if positions.shape[1] == 0:
+                raise InputError(f"split.by: '{entry}' needs positions, and this pose has none; name a column instead")
+            keys.append(np.round(positions.numpy() / _cell(entry)))
+        else:
+            keys.append(_column(entry, columns)[:, None])
+    return np.unique(np.concatenate(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
+
+def _cell(by: str) -> float:
+    """Edge of the cells in m, from ``position:5mm``."""
+    match = re.fullmatch(r"position:\s*(\d+\.?\d*|\.\d+)\s*(\D+)", by)
+    if match is None or float(match[1]) == 0:
+        raise InputError(f"split.by: '{by}' is not of the form position:LENGTH; write e.g. {DEFAULT_BY}")
+    return float(to_si(float(match[1]), match[2].strip(), "m", f"split.by: the length in '{by}'", "position"))
+
+
+def _column(name: str, columns: Mapping[str, Column]) -> NDArray[np.float64]:
+    if name not in columns:
+        near = nearest(name, [*columns, DEFAULT_BY])
+        hint = f"did you mean '{near}'?" if near else f"write {DEFAULT_BY} or one of: {', '.join(columns) or '(none)'}"
+        raise InputError(f"split.by: there is no column '{name}' to group by; {hint}")
+    values = np.asarray(columns[name], dtype=np.float64)
+    missing = np.flatnonzero(np.isnan(values))
+    if len(missing):
+        raise InputError(
+            f"split.by: column '{name}' has no value in row {missing[0] + 1}; fill it in or group otherwise"
+        )
+    return values

@@ -1,0 +1,214 @@
+"""The one training loop: steps, validation, early stopping per repeat, checkpoints, resume."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.learners._protocol import Learner, TrainingData
+from ccnn_torch.training._callbacks import Callback
+from ccnn_torch.training._checkpoint import load_checkpoint, save_checkpoint
+
+__all__ = ["Training", "train", "weighted_mse"]
+
+
+@dataclass
+class Training:
+    """What a training leaves behind; the learner itself holds the chosen state.
+
+    Attributes:
+        step: steps done.
+        best_step: the step whose state each repeat was left in, `r` int64.
+        best_validation: validation error of that state, `r` (mean square of standardised outputs); inf without any.
+        history: metrics by name, `steps x r [x k]`.
+        seconds: time spent inside the learner.
+    """
+
+    step: int
+    best_step: Tensor
+    best_validation: Tensor
+    history: dict[str, Tensor] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+def weighted_mse(predicted: Tensor, targets: Tensor, weights: Tensor) -> Tensor:
+    """Mean squared error over rows and outputs. predicted, targets: `r x s x o`; weights: `r x s`; returns `r`."""
+    per_row = (predicted - targets).square().mean(-1)
+    return (per_row * weights).sum(-1) / weights.sum(-1)
+
+
+def train(
+    learner: Learner,
+    data: TrainingData,
+    *,
+    callbacks: Sequence[Callback] = (),
+    checkpoint: Path | None = None,
+    every: int = 20,
+    patience: int | None = None,
+    stop_at: Tensor | None = None,
+) -> Training:
+    """Drive a learner to its end and leave it in the chosen state of every repeat.
+
+    With `data.validation`, each repeat is left in the state of its lowest validation error, and the loop ends early
+    once no repeat has improved for `patience` steps. With `stop_at`, each repeat is left in the state after that many
+    steps (a refit on all rows for as long as validation found best). Else the last state stays.
+
+    Args:
+        checkpoint: file to write every `every` steps and before the first; if it is there, the training goes on from
+            it and ends in the same tensors as one that was never stopped.
+        stop_at: steps of each repeat, `r` int64.
+
+    Raises:
+        InputError: the checkpoint is damaged or belongs to other data.
+    """
+    learner.start(data)
+    repeats = data.inputs.shape[0]
+    run = _Run(learner, data, repeats, patience, stop_at)
+    if checkpoint is not None and checkpoint.exists():
+        run.restore(checkpoint)
+    elif checkpoint is not None:
+        run.save(checkpoint)
+    for callback in callbacks:
+        callback.on_start(learner, data, run.step)
+    try:
+        while not run.done:
+            metrics = run.advance()
+            for callback in callbacks:
+                callback.on_step(run.step, metrics)
+            run.note(metrics)
+            if checkpoint is not None and run.step % every == 0:
+                run.save(checkpoint)
+    finally:
+        for callback in callbacks:
+            callback.on_end()
+    if checkpoint is not None:
+        run.save(checkpoint)
+    return run.finish()
+
+
+class _Run:
+    """State of one training. Every tensor of a learner's state that has a dimension leads with the repeats, so the
+    states of different steps can be mixed, one step a repeat."""
+
+    def __init__(
+        self, learner: Learner, data: TrainingData, repeats: int, patience: int | None, stop_at: Tensor | None
+    ) -> None:
+        self.learner, self.data, self.patience, self.stop_at = learner, data, patience, stop_at
+        self.step = 0
+        self.seconds = 0.0
+        device = data.inputs.device
+        self.best_step = torch.zeros(repeats, dtype=torch.int64, device=device)
+        self.best_validation = torch.full((repeats,), torch.inf, dtype=data.inputs.dtype, device=device)
+        self.kept = self._copy_state()
+        self.history: list[dict[str, Tensor]] = []
+
+    @property
+    def chooses(self) -> bool:
+        return self.data.validation is not None or self.stop_at is not None
+
+    @property
+    def done(self) -> bool:
+        if self.learner.finished:
+            return True
+        if self.stop_at is not None:
+            return self.step >= int(self.stop_at.max())
+        if self.data.validation is None or self.patience is None or self.step == 0:
+            return False
+        return self.step - int(self.best_step.max()) >= self.patience
+
+    def advance(self) -> dict[str, Tensor]:
+        began = time.perf_counter()
+        metrics = dict(self.learner.step())
+        self.step += 1
+        improved = None
+        if self.stop_at is not None:
+            improved = self.stop_at == self.step
+        elif self.data.validation is not None:
+            held = self.data.validation
+            error = weighted_mse(self.learner.predict(held.inputs), held.targets, held.weights)
+            metrics["error_validation"] = error
+            improved = error < self.best_validation
+            if self.patience is not None:
+                # A repeat that would have stopped by itself takes nothing more, whatever runs beside it.
+                improved &= self.step - self.best_step <= self.patience
+            self.best_validation = torch.where(improved, error, self.best_validation)
+        if improved is not None and bool(improved.any()):
+            self._keep(improved)
+        self.seconds += time.perf_counter() - began
+        return metrics
+
+    def note(self, metrics: dict[str, Tensor]) -> None:
+        self.history.append({name: value.detach().clone() for name, value in metrics.items()})
+
+    def finish(self) -> Training:
+        if self.chooses:
+            self.learner.load_state_dict({name: value.clone() for name, value in self.kept.items()})
+        else:
+            self.best_step = torch.full_like(self.best_step, self.step)
+        return Training(self.step, self.best_step, self.best_validation, _stack(self.history), self.seconds)
+
+    def save(self, path: Path) -> None:
+        tensors = {f"state.{name}": value for name, value in self.learner.state_dict().items()}
+        tensors |= {f"history.{name}": value for name, value in _stack(self.history).items()}
+        tensors |= {"best_step": self.best_step, "best_validation": self.best_validation}
+        if self.chooses:
+            tensors |= {f"kept.{name}": value for name, value in self.kept.items()}
+        save_checkpoint(path, tensors, {**self._identity(), "step": self.step, "seconds": self.seconds})
+
+    def restore(self, path: Path) -> None:
+        tensors, about = load_checkpoint(path)
+        mine = self._identity()
+        for key, value in mine.items():
+            if about.get(key) != value:
+                raise InputError(
+                    f"{path}: this checkpoint has {key} {about.get(key)!r}, this run {value!r}; resume the run folder "
+                    "that it belongs to, with its records unchanged"
+                )
+        device = self.data.inputs.device
+        tensors = {name: value.to(device) for name, value in tensors.items()}
+        self.learner.load_state_dict(_part(tensors, "state."))
+        self.best_step, self.best_validation = tensors["best_step"], tensors["best_validation"]
+        if self.chooses:
+            self.kept = _part(tensors, "kept.")
+        self.step, self.seconds = int(about["step"]), float(about["seconds"])
+        history = _part(tensors, "history.")
+        self.history = [{name: value[i] for name, value in history.items()} for i in range(self.step)]
+
+    def _identity(self) -> dict[str, Any]:
+        data = self.data
+        return {
+            "learner": self.learner.name,
+            "rows": list(data.inputs.shape),
+            "validation": None if data.validation is None else list(data.validation.inputs.shape),
+            "checksum": float(data.inputs.sum() + data.targets.sum()),
+        }
+
+    def _copy_state(self) -> dict[str, Tensor]:
+        return {name: value.detach().clone() for name, value in self.learner.state_dict().items()}
+
+    def _keep(self, improved: Tensor) -> None:
+        state = self.learner.state_dict()
+        for name, value in state.items():
+            if value.dim() == 0:
+                self.kept[name] = value.clone()
+            else:
+                chosen = improved.view(-1, *([1] * (value.dim() - 1)))
+                self.kept[name] = torch.where(chosen, value, self.kept[name])
+        self.best_step = torch.where(improved, torch.full_like(self.best_step, self.step), self.best_step)
+
+
+def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def _stack(history: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    if not history:
+        return {}
+    return {name: torch.stack([metrics[name] for metrics in history]) for name in history[0]}

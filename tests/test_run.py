@@ -1,0 +1,184 @@
+"""`ccnn run` from a config to a run folder: its files, its figures, and going on after a kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.report.json_files import load_schema
+from ccnn_torch.runs import RunConfig, calibrate, load_config, resume_run, start_run
+from ccnn_torch.runs.config import make_config
+
+ROOT = Path(__file__).parent.parent
+TRIPOD = ROOT / "experiments" / "tripod.yaml"
+SHORT = {"hidden": [4], "population": 12, "generations": 15}
+FILES = (
+    "config.yaml",
+    "results.json",
+    "results.csv",
+    "results.md",
+    "card.json",
+    "model.safetensors",
+    "model.onnx",
+    "model.pt2",
+    "report.html",
+)
+
+
+def short(**keys: Any) -> RunConfig:
+    """Case one with a small CCNN, and whatever a test changes."""
+    base: dict[str, Any] = {
+        "case": "tripod",
+        "split": {"test": 0.2, "validation": 0.0},
+        "training": {"early_stop": False, "checkpoint_every": 4},
+        "ccnn": SHORT,
+    }
+    return make_config(**(base | keys))
+
+
+def test_the_folder_of_a_run_holds_what_others_rely_on(tmp_path: Path) -> None:
+    folder = start_run(short(out=str(tmp_path / "run"), repeats=3, methods=["ccnn", "constant"]), quiet=True)
+    for name in FILES:
+        assert (folder.path / name).is_file(), name
+    assert (folder.path / "models" / "constant.card.json").is_file()
+    assert list((folder.path / "checkpoints").glob("*.safetensors"))
+    assert list((folder.path / "tensorboard").rglob("events.*"))
+    assert len(list((folder.path / "plots").glob("*.svg"))) >= 4
+    results = json.loads(folder.results.read_text())
+    jsonschema.validate(results, load_schema("results"))
+    jsonschema.validate(json.loads((folder.path / "card.json").read_text()), load_schema("card"))
+    assert results["rows"]["train"] == 100 and results["rows"]["test"] == 25
+    assert results["repeats"] == 3
+    for method in ("ccnn", "constant"):
+        assert len(results["methods"][method]["test"]["q1"]["mse"]["values"]) == 3
+    # A learner of that name and the trivial baseline beside it are the same thing, found in two ways.
+    found, beside = results["methods"]["constant"]["test"], results["constant"]["test"]
+    assert found["all"]["mse"]["values"] == pytest.approx(beside["all"]["mse"]["values"], rel=1e-9)
+    # In the machine: what is left after the constant is about the noise, and a tenth of what was there.
+    position = results["pose"]["position"]
+    assert position["after"]["rms"]["median"] < 0.5 * position["before"]["rms"]["median"]
+
+
+def test_repeat_k_has_the_noise_split_and_start_of_seed_plus_k() -> None:
+    many = calibrate(short(repeats=3, seed=5))
+    alone = calibrate(short(seed=7))
+    assert torch.equal(many.prepared.noise[2], alone.prepared.noise[0])  # type: ignore[index]
+    assert torch.equal(many.prepared.dataset.splits[2].test, alone.prepared.dataset.splits[0].test)
+    together = many.results["methods"]["ccnn"]["test"]["all"]["mse"]["values"][2]
+    assert alone.results["methods"]["ccnn"]["test"]["all"]["mse"]["values"] == pytest.approx([together], rel=1e-9)
+
+
+def test_the_same_seed_gives_the_same_model_file_byte_by_byte(tmp_path: Path) -> None:
+    files = []
+    for name in ("a", "b"):
+        calibrate(short(seed=3)).save(tmp_path / name)
+        files.append((tmp_path / name / "model.safetensors").read_bytes())
+    assert files[0] == files[1]
+
+
+def test_early_stopping_holds_validation_rows_out_and_refits_on_all() -> None:
+    config = short(split={"test": 0.2, "validation": 0.2}, training={"early_stop": True})
+    calibration = calibrate(config)
+    fitted = calibration.outcomes["ccnn"].fitted
+    assert calibration.results["rows"] == {"train": 80, "validation": 20, "test": 25, "not_trained_on": 0}
+    assert fitted.choice is not None
+    assert torch.equal(fitted.training.best_step, fitted.choice.best_step)
+    assert torch.equal(fitted.score, fitted.choice.best_validation)
+
+
+def test_figures_are_those_of_the_held_out_rows() -> None:
+    calibration = calibrate(short())
+    prepared = calibration.prepared
+    test = prepared.dataset.splits[0].test
+    error = (calibration.outcomes["ccnn"].deviation - prepared.dataset.deviation)[0, test]
+    mse = calibration.results["methods"]["ccnn"]["test"]["all"]["mse"]["median"]
+    assert mse == pytest.approx(float(error.square().mean()), rel=1e-12)
+    noise = prepared.noise
+    assert noise is not None
+    floor = calibration.results["floor"]["realised"]["all"]["mse"]["median"]
+    assert floor == pytest.approx(float(noise[0, test].square().mean()), rel=1e-12)
+    # What is exported predicts what was judged, to the last digits.
+    exported = calibration.compensator().deviation(prepared.joints[test])
+    assert float((exported - calibration.outcomes["ccnn"].deviation[0, test]).abs().max()) < 1e-15
+
+
+def test_time_as_a_covariate_reaches_learner_and_card(tmp_path: Path) -> None:
+    calibration = calibrate(short(covariates=["t"]))
+    assert calibration.prepared.dataset.inputs.shape == (125, 4)
+    calibration.save(tmp_path)
+    card = json.loads((tmp_path / "card.json").read_text())
+    assert [c["name"] for c in card["covariates"]] == ["t"]
+
+
+def test_a_taken_folder_is_not_written_into(tmp_path: Path) -> None:
+    (tmp_path / "note.txt").write_text("mine")
+    with pytest.raises(InputError, match="holds files already"):
+        start_run(short(out=str(tmp_path)), quiet=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+
+
+def test_resuming_a_finished_run_changes_nothing(tmp_path: Path) -> None:
+    folder = start_run(short(out=str(tmp_path / "run")), quiet=True)
+    before = {p: p.stat().st_mtime_ns for p in folder.path.rglob("*")}
+    resume_run(folder.path, quiet=True)
+    assert {p: p.stat().st_mtime_ns for p in folder.path.rglob("*")} == before
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.7])
+def test_a_killed_run_resumes_to_identical_results(tmp_path: Path, delay: float) -> None:
+    keys = ["ccnn.generations=60", "ccnn.population=40", "training.checkpoint_every=5", "seed=2"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+
+    def command(*words: str) -> list[str]:
+        return [sys.executable, "-m", "ccnn_torch", "run", *words]
+
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    subprocess.run(command(str(TRIPOD), *keys, f"out={whole}"), check=True, env=environment, capture_output=True)
+    process = subprocess.Popen(
+        command(str(TRIPOD), *keys, f"out={killed}"), env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    deadline = time.monotonic() + 60
+    while not list(killed.glob("checkpoints/*.safetensors")) and time.monotonic() < deadline:
+        time.sleep(0.005)
+    time.sleep(delay)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    assert not (killed / "results.json").exists()
+    subprocess.run(command("--resume", str(killed)), check=True, env=environment, capture_output=True)
+    assert (whole / "model.safetensors").read_bytes() == (killed / "model.safetensors").read_bytes()
+    for path in (whole / "checkpoints").iterdir():
+        again = load_file(killed / "checkpoints" / path.name)
+        for name, tensor in load_file(path).items():
+            assert torch.equal(tensor, again[name]), (path.name, name)
+    one, other = (json.loads((run / "results.json").read_text()) for run in (whole, killed))
+    for results in (one, other):
+        for method in results["methods"].values():
+            del method["seconds"]
+    assert one == other
+
+
+def test_every_key_of_the_shipped_configs_is_known() -> None:
+    for path in sorted((ROOT / "experiments").glob("*.yaml")):
+        overrides = ["records=x.csv", "mechanism=tripod"] if path.name == "records.yaml" else []
+        assert load_config(path, overrides).name == path.stem
+
+
+def test_shuffled_order_leaves_nothing_to_learn() -> None:
+    raster = calibrate(short(methods=["constant"], repeats=20)).results
+    shuffled = calibrate(short(methods=["constant"], repeats=20, order="shuffled")).results
+    ratios = [r["constant"]["ratio_to_floor"]["median"] for r in (raster, shuffled)]
+    assert np.allclose(ratios, 1.55, atol=0.15)

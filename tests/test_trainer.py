@@ -1,0 +1,145 @@
+"""The training loop: choice of the step per repeat, checkpoints, and going on after a stop."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from toy import Descent, linear_data
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.learners import Learner, TrainingData
+from ccnn_torch.training import Training, load_checkpoint, save_checkpoint, train, weighted_mse
+
+
+class Stop(Exception):
+    pass
+
+
+class StopAfter:
+    """Stands for a kill: leaves the loop in the middle of a step's callbacks."""
+
+    def __init__(self, step: int) -> None:
+        self._step = step
+
+    def on_start(self, learner: Learner, data: TrainingData, step: int) -> None:
+        pass
+
+    def on_step(self, step: int, metrics: dict[str, Tensor]) -> None:
+        if step == self._step:
+            raise Stop
+
+    def on_end(self) -> None:
+        pass
+
+
+def same(one: tuple[Descent, Training], other: tuple[Descent, Training]) -> None:
+    for name, value in one[0].state_dict().items():
+        assert torch.equal(value, other[0].state_dict()[name]), name
+    assert one[1].history.keys() == other[1].history.keys()
+    for name, value in one[1].history.items():
+        assert torch.equal(value, other[1].history[name]), name
+    assert torch.equal(one[1].best_step, other[1].best_step)
+    assert torch.equal(one[1].best_validation, other[1].best_validation)
+
+
+@pytest.mark.parametrize("stop", [1, 6, 7, 13, 29])
+@pytest.mark.parametrize("validation", [False, True])
+def test_a_stopped_training_goes_on_to_the_same_tensors(tmp_path: Path, stop: int, validation: bool) -> None:
+    data = linear_data(validation=validation)
+    whole = Descent()
+    expected = (whole, train(whole, data, every=7))
+    path = tmp_path / "a" / "checkpoint.safetensors"
+    with pytest.raises(Stop):
+        train(Descent(), data, callbacks=[StopAfter(stop)], checkpoint=path, every=7)
+    again = Descent()
+    same(expected, (again, train(again, data, checkpoint=path, every=7)))
+    # Once more from the last checkpoint: nothing is left to do, and nothing changes.
+    done = Descent()
+    same(expected, (done, train(done, data, checkpoint=path, every=7)))
+
+
+def test_the_first_checkpoint_is_written_before_the_first_step(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    with pytest.raises(Stop):
+        train(Descent(), linear_data(), callbacks=[StopAfter(1)], checkpoint=path, every=100)
+    assert load_checkpoint(path)[1]["step"] == 0
+
+
+def test_each_repeat_is_left_in_its_step_of_lowest_validation_error() -> None:
+    data = linear_data(repeats=4, validation=True)
+    learner = Descent(steps=60, rate=0.9)
+    training = train(learner, data)
+    errors = training.history["error_validation"]
+    assert errors.shape == (60, 4)
+    assert torch.equal(training.best_step, errors.argmin(0) + 1)
+    assert torch.equal(training.best_validation, errors.amin(0))
+    held = data.validation
+    assert held is not None
+    reached = weighted_mse(learner.predict(held.inputs), held.targets, held.weights)
+    assert torch.equal(reached, training.best_validation)
+
+
+def test_patience_ends_the_loop_and_a_repeat_does_not_depend_on_its_neighbours() -> None:
+    data = linear_data(repeats=3, validation=True)
+    learner = Descent(steps=500)
+    training = train(learner, data, patience=5)
+    assert training.step < 500
+    for k in range(3):
+        alone = _repeat(data, k)
+        single = Descent(steps=500)
+        assert int(train(single, alone, patience=5).best_step) == int(training.best_step[k])
+        assert torch.allclose(single.state_dict()["map"][0], learner.state_dict()["map"][k], rtol=1e-12)
+
+
+def test_a_refit_stops_each_repeat_after_its_own_number_of_steps() -> None:
+    data = linear_data(repeats=3)
+    learner = Descent(steps=30)
+    training = train(learner, data, stop_at=torch.tensor([0, 4, 9]))
+    assert training.step == 9
+    for k, steps in enumerate([0, 4, 9]):
+        single = Descent(steps=30)
+        single.start(_repeat(data, k))
+        for _ in range(steps):
+            single.step()
+        assert torch.allclose(single.state_dict()["map"][0], learner.state_dict()["map"][k], rtol=1e-12)
+
+
+def test_a_damaged_or_foreign_checkpoint_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    data = linear_data()
+    train(Descent(), data, checkpoint=path)
+    other = dataclasses.replace(data, targets=data.targets + 1)
+    with pytest.raises(InputError, match="records unchanged"):
+        train(Descent(), other, checkpoint=path)
+    content = bytearray(path.read_bytes())
+    content[-3] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="altered"):
+        train(Descent(), data, checkpoint=path)
+    path.write_bytes(content[:50])
+    with pytest.raises(InputError, match="cannot be read"):
+        train(Descent(), data, checkpoint=path)
+
+
+def test_checkpoints_keep_every_type_bit_by_bit(tmp_path: Path) -> None:
+    tensors = {
+        "mask": torch.tensor([[True, False]]),
+        "weight": torch.tensor([[0.1, -0.0, torch.nan]], dtype=torch.float64).T,
+        "count": torch.tensor(7),
+    }
+    save_checkpoint(tmp_path / "c.safetensors", tensors, {"step": 3})
+    loaded, about = load_checkpoint(tmp_path / "c.safetensors")
+    assert about == {"step": 3}
+    for name, value in tensors.items():
+        assert loaded[name].dtype == value.dtype
+        assert loaded[name].numpy().tobytes() == value.numpy().tobytes()
+
+
+def _repeat(data: TrainingData, k: int) -> TrainingData:
+    one = slice(k, k + 1)
+    held = None if data.validation is None else _repeat(data.validation, k)
+    return TrainingData(data.inputs[one], data.targets[one], data.weights[one], data.seeds[one], held)
