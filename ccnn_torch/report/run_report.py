@@ -29,11 +29,15 @@ __all__ = ["make_picture", "run_plots", "write_report"]
 _LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "model.onnx", "model.pt2", "config.yaml")
 
 
-def write_report(folder: str | Path) -> Path:
+def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -> Path:
     """Write `results.csv`, `results.md`, `plots/` and `report.html` of a run folder.
 
-    Reads `results.json`, and as far as they are there `arrays.safetensors`, `history-METHOD.safetensors` and
-    `config.yaml`; the same files give the same report, so it can be written again at any time.
+    Reads, as far as they are there, `arrays.safetensors`, `history-METHOD.safetensors` and `config.yaml`; the same
+    files give the same report, so it can be written again at any time.
+
+    Args:
+        folder: the run folder.
+        results: the content of its `results.json`, which is read when None.
 
     Returns:
         The path of `report.html`.
@@ -42,7 +46,7 @@ def write_report(folder: str | Path) -> Path:
         InputError: `results.json` is not there or damaged, or another file is damaged.
     """
     folder = Path(folder)
-    results = read_json(folder / "results.json")
+    results = read_json(folder / "results.json") if results is None else results
     write_csv(folder / "results.csv", results)
     (folder / "results.md").write_text(markdown_text(results), encoding="utf-8")
     plots = run_plots(folder, results)

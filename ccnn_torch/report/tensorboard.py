@@ -44,7 +44,8 @@ class TensorBoardCallback:
 
         Args:
             folder: where the event files go.
-            masks: gives the masks of the best network of the first repeat, layer by layer, `out x in`, bool.
+            masks: gives the masks of the best network of the first repeat, layer by layer, `out x in`, bool; None =
+                those of the learner, if it has a `genome`.
             every: write scalars each so many steps.
             masks_every: write the masks each so many steps.
         """
@@ -54,8 +55,11 @@ class TensorBoardCallback:
         self._masks_every = masks_every
         self._writer: SummaryWriter | None = None
 
-    def on_start(self, learner: Any, data_info: Any) -> None:
-        """Nothing to do yet: the first step is not known before it comes."""
+    def on_start(self, learner: Any, data: Any, step: int) -> None:
+        """Take the learner's masks where it has some; the writer waits for the first step."""
+        genome = getattr(learner, "genome", None)
+        if self._masks is None and genome is not None:
+            self._masks = lambda: [mask.cpu().numpy() for mask in genome(0)[0]]
 
     def on_step(self, step: int, metrics: Mapping[str, Tensor]) -> None:
         """Write the metrics of one step.

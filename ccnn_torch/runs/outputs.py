@@ -8,22 +8,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
-from ccnn_torch.report.html import write_report
 from ccnn_torch.report.json_files import write_json
-from ccnn_torch.report.plots import (
-    Plot,
-    convergence_plot,
-    joint_error_plot,
-    network_plot,
-    pose_error_plot,
-    population_plot,
-    save_figure,
-    workspace_plot,
-)
-from ccnn_torch.report.tables import results_csv, results_markdown
+from ccnn_torch.report.run_report import write_report
 from ccnn_torch.runs.calibrate import Calibration
 from ccnn_torch.runs.folder import RunFolder
-from ccnn_torch.training import write_whole
+from ccnn_torch.runs.watch import genome
 
 __all__ = ["write_outputs"]
 
@@ -36,23 +25,10 @@ def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
         if method != best:
             folder.models.mkdir(exist_ok=True)
             calibration.save(folder.models, method, name=method)
-    arrays = _arrays(calibration)
-    save_arrays(path, arrays)
-    plots: list[Plot | None] = [joint_error_plot(arrays), pose_error_plot(arrays), workspace_plot(arrays)]
+    save_arrays(path, _arrays(calibration))
     for method in calibration.outcomes:
-        history = _history(calibration, method)
-        save_history(path, method, history)
-        if len(history["step"]) > 1:
-            plots += [_convergence(calibration, method, history), population_plot(history, method)]
-    if arrays.masks:
-        names = [joint.name for joint in calibration.prepared.mechanism.joints]
-        plots.append(network_plot(arrays.masks, arrays.weights, best, names))
-    drawn = [plot for plot in plots if plot is not None]
-    for plot in drawn:
-        save_figure(plot.figure, folder.plots / plot.name)
-    write_whole(path / "results.csv", results_csv(results).encode())
-    write_whole(path / "results.md", results_markdown(results).encode())
-    write_report(path / "report.html", results, drawn, folder.config.read_text())
+        save_history(path, method, _history(calibration, method))
+    write_report(path, results)
     write_json(folder.results, results)
 
 
@@ -64,7 +40,7 @@ def _arrays(calibration: Calibration) -> RunArrays:
     test = torch.zeros(rows, dtype=torch.bool)
     test[prepared.dataset.splits[k].test] = True
     pose = prepared.pose[k] if prepared.pose.dim() == 3 else prepared.pose
-    masks, weights = outcome.fitted.genome(k)
+    masks, weights = genome(outcome.fitted.learner, k)
     systematic = outcome.after_systematic
     case = prepared.case
     return RunArrays(
@@ -92,22 +68,6 @@ def _history(calibration: Calibration, method: str) -> dict[str, NDArray[np.floa
     history = calibration.outcomes[method].fitted.training.history
     steps = len(next(iter(history.values())))
     return {"step": np.arange(1, steps + 1)} | {name: _numpy(value) for name, value in history.items()}
-
-
-def _convergence(calibration: Calibration, method: str, history: dict[str, NDArray[np.float64]]) -> Plot | None:
-    results = calibration.results
-
-    def mse(block: dict[str, dict[str, dict[str, float]]] | None) -> float | None:
-        return None if block is None or "all" not in block else block["all"]["mse"]["median"]
-
-    floor = results["floor"]
-    return convergence_plot(
-        history,
-        method,
-        floor=None if floor is None else mse(floor["realised"]),
-        constant=mse(results["constant"]["test"]),
-        unit=calibration.prepared.mechanism.joints[0].unit,
-    )
 
 
 def _numpy(tensor: Tensor) -> NDArray[np.float64]:
