@@ -78,7 +78,7 @@ def prepare(config: RunConfig) -> Prepared:
 
 def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
     assert config.case is not None
-    case = build_case(config.case, config.variant, config.order)
+    case = build_case(config.case, config.variant or "printed", config.order or "raster")
     mechanism = case.mechanism
     columns = {"t": (case.time, Coordinate("t", "1"))}
     unknown = [name for name in config.covariates or [] if name not in columns]
