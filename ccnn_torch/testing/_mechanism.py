@@ -180,7 +180,8 @@ def _weighted(call: _Call, point: tuple[Tensor, Tensor, Tensor], place: int, wei
 def _differences(function: _RowFunction, point: Tensor) -> Tensor:
     """Central differences of a row-wise function: `... x k` -> `...`; returns `... x k`."""
     steps = _STEP * torch.eye(point.shape[-1], dtype=point.dtype)
-    return torch.stack([(function(point + s) - function(point - s)) / (2 * _STEP) for s in steps], dim=-1)
+    steps = steps.reshape(-1, *([1] * (point.dim() - 1)), point.shape[-1])
+    return ((function(point + steps) - function(point - steps)) / (2 * _STEP)).movedim(0, -1)
 
 
 def _check_jacobian(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
