@@ -93,12 +93,15 @@ class Calibration:
         """Write model files and card of a method's compensator."""
         method = method or self.method
         repeat = self.repeat(method)
+        metrics = _of_repeat(self.results["methods"][method], repeat)
+        # Seconds differ from run to run, and the model file of one config and seed may not.
+        del metrics["seconds"]
         about = {
             "mechanism": self.mechanism(method).describe(),
             "method": method,
             "data_sha256": self.prepared.data_hash,
             "seed": self.config.seed + repeat,
-            "metrics": _of_repeat(self.results["methods"][method], repeat),
+            "metrics": metrics,
             "rotation_weight": self.config.rotation_weight,
         }
         save_model(Path(folder), self.compensator(method), about, method=name)

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.run_report import write_report
@@ -40,6 +41,13 @@ def _arrays(calibration: Calibration) -> RunArrays:
     test = torch.zeros(rows, dtype=torch.bool)
     test[prepared.dataset.splits[k].test] = True
     pose = prepared.pose[k] if prepared.pose.dim() == 3 else prepared.pose
+    # A machine that mostly turns has its errors spread over angles, not over places.
+    turns = sum(coordinate.unit == "m" for coordinate in mechanism.pose) < 2
+    axes = mechanism.pose if turns else tuple(Coordinate(name, "m") for name in "xyz")
+
+    def place(poses: Tensor) -> NDArray[np.float64]:
+        return _numpy(poses if turns else mechanism.frame(poses)[0])
+
     masks, weights = genome(outcome.fitted.learner, k)
     systematic = outcome.after_systematic
     case = prepared.case
@@ -49,17 +57,18 @@ def _arrays(calibration: Calibration) -> RunArrays:
         measured=_numpy(prepared.dataset.deviation[k]),
         predicted=_numpy(outcome.deviation[k]),
         test=test.numpy(),
-        position=_numpy(mechanism.frame(pose)[0]),
+        place=place(pose),
         position_before=_numpy(calibration.before.position[k]),
         position_after=_numpy(outcome.after.position[k]),
         rotation_before=None if calibration.before.rotation is None else _numpy(calibration.before.rotation[k]),
         rotation_after=None if outcome.after.rotation is None else _numpy(outcome.after.rotation[k]),
         noise=None if prepared.noise is None else _numpy(prepared.noise[k]),
-        map_position=None if case is None else _numpy(mechanism.frame(case.pose)[0]),
+        map_place=None if case is None else place(case.pose),
         map_before=None if case is None else _numpy(case.pose_error(case.joints).position),
         map_after=None if systematic is None else _numpy(systematic.position[k]),
         masks=tuple(mask.numpy() for mask in masks),
         weights=tuple(_numpy(weight) for weight in weights),
+        axes=axes,
         labels={"method": method, "repeat": str(k), "mechanism": mechanism.name},
     )
 
