@@ -16,19 +16,31 @@ from torch import Tensor
 from ccnn_torch._covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES
 from ccnn_torch._covariates import choose_covariates
 from ccnn_torch._table import Table as Table
-from ccnn_torch._table import name_lines
+from ccnn_torch._table import name_lines as name_lines
 from ccnn_torch._table import read_table as read_table
 from ccnn_torch._table import write_table as write_table
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.units import to_si
 
-__all__ = ["DEFAULT_COVARIATES", "Records", "Table", "check_rows", "load_records", "read_table", "write_table"]
+__all__ = [
+    "DEFAULT_COVARIATES",
+    "JOINT_LIMIT",
+    "Records",
+    "Table",
+    "check_rows",
+    "load_records",
+    "name_lines",
+    "read_pose",
+    "read_table",
+    "stack_columns",
+    "write_table",
+]
 
 _ROTATION_VECTOR = ("rx", "ry", "rz")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 # Two turns of a joint and one of a pose angle, rounded up so that 360 degrees written as 6.2832 passes.
-_JOINT_LIMIT, _POSE_LIMIT = 12.6, 6.3
+JOINT_LIMIT, _POSE_LIMIT = 12.6, 6.3
 # The tool of an arm whose frames are unknown may lengthen its reach by this share.
 _TOOL_ALLOWANCE = 0.25
 
@@ -119,8 +131,8 @@ def load_records(path: str | Path, mechanism: HasCoordinates, covariates: Sequen
             finite number; values in rad look like degrees; too few rows; no input varies.
     """
     table = read_table(path, {c.name: c.unit for c in (*mechanism.joints, *mechanism.pose)})
-    joints = _stack(table, mechanism.joints, _JOINT_LIMIT)
-    pose, coordinates, orientation = _pose(table, mechanism)
+    joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
+    pose, coordinates, orientation = read_pose(table, mechanism)
     measured = (*coordinates, *(Coordinate(name, "1") for name in _QUATERNION if orientation is not None))
     chosen, notes = choose_covariates(table, mechanism.joints, measured, covariates)
     _check_enough(table, len(mechanism.joints) + len(chosen))
@@ -136,7 +148,7 @@ def load_records(path: str | Path, mechanism: HasCoordinates, covariates: Sequen
         path=table.path,
         joints=torch.from_numpy(joints),
         pose=torch.from_numpy(pose),
-        covariates=torch.from_numpy(_stack(table, chosen)),
+        covariates=torch.from_numpy(stack_columns(table, chosen)),
         joint_coordinates=tuple(mechanism.joints),
         pose_coordinates=coordinates,
         covariate_coordinates=chosen,
@@ -187,7 +199,7 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
         )
 
 
-def _stack(table: Table, coordinates: Sequence[Coordinate], angle_limit: float = np.inf) -> NDArray[np.float64]:
+def stack_columns(table: Table, coordinates: Sequence[Coordinate], angle_limit: float = np.inf) -> NDArray[np.float64]:
     """Columns side by side, `rows x len(coordinates)`; refuses angles in rad beyond `angle_limit`."""
     values = np.empty((len(table), len(coordinates)))
     for k, coordinate in enumerate(coordinates):
@@ -201,17 +213,19 @@ def _stack(table: Table, coordinates: Sequence[Coordinate], angle_limit: float =
     return values
 
 
-def _pose(table: Table, mechanism: HasCoordinates) -> tuple[NDArray[np.float64], tuple[Coordinate, ...], str | None]:
+def read_pose(
+    table: Table, mechanism: HasCoordinates
+) -> tuple[NDArray[np.float64], tuple[Coordinate, ...], str | None]:
     """Pose `rows x p` [SI], its coordinates, and how the orientation was measured."""
     if not mechanism.orientations:
-        return _stack(table, mechanism.pose, _POSE_LIMIT), tuple(mechanism.pose), None
+        return stack_columns(table, mechanism.pose, _POSE_LIMIT), tuple(mechanism.pose), None
     position = tuple(c for c in mechanism.pose if c.name not in _ROTATION_VECTOR)
     full = (*position, *(Coordinate(name, "rad") for name in _ROTATION_VECTOR))
     if any(name in table for name in _ROTATION_VECTOR):
-        return _stack(table, full, _POSE_LIMIT), full, "rotation_vector"
+        return stack_columns(table, full, _POSE_LIMIT), full, "rotation_vector"
     if not any(name in table for name in _QUATERNION):
-        return _stack(table, position), position, "none"
-    quaternion = _stack(table, [Coordinate(name, "1") for name in _QUATERNION])
+        return stack_columns(table, position), position, "none"
+    quaternion = stack_columns(table, [Coordinate(name, "1") for name in _QUATERNION])
     norm = np.linalg.norm(quaternion, axis=1)
     # Written with three digits a unit quaternion is within 0.001 of norm 1; ten times that is no quaternion.
     wrong = np.flatnonzero(np.abs(norm - 1) > 0.01)
@@ -221,7 +235,7 @@ def _pose(table: Table, mechanism: HasCoordinates) -> tuple[NDArray[np.float64],
             f"{norm[wrong[0]]:.3g} instead of 1; correct it, or give the orientation as rx[rad], ry[rad], rz[rad]"
         )
     vector = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_rotvec()
-    return np.concatenate([_stack(table, position), vector], axis=1), full, "quaternion"
+    return np.concatenate([stack_columns(table, position), vector], axis=1), full, "quaternion"
 
 
 def _check_enough(table: Table, inputs: int) -> None:

@@ -137,7 +137,7 @@ class Domain(nn.Module):
         # A comparison with NaN is false, so this catches NaN and infinity alike.
         d = len(self.centre)
         known = inputs.abs() < self.huge
-        number = torch.where(inputs == inputs, inputs, self.centre)  # noqa: PLR0124 (NaN differs from itself)
+        number = torch.where(inputs == inputs, inputs, self.centre)
         edge = torch.minimum(torch.maximum(number, self.low), self.high)
         strange = torch.where(known, torch.zeros_like(self.centre), torch.ones_like(self.centre)) @ self._ones[:d]
         return Known(torch.where(known, inputs, edge), strange)

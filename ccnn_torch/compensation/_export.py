@@ -24,7 +24,16 @@ from ccnn_torch.compensation._contraction import TOLERANCE, Steepness, iteration
 from ccnn_torch.compensation._session import METADATA_KEY, OUTPUTS, open_onnx, open_pt2, run_onnx, run_pt2
 from ccnn_torch.errors import MethodFailedError
 
-__all__ = ["export_float32", "export_onnx", "export_pt2", "probe_points", "quiet_exporter", "to_onnx", "trace", "verify"]
+__all__ = [
+    "export_float32",
+    "export_onnx",
+    "export_pt2",
+    "probe_points",
+    "quiet_exporter",
+    "to_onnx",
+    "trace",
+    "verify",
+]
 
 _OPSET = 20
 _OPSET_FLOAT32 = 17
@@ -88,7 +97,7 @@ def export_onnx(compensator: Compensator, program: torch.export.ExportedProgram,
     Raises:
         MethodFailedError: the file does not give the eager model's numbers to 1e-12 of the limit.
     """
-    content = to_onnx(program, None, OUTPUTS, _OPSET, metadata).SerializeToString(deterministic=True)
+    content: bytes = to_onnx(program, None, OUTPUTS, _OPSET, metadata).SerializeToString(deterministic=True)
     session = open_onnx(content)
     verify(compensator, lambda joints, covariates: run_onnx(session, joints, covariates), "ONNX")
     return content
@@ -104,7 +113,7 @@ def export_pt2(compensator: Compensator, program: torch.export.ExportedProgram, 
     with quiet_exporter():
         torch.export.save(program, stream, extra_files={METADATA_KEY: metadata})
     content = stream.getvalue()
-    module = open_pt2(content)
+    module = open_pt2(content).module()
     verify(compensator, lambda joints, covariates: run_pt2(module, joints, covariates), ".pt2")
     return content
 
@@ -126,7 +135,7 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     joints, covariates = probe_points(compensator)
     given = [v.float() for v in (joints, covariates) if v is not None]
     model = to_onnx(_Single(twin), tuple(v[:1] for v in given), _OUTPUTS_FLOAT32, _OPSET_FLOAT32, metadata)
-    content = model.SerializeToString(deterministic=True)
+    content: bytes = model.SerializeToString(deterministic=True)
     session = open_onnx(content)
     with torch.no_grad():
         expected = compensator.guarded(*(v.double() for v in given))
@@ -176,7 +185,7 @@ def verify(compensator: Compensator, run: Any, form: str) -> None:
 
 
 def probe_points(compensator: Compensator, count: int = 256) -> tuple[Tensor, Tensor | None]:
-    """Points to compare exports at: through the domain and its transition, far outside, not finite; `s x n`, `s x m`."""
+    """Points to compare exports at, `s x n` and `s x m`: the domain, its transition, far outside, not finite."""
     generator = torch.Generator().manual_seed(1)
     domain = compensator.domain
     draw = 2 * torch.rand(count, len(domain.centre), generator=generator, dtype=torch.float64) - 1

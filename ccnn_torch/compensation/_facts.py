@@ -11,6 +11,7 @@ from typing import Any
 
 from torch import Tensor
 
+from ccnn_torch import __version__
 from ccnn_torch.compensation._compensator import Compensator
 from ccnn_torch.compensation._networks import describe_network
 from ccnn_torch.coordinates import Coordinate
@@ -22,7 +23,7 @@ __all__ = ["FORMAT", "check_keys", "check_tensors", "coordinates", "facts_of", "
 FORMAT = "ccnn_torch compensator 1"
 
 _REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
-_PACKAGES = ("ccnn-torch", "torch", "onnx", "onnxscript", "onnxruntime", "safetensors", "numpy")
+_PACKAGES = ("torch", "onnx", "onnxscript", "onnxruntime", "safetensors", "numpy")
 
 
 def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -54,7 +55,8 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
         },
         "lipschitz": compensator.lipschitz,
         "iterations": compensator.iterations,
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES},
+        "versions": {"python": platform.python_version(), "ccnn_torch": __version__}
+        | {name: version(name) for name in _PACKAGES},
     }
     tensors = tensor_digest(dict(compensator.state_dict()))
     return facts | {"sha256": {"tensors": tensors, "keys": _digest(facts)}}

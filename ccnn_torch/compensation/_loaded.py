@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import onnx
 import torch
-from google.protobuf.message import DecodeError
+from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from numpy.typing import ArrayLike
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
@@ -86,7 +86,7 @@ class LoadedModel:
             extra = self._matrix(covariates, self.covariates, "covariates")
             flat = np.broadcast_to(extra, (*lead, extra.shape[-1])).reshape(-1, extra.shape[-1])
         found = self._run(given.reshape(-1, given.shape[-1]), flat)
-        return {name: value.reshape(*lead, *value.shape[1:]) for name, value in found.items()}
+        return {name: value.reshape((*lead, *value.shape[1:])) for name, value in found.items()}
 
     def back(self, command: ArrayLike, covariates: ArrayLike | None = None) -> Array:
         """Ideal joints of commands (or of joints fed back), `... x n` [SI]; arguments and errors as a call."""
@@ -106,7 +106,9 @@ class LoadedModel:
                     f"not for {_words(given[key])}; take the model of that machine"
                 )
         ours, theirs = made_for.get("parameters", {}), given.get("parameters", {})
-        wrong = [k for k in ours if k not in theirs or not math.isclose(ours[k], theirs[k], rel_tol=1e-9, abs_tol=1e-12)]
+        wrong = [
+            k for k in ours if k not in theirs or not math.isclose(ours[k], theirs[k], rel_tol=1e-9, abs_tol=1e-12)
+        ]
         if wrong:
             raise ModelFileError(
                 f"{self.path}: this model was made for {mechanism.name} with {wrong[0]} = {ours[wrong[0]]:g}, not "
@@ -205,7 +207,9 @@ def _open(path: Path, content: bytes) -> tuple[dict[str, Any], Run, Compensator 
         return facts, lambda joints, covariates: run_onnx(session, joints, covariates), None
     if path.suffix == ".pt2":
         facts = _facts(read_pt2_text(content))
-        module = open_pt2(content)
+        program = open_pt2(content)
+        check_tensors(facts, {name.removeprefix("compensator."): v for name, v in program.state_dict.items()})
+        module = program.module()
         return facts, lambda joints, covariates: run_pt2(module, joints, covariates), None
     raise ModelFileError(f"a model file ends in .safetensors, .onnx or .pt2, not in '{path.suffix}'")
 
@@ -265,6 +269,6 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
 
 
 def _run_module(compensator: Compensator, joints: Array, covariates: Array | None) -> dict[str, Array]:
-    given = [torch.from_numpy(np.ascontiguousarray(v)) for v in (joints, covariates) if v is not None]
+    given = [torch.tensor(v) for v in (joints, covariates) if v is not None]
     with torch.no_grad():
         return {name: value.numpy() for name, value in compensator.solve(*given)._asdict().items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,9 @@ from ccnn_torch.compensation._session import METADATA_KEY
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.training import write_whole
 
-__all__ = ["card_name", "save_model"]
+__all__ = ["FORMS", "card_name", "save_model"]
+
+FORMS = ("safetensors", "onnx", "pt2", "float32.onnx")
 
 # Written by this command itself; a field of these names would be lost.
 _OWN = ("files", "date", "notes")
@@ -29,7 +31,11 @@ def card_name(method: str) -> str:
 
 
 def save_model(
-    folder: str | Path, compensator: Compensator, fields: Mapping[str, Any], method: str = "model"
+    folder: str | Path,
+    compensator: Compensator,
+    fields: Mapping[str, Any],
+    method: str = "model",
+    forms: Collection[str] = FORMS,
 ) -> dict[str, Path]:
     """Write METHOD.safetensors, .onnx, .float32.onnx, .pt2 and the card; each whole or not at all, the card last.
 
@@ -42,6 +48,7 @@ def save_model(
         fields: `mechanism` (its `describe()`), `metrics`, `data_sha256`, `seed`: these go into every file and must not
             hold times or paths; further ones go into the card alone.
         method: name of the files.
+        forms: which to write; the master is always written, and the exports take seconds each.
 
     Returns:
         The files by what they are: `safetensors`, `onnx`, `float32.onnx`, `pt2`, `card`. Where single precision cannot
@@ -57,17 +64,19 @@ def save_model(
     if taken:
         raise InputError(f"a model's field may not be named {taken[0]!r}, which the card holds itself")
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in compensator.state_dict().items()}
-    program = trace(compensator)
-    contents = {
-        "safetensors": save(tensors, metadata={METADATA_KEY: text}),
-        "onnx": export_onnx(compensator, program, text),
-        "pt2": export_pt2(compensator, program, text),
-    }
+    contents = {"safetensors": save(tensors, metadata={METADATA_KEY: text})}
     notes = []
-    try:
-        contents["float32.onnx"] = export_float32(compensator, text)
-    except MethodFailedError as reason:
-        notes.append(f"{method}.float32.onnx was not written: {reason}")
+    if "onnx" in forms or "pt2" in forms:
+        program = trace(compensator)
+        # In this order: writing a .pt2 takes the example inputs out of the program.
+        for form, export in (("onnx", export_onnx), ("pt2", export_pt2)):
+            if form in forms:
+                contents[form] = export(compensator, program, text)
+    if "float32.onnx" in forms:
+        try:
+            contents["float32.onnx"] = export_float32(compensator, text)
+        except MethodFailedError as reason:
+            notes.append(f"{method}.float32.onnx was not written: {reason}")
     folder = Path(folder)
     paths = {kind: folder / f"{method}.{kind}" for kind in contents}
     for kind, content in contents.items():

@@ -8,11 +8,10 @@ import zipfile
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import onnxruntime
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from ccnn_torch.errors import ModelFileError
 
@@ -40,7 +39,7 @@ def run_onnx(session: onnxruntime.InferenceSession, joints: Array, covariates: A
     return dict(zip(names, session.run(None, feeds), strict=True))
 
 
-def open_pt2(content: bytes) -> Callable[..., tuple[Tensor, ...]]:
+def open_pt2(content: bytes) -> torch.export.ExportedProgram:
     """The program in a `.pt2` file.
 
     Raises:
@@ -48,9 +47,7 @@ def open_pt2(content: bytes) -> Callable[..., tuple[Tensor, ...]]:
     """
     with _archive(content) as archive:
         _refuse_pickle(archive)
-    program = torch.export.load(io.BytesIO(content))
-    module: nn.Module = program.module()
-    return module
+    return torch.export.load(io.BytesIO(content))
 
 
 def read_pt2_text(content: bytes) -> str | None:
@@ -66,11 +63,9 @@ def read_pt2_text(content: bytes) -> str | None:
     return None
 
 
-def run_pt2(
-    module: Callable[..., tuple[Tensor, ...]], joints: Array, covariates: Array | None
-) -> dict[str, Array]:
+def run_pt2(module: Callable[..., tuple[Tensor, ...]], joints: Array, covariates: Array | None) -> dict[str, Array]:
     """As `run_onnx`."""
-    inputs = [torch.from_numpy(np.ascontiguousarray(v)) for v in (joints, covariates) if v is not None]
+    inputs = [torch.tensor(v) for v in (joints, covariates) if v is not None]
     with torch.no_grad():
         return {name: value.numpy() for name, value in zip(OUTPUTS, module(*inputs), strict=True)}
 

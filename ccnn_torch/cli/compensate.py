@@ -1,0 +1,173 @@
+"""`ccnn compensate`: correct a table of joints or poses with a model file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ccnn_torch.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ccnn_torch.compensation import LoadedModel
+    from ccnn_torch.records import Table
+
+    Array = NDArray[np.float64]
+
+__all__ = ["compensate"]
+
+# How near to the wanted pose the joints must bring the nominal machine [m + rad].
+_REACHED = 1e-8
+
+
+def compensate(
+    model: Annotated[Path, typer.Argument(help="A .safetensors, .onnx or .pt2 file with its card beside it.")],
+    input: Annotated[Path, typer.Argument(metavar="IN.csv", help="Ideal joints; columns are name[unit].")],
+    output: Annotated[Path, typer.Argument(metavar="OUT.csv", help="IN's columns and the commands.")],
+    pose: Annotated[bool, typer.Option("--pose", help="IN has wanted poses instead of joints.")] = False,
+    back: Annotated[bool, typer.Option("--back", help="IN has commands; OUT gets the ideal joints.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
+) -> None:
+    """Correct joints so that the machine reaches what was meant; or, from commands, tell what it reaches.
+
+    OUT.csv repeats the columns of IN.csv and adds command_q1[unit]…, deviation_q1[unit]… and inside_domain[1] (0 =
+    outside the model's domain, where the correction fades into its safe value). With --back it adds ideal_q1[unit]…
+    and inside_domain[1]; the commands are the columns command_q1… where IN.csv has them, else q1…. With --pose a
+    serial arm takes the branch nearest to guess_q1[unit]… where given, else nearest to the row before.
+
+    Examples:
+
+    ccnn compensate checkpoints/tripod/model.onnx joints.csv commands.csv
+
+    ccnn compensate runs/ur10/model.safetensors poses.csv commands.csv --pose
+
+    ccnn compensate checkpoints/tripod/model.onnx commands.csv ideal.csv --back
+    """
+    if pose and back:
+        raise InputError("--pose and --back exclude each other: --pose takes wanted poses, --back takes commands")
+    from ccnn_torch.compensation import load_model
+    from ccnn_torch.records import read_table, stack_columns, write_table
+
+    loaded = load_model(model)
+    table = read_table(input)
+    if pose:
+        joints, units = _joints_of_poses(loaded, table), {c.name: c.unit for c in loaded.joints}
+    else:
+        joints, units = _joints(loaded, table, back)
+    covariates = stack_columns(table, loaded.covariates) if loaded.covariates else None
+    found = loaded(joints, covariates)
+    if back:
+        added = _named("ideal", loaded, found["ideal"], units)
+        inside = found["ideal_inside_domain"]
+    else:
+        added = _named("command", loaded, found["command"], units)
+        added |= _named("deviation", loaded, found["deviation"], units)
+        inside = found["inside_domain"]
+    added["inside_domain[1]"] = inside.astype(float)
+    names = {header.partition("[")[0] for header in added}
+    kept = {f"{name}[{unit}]": table.raw(name) for name, unit in table.units.items() if name not in names}
+    write_table(output, kept | added)
+    if not quiet:
+        _tell(output, inside)
+
+
+def _joints(loaded: LoadedModel, table: Table, back: bool) -> tuple[Array, dict[str, str]]:
+    """Joints `rows x n` [SI], and the unit of each as written."""
+    from ccnn_torch.coordinates import Coordinate
+    from ccnn_torch.records import JOINT_LIMIT, stack_columns
+
+    names = {c.name: c.name for c in loaded.joints}
+    if back and all(f"command_{name}" in table for name in names):
+        names = {name: f"command_{name}" for name in names}
+    _refuse_other_machine(loaded, table)
+    columns = tuple(Coordinate(names[c.name], c.unit) for c in loaded.joints)
+    return stack_columns(table, columns, JOINT_LIMIT), {c.name: table.units[names[c.name]] for c in loaded.joints}
+
+
+def _refuse_other_machine(loaded: LoadedModel, table: Table) -> None:
+    """A file with more joints than the model's is that of another machine; fewer are missed by name anyway."""
+    known = {c.name for c in loaded.joints}
+    other = [name for name in table.names if name[:1] == "q" and name[1:].isdigit() and name not in known]
+    if other:
+        mechanism = loaded.facts["mechanism"]["name"]
+        raise InputError(
+            f"{table.path}: column '{other[0]}' is no joint of this model, which was made for {mechanism} "
+            f"({', '.join(c.header for c in loaded.joints)}); take the model of the other machine, or rename the column"
+        )
+
+
+def _joints_of_poses(loaded: LoadedModel, table: Table) -> Array:
+    """Ideal joints of wanted poses on the mechanism that the model was made for, `rows x n` [SI].
+
+    Raises:
+        InputError: a column is missing, or poses cannot be reached (named by line).
+    """
+    import numpy as np
+    import torch
+
+    from ccnn_torch.coordinates import Coordinate
+    from ccnn_torch.mechanisms import mechanism_from_description
+    from ccnn_torch.records import JOINT_LIMIT, name_lines, read_pose, stack_columns
+
+    mechanism = mechanism_from_description(loaded.facts["mechanism"])
+    values, coordinates, _ = read_pose(table, mechanism)
+    if len(coordinates) != len(mechanism.pose):
+        missing = [c.header for c in mechanism.pose if c.name not in {k.name for k in coordinates}]
+        raise InputError(f"{table.path}: the poses of {mechanism.name} need the columns {', '.join(missing)}, too")
+    poses = torch.from_numpy(values)
+    guesses = tuple(Coordinate(f"guess_{c.name}", c.unit) for c in mechanism.joints)
+    if any(c.name in table for c in guesses):
+        guess = torch.from_numpy(stack_columns(table, guesses, JOINT_LIMIT))
+        joints = mechanism.solve_inverse(poses, guess=guess)
+    elif mechanism.orientations:
+        joints = _follow(mechanism, poses)
+    else:
+        joints = mechanism.solve_inverse(poses)
+    found = joints.detach().numpy()
+    # An arm's solver stops at the nearest pose where the wanted one is out of reach.
+    error = mechanism.pose_error(mechanism.forward_kinematics(joints, guess=poses), poses)
+    missed = error.position > _REACHED if error.rotation is None else (error.position + error.rotation) > _REACHED
+    lost = np.flatnonzero(~np.isfinite(found).all(-1) | missed.detach().numpy())
+    if len(lost):
+        raise InputError(
+            f"{table.path}: the pose at {name_lines(table.lines, lost)} has no joints on this branch of "
+            f"{mechanism.name}: correct or remove it, or give guess_q1[{mechanism.joints[0].unit}]… near the solution"
+        )
+    return found
+
+
+def _follow(mechanism: Any, poses: Any) -> Any:
+    """Joints of poses one after the other, each from those of the row before, so that no branch is jumped."""
+    import torch
+
+    rows = []
+    guess = mechanism.home_joints
+    for pose in poses:
+        joints = mechanism.solve_inverse(pose, guess=guess)
+        rows.append(joints)
+        guess = torch.where(torch.isfinite(joints).all(), joints, guess)
+    return torch.stack(rows)
+
+
+def _named(what: str, loaded: LoadedModel, values: Array, units: dict[str, str]) -> dict[str, Array]:
+    """Columns `what_joint[unit]` in the units that the joints were written in."""
+    from ccnn_torch.units import from_si
+
+    return {
+        f"{what}_{c.name}[{units[c.name]}]": from_si(values[:, k], c.unit, units[c.name])
+        for k, c in enumerate(loaded.joints)
+    }
+
+
+def _tell(output: Path, inside: NDArray[np.bool_]) -> None:
+    outside = len(inside) - int(inside.sum())
+    typer.echo(f"{output}: {len(inside)} rows written.")
+    if outside:
+        typer.echo(
+            f"{outside} of them {'is' if outside == 1 else 'are'} outside the domain that the model was trained on "
+            "(inside_domain = 0): their correction fades into the safe one, the mean training deviation."
+        )
