@@ -6,7 +6,7 @@ from catalogue import FIVE_BAR, NAMES, make
 from five_bar import FiveBar
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, MachineTool, Tripod
+from ccnn_torch.mechanisms import MachineTool, Mechanism, Tripod
 from ccnn_torch.testing import check_mechanism
 
 
