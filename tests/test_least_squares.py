@@ -36,7 +36,9 @@ def test_curve_fits_agree_with_scipy():
     rows = levenberg_marquardt(residual, start, data=(y,))
     torch.testing.assert_close(whole.value, rows.value, rtol=0, atol=1e-12)
     for i in range(6):
-        theirs = least_squares(lambda x, i=i: residual(torch.from_numpy(x), y[i]).numpy(), [1.0, 1.0], xtol=1e-15)
+        theirs = least_squares(
+            lambda x, i=i: residual(torch.from_numpy(x), y[i]).numpy(), [1.0, 1.0], xtol=1e-15, ftol=1e-15, gtol=1e-15
+        )
         np.testing.assert_allclose(whole.value[i].numpy(), theirs.x, rtol=1e-7)
         np.testing.assert_allclose(float(whole.cost[i]), theirs.cost, rtol=1e-10)
 
