@@ -110,9 +110,8 @@ def test_several_poses_of_a_place_are_averaged_by_their_square(arrays: RunArrays
     (mesh,) = [m for m in plot.figure.axes[0].collections if isinstance(m, QuadMesh)]
     corner = (arrays.place[:, 1] == -0.2) & (arrays.place[:, 2] == 0.4)
     assert corner.sum() == 5
-    assert np.ma.getdata(mesh.get_array()).ravel()[0] == pytest.approx(
-        np.sqrt(np.mean(arrays.position_before[corner] ** 2)) * 1e6
-    )
+    together = np.sqrt(np.mean(np.square(arrays.position_before[corner])))
+    assert np.ma.getdata(mesh.get_array()).ravel()[0] == pytest.approx(together * 1e6)
 
 
 def test_an_arm_is_seen_from_above_and_from_the_side() -> None:

@@ -93,6 +93,9 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
     """
     stem = Path(path)
     png, svg = stem.with_suffix(".png"), stem.with_suffix(".svg")
+    # The layout is found once and kept: finding it again for each file costs more than the drawing.
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
     figure.savefig(png, metadata={"Software": None})
     figure.savefig(svg, metadata={"Date": None, "Creator": None})
     return [png, svg]
