@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ccnn_torch.report.plots import Plot, svg_text
 from ccnn_torch.report.tables import failures, result_tables, verdict
 
-__all__ = ["html_text"]
+__all__ = ["InlineFigure", "html_text"]
+
+
+class InlineFigure(NamedTuple):
+    """A figure on the page: its name (the id), one sentence, and an `<svg>` element made by this package."""
+
+    name: str
+    caption: str
+    svg: str
 
 
 def html_text(
-    results: Mapping[str, Any], plots: Sequence[Plot] = (), config: str = "", files: Sequence[str] = ()
+    results: Mapping[str, Any], figures: Sequence[InlineFigure] = (), config: str = "", files: Sequence[str] = ()
 ) -> str:
     """The report of a run.
 
     Args:
         results: as in `results.json`.
-        plots: pictures, in reading order.
+        figures: in reading order.
         config: the resolved configuration, as text.
         files: names of files in the run folder to link to.
     """
@@ -39,7 +46,7 @@ def html_text(
         tables=result_tables(results),
         failures=failures(results),
         # Markup: the SVG is our own; everything else on the page is escaped.
-        figures=[{"name": p.name, "caption": p.caption, "svg": Markup(svg_text(p))} for p in plots],
+        figures=[figure._replace(svg=Markup(figure.svg)) for figure in figures],
         config=config,
         files=files,
     )

@@ -9,11 +9,12 @@ from typing import Any
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_arrays, load_history
 from ccnn_torch.report.csv_file import write_csv
-from ccnn_torch.report.html import html_text
+from ccnn_torch.report.html import InlineFigure, html_text
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.plots import (
     Plot,
     convergence_plot,
+    inline_svg,
     joint_error_plot,
     network_plot,
     overview_plot,
@@ -51,12 +52,14 @@ def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -
     (folder / "results.md").write_text(markdown_text(results), encoding="utf-8")
     plots = run_plots(folder, results)
     (folder / "plots").mkdir(exist_ok=True)
+    figures = []
     for plot in plots:
-        save_figure(plot.figure, folder / "plots" / plot.name)
+        _, svg = save_figure(plot.figure, folder / "plots" / plot.name)
+        figures.append(InlineFigure(plot.name, plot.caption, inline_svg(svg.read_text(encoding="utf-8"), plot.name)))
     config = folder / "config.yaml"
     page = html_text(
         results,
-        plots,
+        figures,
         config.read_text(encoding="utf-8") if config.is_file() else "",
         [name for name in _LINKED if (folder / name).is_file()],
     )

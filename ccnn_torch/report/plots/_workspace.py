@@ -150,7 +150,9 @@ def _draw_map(
     cells = _cells(horizontal, vertical, values)
     if cells is not None:
         panel.grid(False)
-        return panel.pcolormesh(*cells, norm=norm, cmap="viridis", rasterized=cells[2].size > RASTER_ABOVE)
+        raster = cells[2].size > RASTER_ABOVE
+        # Edges in the colour of the cell: SVG viewers would show white seams between the cells.
+        return panel.pcolormesh(*cells, norm=norm, cmap="viridis", edgecolors="face", linewidth=0.4, rasterized=raster)
     order = np.argsort(values)
     return panel.scatter(
         horizontal[order],
