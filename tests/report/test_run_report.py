@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 import typer
-from conftest import arm_run, tripod_run
 from PIL import Image
+from report_runs import arm_run, tripod_run
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from typer.testing import CliRunner
