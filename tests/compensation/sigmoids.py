@@ -46,7 +46,9 @@ def tripod_compensator(gain: float = 0.5, size: float = 2e-4, **keys: Any) -> Co
     joints = tripod_joints()
     network = Sigmoids([3, 5, 3], seed=3, gain=gain)
     blank = torch.ones(1, len(joints), dtype=torch.float64)
-    scaling = Scaling.fit(joints[None], torch.zeros_like(joints)[None], blank, torch.zeros(3, dtype=torch.bool)).repeat(0)
+    scaling = Scaling.fit(joints[None], torch.zeros_like(joints)[None], blank, torch.zeros(3, dtype=torch.bool)).repeat(
+        0
+    )
     scaling.deviation.fill_(size)
     with torch.no_grad():
         deviations = scaling.restore(network(scaling.features(joints)))
