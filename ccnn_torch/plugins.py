@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import inspect
 import sys
@@ -29,11 +30,13 @@ def load_plugin(spec: str) -> Callable[..., Any]:
     path = Path(file)
     if not path.is_file():
         raise InputError(f"{spec}: there is no file {file}")
-    module_spec = importlib.util.spec_from_file_location(path.stem, path)
+    # A name of its own, so that two users' files of the same name, or one called torch.py, do not meet.
+    unique = f"_ccnn_torch_user_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}"
+    module_spec = importlib.util.spec_from_file_location(unique, path)
     if module_spec is None or module_spec.loader is None:
         raise InputError(f"{spec}: {file} is no Python file")
     module = importlib.util.module_from_spec(module_spec)
-    sys.modules.setdefault(module_spec.name, module)
+    sys.modules[unique] = module
     try:
         module_spec.loader.exec_module(module)
     except SyntaxError as error:
