@@ -243,6 +243,7 @@ def test_make_config_is_checked_too() -> None:
         make_config(case="tripod", sed=1)
 
 
+@settings(deadline=None)
 @given(
     st.recursive(
         st.none() | st.booleans() | st.floats(allow_nan=False) | st.integers() | st.text(st.characters(codec="utf-8")),

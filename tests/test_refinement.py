@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 import torch
 from torch import Tensor
@@ -89,3 +91,177 @@ def test_derivatives_match_autodiff(nodes: tuple[int, ...], bias: bool) -> None:
         torch.testing.assert_close(local.matrix[b], matrix, rtol=1e-10, atol=1e-12)
         gradient = torch.einsum("sck,sc,sc->k", expected, precision[b], error[b])
         torch.testing.assert_close(local.gradient[b], gradient, rtol=1e-10, atol=1e-12)
+
+
+def toy(runs: int, rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Inputs, true outputs and noisy targets: a product, a parabola with a line, and nothing at all."""
+    x = torch.rand(runs, rows, 3, generator=generator, dtype=torch.float64) * 2 - 1
+    truth = torch.stack([torch.sin(3 * x[..., 0]) * x[..., 1], x[..., 0] ** 2 + x[..., 2] / 2, 0 * x[..., 0]], dim=-1)
+    noise = torch.tensor([0.1, 0.3, 1.0], dtype=torch.float64)
+    return x, truth, truth + noise * torch.randn(truth.shape, generator=generator, dtype=torch.float64)
+
+
+def predict(masks: Layers, weights: Layers, inputs: Tensor) -> Tensor:
+    outputs = [plain_forward([m[b] for m in masks], [w[b] for w in weights], inputs[b]) for b in range(inputs.shape[0])]
+    return torch.stack(outputs)
+
+
+def test_evidence_beats_plain_least_squares_on_held_out_rows() -> None:
+    generator = torch.Generator().manual_seed(1)
+    x, truth, targets = toy(6, 300, generator)
+    masks, weights = random_network((6,), (3, 6, 6, 3), generator)
+    rows = torch.ones(6, 100, dtype=torch.float64)
+    errors = {}
+    for bayesian in (True, False):
+        settings = RefinementSettings(iterations=40, bayesian=bayesian)
+        refined = refine(masks, weights, x[:, :100], targets[:, :100], rows, settings)
+        difference = predict(masks, refined.weights, x[:, 100:]) - truth[:, 100:]
+        errors[bayesian] = difference.square().mean((0, 1)).sqrt()
+    assert bool((errors[True] < 0.6 * errors[False]).all()), errors
+    # The noise is told from the signal: its deviation is right to a third for each output.
+    refined = refine(masks, weights, x[:, :100], targets[:, :100], rows)
+    deviation = refined.noise.rsqrt().median(0).values
+    assert bool(((deviation / torch.tensor([0.1, 0.3, 1.0])).log().abs() < 0.3).all()), deviation
+
+
+def test_pure_noise_gives_the_mean() -> None:
+    generator = torch.Generator().manual_seed(2)
+    x = torch.rand(4, 200, 3, generator=generator, dtype=torch.float64) * 2 - 1
+    targets = torch.randn(4, 200, 2, generator=generator, dtype=torch.float64) + 5
+    masks, weights = random_network((4,), (3, 6, 6, 2), generator)
+    refined = refine(masks, weights, x, targets, torch.ones(4, 200, dtype=torch.float64))
+    output = predict(masks, refined.weights, x)
+    assert float(refined.effective_parameters.max()) < 8
+    assert float((output - targets.mean(1, keepdim=True)).abs().mean()) < 0.12
+    plain = refine(
+        masks, weights, x, targets, torch.ones(4, 200, dtype=torch.float64), RefinementSettings(bayesian=False)
+    )
+    assert float((predict(masks, plain.weights, x) - targets.mean(1, keepdim=True)).abs().mean()) > 0.2
+
+
+def test_weights_without_a_part_stay_as_they_are() -> None:
+    generator = torch.Generator().manual_seed(4)
+    x, _, targets = toy(5, 40, generator)
+    masks, weights = random_network((5,), (3, 5, 5, 3), generator, density=0.3)
+    masks[0][0] = False  # a network that is a constant
+    weights[0][1, 0] = torch.nan
+    masks[0][1, 0] = False
+    refined = refine(masks, weights, x, targets, torch.ones(5, 40, dtype=torch.float64))
+    active = network_of(masks, bias=True).active
+    before, after = flat(weights), flat(refined.weights)
+    assert torch.equal(torch.nan_to_num(after[~active]), torch.nan_to_num(before[~active]))
+    assert bool(after[active].isfinite().all())
+    assert bool((after[active] != before[active]).any())
+    constant = predict([m[:1] for m in masks], [w[:1] for w in refined.weights], x[:1])
+    torch.testing.assert_close(constant[0, 0], targets[0].mean(0), rtol=0, atol=1e-4)
+
+
+def test_padded_rows_do_not_matter() -> None:
+    generator = torch.Generator().manual_seed(5)
+    x, _, targets = toy(2, 50, generator)
+    masks, weights = random_network((2,), (3, 4, 3), generator)
+    settings = RefinementSettings(iterations=8)
+    rows = torch.ones(2, 50, dtype=torch.float64)
+    alone = refine(masks, weights, x, targets, rows, settings)
+    filler = torch.full((2, 7, 3), torch.nan, dtype=torch.float64)
+    padded = refine(
+        masks,
+        weights,
+        torch.cat([x, filler], dim=1),
+        torch.cat([targets, filler], dim=1),
+        torch.cat([rows, torch.zeros(2, 7, dtype=torch.float64)], dim=1),
+        settings,
+    )
+    torch.testing.assert_close(flat(padded.weights), flat(alone.weights), rtol=1e-6, atol=1e-8)
+    twice = refine(
+        masks,
+        weights,
+        torch.cat([x, x], dim=1),
+        torch.cat([targets, targets], dim=1),
+        torch.cat([rows, rows], 1) / 2,
+        settings,
+    )
+    torch.testing.assert_close(flat(twice.weights), flat(alone.weights), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("groups", ["network", "layer", "unit"])
+def test_a_batch_equals_separate_runs(groups: Literal["network", "layer", "unit"]) -> None:
+    generator = torch.Generator().manual_seed(6)
+    x, _, targets = toy(2, 60, generator)
+    masks, weights = random_network((2, 3), (3, 4, 3), generator, density=0.8)
+    settings = RefinementSettings(iterations=8, groups=groups)
+    rows = torch.ones(60, dtype=torch.float64)
+    together = refine(masks, weights, x.unsqueeze(1), targets.unsqueeze(1), rows, settings)
+    assert together.error.shape == (2, 3)
+    assert together.weights[0].shape == (2, 3, 4, 4)
+    for run in range(2):
+        for start in range(3):
+            one = refine(
+                [m[run, start] for m in masks], [w[run, start] for w in weights], x[run], targets[run], rows, settings
+            )
+            assert one.error.shape == ()
+            expected = flat([w[run, start] for w in together.weights])
+            torch.testing.assert_close(flat(one.weights), expected, rtol=1e-5, atol=1e-7)
+            torch.testing.assert_close(one.log_evidence, together.log_evidence[run, start], rtol=1e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize("bayesian", [True, False])
+def test_steps_interrupted_and_resumed_are_the_same_bit_by_bit(bayesian: bool) -> None:
+    generator = torch.Generator().manual_seed(7)
+    x, _, targets = toy(3, 60, generator)
+    masks, weights = random_network((3,), (3, 4, 3), generator)
+    settings = RefinementSettings(iterations=9, bayesian=bayesian)
+    rows = torch.ones(3, 60, dtype=torch.float64)
+    whole = refine(masks, weights, x, targets, rows, settings)
+    problem = pose_refinement(masks, weights, x, targets, rows, settings)
+    state = start_refinement(problem, weights)
+    for iteration in range(9):
+        if iteration == 4:
+            stored = {name: value.clone() for name, value in state.state_dict().items()}
+            problem = pose_refinement(masks, weights, x, targets, rows, settings)
+            state = RefinementState.from_state_dict(stored)
+        state = step_refinement(problem, state)
+    pieces = finish_refinement(problem, state)
+    assert pieces.iterations == whole.iterations == 9
+    assert torch.equal(flat(pieces.weights), flat(whole.weights))
+    assert torch.equal(pieces.log_evidence, whole.log_evidence)
+
+
+def test_the_plain_objective_never_rises_and_extreme_starts_stay_finite() -> None:
+    generator = torch.Generator().manual_seed(8)
+    x, _, targets = toy(4, 30, generator)
+    masks, weights = random_network((4,), (3, 8, 8, 3), generator)
+    scale = torch.tensor([0.0, 1.0, 1e3, 1e6], dtype=torch.float64).reshape(4, 1, 1)
+    weights = [w * scale for w in weights]
+    rows = torch.ones(4, 30, dtype=torch.float64)
+    settings = RefinementSettings(bayesian=False)
+    problem = pose_refinement(masks, weights, x, targets, rows, settings)
+    state = start_refinement(problem, weights)
+    last = finish_refinement(problem, state).objective
+    for _ in range(15):
+        state = step_refinement(problem, state)
+        objective = finish_refinement(problem, state).objective
+        assert bool((objective <= last).all())
+        last = objective
+    for bayesian in (True, False):
+        refined = refine(masks, weights, x, targets, rows, RefinementSettings(bayesian=bayesian))
+        assert bool(flat(refined.weights).isfinite().all())
+        assert bool(refined.error.isfinite().all() & refined.log_evidence.isfinite().all())
+
+
+def test_a_metric_judges_errors_where_they_are_felt() -> None:
+    """Two outputs of which only their sum is felt, except that a third of the rows feel the first alone."""
+    generator = torch.Generator().manual_seed(9)
+    x = torch.rand(300, 2, generator=generator, dtype=torch.float64) * 2 - 1
+    truth = torch.stack([torch.sin(2 * x[:, 0]), x[:, 0] * x[:, 1]], dim=-1)
+    metric = torch.tensor([[[1.0, 1.0]]], dtype=torch.float64).repeat(300, 1, 1)
+    metric[::3] = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
+    # What is not felt may be measured wildly wrong.
+    blind = torch.stack([metric[:, 0, 1], -metric[:, 0, 0]], dim=-1)
+    wrong = 30 * torch.randn(300, 1, generator=generator, dtype=torch.float64)
+    felt_noise = 0.05 * torch.randn(300, 2, generator=generator, dtype=torch.float64)
+    masks, weights = random_network((), (2, 8, 2), generator)
+    rows = torch.ones(300, dtype=torch.float64)
+    refined = refine(masks, weights, x, truth + felt_noise + wrong * blind, rows, row_metric=metric)
+    error = plain_forward(masks, refined.weights, x) - truth
+    assert float(error.square().mean().sqrt()) < 0.05

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccnn_torch.errors import InputError
@@ -88,6 +88,7 @@ def test_block_is_the_far_end_of_the_principal_direction() -> None:
     assert sets(split_rows(where, "block", seed=9)) == sets(split_rows(where, "block", seed=0))
 
 
+@settings(deadline=None)
 @given(
     st.integers(20, 60),
     st.sampled_from([("random", None), ("group", None), ("group", "c"), ("block", None), ("block", "c")]),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import constants
 
@@ -63,6 +63,7 @@ def test_temperature_has_an_offset(unit: str, scale: str) -> None:
     np.testing.assert_allclose(from_si(kelvin, "K", unit), values, rtol=1e-12, atol=1e-12)
 
 
+@settings(deadline=None)
 @given(st.floats(-1e9, 1e9), st.sampled_from(sorted(FACTORS)))
 def test_back_and_forth(value: float, unit: str) -> None:
     there = to_si(value, unit)
@@ -119,6 +120,7 @@ def test_unknown_unit_is_one_sentence(unit: str, remedy: str) -> None:
     assert f"'{unit}'" in str(caught.value) and remedy in str(caught.value) and "\n" not in str(caught.value)
 
 
+@settings(deadline=None)
 @given(st.text(max_size=12))
 def test_any_text_is_a_unit_or_an_input_error(text: str) -> None:
     try:

@@ -35,12 +35,12 @@ class Network:
     def split(self, flat: Tensor) -> list[Tensor]:
         """flat: `b x k`; returns the weights per layer, `b x out x in (+ 1)`."""
         shapes = [(m.shape[-2], m.shape[-1] + int(self.bias)) for m in self.masks]
-        parts = flat.split([rows * columns for rows, columns in shapes], dim=-1)
-        return [p.unflatten(-1, shape) for p, shape in zip(parts, shapes, strict=True)]
+        parts = torch.split(flat, [rows * columns for rows, columns in shapes], dim=-1)
+        return [p.reshape(-1, *shape) for p, shape in zip(parts, shapes, strict=True)]
 
 
 def network_of(masks: list[Tensor], bias: bool) -> Network:
-    """masks: per layer `b x out x in`, bool. A node without inputs (its bias not counted) or without outputs is dead."""
+    """masks: per layer `b x out x in`, bool. A node without inputs (bias not counted) or without outputs is dead."""
     counts = [m.to(torch.float64) for m in masks]
     fed = [torch.ones_like(counts[0][:, 0, :])]
     for mask in counts:
@@ -149,18 +149,18 @@ def linearise(
     gradient = torch.cat(
         [((error @ b).squeeze(-2).mT @ f).flatten(1) for b, f in zip(back, flows[:-1], strict=True)], dim=-1
     )
-    rows = []
+    rows: list[list[Tensor]] = []
     for i, (back_i, flow_i) in enumerate(zip(back, flows[:-1], strict=True)):
-        blocks = []
+        blocks: list[Tensor] = []
         for j, (back_j, flow_j) in enumerate(zip(back, flows[:-1], strict=True)):
             if j < i:
                 blocks.append(rows[j][i].mT)
                 continue
             nodes = (back_i.mT @ back_j).flatten(2)
             signals = (flow_i.unsqueeze(-1) * flow_j.unsqueeze(-2)).flatten(2)
-            block = (nodes.mT @ signals).unflatten(1, (back_i.shape[-1], back_j.shape[-1]))
-            block = block.unflatten(-1, (flow_i.shape[-1], flow_j.shape[-1])).transpose(2, 3)
-            blocks.append(block.flatten(3).flatten(1, 2))
+            counts = (back_i.shape[-1], back_j.shape[-1], flow_i.shape[-1], flow_j.shape[-1])
+            block = (nodes.mT @ signals).reshape(-1, *counts).transpose(2, 3)
+            blocks.append(block.reshape(-1, counts[0] * counts[2], counts[1] * counts[3]))
         rows.append(blocks)
     matrix = torch.cat([torch.cat(blocks, dim=-1) for blocks in rows], dim=-2)
     active = network.active.to(flat.dtype)

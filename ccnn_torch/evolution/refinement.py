@@ -17,6 +17,7 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -89,7 +90,7 @@ class RefinementProblem:
     rows: Tensor
     metric: Tensor | None
     groups: Tensor
-    leading: torch.Size
+    leading: tuple[int, ...]
     group_count: int
     settings: RefinementSettings
 
@@ -194,7 +195,7 @@ def pose_refinement(
 ) -> RefinementProblem:
     """The fixed part of a refinement; arguments as in `refine`."""
     metrics = [] if row_metric is None else [row_metric.shape[:-3]]
-    leading = torch.broadcast_shapes(
+    leading = np.broadcast_shapes(
         *(m.shape[:-2] for m in masks),
         *(w.shape[:-2] for w in weights),
         inputs.shape[:-2],
@@ -284,7 +285,7 @@ def finish_refinement(problem: RefinementProblem, state: RefinementState) -> Ref
     squares = _squares(problem, state.weights)
     leading = problem.leading
     return Refined(
-        weights=[w.unflatten(0, leading) if leading else w[0] for w in problem.network.split(state.weights)],
+        weights=[w.reshape(*leading, *w.shape[-2:]) for w in problem.network.split(state.weights)],
         error=(squares.sum(-1) / (_row_count(problem) * squares.shape[-1])).reshape(leading),
         objective=objective.reshape(leading),
         effective_parameters=state.effective.sum(-1).reshape(leading),
@@ -295,7 +296,7 @@ def finish_refinement(problem: RefinementProblem, state: RefinementState) -> Ref
 
 
 def _second_order(problem: RefinementProblem, state: RefinementState) -> tuple[Tensor, Tensor]:
-    """Gradient `b x k` and Gauss-Newton matrix `b x k x k` of the objective; 1 on the diagonal of an inactive weight."""
+    """Gradient `b x k` and Gauss-Newton matrix `b x k x k` of the objective, 1 for inactive weights."""
     precision = problem.rows.unsqueeze(-1) * state.noise.unsqueeze(1)
     local = linearise(problem.network, state.weights, problem.inputs, problem.targets, problem.metric, precision)
     prior = state.prior[:, problem.groups]
@@ -375,6 +376,6 @@ def _prior_groups(shapes: list[torch.Size], bias: bool, kind: str) -> Tensor:
     return torch.tensor([order.get(label, len(order)) for label in labels])
 
 
-def _flatten(tensor: Tensor, leading: torch.Size, trailing: int) -> Tensor:
+def _flatten(tensor: Tensor, leading: tuple[int, ...], trailing: int) -> Tensor:
     tail = tensor.shape[tensor.dim() - trailing :]
     return tensor.expand(*leading, *tail).reshape(math.prod(leading), *tail)

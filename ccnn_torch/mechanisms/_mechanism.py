@@ -204,8 +204,9 @@ class Mechanism(nn.Module):
             `... x 6 x n` ([m] above [rad], per joint unit), or `... x 3 x n` without orientation.
         """
         parameters = self.resolve(parameters)
+        others = (parameters,) if guess is None else (parameters, guess)
         return frame_jacobian(
-            lambda q: self.frame(self.forward_kinematics(q, parameters, guess)), expand_leading(joints, parameters)
+            lambda q: self.frame(self.forward_kinematics(q, parameters, guess)), expand_leading(joints, *others)
         )
 
     def condition_number(

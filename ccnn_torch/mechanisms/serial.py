@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 
@@ -77,7 +78,7 @@ class SerialArm(Mechanism):
         Raises:
             InputError: unknown convention or orientation.
         """
-        recipe = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        keys = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         if convention not in LINKS or orientation not in ("rotation_vector", "none"):
             raise InputError(
                 f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector' or 'none'; "
@@ -109,7 +110,7 @@ class SerialArm(Mechanism):
         self.register_buffer("signs", torch.tensor(joint_sign or [1.0] * n, dtype=torch.float64))
         self.register_buffer("revolute", torch.tensor(turn))
         self.register_buffer("limits", torch.tensor(span, dtype=torch.float64))
-        self.recipe = {"spec": "serial", "keys": recipe}
+        self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(keys))}
         self._choose_home()
 
     def _choose_home(self) -> None:

@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
@@ -169,7 +169,8 @@ def _save(path: Path, tensors: Mapping[str, ArrayLike], about: Mapping[str, obje
             value = value.detach().cpu().numpy()
         arrays[name] = np.ascontiguousarray(value)
     part = path.with_name(path.name + ".part")
-    save_file(arrays, part, metadata={"about": json.dumps(about, sort_keys=True)})
+    # safetensors would write the file itself, but readable by its owner only.
+    part.write_bytes(save(arrays, metadata={"about": json.dumps(about, sort_keys=True)}))
     part.replace(path)
 
 

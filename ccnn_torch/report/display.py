@@ -43,7 +43,7 @@ def number_text(value: float | None, digits: int = 4) -> str:
 
 
 def interval_text(spread: Mapping[str, Any] | None, scale: float = 1.0, digits: int = 4) -> str:
-    """A spread as `median [low, high]`, or as one number when there is one repeat; says how many repeats have none.
+    """A spread as `median [low, high]`, or as one number when all repeats agree; says how many repeats have none.
 
     Args:
         spread: a block of `results.json`, or None.
@@ -54,7 +54,7 @@ def interval_text(spread: Mapping[str, Any] | None, scale: float = 1.0, digits: 
         return "–"
     text = number_text(spread["median"] / scale, digits)
     values = spread["values"]
-    if len(values) > 1:
+    if spread["low"] != spread["high"]:
         low, high = (number_text(spread[k] / scale, digits - 1) for k in ("low", "high"))
         text += f" [{low}, {high}]"
     there = sum(v is not None for v in values)

@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from ccnn_torch.compensation import Compensator, fit_compensator, save_model
-from ccnn_torch.errors import MethodFailedError
-from ccnn_torch.learners import make_learner
+from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.learners import LEARNERS, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError
-from ccnn_torch.runs.assemble import assemble, best_method, versions
+from ccnn_torch.runs.assemble import assemble, best_method
 from ccnn_torch.runs.config import RunConfig, method_names
 from ccnn_torch.runs.evaluate import Outcome, evaluate, pose_before
 from ccnn_torch.runs.fitting import Plan, fit_method
@@ -71,22 +74,35 @@ class Calibration:
             prepared.dataset.deviation[repeat, there],
             prepared.mechanism.joints,
             prepared.covariate_coordinates,
-            limit=self.config.compensation.limit,
+            limit=self._limit(),
             margin=self.config.compensation.margin,
         )
+
+    def _limit(self) -> Tensor | None:
+        """The config's limit for every joint, `n` [SI]."""
+        given, joints = self.config.compensation.limit, self.prepared.mechanism.joints
+        if given is None:
+            return None
+        if len(given) not in (1, len(joints)):
+            raise InputError(
+                f"compensation.limit has {len(given)} numbers; write one, or one for each of the {len(joints)} joints"
+            )
+        return torch.tensor(given, dtype=torch.float64).expand(len(joints)).clone()
 
     def save(self, folder: str | Path, method: str | None = None, name: str = "model") -> None:
         """Write model files and card of a method's compensator."""
         method = method or self.method
         repeat = self.repeat(method)
+        metrics = _of_repeat(self.results["methods"][method], repeat)
+        # Seconds differ from run to run, and the model file of one config and seed may not.
+        del metrics["seconds"]
         about = {
             "mechanism": self.mechanism(method).describe(),
             "method": method,
             "data_sha256": self.prepared.data_hash,
             "seed": self.config.seed + repeat,
-            "metrics": _of_repeat(self.results["methods"][method], repeat),
+            "metrics": metrics,
             "rotation_weight": self.config.rotation_weight,
-            "versions": versions(),
         }
         save_model(Path(folder), self.compensator(method), about, method=name)
 
@@ -112,6 +128,9 @@ def calibrate(
     outcomes: dict[str, Outcome] = {}
     failed: dict[str, str] = {}
     for name in method_names(config):
+        if config.methods == ["all"] and name not in LEARNERS:
+            failed[name] = f"this version has no learner {name!r}"
+            continue
         try:
             fitted = fit_method(
                 name,

@@ -7,23 +7,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
-from ccnn_torch.report.html import write_report
 from ccnn_torch.report.json_files import write_json
-from ccnn_torch.report.plots import (
-    Plot,
-    convergence_plot,
-    joint_error_plot,
-    network_plot,
-    pose_error_plot,
-    population_plot,
-    save_figure,
-    workspace_plot,
-)
-from ccnn_torch.report.tables import results_csv, results_markdown
+from ccnn_torch.report.run_report import write_report
 from ccnn_torch.runs.calibrate import Calibration
 from ccnn_torch.runs.folder import RunFolder
-from ccnn_torch.training import write_whole
+from ccnn_torch.runs.watch import genome
 
 __all__ = ["write_outputs"]
 
@@ -36,23 +26,10 @@ def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
         if method != best:
             folder.models.mkdir(exist_ok=True)
             calibration.save(folder.models, method, name=method)
-    arrays = _arrays(calibration)
-    save_arrays(path, arrays)
-    plots: list[Plot | None] = [joint_error_plot(arrays), pose_error_plot(arrays), workspace_plot(arrays)]
+    save_arrays(path, _arrays(calibration))
     for method in calibration.outcomes:
-        history = _history(calibration, method)
-        save_history(path, method, history)
-        if len(history["step"]) > 1:
-            plots += [_convergence(calibration, method, history), population_plot(history, method)]
-    if arrays.masks:
-        names = [joint.name for joint in calibration.prepared.mechanism.joints]
-        plots.append(network_plot(arrays.masks, arrays.weights, best, names))
-    drawn = [plot for plot in plots if plot is not None]
-    for plot in drawn:
-        save_figure(plot.figure, folder.plots / plot.name)
-    write_whole(path / "results.csv", results_csv(results).encode())
-    write_whole(path / "results.md", results_markdown(results).encode())
-    write_report(path / "report.html", results, drawn, folder.config.read_text())
+        save_history(path, method, _history(calibration, method))
+    write_report(path, results)
     write_json(folder.results, results)
 
 
@@ -64,7 +41,14 @@ def _arrays(calibration: Calibration) -> RunArrays:
     test = torch.zeros(rows, dtype=torch.bool)
     test[prepared.dataset.splits[k].test] = True
     pose = prepared.pose[k] if prepared.pose.dim() == 3 else prepared.pose
-    masks, weights = outcome.fitted.genome(k)
+    # A machine that mostly turns has its errors spread over angles, not over places.
+    turns = sum(coordinate.unit == "m" for coordinate in mechanism.pose) < 2
+    axes = mechanism.pose if turns else tuple(Coordinate(name, "m") for name in "xyz")
+
+    def place(poses: Tensor) -> NDArray[np.float64]:
+        return _numpy(poses if turns else mechanism.frame(poses)[0])
+
+    masks, weights = genome(outcome.fitted.learner, k)
     systematic = outcome.after_systematic
     case = prepared.case
     return RunArrays(
@@ -73,17 +57,18 @@ def _arrays(calibration: Calibration) -> RunArrays:
         measured=_numpy(prepared.dataset.deviation[k]),
         predicted=_numpy(outcome.deviation[k]),
         test=test.numpy(),
-        position=_numpy(mechanism.frame(pose)[0]),
+        place=place(pose),
         position_before=_numpy(calibration.before.position[k]),
         position_after=_numpy(outcome.after.position[k]),
         rotation_before=None if calibration.before.rotation is None else _numpy(calibration.before.rotation[k]),
         rotation_after=None if outcome.after.rotation is None else _numpy(outcome.after.rotation[k]),
         noise=None if prepared.noise is None else _numpy(prepared.noise[k]),
-        map_position=None if case is None else _numpy(mechanism.frame(case.pose)[0]),
+        map_place=None if case is None else place(case.pose),
         map_before=None if case is None else _numpy(case.pose_error(case.joints).position),
         map_after=None if systematic is None else _numpy(systematic.position[k]),
         masks=tuple(mask.numpy() for mask in masks),
         weights=tuple(_numpy(weight) for weight in weights),
+        axes=axes,
         labels={"method": method, "repeat": str(k), "mechanism": mechanism.name},
     )
 
@@ -92,22 +77,6 @@ def _history(calibration: Calibration, method: str) -> dict[str, NDArray[np.floa
     history = calibration.outcomes[method].fitted.training.history
     steps = len(next(iter(history.values())))
     return {"step": np.arange(1, steps + 1)} | {name: _numpy(value) for name, value in history.items()}
-
-
-def _convergence(calibration: Calibration, method: str, history: dict[str, NDArray[np.float64]]) -> Plot | None:
-    results = calibration.results
-
-    def mse(block: dict[str, dict[str, dict[str, float]]] | None) -> float | None:
-        return None if block is None or "all" not in block else block["all"]["mse"]["median"]
-
-    floor = results["floor"]
-    return convergence_plot(
-        history,
-        method,
-        floor=None if floor is None else mse(floor["realised"]),
-        constant=mse(results["constant"]["test"]),
-        unit=calibration.prepared.mechanism.joints[0].unit,
-    )
 
 
 def _numpy(tensor: Tensor) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -17,7 +18,7 @@ from ccnn_torch.records import check_rows, load_records
 from ccnn_torch.runs.cases import CaseStudy, build_case
 from ccnn_torch.runs.config import RunConfig
 from ccnn_torch.runs.dataset import Dataset, pad_rows
-from ccnn_torch.splits import Split, split_rows
+from ccnn_torch.splits import Column, Split, split_rows
 
 __all__ = ["Prepared", "prepare"]
 
@@ -78,7 +79,7 @@ def prepare(config: RunConfig) -> Prepared:
 
 def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
     assert config.case is not None
-    case = build_case(config.case, config.variant, config.order)
+    case = build_case(config.case, config.variant or "printed", config.order or "raster")
     mechanism = case.mechanism
     columns = {"t": (case.time, Coordinate("t", "1"))}
     unknown = [name for name in config.covariates or [] if name not in columns]
@@ -165,7 +166,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
     )
 
 
-def _splits(config: RunConfig, positions: Tensor, columns: dict[str, Tensor], seeds: list[int]) -> list[Split]:
+def _splits(config: RunConfig, positions: Tensor, columns: Mapping[str, Column], seeds: list[int]) -> list[Split]:
     split = config.split
     return [split_rows(positions, split.kind, split.by, columns, split.test, split.validation, seed) for seed in seeds]
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ccnn_torch.report.tables import print_results
-from ccnn_torch.report.tensorboard import TensorBoard
+from ccnn_torch.report.results import share_unit
+from ccnn_torch.report.tables import print_tables
+from ccnn_torch.report.tensorboard import TensorBoardCallback
 from ccnn_torch.runs.calibrate import Calibration, calibrate
 from ccnn_torch.runs.config import RunConfig, dump_config, load_config
 from ccnn_torch.runs.folder import RunFolder
@@ -51,12 +52,14 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool) 
         note(sentence, quiet)
 
     def watch(prepared: Prepared, method: str, phase: str, scaling: Scaling) -> list[Callback]:
-        joints = tuple(joint.name for joint in prepared.mechanism.joints)
+        joints = prepared.mechanism.joints
         label = f"{method}: {'choosing how long' if phase == 'choose' else 'training'}"
         board = folder.tensorboard / (method if phase == "fit" else f"{method}-{phase}")
         return [
-            HeldOut(prepared.dataset, scaling, joints, config.training.log_every),
-            TensorBoard(board),
+            HeldOut(
+                prepared.dataset, scaling, tuple(j.name for j in joints), share_unit(joints), config.training.log_every
+            ),
+            TensorBoardCallback(board, every=config.training.log_every),
             ProgressBar(label, quiet),
         ]
 
@@ -64,5 +67,5 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool) 
     note("writing model files, plots and tables …", quiet)
     write_outputs(calibration, folder)
     if not quiet:
-        print_results(calibration.results, stdout)
+        print_tables(calibration.results, stdout)
         stdout.print(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")

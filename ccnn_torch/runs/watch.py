@@ -13,7 +13,13 @@ from ccnn_torch.runs.dataset import Dataset
 from ccnn_torch.runs.screen import stderr
 from ccnn_torch.training import Scaling
 
-__all__ = ["HeldOut", "ProgressBar"]
+__all__ = ["HeldOut", "ProgressBar", "genome"]
+
+
+def genome(learner: Learner, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
+    """Masks `out x in` and weights `out x in [+ 1]` of one repeat's network; empty for a learner without masks."""
+    found = getattr(learner, "genome", None)
+    return ([], []) if found is None else found(repeat)
 
 
 class ProgressBar:
@@ -57,6 +63,7 @@ class HeldOut:
     dataset: Dataset
     scaling: Scaling
     joints: tuple[str, ...]
+    one_unit: bool
     every: int = 1
     last: dict[str, Tensor] = field(default_factory=dict)
 
@@ -87,4 +94,6 @@ class HeldOut:
             errors[f"heldout_mse_{joint}"] = squared[:, j] / rows[:, 0]
             errors[f"heldout_mae_{joint}"] = absolute[:, j] / rows[:, 0]
             errors[f"heldout_sse_{joint}"] = squared[:, j]
+        if self.one_unit:
+            errors["heldout_mse_all"] = squared.mean(-1) / rows[:, 0]
         return {name: value.to(torch.float64) for name, value in errors.items()}

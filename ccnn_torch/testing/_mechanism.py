@@ -19,7 +19,7 @@ _CLOSES = 1e-8
 _STEP = 1e-6
 _SLOPE_TOLERANCE = 2e-5
 # Differences of nearly singular configurations say nothing about the derivative.
-_REGULAR = 1e3
+_REGULAR = 200.0
 
 
 _ARGUMENT = ("joints", "pose", "parameters")
@@ -87,6 +87,7 @@ def _pose_gap(m: Mechanism, first: Tensor, second: Tensor) -> float:
 
 
 def _check_round_trip(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
+    _require(pose.shape == (len(joints), len(m.pose)), m, f"forward_kinematics has shape {tuple(pose.shape)}")
     near = joints + 1e-3
     back = m.solve_inverse(pose, guess=near)
     gap = _pose_gap(m, pose, m.forward_kinematics(back, guess=pose))
@@ -103,10 +104,18 @@ def _check_round_trip(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
 
 
 def _calls(m: Mechanism) -> dict[str, _Call]:
-    """Functions of joints, pose and parameters, by name."""
+    """Functions of joints, pose and parameters, by name.
+
+    The forward map is looked at through `frame`: a rotation vector jumps at half a turn, the frame does not.
+    """
+
+    def placed(q: Tensor, x: Tensor, k: Tensor | None) -> Tensor:
+        position, rotation = m.frame(m.forward_kinematics(q, k, x))
+        return position if rotation is None else torch.cat([position, rotation.flatten(-2)], dim=-1)
+
     return {
         "solve_inverse": lambda q, x, k: m.solve_inverse(x, k, q),
-        "forward_kinematics": lambda q, x, k: m.forward_kinematics(q, k, x),
+        "forward_kinematics": placed,
         "closure": lambda q, x, k: m.closure(x, q, k),
         "jacobian": lambda q, x, k: m.jacobian(q, k, x).flatten(-2),
     }
@@ -180,7 +189,8 @@ def _weighted(call: _Call, point: tuple[Tensor, Tensor, Tensor], place: int, wei
 def _differences(function: _RowFunction, point: Tensor) -> Tensor:
     """Central differences of a row-wise function: `... x k` -> `...`; returns `... x k`."""
     steps = _STEP * torch.eye(point.shape[-1], dtype=point.dtype)
-    return torch.stack([(function(point + s) - function(point - s)) / (2 * _STEP) for s in steps], dim=-1)
+    steps = steps.reshape(-1, *([1] * (point.dim() - 1)), point.shape[-1])
+    return ((function(point + steps) - function(point - steps)) / (2 * _STEP)).movedim(0, -1)
 
 
 def _check_jacobian(m: Mechanism, joints: Tensor, pose: Tensor) -> None:

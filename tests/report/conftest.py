@@ -20,6 +20,7 @@ from ccnn_torch.report.results import (
     ratio_to_floor,
     spread,
 )
+from ccnn_torch.report.run_report import write_report
 
 
 def tripod_run(repeats: int = 5) -> tuple[dict[str, Any], RunArrays, dict[str, np.ndarray]]:
@@ -187,12 +188,24 @@ def history() -> dict[str, np.ndarray]:
     return tripod_run()[2]
 
 
+def fill(folder: Path) -> Path:
+    """Write what the runner leaves in a run folder before the report is made."""
+    found, drawn, curves = tripod_run()
+    write_json(folder / "results.json", found)
+    save_arrays(folder, drawn)
+    save_history(folder, "ccnn", curves)
+    (folder / "config.yaml").write_text("name: tripod\nseed: 0\nmethods: [ccnn, bp_lm, grnn, enn]\n")
+    return folder
+
+
 @pytest.fixture
 def run_folder(tmp_path: Path) -> Path:
-    """A run folder as the runner leaves it before the report is written."""
-    found, drawn, curves = tripod_run()
-    write_json(tmp_path / "results.json", found)
-    save_arrays(tmp_path, drawn)
-    save_history(tmp_path, "ccnn", curves)
-    (tmp_path / "config.yaml").write_text("name: tripod\nseed: 0\nmethods: [ccnn, bp_lm, grnn, enn]\n")
-    return tmp_path
+    return fill(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def report_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with its report, to be read only."""
+    folder = fill(tmp_path_factory.mktemp("run"))
+    write_report(folder)
+    return folder

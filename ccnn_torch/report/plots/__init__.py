@@ -7,7 +7,7 @@ from ccnn_torch.report.plots._learning import population_plot as population_plot
 from ccnn_torch.report.plots._network import alive_nodes as alive_nodes
 from ccnn_torch.report.plots._network import network_plot as network_plot
 from ccnn_torch.report.plots._style import Plot as Plot
+from ccnn_torch.report.plots._style import inline_svg as inline_svg
 from ccnn_torch.report.plots._style import save_figure as save_figure
-from ccnn_torch.report.plots._style import svg_text as svg_text
 from ccnn_torch.report.plots._workspace import overview_plot as overview_plot
 from ccnn_torch.report.plots._workspace import workspace_plot as workspace_plot

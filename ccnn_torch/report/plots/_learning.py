@@ -49,16 +49,19 @@ def convergence_plot(
     if not panels:
         return None
     figure = Figure(figsize=(4.5 * len(panels) + (1.5 if len(panels) == 1 else 0), 3.5), layout="constrained")
-    for axes, (title, label, names, log) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+    for axes, (title, quantity, names, log) in zip(
+        figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True
+    ):
         for i, name in enumerate(names):
-            _draw_band(axes, step, history[name], SERIES[i % len(SERIES)], name.split("_", 1)[1].replace("_", " "))
+            label = "all joints" if name == "heldout_mse_all" else name.split("_", 1)[1].replace("_", " ")
+            _draw_band(axes, step, history[name], SERIES[i % len(SERIES)], label)
         if "heldout_mse_all" in names:
             for value, style, text in ((constant, ":", "constant"), (floor, "--", "noise floor")):
                 if value is not None:
                     axes.axhline(value, color=FLOOR, linestyle=style, linewidth=1.6, label=text)
         if log and all((history[name][np.isfinite(history[name])] > 0).all() for name in names):
             axes.set_yscale("log")
-        axes.set(title=title, xlabel="step of training", ylabel=label)
+        axes.set(title=title, xlabel="step of training", ylabel=quantity)
         axes.legend(loc="best")
     repeats = history[panels[0][2][0]].shape[1]
     band = f"; lines are medians and bands 5 % to 95 % over {repeats} repeats" * (repeats > 1)

@@ -5,7 +5,6 @@ Figures are made without pyplot, so nothing of matplotlib's global state is read
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["AFTER", "BEFORE", "FLOOR", "GREY", "RASTER_ABOVE", "SERIES", "Plot", "save_figure", "styled", "svg_text"]
+__all__ = ["AFTER", "BEFORE", "FLOOR", "GREY", "RASTER_ABOVE", "SERIES", "Plot", "inline_svg", "save_figure", "styled"]
 
 # Okabe and Ito's palette: told apart with every common form of colour blindness, and in grey print.
 BEFORE = "#D55E00"
@@ -94,20 +93,24 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
     """
     stem = Path(path)
     png, svg = stem.with_suffix(".png"), stem.with_suffix(".svg")
+    # The layout is found once and kept: finding it again for each file costs more than the drawing.
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
     figure.savefig(png, metadata={"Software": None})
     figure.savefig(svg, metadata={"Date": None, "Creator": None})
     return [png, svg]
 
 
-@styled
-def svg_text(plot: Plot) -> str:
-    """The figure as an `<svg>` element for a page that holds several: no prolog, ids begin with the plot's name."""
-    buffer = io.StringIO()
-    plot.figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
+def inline_svg(text: str, name: str) -> str:
+    """A saved SVG as an element for a page that holds several: no prolog, no metadata, ids that begin with the name.
+
+    Args:
+        text: content of an SVG file that `save_figure` wrote.
+        name: the plot's name.
+    """
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    return re.sub(r'(\bid="|url\(#|href="#)', rf"\1{plot.name}-", text)
+    return re.sub(r'(\bid="|url\(#|href="#)', rf"\1{name}-", text)
 
 
 def bare(axes: Axes) -> None:

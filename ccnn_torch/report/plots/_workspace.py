@@ -63,7 +63,7 @@ def overview_plot(arrays: RunArrays, joint: int | None = None) -> Plot:
     shape = _shape(place, arrays.axes, planes[0]) if planes else 1.0
     # The maps take the width that their shape needs at this height; the joint's panel takes the rest.
     wide = float(np.clip(1 / shape, 0.7, 1.4))
-    figure = Figure(figsize=(6.0 + 5.6 * wide if planes else 8.2, 4.0), layout="constrained")
+    figure = Figure(figsize=(6.5 + 6.2 * wide if planes else 8.2, 4.0), layout="constrained")
     grid = figure.subplots(1, 3 if planes else 1, width_ratios=(1.8, wide, wide) if planes else (1,), squeeze=False)
     left = grid[0, 0]
     draw_joint_error(left, arrays, joint)
@@ -150,7 +150,9 @@ def _draw_map(
     cells = _cells(horizontal, vertical, values)
     if cells is not None:
         panel.grid(False)
-        return panel.pcolormesh(*cells, norm=norm, cmap="viridis", rasterized=cells[2].size > RASTER_ABOVE)
+        raster = cells[2].size > RASTER_ABOVE
+        # Edges in the colour of the cell: SVG viewers would show white seams between the cells.
+        return panel.pcolormesh(*cells, norm=norm, cmap="viridis", edgecolors="face", linewidth=0.4, rasterized=raster)
     order = np.argsort(values)
     return panel.scatter(
         horizontal[order],

@@ -1,0 +1,122 @@
+"""The next generation of one subpopulation: elites, selection, crossover, hybrid mutation (paper 000, III-D and F)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.evolution.genome import Genome, active, select
+from ccnn_torch.evolution.operators import (
+    crossover,
+    flip_connections,
+    nonuniform_mutation,
+    swap_genes,
+    tournament,
+    weakest_draw,
+)
+from ccnn_torch.evolution.random import uniform
+from ccnn_torch.evolution.settings import CCNNSettings
+
+__all__ = ["BreedingDraws", "breed", "draw_breeding", "initial_population", "with_elites"]
+
+
+class BreedingDraws(NamedTuple):
+    """Uniform numbers that one generation of one subpopulation takes; h = half the number of children.
+
+    Attributes:
+        contestants: `r x 2h x t`.
+        pairs: whether a pair is crossed, `r x h`.
+        places: cut places `r x h x cuts`, or one number a gene `r x h x genes`.
+        flips, fresh: bits that flip, and the weights of those that appear, `r x h x out x in`.
+        genes, steps: which weights mutate, and how far, `r x h x out x (in or in + 1)`.
+    """
+
+    contestants: Tensor
+    pairs: Tensor
+    places: Tensor
+    flips: Tensor
+    fresh: Tensor
+    genes: Tensor
+    steps: Tensor
+
+
+def draw_breeding(
+    population: Genome, settings: CCNNSettings, seeds: Tensor, stream: int, generation: int
+) -> BreedingDraws:
+    """All numbers of a generation in one call; see `BreedingDraws`."""
+    half = (settings.population - settings.elites + 1) // 2
+    bits, reals = tuple(population.mask.shape[2:]), tuple(population.weight.shape[2:])
+    places = math.prod(reals) if settings.crossover_kind == "uniform" else settings.cuts
+    shapes: list[tuple[int, ...]] = [
+        (2 * half, settings.tournament),
+        (half,),
+        (half, places),
+        (half, *bits),
+        (half, *bits),
+        (half, *reals),
+        (half, *reals),
+    ]
+    sizes = [math.prod(shape) for shape in shapes]
+    numbers = uniform(seeds, stream, generation, (sum(sizes),))
+    return BreedingDraws(
+        *(
+            part.reshape(len(seeds), *shape)
+            for part, shape in zip(torch.split(numbers, sizes, dim=1), shapes, strict=True)
+        )
+    )
+
+
+def initial_population(outputs: int, inputs: int, settings: CCNNSettings, seeds: Tensor, stream: int) -> Genome:
+    """Random structures of the stated density, weights uniform in the range; `r x population x out x in (+ 1)`."""
+    size = settings.population
+    draws = uniform(seeds, stream, 0, (size, outputs, 2 * inputs + settings.bias))
+    mask = draws[..., :inputs] < settings.density
+    weight = (draws[..., inputs:] * 2 - 1) * settings.weight_range
+    return Genome(mask, torch.where(active(Genome(mask, weight)), weight, torch.zeros_like(weight)))
+
+
+def breed(population: Genome, fitness: Tensor, settings: CCNNSettings, progress: float, draws: BreedingDraws) -> Genome:
+    """Children of one subpopulation, `r x (population - elites) x ...`.
+
+    Two parents give two children. The first of each pair goes to structural mutation, the second to non-uniform
+    mutation of its weights: the paper's hybrid search, half and half.
+
+    Args:
+        population: `r x p x ...`.
+        fitness: `r x p`.
+        progress: t / T of eq. 13.
+    """
+    half = draws.pairs.shape[1]
+    parents = select(population, tournament(fitness, draws.contestants))
+    mothers, fathers = (
+        Genome(parents.mask[:, part], parents.weight[:, part]) for part in (slice(0, half), slice(half, None))
+    )
+    shape = population.weight.shape[2:]
+    swap = swap_genes(settings.crossover_kind, draws.places, math.prod(shape)).reshape(-1, half, *shape)
+    swap = swap & (draws.pairs < settings.crossover)[..., None, None]
+    first, second = crossover(mothers, fathers, swap)
+    limit = settings.weight_range
+    first = flip_connections(first, draws.flips < settings.structural_mutation, (draws.fresh * 2 - 1) * limit)
+    chosen = (draws.genes < settings.weight_mutation) | weakest_draw(second, draws.genes)
+    second = nonuniform_mutation(second, chosen, draws.steps, progress, -limit, limit, settings.nonuniform_exponent)
+    count = settings.population - settings.elites
+    return Genome(*(torch.cat(pair, dim=1)[:, :count] for pair in zip(first, second, strict=True)))
+
+
+def with_elites(children: Genome, population: Genome, fitness: Tensor, best: Genome, settings: CCNNSettings) -> Genome:
+    """Elites before the children: the part of the best joined network, then the best of the population.
+
+    Individuals as fit as the best of their subpopulation are copies of that part and not taken twice.
+
+    Args:
+        best: that part, `r x 1 x ...`.
+    """
+    parts = [best]
+    if settings.elites > 1:
+        others = fitness.masked_fill(fitness == fitness.amax(-1, keepdim=True), -torch.inf)
+        parts.append(select(population, others.topk(settings.elites - 1, dim=-1).indices))
+    parts.append(children)
+    return Genome(torch.cat([p.mask for p in parts], dim=1), torch.cat([p.weight for p in parts], dim=1))

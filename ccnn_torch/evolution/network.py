@@ -1,0 +1,145 @@
+"""Masked networks: forward pass, dead nodes (paper 000, section III-E), pruning, and the plain module for export."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+
+from ccnn_torch.evolution.genome import Genome, active
+
+__all__ = ["MaskedNetwork", "alive_nodes", "fed_nodes", "forward", "prune"]
+
+
+def fed_nodes(masks: Sequence[Tensor]) -> list[Tensor]:
+    """Hidden nodes that some network input reaches; biases do not count as inputs.
+
+    The others are forced to output 0 (sigmoid(0) is not 0, and a node fed by its bias alone is a constant that belongs
+    into the next bias). A node without outputs needs no forcing: nobody reads it.
+
+    Args:
+        masks: one a layer, `... x out x in`, bool.
+
+    Returns:
+        One a hidden layer, `... x out`, bool.
+    """
+    fed: list[Tensor] = []
+    for mask in masks[:-1]:
+        reaching = mask & fed[-1].unsqueeze(-2) if fed else mask
+        fed.append(reaching.any(-1))
+    return fed
+
+
+def alive_nodes(masks: Sequence[Tensor]) -> list[Tensor]:
+    """Hidden nodes on a path from an input to an output: all others can be deleted without changing a number.
+
+    Returns:
+        One a hidden layer, `... x out`, bool.
+    """
+    alive = fed_nodes(masks)
+    for layer in range(len(alive) - 1, -1, -1):
+        after = masks[layer + 1]
+        if layer + 1 < len(alive):
+            after = after & alive[layer + 1].unsqueeze(-1)
+        alive[layer] = alive[layer] & after.any(-2)
+    return alive
+
+
+def forward(masks: Sequence[Tensor], weights: Sequence[Tensor], inputs: Tensor) -> Tensor:
+    """Sigmoid hidden layers, linear output; unfed nodes give 0.
+
+    Args:
+        masks, weights: one a layer, `... x out x in` and `... x out x (in or in + 1)`; weights without a connection
+            are ignored.
+        inputs: `... x s x i`.
+
+    Returns:
+        `... x s x o`.
+    """
+    fed = fed_nodes(masks)
+    signal = inputs
+    for layer, (mask, weight) in enumerate(zip(masks, weights, strict=True)):
+        signal = _affine(signal, torch.where(active(Genome(mask, weight)), weight, torch.zeros_like(weight)))
+        if layer < len(fed):
+            signal = torch.sigmoid(signal) * fed[layer].unsqueeze(-2)
+    return signal
+
+
+def _affine(signal: Tensor, weight: Tensor) -> Tensor:
+    width = signal.shape[-1]
+    product = signal @ weight[..., :width].transpose(-2, -1)
+    return product + weight[..., width].unsqueeze(-2) if weight.shape[-1] > width else product
+
+
+def prune(masks: Sequence[Tensor], weights: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+    """One network without its dead nodes; the same numbers from smaller matrices.
+
+    A network without any path from input to output keeps no hidden layer: one layer without connections is left,
+    whose bias is the constant output.
+
+    Args:
+        masks, weights: one a layer, `out x in` and `out x (in or in + 1)`.
+    """
+    weights = [torch.where(active(Genome(m, w)), w, torch.zeros_like(w)) for m, w in zip(masks, weights, strict=True)]
+    alive = alive_nodes(masks)
+    if alive and not bool(alive[0].any()):
+        outputs, inputs = len(masks[-1]), masks[0].shape[-1]
+        bias = weights[-1][:, masks[-1].shape[-1] :]
+        return (
+            [masks[-1].new_zeros(outputs, inputs)],
+            [torch.cat([bias.new_zeros(outputs, inputs), bias], dim=-1)],
+        )
+    small_masks, small_weights = [], []
+    for layer, (mask, weight) in enumerate(zip(masks, weights, strict=True)):
+        rows = alive[layer] if layer < len(alive) else mask.new_ones(len(mask))
+        columns = alive[layer - 1] if layer > 0 else mask.new_ones(mask.shape[-1])
+        with_bias = torch.cat([columns, columns.new_ones(weight.shape[-1] - mask.shape[-1])])
+        small_masks.append(mask[rows][:, columns])
+        small_weights.append(weight[rows][:, with_bias])
+    return small_masks, small_weights
+
+
+class MaskedNetwork(nn.Module):
+    """A pruned network as dense double-precision linear layers with sigmoids between, ready for export.
+
+    Args:
+        masks, weights: one a layer, `out x in` and `out x (in or in + 1)`; missing connections become zeros.
+    """
+
+    def __init__(self, masks: Sequence[Tensor], weights: Sequence[Tensor]) -> None:
+        super().__init__()
+        layers = []
+        for mask, weight in zip(*prune(masks, weights), strict=True):
+            outputs, inputs = mask.shape
+            # Without its usual start values: those would be drawn from the global random state.
+            with torch.device("meta"):
+                linear = nn.Linear(inputs, outputs, dtype=torch.float64)
+            linear.to_empty(device=weight.device)
+            linear.requires_grad_(False)
+            linear.weight.copy_(weight[:, :inputs])
+            linear.bias.copy_(weight[:, inputs] if weight.shape[-1] > inputs else torch.zeros_like(weight[:, 0]))
+            layers.append(linear)
+        self.layers = nn.ModuleList(layers)
+
+    def describe(self) -> dict[str, Any]:
+        """What a model file needs to build the module again, beside its tensors."""
+        first, *others = cast("list[nn.Linear]", list(self.layers))
+        sizes = [first.in_features, first.out_features, *(layer.out_features for layer in others)]
+        return {"kind": "masked", "sizes": sizes}
+
+    @classmethod
+    def from_description(cls, description: dict[str, Any]) -> MaskedNetwork:
+        """A module of the described shape, for its tensors to be loaded into."""
+        sizes = [int(size) for size in description["sizes"]]
+        shapes = list(zip(sizes[1:], sizes, strict=False))
+        masks = [torch.ones(shape, dtype=torch.bool) for shape in shapes]
+        return cls(masks, [torch.zeros(out, width + 1, dtype=torch.float64) for out, width in shapes])
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """inputs: `... x i` [1]; returns `... x o` [1]."""
+        signal = inputs
+        for number, layer in enumerate(self.layers):
+            signal = layer(torch.sigmoid(signal) if number else signal)
+        return signal

@@ -1,0 +1,87 @@
+"""Every knob of the cooperative coevolutionary network, with the reason for its value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+__all__ = ["CCNNSettings"]
+
+
+@dataclass(frozen=True)
+class CCNNSettings:
+    """Settings of the CCNN; figures of paper 000, section IV-A where it states one, else ours with the reason.
+
+    Attributes:
+        hidden: nodes of each hidden layer. The paper has two layers and wants more individuals than one has genes (bits
+            and reals): 80 individuals allow two layers of 6.
+        population: individuals of each subpopulation (paper: 80).
+        generations: generations (paper: 120).
+        crossover: probability that a pair of parents is crossed (paper: 0.72).
+        structural_mutation: probability that a bit of a structural offspring flips (paper: 0.0015).
+        weight_mutation: probability that a weight of a weight offspring mutates (paper: 0.0025). With some 30 weights
+            that alone would leave nine of ten offspring as they are, so one weight of each always mutates.
+        tournament: contestants of one tournament.
+        crossover_kind: point (cuts at random places) or uniform.
+        cuts: cut points of a point crossover; 1 = single-point.
+        representatives: random representatives of every other subpopulation beside its best.
+        elites: individuals that survive unchanged: the part of the best joined network, and the next best.
+        weight_range: weights start and mutate in -weight_range .. weight_range (LD and UD of eq. 12).
+        density: share of connections that exist at the start.
+        bias: whether nodes have a bias, an input that is always on; the paper's strings have none.
+        epsilon: added to the error in eq. 11, on standardised outputs.
+        nonuniform_exponent: b of eq. 13 (paper: usually 2).
+        target_error: end once the training error of eq. 11 (standardised) of every repeat is at most this; 0 = never.
+        refine_every: generations between refinements of the best joined network; 0 = only after the last one.
+        refinement_iterations: Levenberg-Marquardt iterations of one refinement; 0 = none, as in the paper.
+
+    Raises:
+        ValueError: a value out of its range, in one sentence with the key.
+    """
+
+    hidden: tuple[int, ...] = (6, 6)
+    population: int = 80
+    generations: int = 120
+    crossover: float = 0.72
+    structural_mutation: float = 0.0015
+    weight_mutation: float = 0.0025
+    tournament: int = 2
+    crossover_kind: Literal["point", "uniform"] = "point"
+    cuts: int = 2
+    representatives: int = 3
+    elites: int = 2
+    weight_range: float = 1.0
+    density: float = 0.7
+    bias: bool = True
+    epsilon: float = 1e-6
+    nonuniform_exponent: float = 2.0
+    target_error: float = 0.0
+    refine_every: int = 0
+    refinement_iterations: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hidden", tuple(self.hidden))
+        if not all(width >= 1 for width in self.hidden):
+            raise ValueError(f"hidden={list(self.hidden)}: every hidden layer needs at least one node")
+        for key, low in (
+            ("generations", 1),
+            ("tournament", 1),
+            ("cuts", 1),
+            ("representatives", 0),
+            ("elites", 1),
+            ("refine_every", 0),
+            ("refinement_iterations", 0),
+        ):
+            if getattr(self, key) < low:
+                raise ValueError(f"{key}={getattr(self, key)} must be at least {low}")
+        if self.population < self.elites + 2:
+            raise ValueError(f"population={self.population} must be at least elites + 2 = {self.elites + 2}")
+        for key in ("crossover", "structural_mutation", "weight_mutation", "density"):
+            if not 0 <= getattr(self, key) <= 1:
+                raise ValueError(f"{key}={getattr(self, key)} is a probability: write a number from 0 to 1")
+        for key in ("weight_range", "epsilon"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"{key}={getattr(self, key)} must be above 0")
+        for key in ("nonuniform_exponent", "target_error"):
+            if not getattr(self, key) >= 0:
+                raise ValueError(f"{key}={getattr(self, key)} must not be negative")

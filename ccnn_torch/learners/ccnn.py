@@ -1,0 +1,159 @@
+"""The cooperative coevolutionary network of paper 000 (section III) as a learner."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.evolution.coevolution import Coevolution, advance, density, diversity, keep_refined, start
+from ccnn_torch.evolution.evaluation import fitness, joined_errors, make_task
+from ccnn_torch.evolution.genome import Genome
+from ccnn_torch.evolution.network import MaskedNetwork, forward
+from ccnn_torch.evolution.refinement import RefinementSettings, refine
+from ccnn_torch.evolution.settings import CCNNSettings
+from ccnn_torch.learners._protocol import TrainingData
+
+__all__ = ["CCNN", "CCNNSettings"]
+
+
+class CCNN:
+    """Cooperative coevolution of structure and weights; one step is one generation of every subpopulation.
+
+    The model is the best joined network so far by training fitness (eq. 11). Where refinement is on, it is the refined
+    network of highest evidence, from the first refinement on: Bayesian regularisation gives up training error for
+    held-out error, so that training fitness could not choose between the two.
+
+    Metrics of a step: `fitness_best`, `fitness_mean` (over all individuals), `error_train` (mean square of the model,
+    standardised), `evaluations` (joined networks so far), each `r`; `density` and `diversity`, `r x layers`.
+    """
+
+    name = "ccnn"
+
+    def __init__(self, settings: CCNNSettings | None = None) -> None:
+        self.settings = settings or CCNNSettings()
+
+    def start(self, data: TrainingData) -> None:
+        """Take the data and judge the random first generation."""
+        self._data = data
+        self._task = make_task(data.inputs, data.targets, data.weights)
+        sizes = (data.inputs.shape[-1], *self.settings.hidden, data.targets.shape[-1])
+        self._state = start(sizes, self._task, self.settings, data.seeds)
+        self._evidence = torch.full_like(self._state.best_fitness, -torch.inf)
+        self._refined = tuple(Genome(part.mask.clone(), part.weight.clone()) for part in self._state.best)
+
+    def step(self) -> dict[str, Tensor]:
+        """One generation, and a refinement where one is due."""
+        settings = self.settings
+        self._state = advance(self._state, self._task, settings, self._data.seeds)
+        every = settings.refine_every
+        if settings.refinement_iterations and (self.finished or (every and self._state.generation % every == 0)):
+            self._refine()
+        state = self._state
+        judged = (state.generation + 1) * len(state.populations) * settings.population * (settings.representatives + 1)
+        return {
+            "fitness_best": state.best_fitness,
+            "fitness_mean": torch.stack([scores.mean(-1) for scores in state.fitness]).mean(0),
+            "error_train": self._error(),
+            "density": density(state),
+            "diversity": diversity(state, settings),
+            "evaluations": torch.full_like(state.best_fitness, judged),
+        }
+
+    @property
+    def finished(self) -> bool:
+        """True after the last generation, or once every repeat has reached the target error."""
+        settings, state = self.settings, self._state
+        error = 1 / state.best_fitness - settings.epsilon
+        reached = settings.target_error > 0 and bool((error <= settings.target_error).all())
+        return reached or state.generation >= settings.generations
+
+    @property
+    def steps(self) -> int:
+        """Generations."""
+        return self.settings.generations
+
+    def predict(self, inputs: Tensor) -> Tensor:
+        """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
+        masks, weights = self.masks(), self.weights()
+        return forward(masks, weights, inputs)
+
+    def masks(self) -> list[Tensor]:
+        """Connections of the model, one layer each, `r x out x in`, bool."""
+        return [part.mask[:, 0] for part in self._model()]
+
+    def weights(self) -> list[Tensor]:
+        """Weights of the model, one layer each, `r x out x in`, or `r x out x (in + 1)` with the biases last."""
+        return [part.weight[:, 0] for part in self._model()]
+
+    def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
+        """Masks and weights of one repeat's model, dead nodes included: `out x in` and `out x (in or in + 1)`."""
+        return [mask[repeat] for mask in self.masks()], [weight[repeat] for weight in self.weights()]
+
+    def network(self, repeat: int) -> MaskedNetwork:
+        """The model of one repeat, pruned of its dead nodes."""
+        return MaskedNetwork(*self.genome(repeat))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Subpopulations with their fitness, the best joined network, the refined one, and the generation."""
+        state = self._state
+        tensors = {"generation": torch.tensor(state.generation, dtype=torch.int64)}
+        for name, parts in (("population", state.populations), ("best", state.best), ("refined", self._refined)):
+            for layer, part in enumerate(parts):
+                tensors[f"{name}_mask_{layer}"] = part.mask
+                tensors[f"{name}_weight_{layer}"] = part.weight
+        tensors |= {f"fitness_{layer}": scores for layer, scores in enumerate(state.fitness)}
+        return tensors | {"best_fitness": state.best_fitness, "refined_evidence": self._evidence}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take back a state; call `start` with the same data first."""
+        layers = range(len(self._state.populations))
+
+        def parts(name: str) -> tuple[Genome, ...]:
+            return tuple(Genome(state[f"{name}_mask_{n}"], state[f"{name}_weight_{n}"]) for n in layers)
+
+        self._state = Coevolution(
+            populations=parts("population"),
+            fitness=tuple(state[f"fitness_{n}"] for n in layers),
+            best=parts("best"),
+            best_fitness=state["best_fitness"],
+            generation=int(state["generation"]),
+        )
+        self._refined = parts("refined")
+        self._evidence = state["refined_evidence"]
+
+    def _model(self) -> tuple[Genome, ...]:
+        return _choose(self._evidence > -torch.inf, self._refined, self._state.best)
+
+    def _error(self) -> Tensor:
+        """Weighted mean squared error on the training rows, `r`."""
+        task = self._task
+        error = self.predict(task.inputs.transpose(1, 2)) - task.targets.transpose(1, 2)
+        return (error.square().mean(-1) * task.shares).sum(-1)
+
+    def _refine(self) -> None:
+        """Refine the best joined network; keep it by evidence, and write it back into the elite where it is fitter."""
+        data, settings, best = self._data, self.settings, self._state.best
+        refined = refine(
+            [part.mask[:, 0] for part in best],
+            [part.weight[:, 0] for part in best],
+            data.inputs,
+            data.targets,
+            data.weights,
+            RefinementSettings(iterations=settings.refinement_iterations),
+        )
+        candidate = tuple(
+            Genome(part.mask, weight.unsqueeze(1)) for part, weight in zip(best, refined.weights, strict=True)
+        )
+        self._refined = _choose(refined.log_evidence > self._evidence, candidate, self._refined)
+        self._evidence = torch.maximum(self._evidence, refined.log_evidence)
+        scores = fitness(joined_errors(0, candidate[0], candidate, self._task)[:, 0, 0], settings.epsilon)
+        self._state = keep_refined(self._state, candidate, scores)
+
+
+def _choose(first: Tensor, one: tuple[Genome, ...], other: tuple[Genome, ...]) -> tuple[Genome, ...]:
+    """Repeat by repeat. first: `r`, bool."""
+    take = first[:, None, None, None]
+    return tuple(
+        Genome(torch.where(take, a.mask, b.mask), torch.where(take, a.weight, b.weight))
+        for a, b in zip(one, other, strict=True)
+    )

@@ -1,0 +1,54 @@
+"""`results.csv`: every figure of `results.json` as one tidy row, in SI."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+__all__ = ["tidy_rows", "write_csv"]
+
+HEADER = ("method", "split", "quantity", "joint", "unit", "median", "low", "high")
+Row = tuple[str, str, str, str, str, float | None, float | None, float | None]
+
+
+def tidy_rows(results: Mapping[str, Any]) -> Iterator[Row]:
+    """Yield (method, split, quantity, joint, unit, median, low, high); `joint` is empty where it means nothing."""
+    units = {joint["name"]: joint["unit"] for joint in results["joints"]}
+    units["all"] = next(iter(units.values()))
+
+    def row(method: str, split: str, quantity: str, joint: str, unit: str, spread: Mapping[str, Any]) -> Row:
+        return (method, split, quantity, joint, unit, spread["median"], spread["low"], spread["high"])
+
+    for split, key in (("train", "before_train"), ("test", "before")):
+        for joint, block in (results.get(key) or {}).items():
+            for quantity, spread in block["spread"].items():
+                yield row("before", split, quantity, joint, units[joint], spread)
+    blocks: dict[str, Mapping[str, Any] | None] = {name: m["test"] for name, m in results["methods"].items()}
+    blocks["constant"] = results["constant"]["test"]
+    for kind, floor in (results["floor"] or {}).items():
+        blocks[f"floor_{kind}"] = floor
+    for method, errors in blocks.items():
+        for joint, measures in (errors or {}).items():
+            for quantity, spread in measures.items():
+                unit = units[joint] if quantity == "mae" or units[joint] == "1" else f"{units[joint]}^2"
+                yield row(method, "test", quantity, joint, unit, spread)
+    for method, block in {**results["methods"], "constant": results["constant"]}.items():
+        for quantity, split, unit in (("ratio_to_floor", "test", "1"), ("seconds", "", "s")):
+            if block.get(quantity):
+                yield row(method, split, quantity, "", unit, block[quantity])
+    for name, block in results["pose"].items():
+        for when in ("before", "after", "not_compensable"):
+            for measure, spread in ((block or {}).get(when) or {}).items():
+                method = (results.get("best_method") or "") if when == "after" else when
+                yield row(method, "test", f"{name}_{measure}", "", block["unit"], spread)
+
+
+def write_csv(path: str | Path, results: Mapping[str, Any]) -> None:
+    """Write `results.csv`; numbers have 17 significant digits, an unknown one is empty."""
+    with Path(path).open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(HEADER)
+        for row in tidy_rows(results):
+            writer.writerow(f"{v:.17g}" if isinstance(v, float | int) else v for v in row)

@@ -1,0 +1,52 @@
+"""One HTML file that opens anywhere, offline: tables and inline SVG, no script, nothing fetched."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from ccnn_torch.report.tables import failures, result_tables, verdict
+
+__all__ = ["InlineFigure", "html_text"]
+
+
+class InlineFigure(NamedTuple):
+    """A figure on the page: its name (the id), one sentence, and an `<svg>` element made by this package."""
+
+    name: str
+    caption: str
+    svg: str
+
+
+def html_text(
+    results: Mapping[str, Any], figures: Sequence[InlineFigure] = (), config: str = "", files: Sequence[str] = ()
+) -> str:
+    """The report of a run.
+
+    Args:
+        results: as in `results.json`.
+        figures: in reading order.
+        config: the resolved configuration, as text.
+        files: names of files in the run folder to link to.
+    """
+    environment = Environment(
+        loader=PackageLoader("ccnn_torch.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    optional: dict[str, Any] = {"case": None, "best_method": None, "notes": [], "versions": {}}
+    return environment.get_template("report.html.jinja").render(
+        results=optional | dict(results),
+        verdict=verdict(results),
+        tables=result_tables(results),
+        failures=failures(results),
+        # Markup: the SVG is our own; everything else on the page is escaped.
+        figures=[figure._replace(svg=Markup(figure.svg)) for figure in figures],
+        config=config,
+        files=files,
+    )

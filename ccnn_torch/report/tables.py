@@ -1,0 +1,204 @@
+"""The tables of a run, from `results.json` alone: for the screen, for `results.md`, and for the HTML report.
+
+They follow the paper: before calibration as Tables I and III, after it as Tables II and IV, and where the run is one of
+the paper's cases its printed figures stand beside ours. All numbers are medians over the repeats with [5 %, 95 %].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from ccnn_torch.report.display import count_text, display_unit, interval_text, number_text, removed_percent
+from ccnn_torch.report.paper_tables import PAPER, PaperCase
+
+__all__ = ["Table", "markdown_text", "print_tables", "result_tables", "verdict"]
+
+Results = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Title, column headers, rows of text (one entry a column), and a sentence below."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+
+def verdict(results: Results) -> str:
+    """One sentence: what the best method does to the error on held-out rows."""
+    position = results["pose"]["position"]
+    best = results.get("best_method") or next(iter(results["methods"]), "the model")
+    rows = count_text(results["rows"]["test"], "held-out row")
+    before, after = position["before"]["rms"], position["after"]["rms"]
+    removed = removed_percent(before, after)
+    if removed is None:
+        return f"On {rows} the pose error of {best} could not be measured."
+    scale, unit = display_unit("m", before["median"])
+    left, right = (number_text(s["median"] / scale, 3) for s in (before, after))
+    did = f"removes {removed:.1f} %" if removed >= 0 else f"adds {-removed:.1f} %"
+    text = f"On {rows} {best} {did} of the RMS position error ({left} → {right} {unit})"
+    ratio = (results["methods"].get(best) or {}).get("ratio_to_floor")
+    if ratio and ratio["median"] is not None:
+        text += f"; its mean squared joint error is {number_text(ratio['median'], 3)} times the noise floor"
+        constant = results["constant"].get("ratio_to_floor")
+        if constant and constant["median"] is not None:
+            text += f" (a constant correction: {number_text(constant['median'], 3)})"
+    return text + "."
+
+
+def result_tables(results: Results) -> list[Table]:
+    """All tables of a run, in reading order."""
+    paper = PAPER.get(results.get("case") or "")
+    return [
+        _before_table(results, paper),
+        *(_after_table(results, paper, measure) for measure in ("mse", "mae", "sse")),
+        _pose_table(results),
+    ]
+
+
+def print_tables(results: Results, console: Console) -> None:
+    """Show the verdict and the tables on a terminal."""
+    for table in result_tables(results):
+        shown = RichTable(title=escape(table.title), title_justify="left", title_style="bold", caption_justify="left")
+        shown.caption = escape(table.note) or None
+        for i, column in enumerate(table.columns):
+            shown.add_column(escape(column), justify="left" if i == 0 else "right", overflow="fold")
+        for row in table.rows:
+            # The interval below its median: three such columns then fit into 80 characters.
+            shown.add_row(*(escape(cell.replace(" [", "\n[") if i else cell) for i, cell in enumerate(row)))
+        console.print(shown)
+    for sentence in failures(results):
+        console.print(escape(sentence), style="yellow")
+    console.print(escape(verdict(results)), style="bold")
+
+
+def markdown_text(results: Results) -> str:
+    """The verdict and the tables as Markdown (`results.md`)."""
+    parts = [f"# {results['name']}", verdict(results)]
+    for table in result_tables(results):
+        head, *lines = (
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (table.columns, *table.rows)
+        )
+        rule = "| " + " | ".join(["---", *["---:"] * (len(table.columns) - 1)]) + " |"
+        parts += [f"## {table.title}", "\n".join([head, rule, *lines]), *([table.note] if table.note else [])]
+    parts += failures(results)
+    return "\n\n".join(parts) + "\n"
+
+
+def failures(results: Results) -> list[str]:
+    """One sentence for each method that failed."""
+    return [f"{name} failed: {m['failed']}" for name, m in results["methods"].items() if m["test"] is None]
+
+
+def _units(results: Results) -> dict[str, str]:
+    return {joint["name"]: joint["unit"] for joint in results["joints"]}
+
+
+def _repeats(results: Results) -> str:
+    count = results["repeats"]
+    return f"Medians [5 %, 95 %] over {count} repeats." if count > 1 else ""
+
+
+def _before_table(results: Results, paper: PaperCase | None) -> Table:
+    units, train = _units(results), results.get("before_train")
+    columns = ["joint"] + ["mean, training rows", "maximum, training rows"] * (train is not None)
+    columns += ["mean, held-out rows", "maximum, held-out rows", "largest by absolute value"]
+    if paper:
+        columns += ["mean, paper", "maximum, paper"]
+    rows = []
+    for i, (name, unit) in enumerate(units.items()):
+        scale, shown = display_unit(unit, results["before"][name]["max_abs"] or 0.0)
+        row = [f"{name} [{shown}]"]
+        if train is not None:
+            row += [interval_text(train[name]["spread"][key], scale) for key in ("mean", "max")]
+        row += [interval_text(results["before"][name]["spread"][key], scale) for key in ("mean", "max", "max_abs")]
+        if paper:
+            row += [number_text(value / scale) for value in paper.before_test[i]]
+        rows.append(tuple(row))
+    note = "Mean and maximum are of the signed error. " + _repeats(results)
+    if paper:
+        note += f" Paper: Table {paper.before}, verification set. {paper.remark}"
+    return Table("Joint error before calibration", tuple(columns), tuple(rows), note.strip())
+
+
+def _after_table(results: Results, paper: PaperCase | None, measure: str) -> Table:
+    titles = {"mse": "Mean squared error", "mae": "Mean absolute error", "sse": "Sum of squared errors"}
+    floor = results["floor"]
+    keys = list(_units(results)) + ["all"] * ("all" in results["constant"]["test"])
+    # Joints of one unit share a scale, so that columns can be compared at a glance.
+    shared = "all" if "all" in keys else None
+    scales = {key: _scale(results, shared or key, measure) for key in keys}
+    beside = measure == "mse"
+    ratio = beside and floor is not None and "all" in keys
+    columns = ["method", *(f"{'all joints' if key == 'all' else key} [{scales[key][1]}]" for key in keys)]
+    columns += ["ratio to floor [1]"] * ratio + ["time [s]"] * beside
+    lines: list[tuple[str, Mapping[str, Any] | None, Mapping[str, Any]]] = [
+        (name, method["test"], method) for name, method in results["methods"].items()
+    ]
+    lines.append(("constant", results["constant"]["test"], results["constant"]))
+    if floor and beside:
+        lines.append(("noise floor, realised", floor["realised"], {}))
+        lines.append(("noise floor, expected", floor["expected"], {}))
+        if floor.get("with_unlearnable"):
+            lines.append(("noise floor with what cannot be learned", floor["with_unlearnable"], {}))
+    rows = []
+    for name, errors, method in lines:
+        cells = [interval_text(errors[key][measure] if errors else None, scales[key][0]) for key in keys]
+        cells += [interval_text(method.get("ratio_to_floor"))] * ratio
+        cells += [interval_text(method.get("seconds"), digits=3)] * beside
+        rows.append((name, *cells))
+    note = _repeats(results)
+    if paper and len(keys) == len(paper.symbols) + 1:
+        for name, printed in paper.methods.items():
+            values = printed[("mse", "mae", "sse").index(measure)]
+            cells = [number_text(value / scales[key][0]) for key, value in zip(keys, values, strict=True)]
+            rows.append((f"{name}, paper's Table {paper.after}", *cells, *["–"] * (ratio + beside)))
+    return Table(f"{titles[measure]} on held-out rows, after calibration", tuple(columns), tuple(rows), note)
+
+
+def _scale(results: Results, key: str, measure: str) -> tuple[float, str]:
+    """One unit for a column: a prefixed one for absolute errors, a power of ten of the SI unit for squares."""
+    units = _units(results)
+    unit = units[key] if key != "all" else next(iter(units.values()))
+    block = [m["test"] for m in results["methods"].values() if m["test"]] or [results["constant"]["test"]]
+    medians = [errors[key][measure]["median"] for errors in block]
+    typical = min((m for m in medians if m), default=1.0)
+    if measure == "mae":
+        return display_unit(unit, typical)
+    square = "1" if unit == "1" else f"{unit}²"
+    power = math.floor(math.log10(typical))
+    return (1.0, square) if power == 0 else (10.0**power, f"1e{power} {square}")
+
+
+def _pose_table(results: Results) -> Table:
+    names = {"position": "position", "rotation": "rotation", "energy": "energy E (eq. 5)"}
+    blocks = {name: results["pose"][key] for key, name in names.items() if results["pose"].get(key)}
+    remainder = any("not_compensable" in block for block in blocks.values())
+    rows = []
+    for name, block in blocks.items():
+        scale, unit = display_unit(block["unit"], block["before"]["rms"]["median"] or 0.0)
+        cells = [f"{name} [{unit}]"]
+        for measure in ("rms", "max"):
+            removed = removed_percent(block["before"][measure], block["after"][measure])
+            cells += [interval_text(block[when][measure], scale) for when in ("before", "after")]
+            cells.append("–" if removed is None else f"{removed:.1f}")
+        if remainder:
+            cells.append(interval_text(block.get("not_compensable", {}).get("rms"), scale))
+        rows.append(tuple(cells))
+    columns = ["pose error"]
+    for measure in ("RMS", "max"):
+        columns += [f"{measure} before", f"{measure} after", f"{measure} removed [%]"]
+    note = _repeats(results)
+    if remainder:
+        columns.append("RMS not compensable")
+        note = f"Not compensable: the part of the measured error that no joint deviation explains. {note}".strip()
+    return Table("Pose error on held-out rows", tuple(columns), tuple(rows), note)

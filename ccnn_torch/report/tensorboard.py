@@ -1,0 +1,119 @@
+"""Training curves and masks for TensorBoard, as a callback of the trainer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
+
+__all__ = ["TensorBoardCallback", "tags_of"]
+
+_PER_SUBPOPULATION = ("density", "diversity")
+_CELL = 16
+"""Pixels a connection gets in the picture of a mask."""
+
+
+class TensorBoardCallback:
+    """Write event files into `RUN/tensorboard`.
+
+    A scalar of `r` repeats gives its median over the repeats under its tag (`fitness/best`, `heldout/mse_q1`,
+    `density/subpopulation_1`) and, when there are several repeats, that of the first one under `repeat_0/…`: a median
+    curve hides how a single run moves, thirty curves hide everything.
+
+    The writer opens at the first step it is given and purges what stood at or after that step, so that a run resumed
+    from a checkpoint shows no step twice.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        masks: Callable[[], Sequence[ArrayLike]] | None = None,
+        *,
+        every: int = 1,
+        masks_every: int = 20,
+    ) -> None:
+        """Make the callback.
+
+        Args:
+            folder: where the event files go.
+            masks: gives the masks of the best network of the first repeat, layer by layer, `out x in`, bool; None =
+                those of the learner, if it has a `genome`.
+            every: write scalars each so many steps.
+            masks_every: write the masks each so many steps.
+        """
+        self._folder = Path(folder)
+        self._masks = masks
+        self._every = every
+        self._masks_every = masks_every
+        self._writer: SummaryWriter | None = None
+
+    def on_start(self, learner: Any, data: Any, step: int) -> None:
+        """Take the learner's masks where it has some; the writer waits for the first step."""
+        genome = getattr(learner, "genome", None)
+        if self._masks is None and genome is not None:
+            self._masks = lambda: [mask.cpu().numpy() for mask in genome(0)[0]]
+
+    def on_step(self, step: int, metrics: Mapping[str, Tensor]) -> None:
+        """Write the metrics of one step.
+
+        Args:
+            step: number of the step, from 1.
+            metrics: by name, each `r`, `r x k` or a plain number.
+        """
+        if self._writer is None:
+            # TensorBoard takes a second to import, which only runs that write curves should pay.
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._writer = SummaryWriter(str(self._folder), purge_step=step)
+        if step % self._every == 0 or step == 1:
+            for name, value in metrics.items():
+                for tag, number in tags_of(name, value).items():
+                    self._writer.add_scalar(tag, number, step)
+        if self._masks is not None and (step % self._masks_every == 0 or step == 1):
+            for layer, mask in enumerate(self._masks(), start=1):
+                picture = np.kron(np.asarray(mask, dtype=np.uint8), np.ones((_CELL, _CELL), dtype=np.uint8)) * 255
+                self._writer.add_image(f"masks/layer_{layer}", picture, step, dataformats="HW")
+
+    def on_end(self) -> None:
+        """Write out and close."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+
+def tags_of(name: str, value: Tensor | float) -> dict[str, float]:
+    """TensorBoard tags of one metric, and their numbers.
+
+    The part before the first underscore is the group: `fitness_best` becomes `fitness/best`, and the elements of
+    `density` (`r x k`) become `density/subpopulation_1` and so on. What is not finite is left out.
+
+    Args:
+        name: the metric's name.
+        value: `r`, `r x k`, or a single number.
+    """
+    numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
+    group, _, rest = name.partition("_")
+    repeats = numbers.shape[0] if numbers.dim() else 1
+    table = numbers.reshape(repeats, -1)
+    tags: dict[str, float] = {}
+    for k in range(table.shape[1]):
+        if numbers.dim() > 1:
+            part = f"{'subpopulation' if name in _PER_SUBPOPULATION else 'part'}_{k + 1}"
+            tag = f"{group}/{rest}_{part}" if rest else f"{group}/{part}"
+        else:
+            tag = f"{group}/{rest}" if rest else f"training/{name}"
+        column = table[:, k]
+        finite = column[column.isfinite()]
+        if len(finite):
+            tags[tag] = float(torch.quantile(finite, 0.5))
+        if repeats > 1 and bool(column[0].isfinite()):
+            tags[f"repeat_0/{tag}"] = float(column[0])
+    return tags

@@ -1,0 +1,117 @@
+"""Geometry files with a mistake: one sentence that names the file, the key or joint, and what would be right."""
+
+import pytest
+from catalogue import PANDA, UR10, URDF
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import load_mechanism, read_dh_file, read_urdf
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            "convention: standard",
+            "convention: Standard",
+            "'standard Denavit-Hartenberg' or 'modified Denavit-Hartenberg'",
+        ),
+        ("convention: standard", "convention: 3 # standard", "key 'convention' must be a text"),
+        ("dof: 6", "dof: six", "key 'dof' must be a finite number, got 'six'"),
+        ("dof: 6", "dof: 2.5", "whole number"),
+        ("dof: 6\n", "", "key 'dof' is missing"),
+        ("theta: [0.0, ", "theta: [", "key 'theta' must list 6 numbers, one per joint, got 5"),
+        ("theta: [0.0, 0.0", "theta: [0.0, 1mm", "key 'theta', entry 2 must be a finite number, got '1mm'"),
+        ("theta: [0.0", "theta: [.nan", "key 'theta', entry 1 must be a finite number"),
+        ("units: {length: mm", "units: {length: furlong", "key 'units.length' must be one of m, cm, mm"),
+        (", angle: rad}", "}", "key 'units.angle' must be one of rad, deg"),
+        ("joint_sign: [1,", "joint_sign: [2,", "key 'joint_sign' must list 6 times 1 or -1"),
+        ("parallel_axes: [[2, 3, 4]]", "parallel_axes: [[2, 3, 7]]", "groups of joints from 1 to 6"),
+        (
+            "tool_frame: unknown",
+            "tool_frame: [1, 2, 3]",
+            r"key 'tool_frame' must be 'unknown', 'identity' or \[x, y, z, rx",
+        ),
+        ("tool_frame: unknown", "tool_frame: [1, 2, 3, 4, 5, x]", "key 'tool_frame', entry 6"),
+        ("tool_frame: unknown", "frame_per: robot", "key 'frame_per' must be a list of names"),
+        ("tool_frame: unknown", "joint_types: [revolute]", "key 'joint_types' must list 6 times"),
+        ("dof: 6", "dof: 6\ndof: 6", "line 3 is no valid YAML"),
+        ("dof: 6", "dof: [6", "no valid YAML"),
+    ],
+)
+def test_dh_file_mistakes(tmp_path, old, new, said):
+    assert old in UR10
+    path = tmp_path / "arm.yaml"
+    path.write_text(UR10.replace(old, new, 1))
+    with pytest.raises(InputError, match=said) as caught:
+        load_mechanism(str(path))
+    assert "arm.yaml" in str(caught.value)
+
+
+def test_dh_file_that_is_none(tmp_path):
+    with pytest.raises(InputError, match="there is no such file"):
+        load_mechanism(str(tmp_path / "no.yaml"))
+    path = tmp_path / "list.yaml"
+    path.write_text("- 1\n")
+    with pytest.raises(InputError, match="must hold keys"):
+        load_mechanism(str(path))
+    path.write_bytes(b"\xff\xfe\x00dof")
+    with pytest.raises(InputError, match=r"list\.yaml"):
+        load_mechanism(str(path))
+
+
+def test_tool_offset_replaces_the_tool_for_positions_only(tmp_path):
+    path = tmp_path / "arm.yaml"
+    path.write_text(PANDA + "tool_offset: [0, 0, 137]\nframe_per: [robot, placement]\ntool_per: [robot]\n")
+    assert read_dh_file(str(path)).nominal[-6:-3].tolist() == pytest.approx([0, 0, 0.1])
+    arm = read_dh_file(str(path), orientation="none")
+    assert arm.nominal[-6:].tolist() == pytest.approx([0, 0, 0.137, 0, 0, 0]) and arm.unknown_frames == ()
+    assert arm.frame_per == ("robot", "placement") and arm.tool_per == ("robot",)
+    path.write_text(PANDA + "tool_offset: unknown, near [0, 0, 137]\n")
+    assert read_dh_file(str(path), orientation="none").unknown_frames == ("tool",)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('type="prismatic"', 'type="floating"', "joint 'slide' is of type 'floating'"),
+        ('<limit lower="-2" upper="2"/></joint>', '<mimic joint="pan"/></joint>', "joint 'lift' follows another joint"),
+        ('xyz="0 0.1 0"', 'xyz="0 0.1"', "joint 'slide' needs three numbers in origin xyz, got '0 0.1'"),
+        ('axis xyz="0 0 2"', 'axis xyz="0 0 0"', "joint 'pan' has the axis 0 0 0"),
+        ('<parent link="rail"/>', "", "joint 'slide' lacks <parent"),
+        ('lower="-0.4"', 'lower="low"', "joint 'slide' has a limit that is no number"),
+        ("</robot>", "", "no valid XML"),
+    ],
+)
+def test_urdf_mistakes(tmp_path, old, new, said):
+    assert old in URDF
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF.replace(old, new, 1))
+    with pytest.raises(InputError, match=said) as caught:
+        load_mechanism(str(path))
+    assert "arm.urdf" in str(caught.value)
+
+
+def test_urdf_branches_ask_for_the_tip(tmp_path):
+    path = tmp_path / "arm.urdf"
+    branch = '<link name="camera"/><joint name="eye" type="fixed"><parent link="hand"/><child link="camera"/></joint>'
+    path.write_text(URDF.replace("</robot>", branch + "</robot>"))
+    with pytest.raises(InputError, match=r"the chain branches; give the last link as tip=, one of gripper, camera"):
+        read_urdf(str(path))
+    assert len(read_urdf(str(path), tip="gripper").joints) == 5
+    assert len(read_urdf(str(path), tip="camera", base="pillar").joints) == 3
+    with pytest.raises(InputError, match="has no link 'hend'; it has world, rail"):
+        read_urdf(str(path), tip="hend")
+    with pytest.raises(InputError, match="does not hang on"):
+        read_urdf(str(path), base="camera", tip="gripper")
+    with pytest.raises(InputError, match="no joint that moves"):
+        read_urdf(str(path), base="world", tip="rail")
+    with pytest.raises(InputError, match="there is no such file"):
+        read_urdf(str(tmp_path / "no.urdf"))
+
+
+def test_urdf_limits_are_the_sampling_box(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF)
+    arm = read_urdf(str(path))
+    assert arm.limits[0].tolist() == [-0.4, 0.6] and [j.unit for j in arm.joints] == ["m", "rad", "rad", "rad", "rad"]
+    assert arm.unknown_frames == ("base", "tool") and arm.name == "gantry_arm"

@@ -1,0 +1,76 @@
+"""Mechanisms by name, by file and from a description."""
+
+import json
+
+import pytest
+import torch
+from catalogue import FIVE_BAR, NAMES, UR10, make
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import load_mechanism, mechanism_from_description
+
+
+def test_by_name_with_keys():
+    assert load_mechanism("tripod", L=1.2).nominal.tolist() == [1.2, 0.3]
+    with pytest.raises(InputError, match="did you mean 'tripod'"):
+        load_mechanism("tripot")
+    with pytest.raises(InputError, match="known: tripod, machine_tool"):
+        load_mechanism("xyz")
+    with pytest.raises(InputError, match="'radius'; it takes L, r"):
+        load_mechanism("tripod", radius=3)
+
+
+def test_users_file(tmp_path):
+    assert load_mechanism(f"{FIVE_BAR}:FiveBar", crank=0.45).nominal.tolist() == [0.25, 0.45, 0.6]
+    with pytest.raises(InputError, match="has no class 'SixBar'; it has FiveBar"):
+        load_mechanism(f"{FIVE_BAR}:SixBar")
+    with pytest.raises(InputError, match="there is no file"):
+        load_mechanism("nowhere.py:Thing")
+    broken = tmp_path / "broken.py"
+    broken.write_text("def f(:\n")
+    with pytest.raises(InputError, match=r"broken.py line 1 is no valid Python"):
+        load_mechanism(f"{broken}:f")
+    broken.write_text("import no_such_module_at_all\n")
+    with pytest.raises(InputError, match="imports something that is not installed"):
+        load_mechanism(f"{broken}:f")
+    broken.write_text("class Thing:\n    pass\n")
+    with pytest.raises(InputError, match="derive the class from"):
+        load_mechanism(f"{broken}:Thing")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_description_is_json_and_exact(name, tmp_path):
+    original = make(name, tmp_path)
+    shifted = original.with_nominal(original.nominal + torch.tensor(1 / 3, dtype=torch.float64))
+    for mechanism in (original, shifted):
+        description = json.loads(json.dumps(mechanism.describe()))
+        twin = mechanism_from_description(description)
+        assert torch.equal(twin.nominal, mechanism.nominal) and type(twin).__name__ == type(mechanism).__name__
+        assert twin.describe() == mechanism.describe()
+
+
+def test_an_arms_description_needs_no_file(tmp_path):
+    path = tmp_path / "arm.yaml"
+    path.write_text(UR10)
+    description = load_mechanism(str(path), orientation="none").describe()
+    path.unlink()
+    twin = mechanism_from_description(description)
+    assert twin.orientation == "none" and twin.unknown_frames == ("base", "tool")
+
+
+def test_faulty_descriptions(tmp_path):
+    with pytest.raises(InputError, match="lacks 'spec'"):
+        mechanism_from_description({})
+    description = load_mechanism("tripod").describe()
+    with pytest.raises(InputError, match="check radius"):
+        mechanism_from_description({**description, "parameters": {"L": 1.0, "r": 0.3, "radius": 1.0}})
+
+
+def test_a_copy_leaves_the_hooks_behind():
+    tripod = load_mechanism("tripod")
+    tripod.inverse_kinematics.register_forward_hook(lambda module, args, output: output + 1)
+    twin = tripod.with_nominal(tripod.nominal * 1.01)
+    pose = tripod.home_pose
+    torch.testing.assert_close(tripod.inverse_kinematics(pose), tripod.solve_inverse(pose) + 1)
+    assert torch.equal(twin.inverse_kinematics(pose), twin.solve_inverse(pose))
+    assert not torch.equal(twin.solve_inverse(pose), tripod.solve_inverse(pose))

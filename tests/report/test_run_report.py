@@ -1,0 +1,202 @@
+"""Tables, CSV, HTML, TensorBoard and the picture command, read back and compared with the numbers they came from."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import typer
+from conftest import arm_run, tripod_run
+from PIL import Image
+from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from typer.testing import CliRunner
+
+from ccnn_torch.cli.picture import picture
+from ccnn_torch.errors import InputError
+from ccnn_torch.report.csv_file import tidy_rows
+from ccnn_torch.report.html import html_text
+from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.run_report import make_picture, write_report
+from ccnn_torch.report.tables import markdown_text, print_tables, result_tables, verdict
+from ccnn_torch.report.tensorboard import TensorBoardCallback, tags_of
+
+
+def test_the_report_folder(report_folder: Path) -> None:
+    names = {p.name for p in report_folder.iterdir()}
+    assert {"results.csv", "results.md", "report.html", "plots"} <= names
+    plots = {p.name for p in (report_folder / "plots").iterdir()}
+    stems = ("pose_error", "workspace", "joint_errors", "network_ccnn", "convergence_ccnn", "population_ccnn")
+    assert plots == {f"{stem}.{kind}" for stem in stems for kind in ("png", "svg")}
+
+
+def test_a_folder_with_numbers_only_still_gets_its_tables(tmp_path: Path) -> None:
+    write_json(tmp_path / "results.json", arm_run()[0])
+    page = write_report(tmp_path).read_text()
+    assert "<svg" not in page and "µrad" in page
+    with pytest.raises(InputError, match=r"results\.json is not there"):
+        write_report(tmp_path / "plots")
+
+
+class Page(HTMLParser):
+    """Collects tags, texts and addresses, and checks that tags are closed in order."""
+
+    VOID = frozenset({"meta", "link", "br", "img", "hr", "input"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.count: dict[str, int] = {}
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.count[tag] = self.count.get(tag, 0) + 1
+        self.addresses += [v or "" for k, v in attrs if k in ("href", "src", "xlink:href", "action")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        self.handle_endtag(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_fetches_nothing(report_folder: Path) -> None:
+    text = (report_folder / "report.html").read_text(encoding="utf-8")
+    page = Page()
+    page.feed(text)
+    page.close()
+    assert page.open == []
+    assert page.count["svg"] == 6 == page.count["figcaption"] and page.count["table"] == 5
+    assert "script" not in page.count and "link" not in page.count
+    outside = [a for a in page.addresses if not a.startswith(("#", "data:"))]
+    assert set(outside) == {"results.json", "results.csv", "config.yaml"}
+    # The only addresses left are the names of XML's namespaces, which nothing fetches.
+    assert set(re.findall(r"https?://[^\s\"'<>]+", text)) <= {
+        "http://www.w3.org/2000/svg",
+        "http://www.w3.org/1999/xlink",
+    }
+    assert "@import" not in text and not re.search(r"url\((?!#)", text)
+
+
+def test_text_from_outside_is_escaped(results: dict[str, Any]) -> None:
+    text = html_text(results | {"name": "<script>alert(1)</script>", "notes": ["a & b"]}, config="x: <b>")
+    assert "<script>" not in text and "&lt;script&gt;" in text and "a &amp; b" in text and "x: &lt;b&gt;" in text
+
+
+def test_verdict(results: dict[str, Any]) -> None:
+    position = results["pose"]["position"]
+    removed = 100 * (1 - position["after"]["rms"]["median"] / position["before"]["rms"]["median"])
+    text = verdict(results)
+    assert text.startswith(f"On 25 held-out rows ccnn removes {removed:.1f} %")
+    assert "times the noise floor" in text
+    swapped = {"unit": "m", "before": position["after"], "after": position["before"]}
+    assert "ccnn adds" in verdict(results | {"pose": {"position": swapped, "rotation": None}})
+
+
+def test_tables_hold_the_numbers_and_the_papers(results: dict[str, Any]) -> None:
+    before, mse, mae, _, pose = result_tables(results)
+    assert before.rows[0][0] == "q1 [µm]" and before.rows[0][-2:] == ("150.5", "168.5")
+    assert mse.columns[1] == "q1 [1e-10 m²]"
+    by_name = {row[0]: row for row in mse.rows}
+    median = results["methods"]["ccnn"]["test"]["all"]["mse"]["median"]
+    assert float(by_name["ccnn"][4].split(" [")[0]) == pytest.approx(median * 1e10, rel=1e-3)
+    assert by_name["ccnn, paper's Table II"][4] == "1.091"
+    assert by_name["enn"][1:] == ("–",) * 6
+    assert {"constant", "noise floor, realised", "noise floor, expected"} <= set(by_name)
+    assert mae.columns[-1] == "all joints [µm]"
+    assert [row[0] for row in pose.rows] == ["position [µm]", "rotation [µrad]", "energy E (eq. 5) [µm]"]
+
+
+def test_real_data_tables_have_no_floor_and_no_paper() -> None:
+    tables = result_tables(arm_run()[0])
+    assert [row[0] for row in tables[1].rows] == ["ccnn", "constant"]
+    assert "ratio to floor [1]" not in tables[1].columns
+    assert not any("paper" in column for table in tables for column in table.columns)
+
+
+def test_markdown_has_whole_tables(results: dict[str, Any]) -> None:
+    lines = markdown_text(results | {"name": "a|b"}).splitlines()
+    tables = "\n".join(lines).split("## ")[1:]
+    for table in tables:
+        widths = {line.count("|") for line in table.splitlines() if line.startswith("|")}
+        assert len(widths) == 1
+    assert any("enn failed: ENN ran out" in line for line in lines)
+
+
+def test_the_screen_shows_title_and_failure(results: dict[str, Any]) -> None:
+    screen = io.StringIO()
+    print_tables(results, Console(file=screen, width=120))
+    text = screen.getvalue()
+    assert "Joint error before calibration" in text and "[1e-10 m²]" in text and "enn failed" in text
+
+
+def test_csv_is_tidy_and_exact(report_folder: Path) -> None:
+    results = tripod_run()[0]
+    with (report_folder / "results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert set(rows[0]) == {"method", "split", "quantity", "joint", "unit", "median", "low", "high"}
+    found = {(r["method"], r["split"], r["quantity"], r["joint"]): r for r in rows}
+    assert len(found) == len(rows)
+    row = found["ccnn", "test", "mse", "all"]
+    assert float(row["median"]) == results["methods"]["ccnn"]["test"]["all"]["mse"]["median"] and row["unit"] == "m^2"
+    assert found["before", "train", "mean", "q1"]["unit"] == "m"
+    pose, floor = results["pose"]["position"]["before"], results["floor"]["realised"]
+    assert float(found["before", "test", "position_rms", ""]["median"]) == pose["rms"]["median"]
+    assert float(found["floor_realised", "test", "mse", "q2"]["high"]) == floor["q2"]["mse"]["high"]
+    assert not [r for r in tidy_rows(arm_run()[0]) if r[0].startswith("floor")]
+
+
+def test_tags() -> None:
+    three = torch.tensor([1.0, 5.0, 3.0])
+    assert tags_of("fitness_best", three) == {"fitness/best": 3.0, "repeat_0/fitness/best": 1.0}
+    assert tags_of("heldout_mse_q1", torch.tensor([2.0])) == {"heldout/mse_q1": 2.0}
+    density = tags_of("density", torch.tensor([[0.1, 0.2], [0.3, 0.4]], dtype=torch.float64))
+    assert density["density/subpopulation_1"] == pytest.approx(0.2)
+    assert density["repeat_0/density/subpopulation_2"] == 0.2
+    assert tags_of("evaluations", 480) == {"training/evaluations": 480.0}
+    assert tags_of("error_train", torch.tensor([float("nan"), 2.0])) == {"error/train": 2.0}
+
+
+def test_a_resumed_run_shows_no_step_twice(tmp_path: Path) -> None:
+    def steps(first: int, last: int, offset: float) -> None:
+        callback = TensorBoardCallback(tmp_path, lambda: [np.eye(3, 2, dtype=bool)], masks_every=4)
+        callback.on_start(None, None)
+        for step in range(first, last + 1):
+            callback.on_step(step, {"fitness_best": torch.tensor([step + offset, step + offset])})
+        callback.on_end()
+
+    steps(1, 7, 0.0)
+    # Killed at step 7 with the last checkpoint at step 5: the trainer goes on with step 6.
+    steps(6, 9, 0.5)
+    events = EventAccumulator(str(tmp_path), size_guidance={"scalars": 0, "images": 0}).Reload()
+    scalars = events.Scalars("fitness/best")
+    assert [s.step for s in scalars] == list(range(1, 10))
+    assert [s.value for s in scalars] == [1, 2, 3, 4, 5, 6.5, 7.5, 8.5, 9.5]
+    images = events.Images("masks/layer_1")
+    assert [i.step for i in images] == [1, 4, 8]
+    with Image.open(io.BytesIO(images[0].encoded_image_string)) as picture_of_mask:
+        pixels = np.asarray(picture_of_mask.convert("L"))
+    assert np.array_equal(pixels[8::16, 8::16] > 0, np.eye(3, 2, dtype=bool))
+
+
+def test_the_picture_command(run_folder: Path) -> None:
+    app = typer.Typer()
+    app.command()(picture)
+    target = run_folder / "docs" / "picture.png"
+    done = CliRunner().invoke(app, [str(run_folder), str(target), "--joint", "q2"])
+    assert done.exit_code == 0 and "joint q2" in done.output
+    with Image.open(target) as drawn:
+        width, height = drawn.size
+    assert width > 2.5 * height and width >= 1500
+    with pytest.raises(InputError, match="no joint 'q9'; this run has q1, q2, q3"):
+        make_picture(run_folder, target, "q9")
