@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.compensation import Compensator, fit_compensator, register_network
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.mechanisms import Tripod
+from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.training import Scaling
 
 
@@ -37,7 +37,7 @@ register_network("sigmoids", Sigmoids)
 
 
 def tripod_joints(count: int = 200, seed: int = 0) -> Tensor:
-    machine = Tripod()
+    machine = load_mechanism("tripod")
     return machine.sample_joints(count, torch.Generator().manual_seed(seed))
 
 
@@ -75,4 +75,4 @@ def arm_compensator() -> Compensator:
 
 
 def fields() -> dict[str, Any]:
-    return {"mechanism": Tripod().describe(), "metrics": {"mse": 1e-10}, "data_sha256": "ab" * 32, "seed": 4}
+    return {"mechanism": load_mechanism("tripod").describe(), "metrics": {"mse": 1e-10}, "data_sha256": "ab" * 32, "seed": 4}
