@@ -75,4 +75,9 @@ def arm_compensator() -> Compensator:
 
 
 def fields() -> dict[str, Any]:
-    return {"mechanism": load_mechanism("tripod").describe(), "metrics": {"mse": 1e-10}, "data_sha256": "ab" * 32, "seed": 4}
+    return {
+        "mechanism": load_mechanism("tripod").describe(),
+        "metrics": {"mse": 1e-10},
+        "data_sha256": "ab" * 32,
+        "seed": 4,
+    }
