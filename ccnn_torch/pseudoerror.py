@@ -72,7 +72,8 @@ def joint_deviations(
         mechanism: nominal kinematics.
         commanded: `s x n` [SI].
         measured: `s x p` [SI].
-        parameters: `k`, or `r x 1 x k` for one set per repeat (fitted frames); nominal when None.
+        parameters: `k`, or `r x 1 x k` for one set per repeat (fitted frames), or `[r x] s x k` for one per row (frames
+            per group of rows); nominal when None.
         rotation_weight: η of eq. 5 [m/rad]; the paper's 10..40 mm.
         max_condition: rows whose Jacobian (rotation rows times η) has a larger condition number are not usable.
         max_deviation: rows with a joint deviation above this are not usable [SI]; no bound when None.
@@ -84,12 +85,14 @@ def joint_deviations(
     Returns:
         Pseudoerror.
     """
-    repeats = 1 if parameters is None else math.prod(parameters.shape[:-2])
-    size = max(1, _CHUNK // max(1, repeats))
-    parts = [
-        _chunk(mechanism, commanded[i : i + size], measured[i : i + size], parameters, rotation_weight, damping)
-        for i in range(0, len(commanded), size)
-    ]
+    rows = len(commanded)
+    by_row = parameters is not None and parameters.dim() > 1 and parameters.shape[-2] == rows > 1
+    size = max(1, _CHUNK // (1 if parameters is None else max(1, math.prod(parameters.shape[:-2]))))
+    parts = []
+    for i in range(0, rows, size):
+        here = slice(i, i + size)
+        own = parameters[..., here, :] if parameters is not None and by_row else parameters
+        parts.append(_chunk(mechanism, commanded[here], measured[here], own, rotation_weight, damping))
     deviation = torch.cat([p[0] for p in parts], dim=-2)
     condition = torch.cat([p[1] for p in parts], dim=-1)
     position = torch.cat([p[2].position for p in parts], dim=-1)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from toy import Descent, linear_data
 from torch import Tensor
+from toy import Descent, linear_data
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners import Learner, TrainingData

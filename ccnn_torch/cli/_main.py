@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from typing import Annotated
 
-import click
 import typer
 
 from ccnn_torch import __version__
@@ -20,7 +19,6 @@ __all__ = ["main"]
 app = typer.Typer(
     name="ccnn",
     help="Neural compensation of robot kinematics: measured records in, corrected commands and a model file out.",
-    no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -33,11 +31,13 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(invoke_without_command=True)
 def _common(
+    context: typer.Context,
     version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Show it.")] = False,
 ) -> None:
-    pass
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
 
 
 for _command in (run, compensate, picture, keys):
@@ -47,17 +47,16 @@ for _command in (run, compensate, picture, keys):
 def main() -> None:
     """Entry point of the console script."""
     try:
-        code = app(standalone_mode=False)
+        # 130 comes back where a person pressed Ctrl-C.
+        code = app(standalone_mode=False) or 0
     except InputError as problem:
         code = _say(str(problem))
-    except click.exceptions.NoArgsIsHelpError as help_wanted:
-        typer.echo(help_wanted.format_message())
-        code = 2
-    except click.ClickException as problem:
+    except typer.TyperException as problem:
         code = _say(f"{problem.format_message()} (ccnn --help, or ccnn COMMAND --help, tells what there is)")
-    except (KeyboardInterrupt, click.Abort):
-        _say("interrupted; what was computed is kept")
+    except typer.Abort:
         code = 130
+    if code == 130:
+        _say("interrupted; what was computed is kept")
     sys.exit(code)
 
 

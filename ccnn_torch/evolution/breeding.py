@@ -20,7 +20,7 @@ from ccnn_torch.evolution.operators import (
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.settings import CCNNSettings
 
-__all__ = ["BreedingDraws", "breed", "draw_breeding", "initial_population", "with_elites"]
+__all__ = ["BreedingDraws", "breed", "breeding_shapes", "initial_population", "with_elites"]
 
 
 class BreedingDraws(NamedTuple):
@@ -43,14 +43,12 @@ class BreedingDraws(NamedTuple):
     steps: Tensor
 
 
-def draw_breeding(
-    population: Genome, settings: CCNNSettings, seeds: Tensor, stream: int, generation: int
-) -> BreedingDraws:
-    """All numbers of a generation in one call; see `BreedingDraws`."""
+def breeding_shapes(population: Genome, settings: CCNNSettings) -> list[tuple[int, ...]]:
+    """Shapes of `BreedingDraws` for one repeat."""
     half = (settings.population - settings.elites + 1) // 2
     bits, reals = tuple(population.mask.shape[2:]), tuple(population.weight.shape[2:])
     places = math.prod(reals) if settings.crossover_kind == "uniform" else settings.cuts
-    shapes: list[tuple[int, ...]] = [
+    return [
         (2 * half, settings.tournament),
         (half,),
         (half, places),
@@ -59,14 +57,6 @@ def draw_breeding(
         (half, *reals),
         (half, *reals),
     ]
-    sizes = [math.prod(shape) for shape in shapes]
-    numbers = uniform(seeds, stream, generation, (sum(sizes),))
-    return BreedingDraws(
-        *(
-            part.reshape(len(seeds), *shape)
-            for part, shape in zip(torch.split(numbers, sizes, dim=1), shapes, strict=True)
-        )
-    )
 
 
 def initial_population(outputs: int, inputs: int, settings: CCNNSettings, seeds: Tensor, stream: int) -> Genome:

@@ -7,6 +7,7 @@ The subpopulations take turns within a generation: each is renewed and judged be
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -14,7 +15,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.breeding import breed, draw_breeding, initial_population, with_elites
+from ccnn_torch.evolution.breeding import BreedingDraws, breed, breeding_shapes, initial_population, with_elites
 from ccnn_torch.evolution.evaluation import Task, fitness, joined_errors
 from ccnn_torch.evolution.genome import Genome, active, select
 from ccnn_torch.evolution.random import uniform
@@ -24,8 +25,8 @@ __all__ = ["Coevolution", "advance", "density", "diversity", "keep_refined", "st
 
 _T = TypeVar("_T")
 
-# Streams of random numbers: layer l breeds from stream l and draws its companions from this one on.
-_COMPANIONS = 1 << 16
+# Streams of random numbers: one for the generations, one for each layer's first individuals.
+_GENERATIONS, _FIRST = 0, 1
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def start(sizes: Sequence[int], task: Task, settings: CCNNSettings, seeds: Tenso
         seeds: `r`, int64.
     """
     populations = tuple(
-        initial_population(after, before, settings, seeds, layer)
+        initial_population(after, before, settings, seeds, _FIRST + layer)
         for layer, (before, after) in enumerate(itertools.pairwise(sizes))
     )
     state = Coevolution(
@@ -65,8 +66,9 @@ def start(sizes: Sequence[int], task: Task, settings: CCNNSettings, seeds: Tenso
         best_fitness=task.inputs.new_zeros(len(seeds)),
         generation=0,
     )
+    company = _numbers([_company_shape(state, settings)], seeds, 0)[0]
     for layer, population in enumerate(populations):
-        state = _judge(state, layer, population, task, settings, seeds)
+        state = _judge(state, layer, population, company[:, layer], task, settings)
     return state
 
 
@@ -74,25 +76,44 @@ def advance(state: Coevolution, task: Task, settings: CCNNSettings, seeds: Tenso
     """One generation (steps 3 and 4 of section III-F)."""
     state = replace(state, generation=state.generation + 1)
     progress = state.generation / settings.generations
+    shapes = [breeding_shapes(population, settings) for population in state.populations]
+    company, *numbers = _numbers([_company_shape(state, settings), *itertools.chain(*shapes)], seeds, state.generation)
     for layer, (population, scores) in enumerate(zip(state.populations, state.fitness, strict=True)):
-        draws = draw_breeding(population, settings, seeds, layer, state.generation)
+        taken = sum(len(before) for before in shapes[:layer])
+        draws = BreedingDraws(*numbers[taken : taken + len(shapes[layer])])
         children = breed(population, scores, settings, progress, draws)
         renewed = with_elites(children, population, scores, state.best[layer], settings)
-        state = _judge(state, layer, renewed, task, settings, seeds)
+        state = _judge(state, layer, renewed, company[:, layer], task, settings)
     return state
 
 
+def _company_shape(state: Coevolution, settings: CCNNSettings) -> tuple[int, ...]:
+    layers = len(state.populations)
+    return layers, layers, settings.representatives
+
+
+def _numbers(shapes: Sequence[tuple[int, ...]], seeds: Tensor, generation: int) -> list[Tensor]:
+    """All random numbers of a generation in one call, cut to the shapes; each `r x shape`."""
+    sizes = [math.prod(shape) for shape in shapes]
+    parts = torch.split(uniform(seeds, _GENERATIONS, generation, (sum(sizes),)), sizes, dim=1)
+    return [part.reshape(len(seeds), *shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
 def _judge(
-    state: Coevolution, layer: int, population: Genome, task: Task, settings: CCNNSettings, seeds: Tensor
+    state: Coevolution, layer: int, population: Genome, company: Tensor, task: Task, settings: CCNNSettings
 ) -> Coevolution:
-    """Fitness of a renewed subpopulation, and the best joined network if one of its networks beats it."""
-    companions = _companions(state, layer, settings, seeds)
+    """Fitness of a renewed subpopulation, and the best joined network if one of its networks beats it.
+
+    Args:
+        company: numbers that choose the random representatives, `r x layers x representatives`.
+    """
+    companions = _companions(state, company)
     scores = fitness(joined_errors(layer, population, companions, task), settings.epsilon)
     best_company, which = scores.max(-1)
     winner_fitness, winner = best_company.max(-1, keepdim=True)
-    company = which.gather(-1, winner)
+    beside = which.gather(-1, winner)
     joined = [
-        select(population, winner) if number == layer else select(companion, company)
+        select(population, winner) if number == layer else select(companion, beside)
         for number, companion in enumerate(companions)
     ]
     renewed = replace(
@@ -103,17 +124,14 @@ def _judge(
     return _keep_best(renewed, joined, winner_fitness.squeeze(-1))
 
 
-def _companions(state: Coevolution, layer: int, settings: CCNNSettings, seeds: Tensor) -> list[Genome]:
-    """Representatives by "optimization + randomization": the best of each subpopulation, then random sets of all.
+def _companions(state: Coevolution, company: Tensor) -> list[Genome]:
+    """Representatives by "optimization + randomization": the best of each subpopulation, then random ones.
 
     The best of a subpopulation is its part of the best joined network, which no other member has beaten.
     """
-    layers = len(state.populations)
-    draws = uniform(seeds, _COMPANIONS + layer, state.generation, (layers, settings.representatives))
-    index = (draws * settings.population).long()
     companions = []
     for number, (population, best) in enumerate(zip(state.populations, state.best, strict=True)):
-        others = select(population, index[:, number])
+        others = select(population, (company[:, number] * population.mask.shape[1]).long())
         companions.append(
             Genome(torch.cat([best.mask, others.mask], dim=1), torch.cat([best.weight, others.weight], dim=1))
         )
@@ -151,9 +169,8 @@ def diversity(state: Coevolution, settings: CCNNSettings) -> Tensor:
     Standard deviation of a gene over the individuals, mean over genes, in units of the weight range; a missing
     connection counts as weight 0. Uniform random weights have about 0.58, a subpopulation of copies 0.
     """
-    return (
-        torch.stack([genome.weight.std(1).mean((1, 2)) for genome in state.populations], dim=-1) / settings.weight_range
-    )
+    spreads = [genome.weight.std(1).mean((1, 2)) for genome in state.populations]
+    return torch.stack(spreads, dim=-1) / settings.weight_range
 
 
 def _put(values: tuple[_T, ...], index: int, value: _T) -> tuple[_T, ...]:

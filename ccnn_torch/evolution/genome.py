@@ -35,5 +35,11 @@ def active(genome: Genome) -> Tensor:
 
 def select(genome: Genome, index: Tensor) -> Genome:
     """Individuals by number. genome: `r x p x ...`; index: `r x c`, int64; returns `r x c x ...`."""
-    rows = torch.arange(len(index), device=index.device).unsqueeze(-1)
-    return Genome(genome.mask[rows, index], genome.weight[rows, index])
+    repeats, individuals = genome.mask.shape[:2]
+    start = torch.arange(0, repeats * individuals, individuals, device=index.device)
+    flat = (index + start.unsqueeze(-1)).flatten()
+
+    def pick(values: Tensor) -> Tensor:
+        return values.flatten(0, 1).index_select(0, flat).view(repeats, index.shape[1], *values.shape[2:])
+
+    return Genome(pick(genome.mask), pick(genome.weight))

@@ -10,6 +10,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.learners._protocol import Learner
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
 from ccnn_torch.learners.constant import Constant
+from ccnn_torch.plugins import is_plugin, load_plugin
 
 __all__ = ["LEARNERS", "make_learner"]
 
@@ -21,11 +22,19 @@ LEARNERS: dict[str, Callable[[dict[str, Any]], Learner]] = {
 
 
 def make_learner(name: str, settings: dict[str, Any] | None = None) -> Learner:
-    """A fresh learner.
+    """A fresh learner, by name or from a user's `path/to/file.py:Name` (a class that is called without arguments).
 
     Raises:
-        InputError: no learner has this name.
+        InputError: no learner has this name, or what the file has is no learner.
     """
+    if is_plugin(name):
+        learner = load_plugin(name)()
+        if not isinstance(learner, Learner):
+            raise InputError(
+                f"methods: {name} is no learner; it needs name, start, step, finished, steps, predict, state_dict, "
+                "load_state_dict and network (ccnn_torch.testing.check_learner tells what is wrong)"
+            )
+        return learner
     if name not in LEARNERS:
         near = difflib.get_close_matches(name, LEARNERS, 1)
         hint = f"; did you mean {near[0]!r}?" if near else ""

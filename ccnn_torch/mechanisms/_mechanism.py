@@ -97,8 +97,8 @@ class Mechanism(nn.Module):
         self.register_buffer("home_joints", torch.zeros(len(self.joints), dtype=torch.float64))
         self.home_joints.copy_(self.solve_inverse(self.home_pose) if home_joints is None else _tensor(home_joints))
         self.inverse_kinematics = InverseKinematics(self)
-        # How to build it again; `load_mechanism` overwrites this with what it was asked for.
-        self.recipe: dict[str, Any] = {"spec": f"{inspect.getfile(type(self))}:{type(self).__qualname__}", "keys": {}}
+        # How to build it again: `spec` and `keys` of `load_mechanism`, which fills this in.
+        self.recipe: dict[str, Any] = {}
 
     # The maths: a mechanism overrides closure or solve_inverse, and what it has in closed form.
 
@@ -256,18 +256,37 @@ class Mechanism(nn.Module):
         twin = copy.deepcopy(self)
         twin.nominal.copy_(parameters)
         twin.inverse_kinematics = InverseKinematics(twin)
+        twin._follow_nominal()
         return twin
 
+    def _follow_nominal(self) -> None:
+        """Called when the nominal parameters have changed; for what is derived from them."""
+
     def describe(self) -> dict[str, Any]:
-        """Everything `mechanism_from_description` needs, as JSON; floats survive it exactly."""
+        """Everything `mechanism_from_description` needs, as JSON; floats survive it exactly.
+
+        Raises:
+            InputError: the class stands in no file (an interactive session), so that nobody could build it again.
+        """
         names = [g.name for g in self.geometry]
         return {
             "name": self.name,
-            **self.recipe,
+            **(self.recipe or self._own_file()),
             "joints": [j.header for j in self.joints],
             "pose": [c.header for c in self.pose],
             "parameters": dict(zip(names, self.nominal.tolist(), strict=True)),
         }
+
+    def _own_file(self) -> dict[str, Any]:
+        """Recipe of a mechanism that was made by its class and not by `load_mechanism`."""
+        try:
+            file = inspect.getfile(type(self))
+        except (TypeError, OSError):
+            raise InputError(
+                f"mechanism '{self.name}': its class {type(self).__name__} stands in no file; write it to one and use "
+                f"load_mechanism('file.py:{type(self).__name__}')"
+            ) from None
+        return {"spec": f"{file}:{type(self).__qualname__}", "keys": {}}
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
         """Set nominal parameters by name [SI].
@@ -280,6 +299,7 @@ class Mechanism(nn.Module):
         if wrong:
             raise InputError(f"mechanism '{self.name}' has the parameters {', '.join(names)}; check {', '.join(wrong)}")
         self.nominal.copy_(_tensor([float(values[n]) for n in names]))
+        self._follow_nominal()
 
 
 def _tensor(values: Sequence[float]) -> Tensor:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import difflib
 import functools
-import importlib.util
 import inspect
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from ccnn_torch.mechanisms.machine_tool import MachineTool
 from ccnn_torch.mechanisms.serial import SerialArm
 from ccnn_torch.mechanisms.tripod import Tripod
 from ccnn_torch.mechanisms.urdf import read_urdf
+from ccnn_torch.plugins import is_plugin, load_plugin
 
 __all__ = ["REGISTRY", "load_mechanism", "mechanism_from_description"]
 
@@ -41,7 +40,7 @@ def load_mechanism(spec: str, **keys: Any) -> Mechanism:
     mechanism = _call(spec, _maker(spec), keys)
     if not isinstance(mechanism, Mechanism):
         raise InputError(f"{spec}: is no mechanism; derive the class from ccnn_torch.mechanisms.Mechanism")
-    if spec in REGISTRY or _is_python(spec):
+    if spec in REGISTRY or is_plugin(spec):
         mechanism.recipe = {"spec": spec, "keys": keys}
     return mechanism
 
@@ -61,44 +60,17 @@ def mechanism_from_description(description: Mapping[str, Any]) -> Mechanism:
     return mechanism
 
 
-def _is_python(spec: str) -> bool:
-    return ".py:" in spec
-
-
 def _maker(spec: str) -> Callable[..., Any]:
     if spec in REGISTRY:
         return REGISTRY[spec]
-    if _is_python(spec):
-        return _from_python(spec)
+    if is_plugin(spec):
+        return load_plugin(spec)
     reader = _READERS.get(Path(spec).suffix.lower())
     if reader is not None:
         return functools.partial(reader, spec)
     near = difflib.get_close_matches(spec, REGISTRY, 1)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(REGISTRY)}"
     raise InputError(f"unknown mechanism '{spec}'; {hint} Otherwise give {_FORMS}")
-
-
-def _from_python(spec: str) -> Callable[..., Any]:
-    file, _, name = spec.rpartition(":")
-    path = Path(file)
-    if not path.is_file():
-        raise InputError(f"{spec}: there is no file {file}")
-    module_spec = importlib.util.spec_from_file_location(path.stem, path)
-    if module_spec is None or module_spec.loader is None:
-        raise InputError(f"{spec}: {file} is no Python file")
-    module = importlib.util.module_from_spec(module_spec)
-    sys.modules.setdefault(module_spec.name, module)
-    try:
-        module_spec.loader.exec_module(module)
-    except SyntaxError as error:
-        raise InputError(f"{spec}: {file} line {error.lineno} is no valid Python: {error.msg}") from error
-    except ImportError as error:
-        raise InputError(f"{spec}: {file} imports something that is not installed: {error}") from error
-    found = getattr(module, name, None)
-    if not callable(found):
-        classes = [n for n, o in vars(module).items() if inspect.isclass(o) and o.__module__ == module.__name__]
-        raise InputError(f"{spec}: {file} has no class '{name}'; it has {', '.join(classes) or 'none'}")
-    return found  # type: ignore[no-any-return]
 
 
 def _call(spec: str, maker: Callable[..., Any], keys: Mapping[str, Any]) -> Any:

@@ -27,8 +27,8 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
 
     Needed: `dof`, `convention` (starts with one of the two known), `units: {length, angle}`, `a`, `alpha`, `d`,
     `theta`. Optional: `joint_types` (revolute), `joint_sign` (+1), `parallel_axes`, `base_frame` and `tool_frame`
-    ("unknown…", "identity", or [x, y, z, rx, ry, rz]; unknown when missing), `tool_offset` ("unknown…" or [x, y, z];
-    replaces the tool frame for records without orientation), `frame_per`, `tool_per`, `robot` (its name).
+    (a text with "unknown", "identity", or [x, y, z, rx, ry, rz]; unknown when missing), `tool_offset` (likewise, but
+    [x, y, z]; replaces the tool frame for records without orientation), `frame_per`, `tool_per`, `robot` (its name).
 
     Args:
         path: the file.
@@ -140,9 +140,9 @@ class _Table:
         return [list(g) for g in value]
 
     def frame(self, key: str, scales: list[float]) -> list[float] | None:
-        """The frame in SI, None when unknown."""
+        """The frame in SI, None when unknown; the text that says so may say more, before and after."""
         value = self.content.get(key, "unknown")
-        if isinstance(value, str) and value.startswith("unknown"):
+        if isinstance(value, str) and "unknown" in value.split(";")[0]:
             return None
         if value == "identity":
             return [0.0] * len(scales)

@@ -45,6 +45,8 @@ class MachineTool(Mechanism):
             low=(-tilt, -tilt, 0.5),
             high=(tilt, tilt, 0.7),
         )
+        if type(self) is MachineTool:
+            self.recipe = {"spec": "machine_tool", "keys": {}}
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Eq. 18: |c_i - u_i d_i| = l with d_i the guideway's direction; the smaller root, NaN where it is not real."""

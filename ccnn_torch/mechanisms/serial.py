@@ -111,9 +111,9 @@ class SerialArm(Mechanism):
         self.register_buffer("revolute", torch.tensor(turn))
         self.register_buffer("limits", torch.tensor(span, dtype=torch.float64))
         self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(keys))}
-        self._choose_home()
+        self._follow_nominal()
 
-    def _choose_home(self) -> None:
+    def _follow_nominal(self) -> None:
         """The best-conditioned of 64 fixed draws (many arms are singular at zero); the box of poses from the reach."""
         draws = self.sample_joints(64, torch.Generator().manual_seed(0))
         self.home_joints.copy_(draws[self.condition_number(draws, self.rotation_weight).argmin()])
@@ -132,6 +132,7 @@ class SerialArm(Mechanism):
         """The same arm, nominal parameters included, for poses of another kind: "rotation_vector" or "none"."""
         twin = SerialArm(**{**self.recipe["keys"], "orientation": orientation})
         twin.nominal.copy_(self.nominal)
+        twin._follow_nominal()
         return twin
 
     def sample_joints(self, count: int, generator: torch.Generator) -> Tensor:

@@ -32,6 +32,8 @@ class Tripod(Mechanism):
             high=(0.2, 0.7, 0.3),
             home_pose=(0.0, 0.55, 0.0),
         )
+        if type(self) is Tripod:
+            self.recipe = {"spec": "tripod", "keys": {}}
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Eq. 15, closed form; NaN where a root is not real."""

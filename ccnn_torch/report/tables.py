@@ -78,6 +78,8 @@ def print_tables(results: Results, console: Console) -> None:
         console.print(shown)
     for sentence in failures(results):
         console.print(escape(sentence), style="yellow")
+    for note in results.get("notes", []):
+        console.print(escape(note), style="dim")
     console.print(escape(verdict(results)), style="bold")
 
 

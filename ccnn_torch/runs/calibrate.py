@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation import Compensator, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
-from ccnn_torch.learners import LEARNERS, make_learner
+from ccnn_torch.learners import LEARNERS, Learner, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError
 from ccnn_torch.runs.assemble import assemble, best_method
 from ccnn_torch.runs.config import RunConfig, method_names
@@ -22,7 +23,7 @@ from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.prepare import Prepared, prepare
 from ccnn_torch.training import Callback, Scaling
 
-__all__ = ["Calibration", "Watch", "calibrate"]
+__all__ = ["Calibration", "Watch", "calibrate", "makers"]
 
 Watch = Callable[[Prepared, str, str, Scaling], list[Callback]]
 """Callbacks of one training, given the rows, the method, the phase (`choose` or `fit`) and the phase's scaling."""
@@ -127,18 +128,18 @@ def calibrate(
     before = pose_before(prepared)
     outcomes: dict[str, Outcome] = {}
     failed: dict[str, str] = {}
-    for name in method_names(config):
-        if config.methods == ["all"] and name not in LEARNERS:
+    for name, make in makers(config).items():
+        if make is None:
             failed[name] = f"this version has no learner {name!r}"
             continue
         try:
             fitted = fit_method(
                 name,
-                lambda name=name: make_learner(name, config.settings(name)),
+                make,
                 prepared.dataset,
                 plan,
                 folder,
-                lambda phase, scaling, name=name: watch(prepared, name, phase, scaling),
+                partial(watch, prepared, name),
             )
         except MethodFailedError as problem:
             failed[name] = str(problem)
@@ -147,6 +148,26 @@ def calibrate(
     if not outcomes:
         raise MethodFailedError("; ".join(f"{name}: {sentence}" for name, sentence in failed.items()))
     return Calibration(config, prepared, before, outcomes, failed, assemble(config, prepared, before, outcomes, failed))
+
+
+def makers(config: RunConfig) -> dict[str, Callable[[], Learner] | None]:
+    """What makes the learner of each method, by the name that results and files have for it.
+
+    A user's `path/to/file.py:Name` is called `Name` there. None stands for a learner that `methods=all` asks for and
+    this version does not have.
+
+    Raises:
+        InputError: a method that was named is not to be had.
+    """
+    found: dict[str, Callable[[], Learner] | None] = {}
+    for method in method_names(config):
+        if config.methods == ["all"] and method not in LEARNERS:
+            found[method] = None
+            continue
+        settings = config.settings(method)
+        make_learner(method, settings)
+        found[method.rpartition(":")[2]] = partial(make_learner, method, settings)
+    return found
 
 
 def _of_repeat(block: Any, repeat: int) -> Any:

@@ -76,7 +76,7 @@ def _arrays(calibration: Calibration) -> RunArrays:
 def _history(calibration: Calibration, method: str) -> dict[str, NDArray[np.float64]]:
     history = calibration.outcomes[method].fitted.training.history
     steps = len(next(iter(history.values())))
-    return {"step": np.arange(1, steps + 1)} | {name: _numpy(value) for name, value in history.items()}
+    return {"step": np.arange(1.0, steps + 1)} | {name: _numpy(value) for name, value in history.items()}
 
 
 def _numpy(tensor: Tensor) -> NDArray[np.float64]:

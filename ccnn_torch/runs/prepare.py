@@ -28,7 +28,8 @@ class Prepared:
     """Everything that is fixed before the first training step.
 
     Attributes:
-        parameters: geometry with the fitted frames of each repeat, `r x 1 x k`, or None for a nominal machine.
+        parameters: geometry with the fitted frames of each repeat, `r x 1 x k` (`r x s x k` where frames are per group
+            of rows), or None for a nominal machine.
         joints: commanded joints, `s x n` [SI].
         pose: measured poses, `r x s x p` or `s x p` [SI].
         pseudoerror: what the poses say about the joints.
@@ -61,8 +62,10 @@ class Prepared:
         }
 
     def repeat_parameters(self, repeat: int) -> Tensor | None:
-        """Geometry of one repeat, `k`, or None."""
-        return None if self.parameters is None else self.parameters[repeat, 0]
+        """Geometry of one repeat, `k`; None where it is nominal, or differs from row to row."""
+        if self.parameters is None or self.parameters.shape[1] > 1:
+            return None
+        return self.parameters[repeat, 0]
 
 
 def prepare(config: RunConfig) -> Prepared:
@@ -139,7 +142,9 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         rows = pad_rows([Dataset.part(split, "fit") for split in splits])
         weights = torch.zeros(len(seeds), len(records.joints), dtype=torch.float64)
         weights.scatter_add_(1, rows.index, rows.weights)
-        parameters = fit_frames(arm, records.joints, records.pose, weights).unsqueeze(-2)
+        parameters = fit_frames(arm, records.joints, records.pose, weights, columns=records.columns)
+        if not (arm.frame_per or arm.tool_per):
+            parameters = parameters.unsqueeze(-2)
         frames = " and ".join(arm.unknown_frames)
         notes.append(f"Frames fitted first, on the training rows of each repeat: {frames}.")
     deviations = joint_deviations(

@@ -7,7 +7,7 @@ from pathlib import Path
 from ccnn_torch.report.results import share_unit
 from ccnn_torch.report.tables import print_tables
 from ccnn_torch.report.tensorboard import TensorBoardCallback
-from ccnn_torch.runs.calibrate import Calibration, calibrate
+from ccnn_torch.runs.calibrate import Calibration, calibrate, makers
 from ccnn_torch.runs.config import RunConfig, dump_config, load_config
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.outputs import write_outputs
@@ -25,6 +25,7 @@ def start_run(config: RunConfig, quiet: bool = False) -> RunFolder:
     Raises:
         InputError: the config or its data cannot be used, or the folder is taken.
     """
+    makers(config)
     prepared = prepare(config)
     folder = RunFolder.create(config.out, config.name)
     folder.write_text("config.yaml", dump_config(config))

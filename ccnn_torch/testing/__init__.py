@@ -1,3 +1,4 @@
-"""Conformance checks for plug-ins, to be called from their tests; each raises AssertionError with one sentence."""
+"""Conformance checks for plug-ins: each raises AssertionError with a sentence that says what is wrong."""
 
+from ccnn_torch.testing._learner import check_learner as check_learner
 from ccnn_torch.testing._mechanism import check_mechanism as check_mechanism

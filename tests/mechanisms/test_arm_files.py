@@ -66,7 +66,7 @@ def test_tool_offset_replaces_the_tool_for_positions_only(tmp_path):
     arm = read_dh_file(str(path), orientation="none")
     assert arm.nominal[-6:].tolist() == pytest.approx([0, 0, 0.137, 0, 0, 0]) and arm.unknown_frames == ()
     assert arm.frame_per == ("robot", "placement") and arm.tool_per == ("robot",)
-    path.write_text(PANDA + "tool_offset: unknown, near [0, 0, 137]\n")
+    path.write_text(PANDA + "tool_offset: ball centre, unknown per robot, near [0, 0, 137] mm; estimate it\n")
     assert read_dh_file(str(path), orientation="none").unknown_frames == ("tool",)
 
 

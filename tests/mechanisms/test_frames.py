@@ -1,11 +1,13 @@
 """Base and tool frames recovered from measured poses."""
 
+import numpy as np
 import pytest
 import torch
 from catalogue import PANDA, UR10, make
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import fit_frames, read_dh_file
+from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 
@@ -101,7 +103,41 @@ def test_refusals(tmp_path):
     joints = arm.sample_joints(2, torch.Generator().manual_seed(0))
     with pytest.raises(InputError, match="at least 3 training rows, got 2"):
         fit_frames(arm, joints, arm.forward_kinematics(joints))
-    path = tmp_path / "arm.yaml"
-    path.write_text(PANDA.replace("base_frame: identity", "base_frame: unknown") + "frame_per: [robot, placement]\n")
-    with pytest.raises(InputError, match="frame_per asks for a frame per group"):
-        fit_frames(read_dh_file(str(path)), joints, joints)
+    panda, columns = _panda_with_groups(tmp_path), {"robot": np.zeros(2), "placement": np.zeros(2)}
+    joints = panda.sample_joints(2, torch.Generator().manual_seed(0))
+    pose = panda.forward_kinematics(joints)
+    with pytest.raises(InputError, match="frame_per names the column 'placement', which the records lack"):
+        fit_frames(panda, joints, pose, columns={"robot": columns["robot"]})
+    with pytest.raises(InputError, match="robot 0, placement 0: a frame needs at least 3 training rows, got 2"):
+        fit_frames(panda, joints, pose, columns=columns)
+
+
+def _panda_with_groups(folder):
+    path = folder / "arm.yaml"
+    text = PANDA.replace("base_frame: identity", "base_frame: unknown") + "tool_offset: unknown\n"
+    path.write_text(text + "frame_per: [robot, placement]\ntool_per: [robot]\n")
+    return read_dh_file(str(path), orientation="none")
+
+
+def test_frames_per_group(tmp_path):
+    """Two robots with tools of their own, five plates: a base frame per plate, the tool shared by a robot's plates."""
+    arm, generator = _panda_with_groups(tmp_path), torch.Generator().manual_seed(6)
+    robot = torch.tensor([0, 0, 0, 1, 1]).repeat_interleave(20)
+    placement = torch.tensor([0, 1, 2, 0, 7]).repeat_interleave(20)
+    joints = arm.sample_joints(100, generator)
+    truth = arm.nominal.repeat(100, 1)
+    for group in range(5):
+        truth[20 * group : 20 * group + 20, :6] = _random_frames(generator)[:6]
+    truth[:, -6:-3] = torch.tensor([[0.01, 0.02, 0.137], [-0.03, 0.0, 0.12]], dtype=torch.float64)[robot]
+    pose = arm.forward_kinematics(joints, truth)
+    weights = (torch.rand(2, 100, generator=generator) > 0.3).double()
+    bad = pose.clone()
+    bad[weights[0] == 0] += 0.2
+    columns = {"robot": robot.double().numpy(), "placement": placement.double().numpy()}
+    fitted = fit_frames(arm, joints, bad, weights[:1], columns=columns)
+    assert fitted.shape == (1, 100, len(arm.geometry))
+    error = arm.pose_error(arm.forward_kinematics(joints, fitted[0]), pose)
+    assert float(error.position.max()) < 1e-8
+    torch.testing.assert_close(fitted[0, :, -6:-3], truth[:, -6:-3], rtol=0, atol=1e-8)
+    found = joint_deviations(arm, joints, pose, fitted)
+    assert found.deviation.shape == (1, 100, 7) and float(found.deviation.abs().max()) < 1e-7

@@ -5,9 +5,10 @@ import json
 import pytest
 import torch
 from catalogue import FIVE_BAR, NAMES, UR10, make
+from five_bar import FiveBar
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import load_mechanism, mechanism_from_description
+from ccnn_torch.mechanisms import Tripod, load_mechanism, mechanism_from_description
 
 
 def test_by_name_with_keys():
@@ -74,3 +75,22 @@ def test_a_copy_leaves_the_hooks_behind():
     torch.testing.assert_close(tripod.inverse_kinematics(pose), tripod.solve_inverse(pose) + 1)
     assert torch.equal(twin.inverse_kinematics(pose), twin.solve_inverse(pose))
     assert not torch.equal(twin.solve_inverse(pose), tripod.solve_inverse(pose))
+
+
+def test_a_directly_made_mechanism_describes_itself():
+    assert Tripod(L=1.1).describe()["spec"] == "tripod"
+    bar = FiveBar(crank=0.45)
+    twin = mechanism_from_description(json.loads(json.dumps(bar.describe())))
+    assert torch.equal(twin.nominal, bar.nominal)
+    homeless = type("Homeless", (FiveBar,), {"__module__": "__nowhere__"})()
+    with pytest.raises(InputError, match="Homeless stands in no file"):
+        homeless.describe()
+
+
+def test_a_fitted_base_moves_the_box(tmp_path):
+    arm = make("ur10", tmp_path)
+    moved = arm.nominal.clone()
+    moved[:3] = 10.0
+    twin = arm.with_nominal(moved)
+    torch.testing.assert_close(twin.bounds[0][:3], arm.bounds[0][:3] + 10.0)
+    torch.testing.assert_close(twin.home_pose[:3], arm.home_pose[:3] + 10.0)

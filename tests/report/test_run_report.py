@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 import typer
-from conftest import arm_run, tripod_run
 from PIL import Image
+from report_runs import arm_run, tripod_run
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from typer.testing import CliRunner
@@ -40,7 +40,7 @@ def test_the_report_folder(report_folder: Path) -> None:
 def test_a_folder_with_numbers_only_still_gets_its_tables(tmp_path: Path) -> None:
     write_json(tmp_path / "results.json", arm_run()[0])
     page = write_report(tmp_path).read_text()
-    assert "<svg" not in page and "µrad" in page
+    assert "<svg" not in page and "µrad" in page and "held-out rows, 4 not usable" in page
     with pytest.raises(InputError, match=r"results\.json is not there"):
         write_report(tmp_path / "plots")
 
@@ -137,7 +137,9 @@ def test_the_screen_shows_title_and_failure(results: dict[str, Any]) -> None:
     screen = io.StringIO()
     print_tables(results, Console(file=screen, width=120))
     text = screen.getvalue()
-    assert "Joint error before calibration" in text and "[1e-10 m²]" in text and "enn failed" in text
+    assert (
+        "Joint error before calibration" in text and "[1e-10 m²]" in text and "enn failed" in text and "goal_x" in text
+    )
 
 
 def test_csv_is_tidy_and_exact(report_folder: Path) -> None:

@@ -180,6 +180,27 @@ def test_schemas_are_schemas(name: str) -> None:
     Draft202012Validator.check_schema(load_schema(name))
 
 
+def test_the_card_schema_wants_hashes_and_what_a_user_must_know() -> None:
+    validator = Draft202012Validator(load_schema("card"))
+    card = {
+        "files": {"model.onnx": "0" * 64},
+        "mechanism": {"name": "tripod"},
+        "joints": [{"name": "q1", "unit": "m"}],
+        "covariates": [],
+        "domain": {"inputs": {"q1": {"low": 0.0, "high": 1.0}}},
+        "limits": {"q1": {"unit": "m", "limit": 1e-4}},
+        "data_sha256": "0" * 64,
+        "metrics": {},
+        "seed": 0,
+        "versions": {"torch": "2.13.0"},
+        "format": "more keys may follow",
+    }
+    assert validator.is_valid(card)
+    for key in set(card) - {"format"}:
+        assert not validator.is_valid({k: v for k, v in card.items() if k != key})
+    assert not validator.is_valid(card | {"files": {"model.onnx": "abc"}})
+
+
 def test_the_schema_refuses_what_the_contract_forbids(results: dict[str, object]) -> None:
     validator = Draft202012Validator(load_schema("results"))
     good = json.loads(json.dumps(plain(results)))

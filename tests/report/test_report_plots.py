@@ -9,11 +9,11 @@ from xml.etree import ElementTree
 import matplotlib as mpl
 import numpy as np
 import pytest
-from conftest import arm_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.colors import LogNorm
+from report_runs import arm_run
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.report.arrays import RunArrays

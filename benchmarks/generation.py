@@ -1,0 +1,178 @@
+"""Generations and joined networks a second, beside a plain numpy loop over individuals, measured in the same run.
+
+    python benchmarks/generation.py
+    python benchmarks/generation.py --populations 80 800 --hidden 12 12 --rows 125 --threads 1
+
+The peer evaluates what the batched code does (every individual joined with the best and three random representatives,
+eq. 11), one joined network after another, its operators one individual at a time. Times are the least of several, in
+process time on one thread and wall time on more, so that a busy machine disturbs little.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ccnn_torch.evolution import CCNNSettings
+from ccnn_torch.evolution.coevolution import advance, start
+from ccnn_torch.evolution.evaluation import make_task
+
+Array = NDArray[np.float64]
+Individual = tuple[NDArray[np.bool_], Array]
+
+
+def main() -> None:
+    """Print one table row a population."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--populations", type=int, nargs="+", default=[80, 800])
+    parser.add_argument("--hidden", type=int, nargs="+", default=[12, 12])
+    parser.add_argument("--inputs", type=int, default=3)
+    parser.add_argument("--outputs", type=int, default=3)
+    parser.add_argument("--rows", type=int, default=125)
+    parser.add_argument("--repeats", type=int, default=1, help="runs side by side in the batched code")
+    parser.add_argument("--threads", type=int, default=1)
+    given = parser.parse_args()
+    torch.set_num_threads(given.threads)
+    sizes = [given.inputs, *given.hidden, given.outputs]
+    clock = time.process_time if given.threads == 1 else time.perf_counter
+    print(f"{'-'.join(map(str, sizes))}, {given.rows} rows, {given.repeats} repeats, {given.threads} threads")
+    print(f"{'population':>10} {'generations/s':>14} {'networks/s':>11} {'numpy loop: generations/s':>26} {'ratio':>6}")
+    for population in given.populations:
+        settings = CCNNSettings(hidden=tuple(given.hidden), population=population)
+        joined = len(sizes[1:]) * population * (settings.representatives + 1)
+        rate = given.repeats / least_time(batched(sizes, given.rows, given.repeats, settings), clock)
+        peer = 1 / least_time(NumpyLoop(sizes, given.rows, settings).generation, clock)
+        print(f"{population:>10} {rate:>14.1f} {rate * joined:>11.0f} {peer:>26.2f} {rate / peer:>6.1f}")
+
+
+def least_time(step: Callable[[], None], clock: Callable[[], float], seconds: float = 3.0) -> float:
+    """Least time of one call over about so many seconds, three calls at least."""
+    step()
+    times: list[float] = []
+    while len(times) < 3 or sum(times) < seconds:
+        began = clock()
+        step()
+        times.append(clock() - began)
+    return min(times)
+
+
+def toy_rows(sizes: list[int], rows: int) -> tuple[Array, Array]:
+    """Inputs in [-1, 1] and smooth standardised outputs."""
+    generator = np.random.default_rng(0)
+    inputs = generator.uniform(-1, 1, (rows, sizes[0]))
+    outputs = np.sin(inputs @ generator.standard_normal((sizes[0], sizes[-1])))
+    return inputs, (outputs - outputs.mean(0)) / outputs.std(0)
+
+
+def batched(sizes: list[int], rows: int, repeats: int, settings: CCNNSettings) -> Callable[[], None]:
+    """One generation of this package, each call from the state that the last one left."""
+    inputs, targets = (torch.from_numpy(part).expand(repeats, -1, -1) for part in toy_rows(sizes, rows))
+    task = make_task(inputs, targets, torch.ones(repeats, rows, dtype=torch.float64))
+    seeds = torch.arange(repeats)
+    state = start(sizes, task, settings, seeds)
+
+    def step() -> None:
+        nonlocal state
+        state = advance(state, task, settings, seeds)
+
+    return step
+
+
+class NumpyLoop:
+    """The same algorithm as a loop over individuals."""
+
+    def __init__(self, sizes: list[int], rows: int, settings: CCNNSettings) -> None:
+        self.settings = settings
+        self.random = np.random.default_rng(1)
+        self.inputs, self.targets = toy_rows(sizes, rows)
+        self.done = 0
+        self.populations: list[list[Individual]] = []
+        for before, after in itertools.pairwise(sizes):
+            self.populations.append([self.individual(after, before) for _ in range(settings.population)])
+        self.best = [population[0] for population in self.populations]
+        self.best_fitness = 0.0
+        self.fitness = [np.array([]) for _ in self.populations]
+        for layer in range(len(self.populations)):
+            self.judge(layer)
+
+    def individual(self, after: int, before: int) -> Individual:
+        mask = self.random.random((after, before)) < self.settings.density
+        weight = self.random.uniform(-1, 1, (after, before + 1)) * self.settings.weight_range
+        weight[:, :-1] *= mask
+        return mask, weight
+
+    def generation(self) -> None:
+        """Elites, selection, crossover, mutation and evaluation of every layer in turn."""
+        settings = self.settings
+        self.done = min(self.done + 1, settings.generations - 1)
+        for layer, population in enumerate(self.populations):
+            order = np.argsort(-self.fitness[layer])
+            renewed = [self.best[layer], *(population[i] for i in order[1 : settings.elites])]
+            while len(renewed) < settings.population:
+                renewed += self.children(population, self.fitness[layer])
+            self.populations[layer] = renewed[: settings.population]
+            self.judge(layer)
+
+    def children(self, population: list[Individual], fitness: Array) -> list[Individual]:
+        settings, random = self.settings, self.random
+        parents = []
+        for _ in range(2):
+            drawn = random.integers(len(population), size=settings.tournament)
+            mask, weight = population[drawn[np.argmax(fitness[drawn])]]
+            parents.append((mask.copy(), weight.copy()))
+        (mask, weight), (other_mask, other_weight) = parents
+        if random.random() < settings.crossover:
+            places = np.arange(weight.size)[:, None] >= random.integers(1, weight.size, settings.cuts)
+            swap = (places.sum(1) % 2 == 1).reshape(weight.shape)
+            bits = swap[:, :-1]
+            mask[bits], other_mask[bits] = other_mask[bits], mask[bits].copy()
+            weight[swap], other_weight[swap] = other_weight[swap], weight[swap].copy()
+        flips = random.random(mask.shape) < settings.structural_mutation
+        fresh = random.uniform(-1, 1, mask.shape) * settings.weight_range
+        weight[:, :-1] = np.where(flips, np.where(mask, 0.0, fresh), weight[:, :-1])
+        mask ^= flips
+        active = np.concatenate([other_mask, np.ones((len(other_mask), 1), dtype=bool)], axis=1)
+        draws = np.where(active, random.random(other_weight.shape), 1.0)
+        chosen = ((draws < settings.weight_mutation) | (draws == draws.min())) & active
+        progress = (1 - self.done / settings.generations) ** settings.nonuniform_exponent
+        share = 1 - random.random(other_weight.shape) ** progress
+        bound = np.where(random.random(other_weight.shape) < 0.5, settings.weight_range, -settings.weight_range)
+        other_weight[chosen] += ((bound - other_weight) * share)[chosen]
+        return [(mask, weight), (other_mask, other_weight)]
+
+    def judge(self, layer: int) -> None:
+        settings = self.settings
+        size = settings.population
+        sets = [self.best] + [
+            [population[self.random.integers(size)] for population in self.populations]
+            for _ in range(settings.representatives)
+        ]
+        scores = np.zeros(size)
+        for number, individual in enumerate(self.populations[layer]):
+            for companions in sets:
+                network = [*companions[:layer], individual, *companions[layer + 1 :]]
+                fitness = self.evaluate(network)
+                scores[number] = max(scores[number], fitness)
+                if fitness > self.best_fitness:
+                    self.best_fitness, self.best = fitness, network
+        self.fitness[layer] = scores
+
+    def evaluate(self, network: list[Individual]) -> float:
+        signal, fed = self.inputs, np.ones(self.inputs.shape[1], dtype=bool)
+        for layer, (mask, weight) in enumerate(network):
+            signal = signal @ weight[:, :-1].T + weight[:, -1]
+            if layer + 1 < len(network):
+                fed = (mask & fed).any(1)
+                signal = fed / (1 + np.exp(-signal))
+        error = np.sqrt(((signal - self.targets) ** 2).sum(1)).mean()
+        return 1 / (float(error) + self.settings.epsilon)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""A user's own class, named as `path/to/file.py:Name`."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ccnn_torch.errors import InputError
+
+__all__ = ["is_plugin", "load_plugin"]
+
+
+def is_plugin(spec: str) -> bool:
+    """Whether a name in a config means a class in a Python file."""
+    return ".py:" in spec
+
+
+def load_plugin(spec: str) -> Callable[..., Any]:
+    """Run the file and return what it calls `Name`.
+
+    Raises:
+        InputError: there is no such file or name in it, or the file cannot be run.
+    """
+    file, _, name = spec.rpartition(":")
+    path = Path(file)
+    if not path.is_file():
+        raise InputError(f"{spec}: there is no file {file}")
+    # A name of its own, so that two users' files of the same name, or one called torch.py, do not meet.
+    unique = f"_ccnn_torch_user_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}"
+    module_spec = importlib.util.spec_from_file_location(unique, path)
+    if module_spec is None or module_spec.loader is None:
+        raise InputError(f"{spec}: {file} is no Python file")
+    module = importlib.util.module_from_spec(module_spec)
+    sys.modules[unique] = module
+    try:
+        module_spec.loader.exec_module(module)
+    except SyntaxError as error:
+        raise InputError(f"{spec}: {file} line {error.lineno} is no valid Python: {error.msg}") from error
+    except ImportError as error:
+        raise InputError(f"{spec}: {file} imports something that is not installed: {error}") from error
+    found = getattr(module, name, None)
+    if not callable(found):
+        classes = [n for n, o in vars(module).items() if inspect.isclass(o) and o.__module__ == module.__name__]
+        raise InputError(f"{spec}: {file} has no class '{name}'; it has {', '.join(classes) or 'none'}")
+    return found  # type: ignore[no-any-return]

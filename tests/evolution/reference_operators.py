@@ -1,0 +1,93 @@
+"""The paper's operators one individual at a time, on the strings of section III-C: the oracle of the batched ones.
+
+Strings carry a bias as one more bit at the end of each row that is always 1.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+Strings = tuple[str, list[float]]
+
+
+def crossover(first: Strings, second: Strings, cuts: list[int]) -> tuple[Strings, Strings]:
+    """Exchange alternate segments of the bit strings, and the segments of the weight strings that belong to them."""
+    children: list[tuple[str, list[float]]] = [("", []), ("", [])]
+    places = [0, *sorted(cuts), len(first[0])]
+    for segment, (start, end) in enumerate(itertools.pairwise(places)):
+        pair = (first, second) if segment % 2 == 0 else (second, first)
+        for child, (bits, weights) in enumerate(pair):
+            # Equivalent crossover: as many weights stand before the cut as ones.
+            ones_before, ones_until = bits[:start].count("1"), bits[:end].count("1")
+            children[child] = (
+                children[child][0] + bits[start:end],
+                children[child][1] + weights[ones_before:ones_until],
+            )
+    return children[0], children[1]
+
+
+def uniform_crossover(first: Strings, second: Strings, swap: list[bool]) -> tuple[Strings, Strings]:
+    """Exchange single genes."""
+    bits: list[list[str]] = [[], []]
+    weights: list[list[float]] = [[], []]
+    left = (list(first[1]), list(second[1]))
+    for place, exchanged in enumerate(swap):
+        for parent, (string, queue) in enumerate(zip((first[0], second[0]), left, strict=True)):
+            child = 1 - parent if exchanged else parent
+            bits[child].append(string[place])
+            if string[place] == "1":
+                weights[child].append(queue.pop(0))
+    return ("".join(bits[0]), weights[0]), ("".join(bits[1]), weights[1])
+
+
+def flip(strings: Strings, flips: list[bool], fresh: list[float]) -> Strings:
+    """Bit-flip mutation: insert a weight for a bit that becomes 1, delete that of one that becomes 0."""
+    bits, weights = "", []
+    queue = list(strings[1])
+    for bit, flipped, new in zip(strings[0], flips, fresh, strict=True):
+        own = queue.pop(0) if bit == "1" else None
+        if flipped:
+            bit, own = ("0", None) if bit == "1" else ("1", new)
+        bits += bit
+        if own is not None:
+            weights.append(own)
+    return bits, weights
+
+
+def nonuniform(
+    strings: Strings,
+    chosen: list[bool],
+    draws: list[float],
+    generation: int,
+    last: int,
+    low: float,
+    high: float,
+    b: float,
+) -> Strings:
+    """Eqs. 12-13. chosen, draws: one for every place of the bit string; those of absent bits are not read."""
+    weights = []
+    queue = list(strings[1])
+    for place, bit in enumerate(strings[0]):
+        if bit == "0":
+            continue
+        weight = queue.pop(0)
+        if chosen[place]:
+            draw = draws[place]
+
+            def step(y: float, r: float) -> float:
+                return float(y * (1 - r ** ((1 - generation / last) ** b)))
+
+            weight += step(high - weight, 2 * draw) if draw < 0.5 else -step(weight - low, 2 * draw - 1)
+        weights.append(weight)
+    return strings[0], weights
+
+
+def tournament(fitness: list[float], draws: list[float]) -> int:
+    """The fittest of those drawn, the first drawn of equals."""
+    winner = None
+    for draw in draws:
+        candidate = int(draw * len(fitness))
+        if winner is None or fitness[candidate] > fitness[winner]:
+            winner = candidate
+    assert winner is not None
+    return winner

@@ -1,0 +1,116 @@
+"""The conformance check passes what keeps the contract and names what does not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+from toy import Descent
+
+from ccnn_torch.learners import Learner, TrainingData
+from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.learners.constant import Constant
+from ccnn_torch.testing import check_learner
+
+SMALL = {"hidden": (3, 2), "population": 8, "generations": 6, "representatives": 1}
+
+
+@pytest.mark.parametrize(
+    "factory",
+    [
+        lambda: CCNN(CCNNSettings(**SMALL)),
+        lambda: CCNN(CCNNSettings(**SMALL, bias=False, elites=3, crossover_kind="uniform")),
+        lambda: CCNN(CCNNSettings(**SMALL, refinement_iterations=4, refine_every=2)),
+        lambda: Descent(steps=8),
+        Constant,
+    ],
+    ids=["ccnn", "ccnn_without_bias", "ccnn_refined", "descent", "constant"],
+)
+def test_learners_keep_the_contract(factory: Callable[[], Learner]) -> None:
+    check_learner(factory)
+
+
+class GlobalRandom(Descent):
+    def start(self, data: TrainingData) -> None:
+        super().start(data)
+        self._map = self._map + 0.01 * torch.randn(self._map.shape, dtype=torch.float64)
+
+
+class Forgetful(Descent):
+    """Its state lacks the velocity."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {name: value for name, value in super().state_dict().items() if name != "velocity"}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        super().load_state_dict(state | {"velocity": torch.zeros_like(state["map"])})
+
+
+class Unweighted(Descent):
+    """Looks at the padded rows."""
+
+    def start(self, data: TrainingData) -> None:
+        ones = torch.ones_like(data.weights)
+        super().start(TrainingData(data.inputs, data.targets, ones, data.seeds))
+
+
+class Endless(Descent):
+    @property
+    def finished(self) -> bool:
+        return False
+
+
+class Single(Descent):
+    def network(self, repeat: int) -> nn.Module:
+        return super().network(repeat).to(torch.float32)
+
+
+class Other(Descent):
+    def network(self, repeat: int) -> nn.Module:
+        return super().network(0)
+
+
+class ScalarMetric(Descent):
+    def step(self) -> dict[str, Tensor]:
+        return {name: value.mean() for name, value in super().step().items()}
+
+
+class WrongShape(Descent):
+    def predict(self, inputs: Tensor) -> Tensor:
+        return super().predict(inputs)[..., :1]
+
+
+class Spoiler(Descent):
+    def step(self) -> dict[str, Tensor]:
+        self._data.targets.mul_(0.9)
+        return super().step()
+
+
+class NotALearner:
+    name = "none"
+
+
+@pytest.mark.parametrize(
+    ("broken", "sentence"),
+    [
+        (GlobalRandom, "global random state"),
+        (Forgetful, "stopped after step 1 and resumed ends elsewhere"),
+        (Unweighted, "rows of weight 0"),
+        (Endless, "not finished after the 8 steps"),
+        (Single, "holds torch.float32; must be float64"),
+        (Other, "network.1. differs from predict"),
+        (ScalarMetric, "metric 'error_train' has shape"),
+        (WrongShape, "predict before the first step gives shape"),
+        (Spoiler, "changes the data"),
+    ],
+)
+def test_a_broken_promise_is_named(broken: Callable[..., Learner], sentence: str) -> None:
+    with pytest.raises(AssertionError, match=sentence):
+        check_learner(lambda: broken(steps=8))
+
+
+def test_a_class_that_lacks_a_verb_is_named() -> None:
+    with pytest.raises(AssertionError, match="NotALearner lacks start, step"):
+        check_learner(NotALearner)  # type: ignore[arg-type]
