@@ -70,8 +70,8 @@ def joint_deviations(
 
     Args:
         mechanism: nominal kinematics.
-        commanded: `s x n` [SI].
-        measured: `s x p` [SI].
+        commanded: `[r x] s x n` [SI].
+        measured: `[r x] s x p` [SI].
         parameters: `k`, or `r x 1 x k` for one set per repeat (fitted frames), or `[r x] s x k` for one per row (frames
             per group of rows); nominal when None.
         rotation_weight: η of eq. 5 [m/rad]; the paper's 10..40 mm.
@@ -85,14 +85,15 @@ def joint_deviations(
     Returns:
         Pseudoerror.
     """
-    rows = len(commanded)
+    rows = commanded.shape[-2]
     by_row = parameters is not None and parameters.dim() > 1 and parameters.shape[-2] == rows > 1
-    size = max(1, _CHUNK // (1 if parameters is None else max(1, math.prod(parameters.shape[:-2]))))
+    sets = (t.shape[:-2] for t in (commanded, measured, parameters) if t is not None)
+    size = max(1, _CHUNK // max(1, *(math.prod(s) for s in sets)))
     parts = []
     for i in range(0, rows, size):
         here = slice(i, i + size)
         own = parameters[..., here, :] if parameters is not None and by_row else parameters
-        parts.append(_chunk(mechanism, commanded[here], measured[here], own, rotation_weight, damping))
+        parts.append(_chunk(mechanism, commanded[..., here, :], measured[..., here, :], own, rotation_weight, damping))
     deviation = torch.cat([p[0] for p in parts], dim=-2)
     condition = torch.cat([p[1] for p in parts], dim=-1)
     position = torch.cat([p[2].position for p in parts], dim=-1)

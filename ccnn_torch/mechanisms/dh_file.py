@@ -58,9 +58,7 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
     links = zip(*([v * unit for v in table.numbers(key, n)] for key, unit in columns), strict=True)
     scales = [length] * 3 + [angle] * 3
     base, tool = table.frame("base_frame", scales), table.frame("tool_frame", scales)
-    if orientation == "none" and "tool_offset" in table.content:
-        offset = table.frame("tool_offset", scales[:3])
-        tool = None if offset is None else [*offset, 0.0, 0.0, 0.0]
+    offset = table.frame("tool_offset", scales[:3]) if "tool_offset" in table.content else None
     return SerialArm(
         name=str(table.content.get("robot", Path(path).stem)),
         convention=convention,
@@ -69,6 +67,7 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
         joint_sign=signs,
         base=base or [0.0] * 6,
         tool=tool or [0.0] * 6,
+        tool_offset=(offset or "unknown") if "tool_offset" in table.content else None,
         unknown_frames=[name for name, frame in (("base", base), ("tool", tool)) if frame is None],
         frame_per=table.words("frame_per", []),
         tool_per=table.words("tool_per", []),

@@ -55,6 +55,7 @@ class SerialArm(Mechanism):
         base: Sequence[float] = (0.0,) * 6,
         tool: Sequence[float] = (0.0,) * 6,
         limits: Sequence[Sequence[float]] | None = None,
+        tool_offset: Sequence[float] | str | None = None,
         unknown_frames: Sequence[str] = (),
         frame_per: Sequence[str] = (),
         tool_per: Sequence[str] = (),
@@ -72,6 +73,7 @@ class SerialArm(Mechanism):
             joint_sign: +1 or -1 per joint.
             axes: joint axes in the link's frame, `n x 3`; z when None.
             base, tool: frames, position and rotation vector.
+            tool_offset: position of the tool, or "unknown"; replaces `tool` where the pose has no orientation.
             limits: lowest and highest value per joint, for sampling only; a full turn or a metre when None.
             unknown_frames, frame_per, tool_per, parallel_axes, orientation, rotation_weight: see the class.
 
@@ -84,6 +86,10 @@ class SerialArm(Mechanism):
                 f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector' or 'none'; "
                 f"got '{convention}', '{orientation}'"
             )
+        unknown = set(unknown_frames)
+        if orientation == "none" and tool_offset is not None:
+            tool = (0.0,) * 6 if isinstance(tool_offset, str) else (*tool_offset, 0.0, 0.0, 0.0)
+            unknown = unknown - {"tool"} | ({"tool"} if isinstance(tool_offset, str) else set())
         n = len(links)
         types = tuple(joint_types or ["revolute"] * n)
         self._transform, names, units, self._axis_before = LINKS[convention]
@@ -102,7 +108,7 @@ class SerialArm(Mechanism):
             home_joints=[0.0] * n,
         )
         self.convention, self.orientation, self.rotation_weight = convention, orientation, rotation_weight
-        self.unknown_frames, self.parallel_axes = tuple(unknown_frames), tuple(map(tuple, parallel_axes))
+        self.unknown_frames, self.parallel_axes = tuple(sorted(unknown)), tuple(map(tuple, parallel_axes))
         self.frame_per, self.tool_per = tuple(frame_per), tuple(tool_per)
         turn = [t == "revolute" for t in types]
         span = limits or [(-math.pi, math.pi) if t else (0.0, 1.0) for t in turn]
@@ -131,7 +137,8 @@ class SerialArm(Mechanism):
     def with_orientation(self, orientation: str) -> SerialArm:
         """The same arm, nominal parameters included, for poses of another kind: "rotation_vector" or "none"."""
         twin = SerialArm(**{**self.recipe["keys"], "orientation": orientation})
-        twin.nominal.copy_(self.nominal)
+        kept = len(self.nominal) - (6 if self.recipe["keys"]["tool_offset"] is not None else 0)
+        twin.nominal[:kept] = self.nominal[:kept]
         twin._follow_nominal()
         return twin
 

@@ -1,6 +1,7 @@
 """Geometry files with a mistake: one sentence that names the file, the key or joint, and what would be right."""
 
 import pytest
+import torch
 from catalogue import PANDA, UR10, URDF
 
 from ccnn_torch.errors import InputError
@@ -65,6 +66,9 @@ def test_tool_offset_replaces_the_tool_for_positions_only(tmp_path):
     assert read_dh_file(str(path)).nominal[-6:-3].tolist() == pytest.approx([0, 0, 0.1])
     arm = read_dh_file(str(path), orientation="none")
     assert arm.nominal[-6:].tolist() == pytest.approx([0, 0, 0.137, 0, 0, 0]) and arm.unknown_frames == ()
+    late = read_dh_file(str(path)).with_orientation("none")
+    assert torch.equal(late.nominal, arm.nominal) and late.unknown_frames == arm.unknown_frames
+    assert torch.equal(late.with_orientation("none").nominal, arm.nominal)
     assert arm.frame_per == ("robot", "placement") and arm.tool_per == ("robot",)
     path.write_text(PANDA + "tool_offset: ball centre, unknown per robot, near [0, 0, 137] mm; estimate it\n")
     assert read_dh_file(str(path), orientation="none").unknown_frames == ("tool",)

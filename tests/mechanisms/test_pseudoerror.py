@@ -51,6 +51,22 @@ def test_chunks_do_not_change_anything(tmp_path, monkeypatch):
     parts = joint_deviations(arm, commanded, measured)
     torch.testing.assert_close(parts.deviation, whole.deviation, rtol=0, atol=1e-12)
     assert torch.equal(parts.usable, whole.usable)
+    sets = arm.nominal.repeat(2, 25, 1)
+    sets[1, 20:, 0] += 1e-3
+    by_row = joint_deviations(arm, commanded, measured, sets)
+    torch.testing.assert_close(by_row.deviation[0], whole.deviation, rtol=0, atol=1e-12)
+    changed = (by_row.deviation[1] - whole.deviation).abs().amax(-1) > 1e-9
+    assert changed.tolist() == [False] * 20 + [True] * 5
+
+
+def test_repeats_may_lead_the_poses(tmp_path):
+    """Simulated repeats: one command, a measured pose per repeat."""
+    tripod, generator = Tripod(), torch.Generator().manual_seed(0)
+    commanded = tripod.sample_joints(7, generator)
+    injected = 1e-4 * torch.randn(3, 7, 3, generator=generator, dtype=torch.float64)
+    found = joint_deviations(tripod, commanded, tripod.forward_kinematics(commanded + injected))
+    torch.testing.assert_close(found.deviation, injected, rtol=0, atol=1e-12)
+    assert found.usable.shape == (3, 7)
 
 
 def test_singular_rows_are_flagged_and_named(tmp_path):
