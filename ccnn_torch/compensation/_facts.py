@@ -58,8 +58,9 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
         "versions": {"python": platform.python_version(), "ccnn_torch": __version__}
         | {name: version(name) for name in _PACKAGES},
     }
-    tensors = tensor_digest(dict(compensator.state_dict()))
-    return facts | {"sha256": {"tensors": tensors, "keys": _digest(facts)}}
+    facts["sha256"] = {"tensors": tensor_digest(dict(compensator.state_dict()))}
+    facts["sha256"]["keys"] = _digest(facts)
+    return facts
 
 
 def check_keys(facts: Any) -> dict[str, Any]:
@@ -71,7 +72,7 @@ def check_keys(facts: Any) -> dict[str, Any]:
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
         raise ModelFileError(f"it says nothing of the form '{FORMAT}', so this package did not write it")
     stated = facts.get("sha256")
-    if not isinstance(stated, dict) or stated.get("keys") != _digest({k: v for k, v in facts.items() if k != "sha256"}):
+    if not isinstance(stated, dict) or stated.get("keys") != _digest(facts):
         raise ModelFileError("what it says about itself was edited after it was written")
     return facts
 
@@ -100,7 +101,9 @@ def to_json(value: Mapping[str, Any], indent: int | None = None) -> str:
 
 
 def _digest(facts: Mapping[str, Any]) -> str:
-    return hashlib.sha256(to_json(facts).encode()).hexdigest()
+    """SHA-256 of everything but itself; that of the tensors is among it."""
+    others = {key: value for key, value in facts["sha256"].items() if key != "keys"}
+    return hashlib.sha256(to_json({**facts, "sha256": others}).encode()).hexdigest()
 
 
 def _plain(coordinate: Coordinate) -> dict[str, str]:

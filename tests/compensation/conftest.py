@@ -23,5 +23,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, tripod: Compensator, arm: C
     """`model.*` of the tripod and `arm.*` of the arm with covariates; read only."""
     path = tmp_path_factory.mktemp("models")
     save_model(path, tripod, fields() | {"remark": "for the card alone"})
-    save_model(path, arm, fields() | {"mechanism": {"name": "arm", "joints": ["q1[rad]", "q2[rad]"], "pose": []}}, "arm")
+    save_model(
+        path, arm, fields() | {"mechanism": {"name": "arm", "joints": ["q1[rad]", "q2[rad]"], "pose": []}}, "arm"
+    )
     return path

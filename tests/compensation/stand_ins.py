@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -18,7 +19,7 @@ class Sigmoids(nn.Module):
         super().__init__()
         self.sizes = sizes
         generator = torch.Generator().manual_seed(seed or 0)
-        draw = [torch.randn(o, i, generator=generator, dtype=torch.float64) * gain for i, o in zip(sizes, sizes[1:])]
+        draw = [torch.randn(o, i, generator=generator, dtype=torch.float64) * gain for i, o in pairwise(sizes)]
         self.weights = nn.ParameterList(draw)
 
     def forward(self, features: Tensor) -> Tensor:
@@ -75,4 +76,9 @@ def arm_compensator() -> Compensator:
 
 
 def fields() -> dict[str, Any]:
-    return {"mechanism": load_mechanism("tripod").describe(), "metrics": {"mse": 1e-10}, "data_sha256": "ab" * 32, "seed": 4}
+    return {
+        "mechanism": load_mechanism("tripod").describe(),
+        "metrics": {"mse": 1e-10},
+        "data_sha256": "ab" * 32,
+        "seed": 4,
+    }

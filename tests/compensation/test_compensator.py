@@ -82,16 +82,17 @@ wild = st.floats(allow_nan=True, allow_infinity=True, width=64)
 
 
 @given(st.lists(wild, min_size=4, max_size=4))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_no_input_gives_nan_or_more_than_the_limit(values: list[float]) -> None:
     inputs = torch.tensor(values, dtype=torch.float64)
     solution = ARM.solve(inputs[:2], inputs[2:])
     assert bool((solution.deviation.abs() <= ARM.limit).all())
     assert all(bool(torch.isfinite(value).all()) for value in solution)
     moved = solution.command + solution.deviation
-    clean = torch.where(torch.isfinite(inputs[:2]), inputs[:2], moved)
+    finite = inputs.abs() < ARM.domain.huge
+    clean = torch.where(finite[:2], inputs[:2], moved)
     torch.testing.assert_close(moved, clean, rtol=1e-15, atol=1e-15)
-    if not bool(torch.isfinite(inputs).all()):
+    if not bool(finite.all()):
         assert not bool(solution.inside_domain) and not bool(solution.ideal_inside_domain)
 
 
@@ -142,7 +143,7 @@ def test_iterations_count_the_largest_deviation() -> None:
 
 
 def test_a_steep_deviation_is_refused_with_a_sentence() -> None:
-    with pytest.raises(MethodFailedError, match="above 0.2 the command cannot be solved"):
+    with pytest.raises(MethodFailedError, match=r"above 0\.2 the command cannot be solved"):
         tripod_compensator(gain=8.0, size=5e-2)
 
 
