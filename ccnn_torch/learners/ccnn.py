@@ -22,8 +22,9 @@ class CCNN:
 
     The model is the best joined network so far by training fitness (eq. 11). Where refinement is on, it is the refined
     network of highest evidence, from the first refinement on: Bayesian regularisation gives up training error for
-    held-out error, so that training fitness could not choose between the two. With several members, each repeat runs as
-    many coevolutions, and its model is the mean of their networks.
+    held-out error, so that training fitness could not choose between the two. Refinement judges errors in the
+    channels of `data.metric`, evolution (eq. 11) always in the outputs. With several members, each repeat runs as many
+    coevolutions, and its model is the mean of their networks.
 
     Metrics of a step: `fitness_best`, `fitness_mean` (over all individuals), `error_train` (mean square of the model,
     standardised), `evaluations` (joined networks so far), each `r`; `density` and `diversity`, `r x layers`.
@@ -41,6 +42,7 @@ class CCNN:
         self._inputs, self._targets, self._rows = (
             part.repeat_interleave(members, dim=0) for part in (data.inputs, data.targets, data.weights)
         )
+        self._metric = None if data.metric is None else data.metric.repeat_interleave(members, dim=0)
         self._task = make_task(self._inputs, self._targets, self._rows)
         self._seeds = member_seeds(data.seeds, members).flatten()
         sizes = (data.inputs.shape[-1], *self.settings.hidden, data.targets.shape[-1])
@@ -161,6 +163,7 @@ class CCNN:
             self._targets,
             self._rows,
             RefinementSettings(iterations=settings.refinement_iterations),
+            self._metric,
         )
         candidate = tuple(
             Genome(part.mask, weight.unsqueeze(1)) for part, weight in zip(best, refined.weights, strict=True)
