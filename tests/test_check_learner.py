@@ -22,7 +22,7 @@ SMALL = {"hidden": (3, 2), "population": 8, "generations": 6, "representatives":
     [
         lambda: CCNN(CCNNSettings(**SMALL)),
         lambda: CCNN(CCNNSettings(**SMALL, bias=False, elites=3, crossover_kind="uniform")),
-        lambda: CCNN(CCNNSettings(**SMALL, refinement_iterations=4, refine_every=2)),
+        lambda: CCNN(CCNNSettings(**SMALL, refinement_iterations=4, refine_every=2, members=2)),
         lambda: Descent(steps=8),
         Constant,
     ],

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.evolution.genome import Genome, active
 
-__all__ = ["MaskedNetwork", "alive_nodes", "fed_nodes", "forward", "prune"]
+__all__ = ["MaskedNetwork", "alive_nodes", "average", "fed_nodes", "forward", "prune"]
 
 
 def fed_nodes(masks: Sequence[Tensor]) -> list[Tensor]:
@@ -71,6 +71,44 @@ def _affine(signal: Tensor, weight: Tensor) -> Tensor:
     width = signal.shape[-1]
     product = signal @ weight[..., :width].transpose(-2, -1)
     return product + weight[..., width].unsqueeze(-2) if weight.shape[-1] > width else product
+
+
+def average(masks: Sequence[Tensor], weights: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+    """The mean of several networks of one shape as one masked network: their hidden nodes stand side by side.
+
+    Args:
+        masks, weights: one a layer, `... x m x out x in` and `... x m x out x (in or in + 1)`, m = networks.
+
+    Returns:
+        The same without the dimension `m`; a hidden layer has m times the nodes, blocks of zeros between networks.
+    """
+    members, last = masks[0].shape[-3], len(masks) - 1
+    wide_masks, wide_weights = [], []
+    for layer, (mask, weight) in enumerate(zip(masks, weights, strict=True)):
+        width = mask.shape[-1]
+        kept = torch.where(active(Genome(mask, weight)), weight, 0.0)
+        parts = [mask, kept[..., :width], kept[..., width:]]
+        if layer == last:
+            # Outputs are summed, so every share is divided.
+            parts = [mask, kept[..., :width] / members, kept[..., width:].mean(-3)]
+        connections = [_side_by_side(part, layer == 0, layer == last) for part in parts[:2]]
+        bias = parts[2] if layer == last else parts[2].flatten(-3, -2)
+        wide_masks.append(connections[0] > 0)
+        wide_weights.append(torch.cat([connections[1], bias], dim=-1))
+    return wide_masks, wide_weights
+
+
+def _side_by_side(blocks: Tensor, first: bool, last: bool) -> Tensor:
+    """Matrices `... x m x out x in` of networks that share the inputs (first layer) or add up in the outputs (last)."""
+    if first and last:
+        return blocks.sum(-3)
+    if first:
+        return blocks.flatten(-3, -2)
+    if last:
+        return blocks.transpose(-3, -2).flatten(-2)
+    members = blocks.shape[-3]
+    apart = torch.eye(members, dtype=blocks.dtype, device=blocks.device)[:, None, :, None]
+    return (blocks.unsqueeze(-2) * apart).flatten(-2).flatten(-3, -2)
 
 
 def prune(masks: Sequence[Tensor], weights: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["uniform"]
+__all__ = ["member_seeds", "uniform"]
 
 
 def _signed(word: int) -> int:
@@ -54,3 +54,17 @@ def uniform(seeds: Tensor, stream: int, counter: int, shape: tuple[int, ...]) ->
     halves = _mix_(key.unsqueeze(-1) + words).view(torch.int32)[:, :count]
     # Half a step is added so that neither 0 nor 1 appears: logarithms and powers of the numbers stay finite.
     return halves.to(torch.float64).mul_(2.0**-32).add_(0.5 + 2.0**-33).reshape(len(seeds), *shape)
+
+
+def member_seeds(seeds: Tensor, members: int) -> Tensor:
+    """Seeds for independent runs inside each repeat: the repeat's own for the first, hashes of it for the others.
+
+    Args:
+        seeds: `r`, int64.
+
+    Returns:
+        `r x members`, int64.
+    """
+    others = torch.arange(members, device=seeds.device, dtype=torch.int64)
+    hashed = _mix_(_mix_(seeds.unsqueeze(-1) * _GOLDEN + _FIRST) + others * _GOLDEN)
+    return torch.where(others == 0, seeds.unsqueeze(-1), hashed)

@@ -33,6 +33,8 @@ class CCNNSettings:
         epsilon: added to the error in eq. 11, on standardised outputs.
         nonuniform_exponent: b of eq. 13 (paper: usually 2).
         target_error: end once the training error of eq. 11 (standardised) of every repeat is at most this; 0 = never.
+        members: independent coevolutions of each repeat; the model is the mean of their networks, itself one masked
+            network with their hidden layers side by side. The paper has 1.
         refine_every: generations between refinements of the best joined network; 0 = only after the last one.
         refinement_iterations: Levenberg-Marquardt iterations of one refinement; 0 = none, as in the paper.
 
@@ -57,6 +59,7 @@ class CCNNSettings:
     epsilon: float = 1e-6
     nonuniform_exponent: float = 2.0
     target_error: float = 0.0
+    members: int = 1
     refine_every: int = 0
     refinement_iterations: int = 0
 
@@ -70,6 +73,7 @@ class CCNNSettings:
             ("cuts", 1),
             ("representatives", 0),
             ("elites", 1),
+            ("members", 1),
             ("refine_every", 0),
             ("refinement_iterations", 0),
         ):

@@ -20,6 +20,9 @@ class TrainingData:
         weights: row weights, `r x s` [1]; 0 marks a padded row.
         seeds: one seed a repeat, `r`, int64.
         validation: rows held out from training for early stopping and model choice, or None.
+        metric: in which channels the error of a row is judged, `r x s x c x o`: this matrix times (output - target),
+            such as the pose error that joint deviations cause. None = the outputs themselves. Learners may leave it
+            aside.
     """
 
     inputs: Tensor
@@ -27,6 +30,7 @@ class TrainingData:
     weights: Tensor
     seeds: Tensor
     validation: TrainingData | None = None
+    metric: Tensor | None = None
 
 
 @runtime_checkable

@@ -8,7 +8,8 @@ from torch import Tensor
 from ccnn_torch.evolution.coevolution import Coevolution, advance, density, diversity, keep_refined, start
 from ccnn_torch.evolution.evaluation import fitness, joined_errors, make_task
 from ccnn_torch.evolution.genome import Genome
-from ccnn_torch.evolution.network import MaskedNetwork, forward
+from ccnn_torch.evolution.network import MaskedNetwork, average, forward
+from ccnn_torch.evolution.random import member_seeds
 from ccnn_torch.evolution.refinement import RefinementSettings, refine
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners._protocol import TrainingData
@@ -21,7 +22,9 @@ class CCNN:
 
     The model is the best joined network so far by training fitness (eq. 11). Where refinement is on, it is the refined
     network of highest evidence, from the first refinement on: Bayesian regularisation gives up training error for
-    held-out error, so that training fitness could not choose between the two.
+    held-out error, so that training fitness could not choose between the two. Refinement judges errors in the
+    channels of `data.metric`, evolution (eq. 11) always in the outputs. With several members, each repeat runs as many
+    coevolutions, and its model is the mean of their networks.
 
     Metrics of a step: `fitness_best`, `fitness_mean` (over all individuals), `error_train` (mean square of the model,
     standardised), `evaluations` (joined networks so far), each `r`; `density` and `diversity`, `r x layers`.
@@ -34,34 +37,43 @@ class CCNN:
 
     def start(self, data: TrainingData) -> None:
         """Take the data and judge the random first generation."""
-        self._data = data
-        self._task = make_task(data.inputs, data.targets, data.weights)
+        members = self.settings.members
+        self._repeats = len(data.seeds)
+        self._inputs, self._targets, self._rows = (
+            part.repeat_interleave(members, dim=0) for part in (data.inputs, data.targets, data.weights)
+        )
+        self._metric = None if data.metric is None else data.metric.repeat_interleave(members, dim=0)
+        self._task = make_task(self._inputs, self._targets, self._rows)
+        self._seeds = member_seeds(data.seeds, members).flatten()
         sizes = (data.inputs.shape[-1], *self.settings.hidden, data.targets.shape[-1])
-        self._state = start(sizes, self._task, self.settings, data.seeds)
+        self._state = start(sizes, self._task, self.settings, self._seeds)
         self._evidence = torch.full_like(self._state.best_fitness, -torch.inf)
         self._refined = tuple(Genome(part.mask.clone(), part.weight.clone()) for part in self._state.best)
 
     def step(self) -> dict[str, Tensor]:
         """One generation, and a refinement where one is due."""
         settings = self.settings
-        self._state = advance(self._state, self._task, settings, self._data.seeds)
+        self._state = advance(self._state, self._task, settings, self._seeds)
         every = settings.refine_every
         if settings.refinement_iterations and (self.finished or (every and self._state.generation % every == 0)):
             self._refine()
         state = self._state
+        best = self._by_repeat(state.best_fitness)
         judged = (state.generation + 1) * len(state.populations) * settings.population * (settings.representatives + 1)
         return {
-            "fitness_best": state.best_fitness,
-            "fitness_mean": torch.stack([scores.mean(-1) for scores in state.fitness]).mean(0),
+            "fitness_best": best.amax(1),
+            "fitness_mean": self._by_repeat(torch.stack([scores.mean(-1) for scores in state.fitness], -1)).mean(
+                (1, 2)
+            ),
             "error_train": self._error(),
-            "density": density(state),
-            "diversity": diversity(state, settings),
-            "evaluations": torch.full_like(state.best_fitness, judged),
+            "density": self._by_repeat(density(state)).mean(1),
+            "diversity": self._by_repeat(diversity(state, settings)).mean(1),
+            "evaluations": torch.full_like(best[:, 0], judged * settings.members),
         }
 
     @property
     def finished(self) -> bool:
-        """True after the last generation, or once every repeat has reached the target error."""
+        """True after the last generation, or once every coevolution has reached the target error."""
         settings, state = self.settings, self._state
         error = 1 / state.best_fitness - settings.epsilon
         reached = settings.target_error > 0 and bool((error <= settings.target_error).all())
@@ -74,72 +86,84 @@ class CCNN:
 
     def predict(self, inputs: Tensor) -> Tensor:
         """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
-        masks, weights = self.masks(), self.weights()
-        return forward(masks, weights, inputs)
+        masks, weights = self._member_networks()
+        return forward(masks, weights, inputs.unsqueeze(1)).mean(1)
 
     def masks(self) -> list[Tensor]:
         """Connections of the model, one layer each, `r x out x in`, bool."""
-        return [part.mask[:, 0] for part in self._model()]
+        return average(*self._member_networks())[0]
 
     def weights(self) -> list[Tensor]:
         """Weights of the model, one layer each, `r x out x in`, or `r x out x (in + 1)` with the biases last."""
-        return [part.weight[:, 0] for part in self._model()]
+        return average(*self._member_networks())[1]
 
     def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
         """Masks and weights of one repeat's model, dead nodes included: `out x in` and `out x (in or in + 1)`."""
-        return [mask[repeat] for mask in self.masks()], [weight[repeat] for weight in self.weights()]
+        masks, weights = average(*self._member_networks())
+        return [mask[repeat] for mask in masks], [weight[repeat] for weight in weights]
 
     def network(self, repeat: int) -> MaskedNetwork:
         """The model of one repeat, pruned of its dead nodes."""
         return MaskedNetwork(*self.genome(repeat))
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Subpopulations with their fitness, the best joined network, the refined one, and the generation."""
+        """Subpopulations with their fitness, the best joined network, the refined one: `r x members x ...`."""
         state = self._state
-        tensors = {"generation": torch.tensor(state.generation, dtype=torch.int64)}
+        tensors = {"best_fitness": state.best_fitness, "refined_evidence": self._evidence}
         for name, parts in (("population", state.populations), ("best", state.best), ("refined", self._refined)):
             for layer, part in enumerate(parts):
                 tensors[f"{name}_mask_{layer}"] = part.mask
                 tensors[f"{name}_weight_{layer}"] = part.weight
         tensors |= {f"fitness_{layer}": scores for layer, scores in enumerate(state.fitness)}
-        return tensors | {"best_fitness": state.best_fitness, "refined_evidence": self._evidence}
+        generation = torch.tensor(state.generation, dtype=torch.int64)
+        return {name: self._by_repeat(tensor) for name, tensor in tensors.items()} | {"generation": generation}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take back a state; call `start` with the same data first."""
         layers = range(len(self._state.populations))
+        flat = {name: tensor.flatten(0, 1) for name, tensor in state.items() if tensor.dim() > 0}
 
         def parts(name: str) -> tuple[Genome, ...]:
-            return tuple(Genome(state[f"{name}_mask_{n}"], state[f"{name}_weight_{n}"]) for n in layers)
+            return tuple(Genome(flat[f"{name}_mask_{n}"], flat[f"{name}_weight_{n}"]) for n in layers)
 
         self._state = Coevolution(
             populations=parts("population"),
-            fitness=tuple(state[f"fitness_{n}"] for n in layers),
+            fitness=tuple(flat[f"fitness_{n}"] for n in layers),
             best=parts("best"),
-            best_fitness=state["best_fitness"],
+            best_fitness=flat["best_fitness"],
             generation=int(state["generation"]),
         )
         self._refined = parts("refined")
-        self._evidence = state["refined_evidence"]
+        self._evidence = flat["refined_evidence"]
 
-    def _model(self) -> tuple[Genome, ...]:
-        return _choose(self._evidence > -torch.inf, self._refined, self._state.best)
+    def _by_repeat(self, tensor: Tensor) -> Tensor:
+        """`(r members) x ...` to `r x members x ...`."""
+        return tensor.reshape(self._repeats, self.settings.members, *tensor.shape[1:])
+
+    def _member_networks(self) -> tuple[list[Tensor], list[Tensor]]:
+        """Model of each member: masks and weights, one a layer, `r x members x out x ...`."""
+        model = _choose(self._evidence > -torch.inf, self._refined, self._state.best)
+        masks = [self._by_repeat(part.mask[:, 0]) for part in model]
+        return masks, [self._by_repeat(part.weight[:, 0]) for part in model]
 
     def _error(self) -> Tensor:
-        """Weighted mean squared error on the training rows, `r`."""
-        task = self._task
-        error = self.predict(task.inputs.transpose(1, 2)) - task.targets.transpose(1, 2)
-        return (error.square().mean(-1) * task.shares).sum(-1)
+        """Weighted mean squared error of the model on the training rows, `r`."""
+        first = slice(None, None, self.settings.members)
+        inputs, targets, shares = (part[first] for part in self._task)
+        error = self.predict(inputs.transpose(1, 2)) - targets.transpose(1, 2)
+        return (error.square().mean(-1) * shares).sum(-1)
 
     def _refine(self) -> None:
-        """Refine the best joined network; keep it by evidence, and write it back into the elite where it is fitter."""
-        data, settings, best = self._data, self.settings, self._state.best
+        """Refine the best joined networks, keep them by evidence, and write them back into the elite where fitter."""
+        settings, best = self.settings, self._state.best
         refined = refine(
             [part.mask[:, 0] for part in best],
             [part.weight[:, 0] for part in best],
-            data.inputs,
-            data.targets,
-            data.weights,
+            self._inputs,
+            self._targets,
+            self._rows,
             RefinementSettings(iterations=settings.refinement_iterations),
+            self._metric,
         )
         candidate = tuple(
             Genome(part.mask, weight.unsqueeze(1)) for part, weight in zip(best, refined.weights, strict=True)

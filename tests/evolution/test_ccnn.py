@@ -161,6 +161,38 @@ def test_refinement_is_written_back_and_makes_the_model() -> None:
     assert torch.allclose(fitness(scores, SMALL.epsilon), state.best_fitness, rtol=1e-12, atol=0)
 
 
+def test_refinement_judges_errors_in_the_channels_of_the_metric() -> None:
+    """A metric that sees the first output alone: that one is fitted, the other is lost."""
+    data = toy_data([1, 2])
+    first = torch.tensor([[1.0, 0.0]], dtype=torch.float64).expand(2, data.inputs.shape[1], 1, 2)
+    settings = replace(SMALL, refinement_iterations=40, density=1.0)
+    plain, judged = CCNN(settings), CCNN(settings)
+    train(plain, data)
+    train(judged, replace(data, metric=first.contiguous()))
+
+    def errors(learner: CCNN) -> Tensor:
+        return (learner.predict(data.inputs) - data.targets).square().mean(1)
+
+    assert bool((errors(judged)[:, 0] < 0.05).all())
+    assert bool((errors(judged)[:, 1] > 3 * errors(plain)[:, 1]).all())
+
+
+def test_several_members_make_one_model() -> None:
+    data = toy_data([1, 2])
+    learner = CCNN(replace(SMALL, members=3))
+    history = train(learner, data)
+    masks, weights = learner.genome(1)
+    assert [tuple(mask.shape) for mask in masks] == [(12, 2), (9, 12), (2, 9)]
+    assert torch.allclose(forward(masks, weights, data.inputs[1]), learner.predict(data.inputs)[1], rtol=0, atol=1e-13)
+    assert history[0]["fitness_best"].shape == (2,) and history[0]["density"].shape == (2, 3)
+    # The first member is the only one of a learner without others.
+    alone = CCNN(SMALL)
+    train(alone, data)
+    state, single = learner.state_dict(), alone.state_dict()
+    assert torch.allclose(state["population_weight_1"][:, :1], single["population_weight_1"], rtol=0, atol=1e-12)
+    assert not torch.equal(state["population_weight_1"][:, 1], state["population_weight_1"][:, 0])
+
+
 def test_the_network_is_pruned_and_equal() -> None:
     learner = CCNN(replace(SMALL, density=0.3))
     data = toy_data([1, 2])

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from ccnn_torch.evolution import Genome, MaskedNetwork, alive_nodes, decode, forward, prune
-from ccnn_torch.evolution.network import fed_nodes
+from ccnn_torch.evolution.network import average, fed_nodes
 
 SIZES = st.sampled_from([[3, 6, 6, 3], [2, 4, 1], [3, 3], [4, 2, 3, 2, 2]])
 
@@ -42,6 +42,22 @@ def test_forward_pruned_and_exported_network_give_the_naive_numbers(
         assert all(bool(alive.all()) for alive in alive_nodes(small_masks))
         network = MaskedNetwork(one_masks, one_weights)
         assert torch.allclose(network(inputs[k]), together[k], rtol=0, atol=1e-13)
+
+
+@settings(max_examples=40, deadline=None)
+@given(SIZES, st.sampled_from([0.15, 0.5, 1.0]), st.booleans(), st.integers(1, 4), st.integers(0, 2**31))
+def test_the_average_of_networks_is_one_network(
+    sizes: list[int], density: float, bias: bool, members: int, seed: int
+) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    masks, weights = parts(naive.random_layers(sizes, (2, members), density, bias, generator))
+    inputs = 2 * torch.rand(2, 5, sizes[0], generator=generator, dtype=torch.float64) - 1
+    expected = forward(masks, weights, inputs.unsqueeze(1)).mean(1)
+    wide_masks, wide_weights = average(masks, weights)
+    assert [mask.shape[-2] for mask in wide_masks[:-1]] == [members * size for size in sizes[1:-1]]
+    assert torch.allclose(forward(wide_masks, wide_weights, inputs), expected, rtol=0, atol=1e-13)
+    if len(sizes) > 2:
+        assert [int(m.sum()) for m in wide_masks] == [int(m.sum()) for m in masks]
 
 
 @settings(max_examples=60, deadline=None)

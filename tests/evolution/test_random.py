@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from scipy import stats
 
-from ccnn_torch.evolution.random import _GOLDEN, _mix_, uniform
+from ccnn_torch.evolution.random import _GOLDEN, _mix_, member_seeds, uniform
 
 
 def test_the_mixer_is_splitmix64() -> None:
@@ -50,6 +50,13 @@ def test_a_repeat_draws_the_same_whatever_stands_beside_it() -> None:
     for k, seed in enumerate((8, -3, 2**62)):
         assert torch.equal(uniform(torch.tensor([seed]), 1, 4, (6, 7))[0], together[k])
     assert torch.equal(uniform(torch.tensor([8]), 1, 4, (21,))[0], together[0].flatten()[:21])
+
+
+def test_members_of_a_repeat_have_seeds_of_their_own() -> None:
+    seeds = member_seeds(torch.arange(200), 5)
+    assert torch.equal(seeds[:, 0], torch.arange(200))
+    assert len(torch.unique(seeds)) == 1000
+    assert torch.equal(member_seeds(torch.tensor([7]), 3)[0], seeds[7, :3])
 
 
 def test_no_seeds_or_numbers_repeat() -> None:
