@@ -138,8 +138,17 @@ class RunConfig(_Part):
     rotation_weight: float = Field(
         default=0.04, gt=0, description="weight of orientation against position in m per rad (η of eq. 5)"
     )
-    max_condition: float = Field(
-        default=50.0, gt=1, description="rows whose Jacobian is worse conditioned are not trained on, but still judged"
+    damping: float | None = Field(
+        default=None,
+        ge=0,
+        description="weight of the joint deviation itself beside the pose error it explains, in m per rad; keeps it small "
+        "near singular poses; null = 0.01 for a serial arm, 0 for other mechanisms",
+    )
+    max_condition: float | None = Field(
+        default=None,
+        gt=1,
+        description="rows whose Jacobian is worse conditioned are not trained on, but still judged; null = 50, and no "
+        "bound where damping is above 0",
     )
     max_deviation: float | None = Field(
         default=None, gt=0, description="rows with a larger joint deviation (SI) are not trained on; null = no bound"

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -98,9 +100,7 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
         mechanism,
         case.joints,
         pose,
-        rotation_weight=config.rotation_weight,
-        max_condition=config.max_condition,
-        max_deviation=config.max_deviation,
+        **_pseudoerror_settings(config, mechanism),
     )
     splits = _splits(config, mechanism.frame(case.pose)[0], {"t": case.time}, seeds)
     notes = deviations.notes()
@@ -152,9 +152,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         records.joints,
         records.pose,
         parameters=parameters,
-        rotation_weight=config.rotation_weight,
-        max_condition=config.max_condition,
-        max_deviation=config.max_deviation,
+        **_pseudoerror_settings(config, mechanism),
     )
     notes += deviations.notes()
     return Prepared(
@@ -169,6 +167,26 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         data_hash=records.data_hash,
         notes=notes,
     )
+
+
+def _pseudoerror_settings(config: RunConfig, mechanism: Mechanism) -> dict[str, Any]:
+    """Damping and bounds, by default those that suit the mechanism.
+
+    Six-joint arms pass near singular poses all over their workspace: half of a UR10's rows have a condition number
+    above 50. Damped, all of them can be learned from, and the deviation stays a smooth function of the joints.
+    """
+    damping = config.damping
+    if damping is None:
+        damping = 0.01 if isinstance(mechanism, SerialArm) else 0.0
+    bound = config.max_condition
+    if bound is None:
+        bound = math.inf if damping > 0 else 50.0
+    return {
+        "rotation_weight": config.rotation_weight,
+        "damping": damping,
+        "max_condition": bound,
+        "max_deviation": config.max_deviation,
+    }
 
 
 def _splits(config: RunConfig, positions: Tensor, columns: Mapping[str, Column], seeds: list[int]) -> list[Split]:
