@@ -40,7 +40,7 @@ def columns(path: Path, *names: str) -> np.ndarray:
 
 @pytest.fixture
 def ideal(tmp_path: Path) -> Path:
-    """Twenty ideal joints that the model was trained on, q2 in mm, the last row far outside; and a column of no concern."""
+    """Twenty ideal joints that the model was trained on, the last row far outside; and a column of no concern."""
     joints = tripod_joints()[:20].numpy()
     joints[-1] += 3
     path = tmp_path / "ideal.csv"
@@ -87,7 +87,12 @@ def test_it_says_how_many_rows_are_outside(folder: Path, tmp_path: Path, ideal: 
 
 
 def test_covariates_come_from_the_table_in_any_unit(folder: Path, tmp_path: Path, arm: Compensator) -> None:
-    table = {"q1[deg]": [20.0, 30.0], "q2[rad]": [1.0, -1.0], "time[min]": [10.0, 20.0], "temperature[degC]": [20.0, 22]}
+    table = {
+        "q1[deg]": [20.0, 30.0],
+        "q2[rad]": [1.0, -1.0],
+        "time[min]": [10.0, 20.0],
+        "temperature[degC]": [20.0, 22],
+    }
     write_table(tmp_path / "in.csv", table)
     compensate(folder / "arm.onnx", tmp_path / "in.csv", tmp_path / "out.csv", quiet=True)
     joints = torch.tensor([[20.0, 30.0], [1.0, -1.0]], dtype=torch.float64).mT.clone()
