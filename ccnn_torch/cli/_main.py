@@ -12,7 +12,7 @@ from ccnn_torch.cli.compensate import compensate
 from ccnn_torch.cli.keys import keys
 from ccnn_torch.cli.picture import picture
 from ccnn_torch.cli.run import run
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import InputError, MethodFailedError
 
 __all__ = ["main"]
 
@@ -49,7 +49,7 @@ def main() -> None:
     try:
         # 130 comes back where a person pressed Ctrl-C.
         code = app(standalone_mode=False) or 0
-    except InputError as problem:
+    except (InputError, MethodFailedError) as problem:
         code = _say(str(problem))
     except typer.TyperException as problem:
         code = _say(f"{problem.format_message()} (ccnn --help, or ccnn COMMAND --help, tells what there is)")

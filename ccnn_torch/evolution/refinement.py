@@ -53,6 +53,9 @@ class RefinementSettings:
         noise: one noise precision for all channels (`shared`) or one for each (`channel`).
         first_prior: prior precision before its first estimate.
         warm_up: iterations before the first estimate of the precisions.
+        prior_shape, prior_rate: Gamma distribution that the prior precisions themselves are drawn from; they then are
+            (gamma + 2 shape) / (sum w^2 + 2 rate). With a hundred rows and small groups of weights this holds back
+            what the estimate of gamma alone would let through; with many rows it makes no difference.
         damping: first damping, relative to the diagonal of H.
         trials: dampings tried in an iteration before it is given up.
     """
@@ -60,10 +63,12 @@ class RefinementSettings:
     iterations: int = 50
     bayesian: bool = True
     ridge: float = 1e-6
-    groups: Literal["network", "layer", "unit"] = "layer"
+    groups: Literal["network", "layer", "unit"] = "unit"
     noise: Literal["shared", "channel"] = "channel"
-    first_prior: float = 0.1
+    first_prior: float = 1e-3
     warm_up: int = 3
+    prior_shape: float = 1.0
+    prior_rate: float = 0.1
     damping: float = 1e-2
     trials: int = 6
 
@@ -348,8 +353,8 @@ def _estimate_precisions(problem: RefinementProblem, state: RefinementState, mat
     determined = 1 - state.prior[:, problem.groups] * variance
     effective = _group_sums(problem, determined, group_count).clamp_min(0)
     squares = _group_sums(problem, state.weights.square(), group_count)
-    tiny = 1e-12
-    prior = ((effective + tiny) / (squares + tiny)).clamp(*_PRECISION_RANGE)
+    shape, rate = problem.settings.prior_shape, problem.settings.prior_rate
+    prior = ((effective + 2 * shape) / (squares + 2 * rate)).clamp(*_PRECISION_RANGE)
     prior[:, -1] = _PRECISION_RANGE[0]
     usable = ((failed == 0) & effective.isfinite().all(-1)).unsqueeze(-1)
     estimated = replace(

@@ -60,7 +60,7 @@ def fit_frames(
     needed = 3 if grouped or arm.orientation == "rotation_vector" else 5
     for group_of, names in ((base_of, base_names), (tool_of, tool_names)):
         _check_rows(arm, weights, group_of, names, needed)
-    rotation, position, _, _ = arm.chain(joints)
+    rotation, position = arm.flange(joints)
     measured = arm.frame(pose)
     base = arm.nominal[:6].expand(*lead, len(base_names), 6).clone()
     tool = arm.nominal[-6:].expand(*lead, len(tool_names), 6).clone()

@@ -150,43 +150,29 @@ class SerialArm(Mechanism):
         distance: Tensor = torch.linalg.vector_norm(pose[..., :3] - values[..., :3], dim=-1)
         return distance <= self.reach
 
-    def chain(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The arm from its base to its flange, without base and tool frame, in the base's axes.
+    def flange(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Flange in the arm's own base, without base and tool frame: rotation `... x 3 x 3`, position `... x 3` [m]."""
+        return self._walk(joints, self.resolve(parameters))[-1]
 
-        Returns:
-            flange rotation `... x 3 x 3` and position `... x 3` [m]; joint axes and points on them, `... x n x 3` each.
-        """
-        values = self.resolve(parameters)
+    def _walk(self, joints: Tensor, values: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Frames of the links one after the other, n + 1 of them, from the arm's own base to the flange."""
         links = values[..., 6:-6].reshape(*values.shape[:-1], len(self.joints), -1)
         motion = joints * self.signs
-        turn, slide = motion * self.revolute, motion * ~self.revolute
-        rotations, translations = self._transform(links, turn, slide, self.axes)
-        flange = (torch.eye(3, dtype=joints.dtype), torch.zeros(3, dtype=joints.dtype))
-        directions, points = [], []
-        for i in range(len(self.joints)):
-            behind = compose(flange, (rotations[..., i, :, :], translations[..., i, :]))
-            rotation, point = flange if self._axis_before else behind
-            directions.append((rotation @ self.axes[i]).expand_as(behind[1]))
-            points.append(point.expand_as(behind[1]))
-            flange = behind
-        return *flange, torch.stack(directions, dim=-2), torch.stack(points, dim=-2)
+        rotations, translations = self._transform(links, motion * self.revolute, motion * ~self.revolute, self.axes)
+        lead = translations.shape[:-2]
+        start = torch.eye(3, dtype=joints.dtype).expand(*lead, 3, 3), torch.zeros(*lead, 3, dtype=joints.dtype)
+        frames = [start, (rotations[..., 0, :, :], translations[..., 0, :])]
+        for i in range(1, len(self.joints)):
+            frames.append(compose(frames[-1], (rotations[..., i, :, :], translations[..., i, :])))
+        return frames
 
     def forward_frame(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Position `... x 3` [m] and rotation `... x 3 x 3` of the tool, also where the pose has no orientation."""
-        return self._placed(joints, self.resolve(parameters))[:2]
-
-    def _placed(self, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Tool position, tool rotation, and the geometric Jacobian `... x 6 x n`, in the record's frame."""
-        rotation, position, axes, points = self.chain(joints, values)
-        base = rotation_vector_to_matrix(values[..., 3:6])
-        tool = compose((rotation, position), (rotation_vector_to_matrix(values[..., -3:]), values[..., -6:-3]))
-        # A point on the axis gives the lever arm of a revolute joint; a prismatic one only moves along its axis.
-        swept = torch.linalg.cross(axes, tool[1][..., None, :] - points, dim=-1)
-        turning = self.revolute[:, None]
-        columns = torch.cat([torch.where(turning, swept, axes), axes * turning], dim=-1) * self.signs[:, None]
-        linear, angular = columns[..., :3] @ base.mT, columns[..., 3:] @ base.mT
-        placed = compose((base, values[..., :3]), tool)
-        return placed[1], placed[0], torch.cat([linear, angular], dim=-1).mT
+        values = self.resolve(parameters)
+        base = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3]
+        tool = rotation_vector_to_matrix(values[..., -3:]), values[..., -6:-3]
+        rotation, position = compose(compose(base, self._walk(joints, values)[-1]), tool)
+        return position, rotation
 
     def forward_kinematics(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
@@ -199,8 +185,20 @@ class SerialArm(Mechanism):
 
     def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Geometric Jacobian, closed form; see `Mechanism.jacobian`."""
-        jacobian = self._placed(joints, self.resolve(parameters))[2]
-        return jacobian if self.orientation == "rotation_vector" else jacobian[..., :3, :]
+        values = self.resolve(parameters)
+        frames = self._walk(joints, values)
+        rotation, position = frames[-1]
+        tip = position + (rotation @ values[..., -6:-3, None])[..., 0]
+        holders = frames[:-1] if self._axis_before else frames[1:]
+        axes = (torch.stack([f[0] for f in holders], dim=-3) @ self.axes[..., None])[..., 0]
+        # A point on the axis gives the lever arm of a revolute joint; a prismatic one only moves along its axis.
+        swept = torch.linalg.cross(axes, tip[..., None, :] - torch.stack([f[1] for f in holders], dim=-2), dim=-1)
+        turning, signs = self.revolute[:, None], self.signs[:, None]
+        base = rotation_vector_to_matrix(values[..., 3:6]).mT
+        linear = (torch.where(turning, swept, axes) * signs) @ base
+        if self.orientation == "none":
+            return linear.mT
+        return torch.cat([linear, (axes * turning * signs) @ base], dim=-1).mT
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Position difference [m] and rotation vector [rad] from the pose to the arm's, `... x 6` (or `... x 3`)."""
@@ -208,11 +206,11 @@ class SerialArm(Mechanism):
         return self._gap(joints, position, rotation, self.resolve(parameters), 1.0)
 
     def _gap(self, joints: Tensor, position: Tensor, rotation: Tensor | None, values: Tensor, weight: float) -> Tensor:
-        placed = self._placed(joints, values)
+        tool_position, tool_rotation = self.forward_frame(joints, values)
         if rotation is None:
-            return placed[0] - position
-        turn = matrix_to_rotation_vector(placed[1] @ rotation.mT)
-        return torch.cat([placed[0] - position, weight * turn], dim=-1)
+            return tool_position - position
+        turn = matrix_to_rotation_vector(tool_rotation @ rotation.mT)
+        return torch.cat([tool_position - position, weight * turn], dim=-1)
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Joints of the closest pose, as `nearest_joints`. Never NaN: `pose_error` tells how close it comes."""
@@ -257,7 +255,7 @@ class SerialArm(Mechanism):
             return torch.cat([rows, ridge.expand(*q.shape[:-1], -1, -1)], dim=-2) if damping else rows
 
         data = tuple(d.detach() for d in (anchor, values, *parts))
-        found = levenberg_marquardt(residual, anchor, slope, data, damping=1e-8)
+        found = levenberg_marquardt(residual, anchor, slope, data, tolerance=1e-10, damping=1e-8)
         if damping == 0 and len(self.joints) > len(weights):
             return least_norm(residual, slope, found, anchor, data)
         return found.value

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.run_report import write_report
@@ -20,17 +21,26 @@ __all__ = ["write_outputs"]
 
 def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
     """Model files, arrays, curves, plots, tables, report, and at last `results.json`."""
-    path, results, best = folder.path, calibration.results, calibration.method
-    calibration.save(path)
-    for method in calibration.outcomes:
-        if method != best:
-            folder.models.mkdir(exist_ok=True)
-            calibration.save(folder.models, method, name=method)
+    path, results = folder.path, calibration.results
+    if calibration.config.save_models:
+        results["notes"] += _save_models(calibration, folder)
     save_arrays(path, _arrays(calibration))
     for method in calibration.outcomes:
         save_history(path, method, _history(calibration, method))
     write_report(path, results)
     write_json(folder.results, results)
+
+
+def _save_models(calibration: Calibration, folder: RunFolder) -> list[str]:
+    """Write every method's model files; returns why one could not be written, a sentence each."""
+    problems = []
+    for method in calibration.outcomes:
+        best = method == calibration.method
+        try:
+            calibration.save(folder.path if best else folder.models, method, "model" if best else method)
+        except MethodFailedError as problem:
+            problems.append(f"No model file of {method}: {problem}.")
+    return problems
 
 
 def _arrays(calibration: Calibration) -> RunArrays:
