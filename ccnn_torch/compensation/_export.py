@@ -251,7 +251,10 @@ def to_onnx(
 @contextmanager
 def quiet_exporter() -> Iterator[None]:
     """Keep the exporters' progress, warnings and log lines from the user, here only."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "torch.export", "onnxscript", "onnx_ir", "torch")]
+    loggers = [
+        logging.getLogger(name)
+        for name in ("torch", "torch.onnx", "torch.export", "torch.__trace", "onnxscript", "onnx_ir")
+    ]
     levels = [logger.level for logger in loggers]
     try:
         for logger in loggers:

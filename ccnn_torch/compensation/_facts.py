@@ -14,6 +14,7 @@ from torch import Tensor
 from ccnn_torch import __version__
 from ccnn_torch.compensation._compensator import Compensator
 from ccnn_torch.compensation._networks import describe_network
+from ccnn_torch.compensation._session import TAKE_AGAIN
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.training import tensor_digest
@@ -70,17 +71,17 @@ def check_keys(facts: Any) -> dict[str, Any]:
         ModelFileError: they are not.
     """
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
-        raise ModelFileError(f"it says nothing of the form '{FORMAT}', so this package did not write it")
+        raise ModelFileError(f"it says nothing of the form '{FORMAT}', so this package did not write it" + TAKE_AGAIN)
     stated = facts.get("sha256")
     if not isinstance(stated, dict) or stated.get("keys") != _digest(facts):
-        raise ModelFileError("what it says about itself was edited after it was written")
+        raise ModelFileError("what it says about itself was edited after it was written" + TAKE_AGAIN)
     return facts
 
 
 def check_tensors(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
     """Raise ModelFileError unless the tensors are those that the facts were written with."""
     if facts["sha256"]["tensors"] != tensor_digest(tensors):
-        raise ModelFileError("its weights were altered after it was written")
+        raise ModelFileError("its weights were altered after it was written" + TAKE_AGAIN)
 
 
 def coordinates(entries: list[dict[str, str]]) -> tuple[Coordinate, ...]:

@@ -23,7 +23,16 @@ from ccnn_torch.compensation._compensator import Compensator, Hook
 from ccnn_torch.compensation._domain import Domain
 from ccnn_torch.compensation._facts import check_keys, check_tensors, coordinates
 from ccnn_torch.compensation._networks import network_from_description
-from ccnn_torch.compensation._session import METADATA_KEY, Array, open_onnx, open_pt2, read_pt2_text, run_onnx, run_pt2
+from ccnn_torch.compensation._session import (
+    METADATA_KEY,
+    TAKE_AGAIN,
+    Array,
+    open_onnx,
+    open_pt2,
+    read_pt2_text,
+    run_onnx,
+    run_pt2,
+)
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.training import Scaling
@@ -149,7 +158,7 @@ def load_model(path: str | Path) -> LoadedModel:
     try:
         facts, run, compensator = _open(path, content)
     except ModelFileError as reason:
-        raise ModelFileError(f"{path}: {reason}; take the file again from where it was written") from None
+        raise ModelFileError(f"{path}: {reason}") from None
     different = [key for key in facts if card.get(key) != facts[key]]
     if different:
         raise ModelFileError(
@@ -218,7 +227,7 @@ def _facts(text: str | None) -> dict[str, Any]:
     try:
         return check_keys(json.loads(text or "null"))
     except json.JSONDecodeError:
-        raise ModelFileError("what it says about itself is no JSON") from None
+        raise ModelFileError("what it says about itself is no JSON" + TAKE_AGAIN) from None
 
 
 def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
@@ -227,7 +236,7 @@ def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
         # The header's length stands in the first eight bytes, the header behind it; load() keeps it to itself.
         header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
     except (SafetensorError, ValueError):
-        raise ModelFileError("it is damaged, or no safetensors file") from None
+        raise ModelFileError("it is damaged, or no safetensors file" + TAKE_AGAIN) from None
     facts = _facts(header.get("__metadata__", {}).get(METADATA_KEY))
     check_tensors(facts, tensors)
     return facts, _rebuild(facts, tensors)
@@ -237,7 +246,7 @@ def _open_onnx(content: bytes) -> tuple[dict[str, Any], Any]:
     try:
         model = onnx.load_from_string(content)
     except DecodeError:
-        raise ModelFileError("it is damaged, or no ONNX file") from None
+        raise ModelFileError("it is damaged, or no ONNX file" + TAKE_AGAIN) from None
     facts = _facts({entry.key: entry.value for entry in model.metadata_props}.get(METADATA_KEY))
     if model.graph.input[0].type.tensor_type.elem_type != onnx.TensorProto.DOUBLE:
         raise ModelFileError(

@@ -15,9 +15,22 @@ from torch import Tensor
 
 from ccnn_torch.errors import ModelFileError
 
-__all__ = ["METADATA_KEY", "OUTPUTS", "Array", "open_onnx", "open_pt2", "read_pt2_text", "run_onnx", "run_pt2"]
+__all__ = [
+    "METADATA_KEY",
+    "OUTPUTS",
+    "TAKE_AGAIN",
+    "Array",
+    "open_onnx",
+    "open_pt2",
+    "read_pt2_text",
+    "run_onnx",
+    "run_pt2",
+]
 
 Array = NDArray[Any]
+
+# How sentences about a touched file end.
+TAKE_AGAIN = "; take it again from where it was written"
 
 METADATA_KEY = "ccnn_torch"
 OUTPUTS = ("command", "deviation", "inside_domain", "ideal", "ideal_inside_domain")
@@ -74,7 +87,7 @@ def _archive(content: bytes) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(io.BytesIO(content))
     except zipfile.BadZipFile:
-        raise ModelFileError("it is damaged, or no .pt2 file") from None
+        raise ModelFileError("it is damaged, or no .pt2 file" + TAKE_AGAIN) from None
 
 
 def _refuse_pickle(archive: zipfile.ZipFile) -> None:
@@ -88,7 +101,7 @@ def _refuse_pickle(archive: zipfile.ZipFile) -> None:
         elif inner.startswith(("data/weights/", "data/constants/")):
             pickled = not _plain(inner.rsplit("/", 1)[-1])
         if pickled:
-            raise ModelFileError(f"it holds pickled data ({inner}), which is never loaded")
+            raise ModelFileError(f"it holds pickled data ({inner}), which is never loaded" + TAKE_AGAIN)
 
 
 def _plain(name: str) -> bool:

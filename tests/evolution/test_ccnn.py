@@ -162,19 +162,14 @@ def test_refinement_is_written_back_and_makes_the_model() -> None:
 
 
 def test_refinement_judges_errors_in_the_channels_of_the_metric() -> None:
-    """A metric that sees the first output alone: that one is fitted, the other is lost."""
+    """A metric that sees the first output alone: that one is fitted, the other shrinks to its mean, 0, with mse 1."""
     data = toy_data([1, 2])
     first = torch.tensor([[1.0, 0.0]], dtype=torch.float64).expand(2, data.inputs.shape[1], 1, 2)
-    settings = replace(SMALL, refinement_iterations=40, density=1.0)
-    plain, judged = CCNN(settings), CCNN(settings)
-    train(plain, data)
-    train(judged, replace(data, metric=first.contiguous()))
-
-    def errors(learner: CCNN) -> Tensor:
-        return (learner.predict(data.inputs) - data.targets).square().mean(1)
-
-    assert bool((errors(judged)[:, 0] < 0.05).all())
-    assert bool((errors(judged)[:, 1] > 3 * errors(plain)[:, 1]).all())
+    learner = CCNN(replace(SMALL, refinement_iterations=40, density=1.0))
+    train(learner, replace(data, metric=first.contiguous()))
+    errors = (learner.predict(data.inputs) - data.targets).square().mean(1)
+    assert bool((errors[:, 0] < 0.25).all())
+    assert errors[:, 1].tolist() == pytest.approx([1.0, 1.0], abs=1e-6)
 
 
 def test_several_members_make_one_model() -> None:
