@@ -48,13 +48,13 @@ def jacobian_of(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Te
     Returns:
         value `... x c` and Jacobian `... x c x k`.
     """
-    value, pull = torch.func.vjp(function, point.detach())
+    value, pull = torch.func.vjp(function, point.detach())[:2]
     c, k = value.shape[-1], point.shape[-1]
     if c <= 2 * k:
         outputs = torch.eye(c, dtype=value.dtype, device=value.device)
         rows = [pull(e.expand_as(value))[0] for e in outputs]
         return value.detach(), torch.stack(rows, dim=-2) if rows else value.new_zeros(*value.shape, k)
-    _, push = torch.func.vjp(lambda cotangent: pull(cotangent)[0], torch.zeros_like(value))
+    push = torch.func.vjp(lambda cotangent: pull(cotangent)[0], torch.zeros_like(value))[1]
     columns = [push(e.expand_as(point))[0] for e in torch.eye(k, dtype=point.dtype, device=point.device)]
     return value.detach(), torch.stack(columns, dim=-1)
 
