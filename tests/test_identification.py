@@ -46,7 +46,7 @@ def arm_of(kind: str) -> SerialArm:
 
 
 def machine(kind: str, seed: int) -> tuple[SerialArm, Tensor, Tensor, Tensor]:
-    """Arm, its true parameters (0.5 mm and 0.5 mrad off, frames anywhere), joints and poses with 20 µm, 50 µrad noise."""
+    """Arm, its true parameters (0.5 mm and 0.5 mrad off, frames anywhere), joints, poses with 20 µm and 50 µrad."""
     generator = torch.Generator().manual_seed(seed)
     arm = arm_of(kind)
     truth = arm.nominal + 5e-4 * torch.randn(arm.nominal.shape, generator=generator, dtype=torch.float64)
@@ -96,6 +96,7 @@ def test_the_deviation_brings_the_nominal_arm_where_the_identified_one_stands(ki
     torch.testing.assert_close(correction(joints.reshape(4, 40, -1)), deviation.reshape(4, 40, -1), rtol=0, atol=1e-14)
 
 
+@pytest.mark.filterwarnings("ignore::FutureWarning")  # torch's exporter, about its own parts
 def test_the_deviation_runs_in_onnx_in_double() -> None:
     arm, truth, joints, pose = machine("six", seed=3)
     correction = GeometricDeviation(arm, fit_frames(arm, joints, pose), truth).eval()
