@@ -1,16 +1,14 @@
-"""Link parameters from noisy poses of arms that the fit has not seen, and the correction that follows from them."""
+"""Link parameters from noisy poses of arms that the fit has not seen."""
 
 from __future__ import annotations
 
-import io
 import math
 
-import onnxruntime
 import pytest
 import torch
 from torch import Tensor
 
-from ccnn_torch.identification import GeometricDeviation, fit_links
+from ccnn_torch.identification import fit_links
 from ccnn_torch.mechanisms.frames import fit_frames
 from ccnn_torch.mechanisms.serial import SerialArm
 
@@ -76,37 +74,3 @@ def test_links_predict_held_out_poses(kind: str) -> None:
     assert float(after) < 3e-5 < 3e-4 < float(before)
     alone = fit_links(arm, joints, pose, frames[0], weights[0])
     torch.testing.assert_close(alone, fitted[0], rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("kind", ["six", "seven"])
-def test_the_deviation_brings_the_nominal_arm_where_the_identified_one_stands(kind: str) -> None:
-    arm, truth, joints, pose = machine(kind, seed=2)
-    frames = fit_frames(arm, joints, pose)
-    correction = GeometricDeviation(arm, frames, truth)
-    deviation = correction(joints)
-    assert deviation.shape == joints.shape
-    condition = arm.condition_number(joints, 0.3, frames)
-    gap = arm.pose_error(arm.forward_kinematics(joints + deviation, frames), arm.forward_kinematics(joints, truth))
-    start = arm.pose_error(arm.forward_kinematics(joints, frames), arm.forward_kinematics(joints, truth))
-    good = condition < 15
-    assert int(good.sum()) > 20
-    assert float(gap.position[good].max()) < 0.02 * float(start.position.median())
-    assert bool((gap.position <= start.position.max()).all())
-    assert float(deviation.abs().max()) < 0.1
-    torch.testing.assert_close(correction(joints.reshape(4, 40, -1)), deviation.reshape(4, 40, -1), rtol=0, atol=1e-14)
-
-
-@pytest.mark.filterwarnings("ignore::FutureWarning")  # torch's exporter, about its own parts
-def test_the_deviation_runs_in_onnx_in_double() -> None:
-    arm, truth, joints, pose = machine("six", seed=3)
-    correction = GeometricDeviation(arm, fit_frames(arm, joints, pose), truth).eval()
-    batch = torch.export.Dim("batch")
-    program = torch.onnx.export(
-        correction, (joints[:3],), dynamo=True, external_data=False, dynamic_shapes=({0: batch},), verbose=False
-    )
-    assert program is not None
-    stream = io.BytesIO()
-    program.save(stream)
-    session = onnxruntime.InferenceSession(stream.getvalue())
-    (result,) = session.run(None, {session.get_inputs()[0].name: joints.numpy()})
-    torch.testing.assert_close(torch.from_numpy(result), correction(joints), rtol=0, atol=1e-13)

@@ -80,7 +80,7 @@ def test_group_by_column_and_cell() -> None:
 
 def test_block_is_the_far_end_of_the_principal_direction() -> None:
     where = positions()
-    along = where.numpy() @ np.array([-1, -2, 3])  # the largest component counts as positive
+    along = where.numpy() @ np.array([1, 2, -3])  # the largest component counts as negative
     split = split_rows(where, "block", test=0.3, validation=0.2, seed=0)
     order = np.argsort(along, kind="stable")
     assert sets(split)[2] == set(order[-60:])  # 200 rows in fives: no group stands across a border

@@ -1,4 +1,3 @@
-"""Geometric parameters of a machine from measured records, and the correction that follows from them."""
+"""Geometric parameters of a machine from measured records."""
 
-from ccnn_torch.identification._geometric_deviation import GeometricDeviation as GeometricDeviation
-from ccnn_torch.identification._links import fit_links as fit_links
+from ccnn_torch.identification.links import fit_links as fit_links

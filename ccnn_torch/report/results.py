@@ -210,6 +210,8 @@ def pose_block(
     rotation_weight: float | None = None,
     position_remainder: ArrayLike | None = None,
     rotation_remainder: ArrayLike | None = None,
+    position_geometry: ArrayLike | None = None,
+    rotation_geometry: ArrayLike | None = None,
 ) -> Block:
     """Root mean square and maximum of the pose error over the held-out rows, before and after.
 
@@ -220,6 +222,8 @@ def pose_block(
         rotation_weight: η of eq. 5 [m/rad]; adds `energy`, E = position error + η · rotation error, row by row [m].
         position_remainder, rotation_remainder: what no joint deviation can explain, `r x s` [m], [rad]; adds
             `not_compensable` beside `before` and `after`.
+        position_geometry, rotation_geometry: what geometric calibration alone leaves, `r x s` [m], [rad]; adds
+            `geometry`.
 
     Returns:
         `{"position": {"unit": "m", "before": {"rms": S, "max": S}, "after": …}, "rotation": {…} or null}`, and `energy`
@@ -233,13 +237,23 @@ def pose_block(
         return {"unit": unit} | {k: _rms_and_max(_array(v), weights) for k, v in errors.items() if v is not None}
 
     block: Block = {
-        "position": quantity("m", before=position_before, after=position_after, not_compensable=position_remainder),
+        "position": quantity(
+            "m",
+            before=position_before,
+            after=position_after,
+            geometry=position_geometry,
+            not_compensable=position_remainder,
+        ),
         "rotation": None,
     }
     if rotation_before is None or rotation_after is None:
         return block
     block["rotation"] = quantity(
-        "rad", before=rotation_before, after=rotation_after, not_compensable=rotation_remainder
+        "rad",
+        before=rotation_before,
+        after=rotation_after,
+        geometry=rotation_geometry,
+        not_compensable=rotation_remainder,
     )
     if rotation_weight is not None:
         before = _array(position_before) + rotation_weight * _array(rotation_before)

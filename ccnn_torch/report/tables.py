@@ -184,7 +184,19 @@ def _scale(results: Results, key: str, measure: str) -> tuple[float, str]:
 def _pose_table(results: Results) -> Table:
     names = {"position": "position", "rotation": "rotation", "energy": "energy E (eq. 5)"}
     blocks = {name: results["pose"][key] for key, name in names.items() if results["pose"].get(key)}
-    remainder = any("not_compensable" in block for block in blocks.values())
+    # Beside before and after, where the run has them: block key, column, and the sentence that explains it.
+    extras = [
+        extra
+        for extra in (
+            ("geometry", "RMS geometry alone", "Geometry alone: link parameters and frames fitted to the same rows."),
+            (
+                "not_compensable",
+                "RMS not compensable",
+                "Not compensable: the part of the measured error that no joint deviation explains.",
+            ),
+        )
+        if any(extra[0] in block for block in blocks.values())
+    ]
     rows = []
     for name, block in blocks.items():
         scale, unit = display_unit(block["unit"], block["before"]["rms"]["median"] or 0.0)
@@ -193,14 +205,11 @@ def _pose_table(results: Results) -> Table:
             removed = removed_percent(block["before"][measure], block["after"][measure])
             cells += [interval_text(block[when][measure], scale) for when in ("before", "after")]
             cells.append("–" if removed is None else f"{removed:.1f}")
-        if remainder:
-            cells.append(interval_text(block.get("not_compensable", {}).get("rms"), scale))
+        cells += [interval_text(block.get(key, {}).get("rms"), scale) for key, _, _ in extras]
         rows.append(tuple(cells))
     columns = ["pose error"]
     for measure in ("RMS", "max"):
         columns += [f"{measure} before", f"{measure} after", f"{measure} removed [%]"]
-    note = _repeats(results)
-    if remainder:
-        columns.append("RMS not compensable")
-        note = f"Not compensable: the part of the measured error that no joint deviation explains. {note}".strip()
+    columns += [column for _, column, _ in extras]
+    note = " ".join([*(sentence for _, _, sentence in extras), _repeats(results)]).strip()
     return Table("Pose error on held-out rows", tuple(columns), tuple(rows), note)

@@ -20,7 +20,7 @@ from ccnn_torch.report.results import (
 )
 from ccnn_torch.runs.config import RunConfig
 from ccnn_torch.runs.dataset import Dataset, pad_rows
-from ccnn_torch.runs.evaluate import Outcome
+from ccnn_torch.runs.evaluate import Outcome, pose_with_geometry
 from ccnn_torch.runs.prepare import Prepared
 
 __all__ = ["assemble", "best_method", "versions"]
@@ -118,6 +118,7 @@ def _pose(config: RunConfig, prepared: Prepared, before: PoseError, after: PoseE
     """Over all test rows, those that were not fit to be trained on as well."""
     rows = pad_rows([split.test for split in prepared.dataset.splits])
     remainder = prepared.pseudoerror
+    geometry = pose_with_geometry(prepared)
 
     def held_out(values: Tensor | None) -> Tensor | None:
         return None if values is None else rows.take(values.expand(len(rows.index), -1))
@@ -133,6 +134,8 @@ def _pose(config: RunConfig, prepared: Prepared, before: PoseError, after: PoseE
         config.rotation_weight,
         held_out(_finite(remainder.remainder_position)),
         held_out(_finite(remainder.remainder_rotation)),
+        held_out(None if geometry is None else geometry.position),
+        held_out(None if geometry is None else geometry.rotation),
     )
 
 

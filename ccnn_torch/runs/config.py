@@ -141,8 +141,8 @@ class RunConfig(_Part):
     damping: float | None = Field(
         default=None,
         ge=0,
-        description="weight of the joint deviation itself beside the pose error it explains, in m per rad; keeps it small "
-        "near singular poses; null = 0.01 for a serial arm, 0 for other mechanisms",
+        description="weight of the joint deviation itself beside the pose error it explains, in m per rad; keeps it "
+        "small near singular poses; null = 0.01 for a serial arm, 0 for other mechanisms",
     )
     max_condition: float | None = Field(
         default=None,

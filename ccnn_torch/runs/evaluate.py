@@ -11,7 +11,7 @@ from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.runs.fitting import Fitted
 from ccnn_torch.runs.prepare import Prepared
 
-__all__ = ["Outcome", "evaluate", "pose_before"]
+__all__ = ["Outcome", "evaluate", "pose_before", "pose_with_geometry"]
 
 # The fixed point q = q* - δ(q) gains a factor of the Lipschitz constant of δ each time, about 1e-3 for real machines.
 _COMMAND_ITERATIONS = 8
@@ -43,6 +43,14 @@ def pose_before(prepared: Prepared) -> PoseError:
         return prepared.mechanism.pose_error(prepared.pose, prepared.case.pose)
     nominal = prepared.mechanism.forward_kinematics(_joints(prepared), prepared.parameters)
     return prepared.mechanism.pose_error(prepared.pose, nominal)
+
+
+def pose_with_geometry(prepared: Prepared) -> PoseError | None:
+    """Pose error that geometric calibration alone leaves, `r x s`; None where no geometry was fitted."""
+    if prepared.identified is None:
+        return None
+    reached = prepared.mechanism.forward_kinematics(_joints(prepared), prepared.identified)
+    return prepared.mechanism.pose_error(prepared.pose, reached)
 
 
 def evaluate(prepared: Prepared, fitted: Fitted) -> Outcome:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
+from ccnn_torch.identification import fit_links
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.mechanisms.frames import fit_frames
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
@@ -35,6 +36,8 @@ class Prepared:
         joints: commanded joints, `s x n` [SI].
         pose: measured poses, `r x s x p` or `s x p` [SI].
         pseudoerror: what the poses say about the joints.
+        identified: geometry with links and frames fitted to the training rows of each repeat, like `parameters`: what a
+            geometric calibration would command by, to be compared with; None where it was not fitted.
         case: the case study behind simulated rows (its noise is `noise`, `r x s x n`), or None for measured records.
         notes: sentences for the person who reads the results.
     """
@@ -48,6 +51,7 @@ class Prepared:
     pseudoerror: Pseudoerror
     dataset: Dataset
     data_hash: str
+    identified: Tensor | None = None
     case: CaseStudy | None = None
     noise: Tensor | None = None
     notes: list[str] = field(default_factory=list)
@@ -136,7 +140,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
     if arm is not None and records.orientation == "none":
         mechanism = arm = arm.with_orientation("none")
     splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds)
-    parameters = None
+    parameters, identified = None, None
     notes = list(records.notes)
     if arm is not None and arm.unknown_frames:
         rows = pad_rows([Dataset.part(split, "fit") for split in splits])
@@ -144,6 +148,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         weights.scatter_add_(1, rows.index, rows.weights)
         parameters = fit_frames(arm, records.joints, records.pose, weights, columns=records.columns)
         if not (arm.frame_per or arm.tool_per):
+            identified = fit_links(arm, records.joints, records.pose, parameters, weights).unsqueeze(-2)
             parameters = parameters.unsqueeze(-2)
         frames = " and ".join(arm.unknown_frames)
         notes.append(f"Frames fitted first, on the training rows of each repeat: {frames}.")
@@ -165,6 +170,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         pseudoerror=deviations,
         dataset=_dataset(mechanism, records.joints, records.covariates, deviations, splits, seeds),
         data_hash=records.data_hash,
+        identified=identified,
         notes=notes,
     )
 

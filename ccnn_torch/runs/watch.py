@@ -23,7 +23,7 @@ def genome(learner: Learner, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
 
 
 class ProgressBar:
-    """One line on stderr: what is trained, steps done, time left, and the best training error. Silent off a terminal."""
+    """One line on stderr: what is trained, steps done, time left, the error so far. Silent off a terminal."""
 
     def __init__(self, label: str, quiet: bool) -> None:
         self._label = label
