@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,16 +12,20 @@ from ccnn_torch.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+    from torch import Tensor
 
     from ccnn_torch.compensation import LoadedModel
+    from ccnn_torch.mechanisms import Mechanism
     from ccnn_torch.records import Table
 
     Array = NDArray[np.float64]
 
 __all__ = ["compensate"]
 
-# How near to the wanted pose the joints must bring the nominal machine [m + rad].
-_REACHED = 1e-8
+# How near to the wanted pose the joints must bring the nominal machine [m, rad].
+_CLOSE = 1e-8
+# Starts tried at once where the row before leads to no joints.
+_STARTS = 64
 
 
 def compensate(
@@ -37,7 +41,7 @@ def compensate(
     OUT.csv repeats the columns of IN.csv and adds command_q1[unit]…, deviation_q1[unit]… and inside_domain[1] (0 =
     outside the model's domain, where the correction fades into its safe value). With --back it adds ideal_q1[unit]…
     and inside_domain[1]; the commands are the columns command_q1… where IN.csv has them, else q1…. With --pose a
-    serial arm takes the branch nearest to guess_q1[unit]… where given, else nearest to the row before.
+    serial arm takes the branch of guess_q1[unit]… where given, else that of the row before.
 
     Examples:
 
@@ -119,38 +123,53 @@ def _joints_of_poses(loaded: LoadedModel, table: Table) -> Array:
         missing = [c.header for c in mechanism.pose if c.name not in {k.name for k in coordinates}]
         raise InputError(f"{table.path}: the poses of {mechanism.name} need the columns {', '.join(missing)}, too")
     poses = torch.from_numpy(values)
+    edges = [loaded.facts["domain"]["inputs"][c.name] for c in mechanism.joints]
+    guess = torch.tensor([(edge["low"] + edge["high"]) / 2 for edge in edges], dtype=torch.float64)
     guesses = tuple(Coordinate(f"guess_{c.name}", c.unit) for c in mechanism.joints)
-    if any(c.name in table for c in guesses):
+    guided = any(c.name in table for c in guesses)
+    if guided:
         guess = torch.from_numpy(stack_columns(table, guesses, JOINT_LIMIT))
-        joints = mechanism.solve_inverse(poses, guess=guess)
-    elif mechanism.orientations:
-        joints = _follow(mechanism, poses)
-    else:
-        joints = mechanism.solve_inverse(poses)
-    found = joints.detach().numpy()
-    # An arm's solver stops at the nearest pose where the wanted one is out of reach.
-    error = mechanism.pose_error(mechanism.forward_kinematics(joints, guess=poses), poses)
-    missed = error.position > _REACHED if error.rotation is None else (error.position + error.rotation) > _REACHED
-    lost = np.flatnonzero(~np.isfinite(found).all(-1) | missed.detach().numpy())
+    follow = bool(mechanism.orientations) and not guided
+    joints = _follow(mechanism, poses, guess) if follow else mechanism.solve_inverse(poses, guess=guess)
+    # Of all full turns of a revolute joint the one nearest to the guess, or to the middle of the model's domain.
+    turning = torch.tensor([c.unit == "rad" for c in mechanism.joints])
+    joints = joints - torch.where(turning, 2 * torch.pi * torch.round((joints - guess) / (2 * torch.pi)), 0.0)
+    lost = np.flatnonzero(~_reached(mechanism, joints, poses).numpy())
     if len(lost):
         raise InputError(
-            f"{table.path}: the pose at {name_lines(table.lines, lost)} has no joints on this branch of "
-            f"{mechanism.name}: correct or remove it, or give guess_q1[{mechanism.joints[0].unit}]… near the solution"
+            f"{table.path}: no joints of {mechanism.name} were found for the pose at {name_lines(table.lines, lost)}; "
+            f"correct or remove it, or give guess_q1[{mechanism.joints[0].unit}]… near the solution"
         )
-    return found
+    return joints.detach().numpy()
 
 
-def _follow(mechanism: Any, poses: Any) -> Any:
-    """Joints of poses one after the other, each from those of the row before, so that no branch is jumped."""
+def _follow(mechanism: Mechanism, poses: Tensor, guess: Tensor) -> Tensor:
+    """Joints of poses one after the other, each on the branch of those of the row before, the first on the guess's.
+
+    Where no such branch is found, the joints nearest to those of the row before are taken, out of many starts.
+    """
     import torch
 
+    starts = mechanism.sample_joints(_STARTS, torch.Generator().manual_seed(0))
     rows = []
-    guess = mechanism.home_joints
     for pose in poses:
         joints = mechanism.solve_inverse(pose, guess=guess)
+        if not bool(_reached(mechanism, joints, pose)):
+            found = mechanism.solve_inverse(pose.expand(_STARTS, -1), guess=starts)
+            distance = mechanism.wrap(found - guess).norm(dim=-1)
+            good = _reached(mechanism, found, pose.expand(_STARTS, -1))
+            joints = found[torch.where(good, distance, torch.inf).argmin()]
         rows.append(joints)
-        guess = torch.where(torch.isfinite(joints).all(), joints, guess)
+        guess = torch.where(_reached(mechanism, joints, pose), joints, guess)
     return torch.stack(rows)
+
+
+def _reached(mechanism: Mechanism, joints: Tensor, poses: Tensor) -> Tensor:
+    """Whether joints bring the nominal machine to the poses, `...`; an arm's solver stops at the nearest one."""
+    error = mechanism.pose_error(mechanism.forward_kinematics(joints, guess=poses), poses)
+    # A comparison with NaN is false, so a pose without joints is not reached either.
+    reached = error.position < _CLOSE
+    return reached if error.rotation is None else reached & (error.rotation < _CLOSE)
 
 
 def _named(what: str, loaded: LoadedModel, values: Array, units: dict[str, str]) -> dict[str, Array]:

@@ -1,0 +1,79 @@
+"""Link parameters of a serial arm from measured poses: Bayesian least squares around the maker's geometry."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.least_squares import jacobian_of, levenberg_marquardt
+from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.rotations import matrix_to_rotation_vector
+
+__all__ = ["fit_links"]
+
+# The noise and the parameters are estimated in turn; the noise has settled after two rounds.
+_ROUNDS = 3
+
+
+def fit_links(
+    arm: SerialArm,
+    joints: Tensor,
+    pose: Tensor,
+    start: Tensor,
+    weights: Tensor | None = None,
+    rotation_weight: float = 0.3,
+    length_tolerance: float = 1e-3,
+    angle_tolerance: float = 1e-3,
+) -> Tensor:
+    """Fit all link parameters, and with them the frames that are unknown, in each repeat on its own rows.
+
+    Every link parameter is drawn to the maker's value with the tolerance as standard deviation, against the noise that
+    the rows show: what the rows cannot tell (two parallel axes, a tool length along the last axis) stays nominal, so
+    that nothing needs to be left out by hand. Frames in `arm.unknown_frames` are free.
+
+    Args:
+        arm: the arm, with one base and one tool frame for all rows.
+        joints: `s x n` [SI].
+        pose: measured, `s x p` [SI].
+        start: parameters with the frames fitted, as `fit_frames` returns them, `r x k` or `k` [SI].
+        weights: `r x s` or `s` [1]; 0 leaves a row out (held-out rows); all 1 when None.
+        rotation_weight: [m/rad].
+        length_tolerance: of the lengths in the links [m].
+        angle_tolerance: of the angles in the links [rad].
+
+    Returns:
+        All parameters, as `start`.
+    """
+    weights = torch.ones(len(joints), dtype=torch.float64) if weights is None else weights
+    root = weights.sqrt()[..., None]
+    position, rotation = arm.frame(pose)
+    unit = {"m": 1 / length_tolerance, "rad": 1 / angle_tolerance}
+    stiffness = torch.tensor([unit[p.unit] for p in arm.geometry], dtype=torch.float64)
+    for name, part in (("base", slice(0, 6)), ("tool", slice(-6, None))):
+        if name in arm.unknown_frames:
+            stiffness[part] = 0
+
+    def gap(values: Tensor) -> Tensor:
+        """Weighted pose difference, `... x s x c`. values: `... x s x k`."""
+        there, turned = arm.forward_frame(joints, values)
+        if rotation is None:
+            return (there - position) * root
+        turn = matrix_to_rotation_vector(turned @ rotation.mT)
+        return torch.cat([there - position, rotation_weight * turn], dim=-1) * root
+
+    def by_row(values: Tensor) -> Tensor:
+        return values[..., None, :].expand(*values.shape[:-1], len(joints), -1)
+
+    value = start
+    for _ in range(_ROUNDS):
+        square = gap(by_row(value)).square().mean(-1).sum(-1) / weights.sum(-1)
+        pull = square.sqrt()[..., None] * stiffness
+
+        def residual(values: Tensor, pull: Tensor = pull) -> Tensor:
+            return torch.cat([gap(by_row(values)).flatten(-2), (values - arm.nominal) * pull], dim=-1)
+
+        def slope(values: Tensor, pull: Tensor = pull) -> Tensor:
+            return torch.cat([jacobian_of(gap, by_row(values))[1].flatten(-3, -2), torch.diag_embed(pull)], dim=-2)
+
+        value = levenberg_marquardt(residual, value, slope, max_iterations=20, damping=1e-6).value
+    return value

@@ -1,0 +1,112 @@
+"""Link parameters from noisy poses of arms that the fit has not seen, and the correction that follows from them."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import onnxruntime
+import pytest
+import torch
+from torch import Tensor
+
+from ccnn_torch.identification import GeometricDeviation, fit_links
+from ccnn_torch.mechanisms.frames import fit_frames
+from ccnn_torch.mechanisms.serial import SerialArm
+
+HALF = math.pi / 2
+SIX = [
+    [0.1, HALF, 0.4, 0.0],
+    [-0.5, 0, 0.0, 0.0],
+    [-0.4, 0, 0, 0],
+    [0, HALF, 0.12, 0],
+    [0, -HALF, 0.1, 0],
+    [0, 0, 0.09, 0],
+]
+SEVEN = [
+    [0.0, 0.0, 0.333, 0.0],
+    [0.0, -HALF, 0.0, 0.0],
+    [0.0, HALF, 0.316, 0.0],
+    [0.0825, HALF, 0.0, 0.0],
+    [-0.0825, -HALF, 0.384, 0.0],
+    [0.0, HALF, 0.0, 0.0],
+    [0.088, HALF, 0.107, 0.0],
+]
+
+
+def arm_of(kind: str) -> SerialArm:
+    links, convention = (SIX, "standard") if kind == "six" else (SEVEN, "modified")
+    return SerialArm(
+        name=kind,
+        convention=convention,
+        links=links,
+        limits=[(-2.0, 2.0)] * len(links),
+        unknown_frames=("base", "tool"),
+    )
+
+
+def machine(kind: str, seed: int) -> tuple[SerialArm, Tensor, Tensor, Tensor]:
+    """Arm, its true parameters (0.5 mm and 0.5 mrad off, frames anywhere), joints, poses with 20 µm and 50 µrad."""
+    generator = torch.Generator().manual_seed(seed)
+    arm = arm_of(kind)
+    truth = arm.nominal + 5e-4 * torch.randn(arm.nominal.shape, generator=generator, dtype=torch.float64)
+    truth[:6] = torch.tensor([1.0, -2.0, 0.3, 0.1, -0.4, 2.0], dtype=torch.float64)
+    truth[-6:] = torch.tensor([0.02, 0.05, 0.11, 0.3, 1.0, -0.2], dtype=torch.float64)
+    joints = arm.sample_joints(160, generator)
+    pose = arm.forward_kinematics(joints, truth)
+    noise = torch.randn(pose.shape, generator=generator, dtype=torch.float64)
+    scale = torch.tensor([2e-5] * 3 + [5e-5] * 3, dtype=torch.float64)
+    return arm, truth, joints, pose + noise * scale
+
+
+@pytest.mark.parametrize("kind", ["six", "seven"])
+def test_links_predict_held_out_poses(kind: str) -> None:
+    arm, truth, joints, pose = machine(kind, seed=1)
+    weights = torch.ones(2, 160, dtype=torch.float64)
+    weights[0, 100:] = 0
+    weights[1, :60] = 0
+    pose[100:101, 0] += 0.5  # a held-out row of the first repeat must not be looked at
+    frames = fit_frames(arm, joints, pose, weights)
+    fitted = fit_links(arm, joints, pose, frames, weights)
+    assert fitted.shape == frames.shape == (2, len(arm.geometry))
+    held_out = slice(101, 160)
+    real = arm.forward_kinematics(joints[held_out], truth)
+    before = arm.pose_error(arm.forward_kinematics(joints[held_out], frames[0]), real).position.square().mean().sqrt()
+    after = arm.pose_error(arm.forward_kinematics(joints[held_out], fitted[0]), real).position.square().mean().sqrt()
+    assert float(after) < 3e-5 < 3e-4 < float(before)
+    alone = fit_links(arm, joints, pose, frames[0], weights[0])
+    torch.testing.assert_close(alone, fitted[0], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["six", "seven"])
+def test_the_deviation_brings_the_nominal_arm_where_the_identified_one_stands(kind: str) -> None:
+    arm, truth, joints, pose = machine(kind, seed=2)
+    frames = fit_frames(arm, joints, pose)
+    correction = GeometricDeviation(arm, frames, truth)
+    deviation = correction(joints)
+    assert deviation.shape == joints.shape
+    condition = arm.condition_number(joints, 0.3, frames)
+    gap = arm.pose_error(arm.forward_kinematics(joints + deviation, frames), arm.forward_kinematics(joints, truth))
+    start = arm.pose_error(arm.forward_kinematics(joints, frames), arm.forward_kinematics(joints, truth))
+    good = condition < 15
+    assert int(good.sum()) > 20
+    assert float(gap.position[good].max()) < 0.02 * float(start.position.median())
+    assert bool((gap.position <= start.position.max()).all())
+    assert float(deviation.abs().max()) < 0.1
+    torch.testing.assert_close(correction(joints.reshape(4, 40, -1)), deviation.reshape(4, 40, -1), rtol=0, atol=1e-14)
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")  # torch's exporter, about its own parts
+def test_the_deviation_runs_in_onnx_in_double() -> None:
+    arm, truth, joints, pose = machine("six", seed=3)
+    correction = GeometricDeviation(arm, fit_frames(arm, joints, pose), truth).eval()
+    batch = torch.export.Dim("batch")
+    program = torch.onnx.export(
+        correction, (joints[:3],), dynamo=True, external_data=False, dynamic_shapes=({0: batch},), verbose=False
+    )
+    assert program is not None
+    stream = io.BytesIO()
+    program.save(stream)
+    session = onnxruntime.InferenceSession(stream.getvalue())
+    (result,) = session.run(None, {session.get_inputs()[0].name: joints.numpy()})
+    torch.testing.assert_close(torch.from_numpy(result), correction(joints), rtol=0, atol=1e-13)
