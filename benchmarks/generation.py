@@ -44,7 +44,7 @@ def main() -> None:
     print(f"{'-'.join(map(str, sizes))}, {given.rows} rows, {given.repeats} repeats, {given.threads} threads")
     print(f"{'population':>10} {'generations/s':>14} {'networks/s':>11} {'numpy loop: generations/s':>26} {'ratio':>6}")
     for population in given.populations:
-        settings = CCNNSettings(hidden=tuple(given.hidden), population=population)
+        settings = CCNNSettings(hidden=tuple(given.hidden), population=population, generations=120)
         joined = len(sizes[1:]) * population * (settings.representatives + 1)
         rate = given.repeats / least_time(batched(sizes, given.rows, given.repeats, settings), clock)
         peer = 1 / least_time(NumpyLoop(sizes, given.rows, settings).generation, clock)

@@ -14,7 +14,14 @@ from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
 from ccnn_torch.learners.constant import Constant
 from ccnn_torch.testing import check_learner
 
-SMALL = {"hidden": (3, 2), "population": 8, "generations": 6, "representatives": 1}
+SMALL = {
+    "hidden": (3, 2),
+    "population": 8,
+    "generations": 6,
+    "representatives": 1,
+    "members": 1,
+    "refinement_iterations": 0,
+}
 
 
 @pytest.mark.parametrize(
@@ -22,7 +29,7 @@ SMALL = {"hidden": (3, 2), "population": 8, "generations": 6, "representatives":
     [
         lambda: CCNN(CCNNSettings(**SMALL)),
         lambda: CCNN(CCNNSettings(**SMALL, bias=False, elites=3, crossover_kind="uniform")),
-        lambda: CCNN(CCNNSettings(**SMALL, refinement_iterations=4, refine_every=2, members=2)),
+        lambda: CCNN(CCNNSettings(**{**SMALL, "refinement_iterations": 4, "refine_every": 2, "members": 2})),
         lambda: Descent(steps=8),
         Constant,
     ],

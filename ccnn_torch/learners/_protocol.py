@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
-__all__ = ["Learner", "TrainingData"]
+__all__ = ["Learner", "TrainingData", "missing_verbs"]
 
 
 @dataclass(frozen=True)
@@ -76,3 +76,16 @@ class Learner(Protocol):
 
         Only operators that ONNX Runtime has in double (matmul, add, mul, sigmoid, tanh, relu, exp, sin, cos, where).
         """
+
+
+_VERBS = ("start", "step", "finished", "steps", "predict", "state_dict", "load_state_dict", "network")
+
+
+def missing_verbs(learner: object) -> list[str]:
+    """What `learner` lacks of `Learner`.
+
+    The verbs are asked of its class: `isinstance` would read the properties, which a learner that was not started may
+    not have yet (Python before 3.12).
+    """
+    missing = [verb for verb in _VERBS if not hasattr(type(learner), verb)]
+    return missing if isinstance(getattr(learner, "name", None), str) else ["name", *missing]

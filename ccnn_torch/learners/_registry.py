@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.learners._protocol import Learner
+from ccnn_torch.learners._protocol import Learner, missing_verbs
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
 from ccnn_torch.learners.constant import Constant
 from ccnn_torch.plugins import is_plugin, load_plugin
@@ -29,12 +29,13 @@ def make_learner(name: str, settings: dict[str, Any] | None = None) -> Learner:
     """
     if is_plugin(name):
         learner = load_plugin(name)()
-        if not isinstance(learner, Learner):
+        missing = missing_verbs(learner)
+        if missing:
             raise InputError(
-                f"methods: {name} is no learner; it needs name, start, step, finished, steps, predict, state_dict, "
-                "load_state_dict and network (ccnn_torch.testing.check_learner tells what is wrong)"
+                f"methods: {name} is no learner, it lacks {', '.join(missing)} "
+                "(ccnn_torch.testing.check_learner tells all that a learner needs)"
             )
-        return learner
+        return cast(Learner, learner)
     if name not in LEARNERS:
         near = difflib.get_close_matches(name, LEARNERS, 1)
         hint = f"; did you mean {near[0]!r}?" if near else ""

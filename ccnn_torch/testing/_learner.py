@@ -11,11 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from ccnn_torch.learners import Learner, TrainingData
+from ccnn_torch.learners._protocol import missing_verbs
 
 __all__ = ["check_learner"]
-
-
-_VERBS = ("start", "step", "finished", "steps", "predict", "state_dict", "load_state_dict", "network")
 
 
 def check_learner(factory: Callable[[], Learner], rows: int = 40) -> None:
@@ -66,12 +64,10 @@ def _data(repeats: int, rows: int) -> TrainingData:
 
 def _check_training(factory: Callable[[], Learner], data: TrainingData) -> Learner:
     learner = factory()
-    # Asked of the class: `isinstance` would read the properties of a learner that has not started.
-    kind = type(learner)
-    lacking = [verb for verb in _VERBS if not hasattr(kind, verb)]
-    _require(not lacking, f"{kind.__name__} lacks {', '.join(lacking)} of ccnn_torch.learners.Learner")
-    name = getattr(learner, "name", None)
-    _require(isinstance(name, str) and name != "", f"{kind.__name__}.name must be a text that is not empty")
+    kind = type(learner).__name__
+    missing = missing_verbs(learner)
+    _require(not missing, f"{kind} lacks {', '.join(missing)} of ccnn_torch.learners.Learner")
+    _require(learner.name != "", f"{kind}.name must be a text that is not empty")
     learner.start(data)
     _check_prediction(learner, data, "before the first step")
     planned = learner.steps
