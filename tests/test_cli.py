@@ -18,7 +18,7 @@ from ccnn_torch.records import read_table, write_table
 
 ROOT = Path(__file__).parent.parent
 EXPERIMENTS = ROOT / "experiments"
-FAST = ["ccnn.generations=3", "ccnn.population=8", "ccnn.hidden=[3]", "ccnn.refinement_iterations=2"]
+FAST = ["ccnn.generations=3", "ccnn.population=8", "ccnn.hidden=[3]", "ccnn.members=1", "ccnn.refinement_iterations=2"]
 Cli = Callable[..., tuple[int, str, str]]
 
 
@@ -187,12 +187,27 @@ def test_the_real_robot_runs_from_the_shipped_records(cli: Cli, tmp_path: Path) 
     assert code == 0, err
     results = json.loads((out / "results.json").read_text())
     assert results["rows"]["train"] + results["rows"]["validation"] == 350
-    assert 0 < len(results["records"]["rows_set_aside"]) < 100
+    # Damped by default, so that rows near a singularity are learned from like all others.
+    assert results["records"]["rows_set_aside"] == []
     position = results["pose"]["position"]
     # Frames alone leave about 1.0 mm on this robot; a few refinement steps of three nodes already help.
     assert 0.9e-3 < position["before"]["rms"]["median"] < 1.2e-3
     assert position["after"]["rms"]["median"] < 0.85e-3
-    assert position["not_compensable"]["rms"]["median"] < 1e-9
+    assert position["not_compensable"]["rms"]["median"] < 1e-5
+    # 0.42 to 0.43 mm is what geometric calibration leaves on this robot.
+    assert 0.35e-3 < position["geometry"]["rms"]["median"] < 0.5e-3
+
+
+def test_rows_near_a_singularity_are_set_aside_where_asked_for(cli: Cli, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    words = ["damping=0", "rotation_weight=0.3", "methods=[constant]", "save_models=false", f"out={out}", "--quiet"]
+    code, _, err = cli("run", EXPERIMENTS / "ur10.yaml", *words)
+    assert code == 0, err
+    results = json.loads((out / "results.json").read_text())
+    aside = results["records"]["rows_set_aside"]
+    assert 0 < len(aside) < 50
+    assert results["records"]["why_set_aside"]["condition"] == len(aside) == results["rows"]["not_trained_on"]
+    assert any("near a singularity" in note for note in results["notes"])
 
 
 @pytest.mark.parametrize("orientation", ["quaternion", "none"])

@@ -18,7 +18,12 @@ def picture(
     joint: Annotated[str | None, typer.Option(help="Joint to show; by default the one with the largest error.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
 ) -> None:
-    """Draw a joint's error and the pose error over the workspace, before and after compensation."""
+    """Draw a joint's error and the pose error over the workspace, before and after compensation.
+
+    Example:
+
+    ccnn picture runs/tripod docs/picture.png --joint q3
+    """
     caption = make_picture(run_dir, out, joint)
     if not quiet:
         typer.echo(caption)
