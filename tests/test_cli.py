@@ -223,7 +223,7 @@ def test_orientation_as_a_quaternion_or_not_at_all(cli: Cli, tmp_path: Path, ori
         columns |= {f"q{name}[1]": values[:, k] for k, name in enumerate("xyzw")}
     records, out = tmp_path / "records.csv", tmp_path / "run"
     write_table(records, columns)
-    words = [f"records={records}", f"out={out}", "--quiet", *FAST]
+    words = [f"records={records}", f"out={out}", "save_models=false", "--quiet", *FAST]
     code, _, err = cli("run", EXPERIMENTS / "ur10.yaml", *words)
     assert code == 0, err
     pose = json.loads((out / "results.json").read_text())["pose"]

@@ -84,7 +84,7 @@ def test_repeat_k_has_the_noise_split_and_start_of_seed_plus_k() -> None:
 def test_the_same_seed_gives_the_same_model_file_byte_by_byte(tmp_path: Path) -> None:
     files = []
     for name in ("a", "b"):
-        calibrate(short(seed=3)).save(tmp_path / name)
+        calibrate(short(seed=3)).save(tmp_path / name, forms=["safetensors"])
         files.append((tmp_path / name / "model.safetensors").read_bytes())
     assert files[0] == files[1]
 
@@ -118,7 +118,7 @@ def test_figures_are_those_of_the_held_out_rows() -> None:
 def test_time_as_a_covariate_reaches_learner_and_card(tmp_path: Path) -> None:
     calibration = calibrate(short(covariates=["t"]))
     assert calibration.prepared.dataset.inputs.shape == (125, 4)
-    calibration.save(tmp_path)
+    calibration.save(tmp_path, forms=["safetensors"])
     card = json.loads((tmp_path / "card.json").read_text())
     assert [c["name"] for c in card["covariates"]] == ["t"]
 
@@ -131,7 +131,7 @@ def test_a_taken_folder_is_not_written_into(tmp_path: Path) -> None:
 
 
 def test_resuming_a_finished_run_changes_nothing(tmp_path: Path) -> None:
-    folder = start_run(short(out=str(tmp_path / "run")), quiet=True)
+    folder = start_run(short(out=str(tmp_path / "run"), save_models=False), quiet=True)
     before = {p: p.stat().st_mtime_ns for p in folder.path.rglob("*")}
     resume_run(folder.path, quiet=True)
     assert {p: p.stat().st_mtime_ns for p in folder.path.rglob("*")} == before
@@ -139,7 +139,7 @@ def test_resuming_a_finished_run_changes_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("delay", [0.0, 0.7])
 def test_a_killed_run_resumes_to_identical_results(tmp_path: Path, delay: float) -> None:
-    keys = ["ccnn.generations=60", "ccnn.population=40", "training.checkpoint_every=5", "seed=2"]
+    keys = ["ccnn.generations=60", "ccnn.population=40", "training.checkpoint_every=5", "seed=2", "save_models=false"]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
 
     def command(*words: str) -> list[str]:
@@ -159,7 +159,6 @@ def test_a_killed_run_resumes_to_identical_results(tmp_path: Path, delay: float)
     assert process.returncode == -signal.SIGKILL
     assert not (killed / "results.json").exists()
     subprocess.run(command("--resume", str(killed)), check=True, env=environment, capture_output=True)
-    assert (whole / "model.safetensors").read_bytes() == (killed / "model.safetensors").read_bytes()
     for path in (whole / "checkpoints").iterdir():
         again = load_file(killed / "checkpoints" / path.name)
         for name, tensor in load_file(path).items():

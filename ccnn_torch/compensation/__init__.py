@@ -6,6 +6,7 @@ from ccnn_torch.compensation._compensator import fit_compensator as fit_compensa
 from ccnn_torch.compensation._domain import Domain as Domain
 from ccnn_torch.compensation._loaded import LoadedModel as LoadedModel
 from ccnn_torch.compensation._loaded import load_model as load_model
+from ccnn_torch.compensation._model_file import FORMS as FORMS
 from ccnn_torch.compensation._model_file import card_name as card_name
 from ccnn_torch.compensation._model_file import save_model as save_model
 from ccnn_torch.compensation._networks import network_from_description as network_from_description

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation._compensator import Compensator, Hook
 from ccnn_torch.compensation._domain import Domain
-from ccnn_torch.compensation._facts import check_keys, check_tensors, coordinates
+from ccnn_torch.compensation._facts import check_keys, check_tensors, coordinates, to_json
 from ccnn_torch.compensation._networks import network_from_description
 from ccnn_torch.compensation._session import (
     METADATA_KEY,
@@ -225,9 +225,13 @@ def _open(path: Path, content: bytes) -> tuple[dict[str, Any], Run, Compensator 
 
 def _facts(text: str | None) -> dict[str, Any]:
     try:
-        return check_keys(json.loads(text or "null"))
+        facts = check_keys(json.loads(text or "null"))
     except json.JSONDecodeError:
         raise ModelFileError("what it says about itself is no JSON" + TAKE_AGAIN) from None
+    # Two texts can mean one number (long decimals do), so the text itself must be the one we would write.
+    if to_json(facts) != text:
+        raise ModelFileError("what it says about itself was edited after it was written")
+    return facts
 
 
 def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:

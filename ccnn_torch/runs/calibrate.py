@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation import Compensator, fit_compensator, save_model
+from ccnn_torch.compensation import FORMS, Compensator, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import LEARNERS, Learner, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError
@@ -90,8 +90,23 @@ class Calibration:
             )
         return torch.tensor(given, dtype=torch.float64).expand(len(joints)).clone()
 
-    def save(self, folder: str | Path, method: str | None = None, name: str = "model") -> None:
-        """Write model files and card of a method's compensator."""
+    def save(
+        self,
+        folder: str | Path,
+        method: str | None = None,
+        name: str = "model",
+        forms: Collection[str] = FORMS,
+    ) -> None:
+        """Write model files and card of a method's compensator.
+
+        Args:
+            method: the best one when None.
+            name: of the files.
+            forms: which files; each takes a few seconds to export and check.
+
+        Raises:
+            MethodFailedError: the model cannot be exported; the sentence says why.
+        """
         method = method or self.method
         repeat = self.repeat(method)
         metrics = _of_repeat(self.results["methods"][method], repeat)
@@ -105,7 +120,7 @@ class Calibration:
             "metrics": metrics,
             "rotation_weight": self.config.rotation_weight,
         }
-        save_model(Path(folder), self.compensator(method), about, method=name)
+        save_model(Path(folder), self.compensator(method), about, method=name, forms=forms)
 
 
 def calibrate(

@@ -57,6 +57,8 @@ class Dataset:
         splits: one a repeat.
         seeds: one a repeat.
         turning: which inputs are revolute joints, `i` bool.
+        jacobian: of the machine at the commanded joints, `r x s x c x n`: position [m] above rotation [rad], per joint
+            unit; learners that can then weigh a row's joint errors by the pose error they cause. None = all alike.
     """
 
     inputs: Tensor
@@ -65,6 +67,7 @@ class Dataset:
     splits: list[Split]
     seeds: list[int]
     turning: Tensor
+    jacobian: Tensor | None = None
 
     def usable_rows(self, part: str) -> Rows:
         """Usable rows of `train`, `validation`, `fit` (both) or `test`."""
@@ -111,9 +114,30 @@ class Dataset:
                 torch.tensor(self.seeds),
             )
         data = TrainingData(
-            scaling.features(inputs), scaling.standardise(targets), rows.weights, torch.tensor(self.seeds), held
+            scaling.features(inputs),
+            scaling.standardise(targets),
+            rows.weights,
+            torch.tensor(self.seeds),
+            held,
+            self._metric(rows, targets, scaling),
         )
         return data, scaling
+
+    def _metric(self, rows: Rows, targets: Tensor, scaling: Scaling) -> Tensor | None:
+        """From an error of the standardised outputs to the pose error it causes, `r x t x c x n` [1].
+
+        Position and rotation are each in units of what the deviations of the training rows cause (root mean square), so
+        that neither outweighs the other and no length has to be chosen.
+        """
+        if self.jacobian is None:
+            return None
+        jacobian = rows.take(self.jacobian)
+        caused = (jacobian @ targets.unsqueeze(-1)).squeeze(-1).square() * rows.weights.unsqueeze(-1)
+        total = rows.weights.sum(-1)
+        parts = [caused[..., :3].sum((1, 2)) / total, caused[..., 3:].sum((1, 2)) / total]
+        scale = torch.cat([part.sqrt().unsqueeze(-1).expand(-1, 3) for part in parts], -1)[:, : jacobian.shape[-2]]
+        scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+        return jacobian / scale[:, None, :, None] * scaling.deviation[:, None, None, :]
 
     def periodic(self) -> Tensor:
         """Revolute joints that turn by more than a quarter: fed as sine and cosine. Returns `i` bool."""

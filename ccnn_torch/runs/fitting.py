@@ -108,4 +108,5 @@ def _to(data: TrainingData, device: str) -> TrainingData:
         data.weights.to(device),
         data.seeds.to(device),
         None if data.validation is None else _to(data.validation, device),
+        None if data.metric is None else data.metric.to(device),
     )

@@ -160,6 +160,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         **_pseudoerror_settings(config, mechanism),
     )
     notes += deviations.notes()
+    jacobian = mechanism.jacobian(records.joints, parameters, guess=records.pose)
     return Prepared(
         mechanism=mechanism,
         parameters=parameters,
@@ -168,7 +169,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         covariate_coordinates=records.covariate_coordinates,
         pose=records.pose,
         pseudoerror=deviations,
-        dataset=_dataset(mechanism, records.joints, records.covariates, deviations, splits, seeds),
+        dataset=_dataset(mechanism, records.joints, records.covariates, deviations, splits, seeds, jacobian),
         data_hash=records.data_hash,
         identified=identified,
         notes=notes,
@@ -207,7 +208,9 @@ def _dataset(
     deviations: Pseudoerror,
     splits: list[Split],
     seeds: list[int],
+    jacobian: Tensor | None = None,
 ) -> Dataset:
+    """Measured records are judged by the pose, so they bring the Jacobian; the paper's cases by the joints alone."""
     repeats, rows = len(seeds), len(joints)
     turning = [joint.unit == "rad" for joint in mechanism.joints] + [False] * covariates.shape[-1]
     return Dataset(
@@ -217,6 +220,8 @@ def _dataset(
         splits=splits,
         seeds=seeds,
         turning=torch.tensor(turning),
+        # Singular rows are not trained on; their Jacobian must only not spoil sums with weight 0.
+        jacobian=None if jacobian is None else torch.nan_to_num(jacobian).expand(repeats, rows, -1, -1),
     )
 
 

@@ -261,7 +261,7 @@ def test_edited_metadata_is_refused_also_where_the_card_was_forged(copied: Path)
     with safe_open(path, framework="pt") as file:
         facts = json.loads(file.metadata()["ccnn_torch"])
     facts["limits"]["q1"]["limit"] = 1.0
-    save_file(load_file(path), path, metadata={"ccnn_torch": json.dumps(facts, sort_keys=True)})
+    save_file(load_file(path), path, metadata={"ccnn_torch": json.dumps(facts, sort_keys=True, ensure_ascii=False)})
     vouch(path)
     with pytest.raises(ModelFileError, match="edited after it was written"):
         load_model(path)
