@@ -11,4 +11,6 @@ import ccnn_torch as ct
 calibration = ct.calibrate(case="tripod", seed=0, split={"test": 0.2, "validation": 0.2})
 calibration.save(Path(__file__).parent / "tripod")
 test = calibration.results["methods"]["ccnn"]
-print(f"held-out mse {test['test']['all']['mse']['median']:.3g} m², {test['ratio_to_floor']['median']:.3f} of the floor")
+print(
+    f"held-out mse {test['test']['all']['mse']['median']:.3g} m², {test['ratio_to_floor']['median']:.3f} of the floor"
+)

@@ -47,7 +47,7 @@ def test_the_readme_shows_the_quickstart_and_it_runs(tmp_path: Path) -> None:
         capture_output=True,
         text=True,
         check=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
     )
     assert "before" in told.stdout and "command" in told.stdout
     assert (tmp_path / "runs" / "quickstart" / "model.onnx").is_file()
