@@ -26,8 +26,19 @@ SHIPPED = ROOT / "checkpoints" / "tripod"
 
 # A package imports only from lower floors; on its own floor only what stands before it here.
 FLOORS = [
-    ["errors", "coordinates", "batching", "plugins", "units", "_table", "_covariates", "records", "splits"]
-    + ["rotations", "least_squares"],
+    [
+        "errors",
+        "coordinates",
+        "batching",
+        "plugins",
+        "units",
+        "_table",
+        "_covariates",
+        "records",
+        "splits",
+        "rotations",
+        "least_squares",
+    ],
     ["mechanisms", "pseudoerror"],
     ["learners/_protocol", "training", "evolution", "learners"],
     ["identification", "compensation"],
