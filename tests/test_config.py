@@ -191,7 +191,6 @@ def test_all_errors_at_once_each_with_the_nearest_key(tmp_path: Path) -> None:
         ("methods=[ccnn, ccnn]", ("'ccnn' stands twice",)),
         ("methods=[all, ccnn]", ("'all' stands alone",)),
         ("device=gpu", ("device: must be cpu, cuda, cuda:N or mps, not gpu",)),
-        ("gravity=[1, 2]", ("gravity: must have at least 3 items, not 2",)),
         ("covariates=3", ("covariates: must be a list, not 3",)),
         ("compensation.limit=-1", ("compensation.limit", "greater than 0")),
         ("ccnn.hidden=3", ("ccnn.hidden: must be a list, not 3",)),

@@ -137,28 +137,47 @@ def test_resuming_a_finished_run_changes_nothing(tmp_path: Path) -> None:
     assert {p: p.stat().st_mtime_ns for p in folder.path.rglob("*")} == before
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.7])
-def test_a_killed_run_resumes_to_identical_results(tmp_path: Path, delay: float) -> None:
-    keys = ["ccnn.generations=60", "ccnn.population=40", "training.checkpoint_every=5", "seed=2", "save_models=false"]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
 
-    def command(*words: str) -> list[str]:
-        return [sys.executable, "-m", "ccnn_torch", "run", *words]
 
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    subprocess.run(command(str(TRIPOD), *keys, f"out={whole}"), check=True, env=environment, capture_output=True)
+def command(*words: str) -> list[str]:
+    return [sys.executable, "-m", "ccnn_torch", "run", *words]
+
+
+def stopped(out: Path, keys: list[str], delay: float, number: signal.Signals) -> tuple[int, str]:
+    """Start a run, stop it by a signal `delay` seconds after its first checkpoint; returns exit code and stderr."""
     process = subprocess.Popen(
-        command(str(TRIPOD), *keys, f"out={killed}"), env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        command(str(TRIPOD), *keys, f"out={out}"), env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
     deadline = time.monotonic() + 60
-    while not list(killed.glob("checkpoints/*.safetensors")) and time.monotonic() < deadline:
+    while not list(out.glob("checkpoints/*.safetensors")) and time.monotonic() < deadline:
         time.sleep(0.005)
     time.sleep(delay)
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
-    assert not (killed / "results.json").exists()
-    subprocess.run(command("--resume", str(killed)), check=True, env=environment, capture_output=True)
+    process.send_signal(number)
+    told = process.communicate()[1].decode()
+    assert not (out / "results.json").exists()
+    return process.returncode, told
+
+
+def test_an_interrupted_run_says_so_in_one_sentence_and_keeps_its_checkpoint(tmp_path: Path) -> None:
+    code, told = stopped(tmp_path / "run", ["ccnn.generations=5000"], 0.5, signal.SIGINT)
+    assert code == 130
+    assert told.strip() == "interrupted; what was computed is kept"
+    assert list((tmp_path / "run" / "checkpoints").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("delay", "more"),
+    [(0.0, []), (0.5, ["training.early_stop=true", "split.validation=0.2", "ccnn.refinement_iterations=3"])],
+)
+def test_a_killed_run_resumes_to_identical_results(tmp_path: Path, delay: float, more: list[str]) -> None:
+    keys = ["ccnn.generations=60", "ccnn.population=40", "training.checkpoint_every=5", "seed=2", "save_models=false"]
+    keys += more
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    subprocess.run(command(str(TRIPOD), *keys, f"out={whole}"), check=True, env=ENVIRONMENT, capture_output=True)
+    code, _ = stopped(killed, keys, delay, signal.SIGKILL)
+    assert code == -signal.SIGKILL
+    subprocess.run(command("--resume", str(killed)), check=True, env=ENVIRONMENT, capture_output=True)
     for path in (whole / "checkpoints").iterdir():
         again = load_file(killed / "checkpoints" / path.name)
         for name, tensor in load_file(path).items():

@@ -153,9 +153,6 @@ class RunConfig(_Part):
     max_deviation: float | None = Field(
         default=None, gt=0, description="rows with a larger joint deviation (SI) are not trained on; null = no bound"
     )
-    gravity: list[float] = Field(
-        default=[0.0, 0.0, -9.81], min_length=3, max_length=3, description="gravity in the base frame in m/s^2"
-    )
     training: TrainingConfig = Field(default_factory=TrainingConfig)
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
     save_models: bool = Field(default=True, description="write model files and their card")
