@@ -123,6 +123,15 @@ def test_time_as_a_covariate_reaches_learner_and_card(tmp_path: Path) -> None:
     assert [c["name"] for c in card["covariates"]] == ["t"]
 
 
+def test_the_limit_of_the_config_holds_for_every_joint() -> None:
+    calibration = calibrate(short(compensation={"limit": 5e-5}))
+    deviation = calibration.compensator().deviation(calibration.prepared.joints)
+    # The constant part alone is 1e-4 m, so the limit is what is met.
+    assert torch.equal(deviation.abs().amax(0), torch.full((3,), 5e-5, dtype=torch.float64))
+    with pytest.raises(InputError, match=r"compensation\.limit has 2 numbers"):
+        calibrate(short(compensation={"limit": [1e-4, 1e-4]}))
+
+
 def test_a_taken_folder_is_not_written_into(tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
     with pytest.raises(InputError, match="holds files already"):

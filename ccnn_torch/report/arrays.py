@@ -36,6 +36,7 @@ from safetensors.numpy import save
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
+from ccnn_torch.training import write_whole
 
 __all__ = ["ARRAYS_FILE", "RunArrays", "load_arrays", "load_history", "save_arrays", "save_history"]
 
@@ -168,10 +169,7 @@ def _save(path: Path, tensors: Mapping[str, ArrayLike], about: Mapping[str, obje
         if isinstance(value, torch.Tensor):
             value = value.detach().cpu().numpy()
         arrays[name] = np.ascontiguousarray(value)
-    part = path.with_name(path.name + ".part")
-    # safetensors would write the file itself, but readable by its owner only.
-    part.write_bytes(save(arrays, metadata={"about": json.dumps(about, sort_keys=True)}))
-    part.replace(path)
+    write_whole(path, save(arrays, metadata={"about": json.dumps(about, sort_keys=True)}))
 
 
 def _load(path: Path) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.training import write_whole
 
 __all__ = ["load_schema", "plain", "read_json", "write_json"]
 
@@ -43,10 +44,8 @@ def plain(value: Any) -> Any:
 
 def write_json(path: str | Path, value: Mapping[str, Any]) -> None:
     """Write a JSON file; a reader sees the old file or the new one, never half of one."""
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
-    os.replace(part, path)
+    text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
+    write_whole(Path(path), (text + "\n").encode())
 
 
 def read_json(path: str | Path) -> dict[str, Any]:

@@ -75,20 +75,9 @@ class Calibration:
             prepared.dataset.deviation[repeat, there],
             prepared.mechanism.joints,
             prepared.covariate_coordinates,
-            limit=self._limit(),
+            limit=_limit(self.config, len(prepared.mechanism.joints)),
             margin=self.config.compensation.margin,
         )
-
-    def _limit(self) -> Tensor | None:
-        """The config's limit for every joint, `n` [SI]."""
-        given, joints = self.config.compensation.limit, self.prepared.mechanism.joints
-        if given is None:
-            return None
-        if len(given) not in (1, len(joints)):
-            raise InputError(
-                f"compensation.limit has {len(given)} numbers; write one, or one for each of the {len(joints)} joints"
-            )
-        return torch.tensor(given, dtype=torch.float64).expand(len(joints)).clone()
 
     def save(
         self,
@@ -138,6 +127,8 @@ def calibrate(
         MethodFailedError: no method could be trained.
     """
     prepared = prepared or prepare(config)
+    # Looked at before anything is computed, though it is used last.
+    _limit(config, len(prepared.mechanism.joints))
     training = config.training
     plan = Plan(training.early_stop, training.patience, training.checkpoint_every, config.device)
     before = pose_before(prepared)
@@ -183,6 +174,18 @@ def makers(config: RunConfig) -> dict[str, Callable[[], Learner] | None]:
         make_learner(method, settings)
         found[method.rpartition(":")[2]] = partial(make_learner, method, settings)
     return found
+
+
+def _limit(config: RunConfig, joints: int) -> Tensor | None:
+    """The config's limit for every joint, `n` [SI]; None = by the training deviations."""
+    given = config.compensation.limit
+    if given is None:
+        return None
+    if len(given) not in (1, joints):
+        raise InputError(
+            f"compensation.limit has {len(given)} numbers; write one, or one for each of the {joints} joints"
+        )
+    return torch.tensor(given, dtype=torch.float64).expand(joints).clone()
 
 
 def _of_repeat(block: Any, repeat: int) -> Any:

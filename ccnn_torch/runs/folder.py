@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.training import write_whole
@@ -67,20 +65,11 @@ class RunFolder:
         return self.path / "tensorboard"
 
     @property
-    def plots(self) -> Path:
-        return self.path / "plots"
-
-    @property
     def models(self) -> Path:
         return self.path / "models"
 
     def checkpoint(self, method: str, phase: str) -> Path:
         return self.path / "checkpoints" / f"{method}-{phase}.safetensors"
-
-    def write_json(self, name: str, content: dict[str, Any]) -> None:
-        """NaN and infinity are bugs here, so they raise."""
-        text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
-        write_whole(self.path / name, (text + "\n").encode())
 
     def write_text(self, name: str, content: str) -> None:
         write_whole(self.path / name, content.encode())

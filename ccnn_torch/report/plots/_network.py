@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from ccnn_torch.evolution.network import alive_nodes as path_nodes
 from ccnn_torch.report.display import count_text
 from ccnn_torch.report.plots._style import GREY, Plot, bare, styled
 
@@ -31,14 +33,9 @@ def alive_nodes(masks: Sequence[Mask]) -> list[Mask]:
     Returns:
         One array a layer of nodes, inputs first; inputs and outputs always count as alive.
     """
-    fed: list[Mask] = [np.ones(masks[0].shape[1], dtype=bool)]
-    for mask in masks[:-1]:
-        fed.append(np.any(mask & fed[-1], axis=1))
-    fed.append(np.ones(masks[-1].shape[0], dtype=bool))
-    used = [fed[-1]]
-    for mask, nodes in zip(masks[:0:-1], fed[-2:0:-1], strict=True):
-        used.insert(0, nodes & np.any(mask & used[0][:, None], axis=0))
-    return [fed[0], *used]
+    hidden = path_nodes([torch.as_tensor(mask) for mask in masks])
+    ends = np.ones(masks[0].shape[1], dtype=bool), np.ones(masks[-1].shape[0], dtype=bool)
+    return [ends[0], *(nodes.numpy() for nodes in hidden), ends[1]]
 
 
 @styled
