@@ -47,8 +47,8 @@ for _command in (run, compensate, picture, keys):
 
 def main() -> None:
     """Entry point of the console script."""
-    # Before torch is loaded. Threads that spin while they wait make two runs side by side fifty times slower, and one
-    # run alone a quarter faster.
+    # Before torch is loaded. With threads that spin while they wait, a run beside another one took tens of times as
+    # long on two cores; alone no clear difference was seen.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         # 130 comes back where a person pressed Ctrl-C.
