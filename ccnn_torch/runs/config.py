@@ -33,6 +33,7 @@ __all__ = [
     "load_config",
     "make_config",
     "method_names",
+    "validate_tree",
 ]
 
 METHODS = ("ccnn", "bp_lm", "grnn", "enn", "constant", "gp")
@@ -254,7 +255,7 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> RunConfig:
     tree.setdefault("name", path.stem)
     resolve_paths(tree, path.absolute().parent)
     given = apply_overrides(tree, overrides, Path.cwd())
-    return _validate(tree, str(path), given)
+    return validate_tree(tree, str(path), given)
 
 
 def make_config(**keys: Any) -> RunConfig:
@@ -265,10 +266,20 @@ def make_config(**keys: Any) -> RunConfig:
     """
     tree = dict(keys)
     resolve_paths(tree, Path.cwd())
-    return _validate(tree, "config", {})
+    return validate_tree(tree, "config", {})
 
 
-def _validate(tree: dict[str, Any], source: str, given: dict[str, str]) -> RunConfig:
+def validate_tree(tree: dict[str, Any], source: str, given: dict[str, str]) -> RunConfig:
+    """A config from a tree of keys whose paths are absolute.
+
+    Args:
+        tree: keys and sections.
+        source: the config's name, which opens the sentence of an error.
+        given: key -> override, for keys that were set on the command line.
+
+    Raises:
+        InputError: keys are wrong: one line that names them all.
+    """
     try:
         return RunConfig.model_validate(tree)
     except ValidationError as error:
