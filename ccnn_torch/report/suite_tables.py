@@ -46,8 +46,8 @@ def verdict(comparison: Mapping[str, Any]) -> str:
     block = comparison["methods"][_WATCHED]
     cases, share = count_text(block["cases"], "case"), 100 * block["share"]["best_or_tied"]
     return (
-        f"{_WATCHED} is the best method or tied with it in {block['best_or_tied']} of {cases} ({share:.0f} %), the best in "
-        f"{block['best']}; in {block['close']} its error is within 5 % of the best method's."
+        f"{_WATCHED} is the best method or tied with it in {block['best_or_tied']} of {cases} ({share:.0f} %), the best "
+        f"in {block['best']}; in {block['close']} its error is within 5 % of the best method's."
     )
 
 
@@ -106,20 +106,17 @@ def _standing(case: Mapping[str, Any]) -> str:
 
 
 def _methods_table(comparison: Mapping[str, Any]) -> Table:
-    def count(block: Mapping[str, Any], key: str) -> str:
-        return f"{block[key]} ({100 * block['share'][key]:.0f} %)"
-
     rows = []
     for method, block in comparison["methods"].items():
-        cells = [method, str(block["cases"]), *(count(block, key) for key in ("best", "best_or_tied", "close"))]
-        cells += [
-            number_text(block["typical_ratio_to_best"], 3),
-            number_text(block["seconds"], 3),
-            str(block["failed"]),
-        ]
-        rows.append(tuple(cells))
-    columns = ("method", "cases", "best", "best or tied", "close", "ratio to the best", "time [s]", "failed")
-    note = "Ratio to the best: geometric mean over the cases of the median ratio. Time: median, of one repeat."
+        share = f"{block['best_or_tied']} ({100 * block['share']['best_or_tied']:.0f} %)"
+        cells = [method, str(block["cases"]), str(block["best"]), share, str(block["close"])]
+        cells += [number_text(block[key], 3) for key in ("typical_ratio_to_best", "seconds")]
+        rows.append((*cells, str(block["failed"])))
+    columns = ("method", "cases", "best", "best or tied", "close", "ratio", "time [s]", "failed")
+    note = (
+        "Number of cases. Ratio: its error to the best method's, geometric mean over the cases of the median. Time: of "
+        "one repeat, median."
+    )
     return Table("How often a method is the best", columns, tuple(rows), note)
 
 
