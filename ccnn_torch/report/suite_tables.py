@@ -46,8 +46,8 @@ def verdict(comparison: Mapping[str, Any]) -> str:
     block = comparison["methods"][_WATCHED]
     cases, share = count_text(block["cases"], "case"), 100 * block["share"]["best_or_tied"]
     return (
-        f"{_WATCHED} is the best method or tied with it in {block['best_or_tied']} of {cases} ({share:.0f} %), the best "
-        f"in {block['best']}; in {block['close']} its error is within 5 % of the best method's."
+        f"{_WATCHED} is the best method or tied with it in {block['best_or_tied']} of {cases} ({share:.0f} %), the "
+        f"best in {block['best']}; in {block['close']} its error is within 5 % of the best method's."
     )
 
 
