@@ -18,7 +18,7 @@ from rich.table import Table as RichTable
 from ccnn_torch.report.display import count_text, display_unit, interval_text, number_text, removed_percent
 from ccnn_torch.report.paper_tables import PAPER, PaperCase
 
-__all__ = ["Table", "markdown_text", "print_tables", "result_tables", "verdict"]
+__all__ = ["Table", "markdown_table", "markdown_text", "print_table", "print_tables", "result_tables", "verdict"]
 
 Results = Mapping[str, Any]
 
@@ -68,14 +68,7 @@ def result_tables(results: Results) -> list[Table]:
 def print_tables(results: Results, console: Console) -> None:
     """Show the verdict and the tables on a terminal."""
     for table in result_tables(results):
-        shown = RichTable(title=escape(table.title), title_justify="left", title_style="bold", caption_justify="left")
-        shown.caption = escape(table.note) or None
-        for i, column in enumerate(table.columns):
-            shown.add_column(escape(column), justify="left" if i == 0 else "right", overflow="fold")
-        for row in table.rows:
-            # The interval below its median: three such columns then fit into 80 characters.
-            shown.add_row(*(escape(cell.replace(" [", "\n[") if i else cell) for i, cell in enumerate(row)))
-        console.print(shown)
+        print_table(table, console)
     for sentence in failures(results):
         console.print(escape(sentence), style="yellow")
     for note in results.get("notes", []):
@@ -83,16 +76,30 @@ def print_tables(results: Results, console: Console) -> None:
     console.print(escape(verdict(results)), style="bold")
 
 
+def print_table(table: Table, console: Console) -> None:
+    """Show one table on a terminal."""
+    shown = RichTable(title=escape(table.title), title_justify="left", title_style="bold", caption_justify="left")
+    shown.caption = escape(table.note) or None
+    for i, column in enumerate(table.columns):
+        shown.add_column(escape(column), justify="left" if i == 0 else "right", overflow="fold")
+    for row in table.rows:
+        # The interval below its median: three such columns then fit into 80 characters.
+        shown.add_row(*(escape(cell.replace(" [", "\n[") if i else cell) for i, cell in enumerate(row)))
+    console.print(shown)
+
+
+def markdown_table(table: Table) -> str:
+    """One table as Markdown: title, rows, and the sentence below."""
+    head, *lines = (
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (table.columns, *table.rows)
+    )
+    rule = "| " + " | ".join(["---", *["---:"] * (len(table.columns) - 1)]) + " |"
+    return "\n\n".join([f"## {table.title}", "\n".join([head, rule, *lines]), *([table.note] if table.note else [])])
+
+
 def markdown_text(results: Results) -> str:
     """The verdict and the tables as Markdown (`results.md`)."""
-    parts = [f"# {results['name']}", verdict(results)]
-    for table in result_tables(results):
-        head, *lines = (
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (table.columns, *table.rows)
-        )
-        rule = "| " + " | ".join(["---", *["---:"] * (len(table.columns) - 1)]) + " |"
-        parts += [f"## {table.title}", "\n".join([head, rule, *lines]), *([table.note] if table.note else [])]
-    parts += failures(results)
+    parts = [f"# {results['name']}", verdict(results), *map(markdown_table, result_tables(results)), *failures(results)]
     return "\n\n".join(parts) + "\n"
 
 
