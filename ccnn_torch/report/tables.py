@@ -101,6 +101,16 @@ def failures(results: Results) -> list[str]:
     return [f"{name} failed: {m['failed']}" for name, m in results["methods"].items() if m["test"] is None]
 
 
+def method_label(results: Results, name: str) -> str:
+    """A method's name, and in how many repeats it has not converged."""
+    found = (results["methods"].get(name) or {}).get("converged")
+    values = found["values"] if found else []
+    missed = sum(value == 0 for value in values)
+    if missed == 0:
+        return name
+    return f"{name} ({missed} of {count_text(len(values), 'repeat')} not converged)"
+
+
 def _units(results: Results) -> dict[str, str]:
     return {joint["name"]: joint["unit"] for joint in results["joints"]}
 
@@ -157,7 +167,7 @@ def _after_table(results: Results, paper: PaperCase | None, measure: str) -> Tab
         cells = [interval_text(errors[key][measure] if errors else None, scales[key][0]) for key in keys]
         cells += [interval_text(method.get("ratio_to_floor"))] * ratio
         cells += [interval_text(method.get("seconds"), digits=3)] * beside
-        rows.append((name, *cells))
+        rows.append((method_label(results, name), *cells))
     note = _repeats(results)
     if paper and len(keys) == len(paper.symbols) + 1:
         for name, printed in paper.methods.items():

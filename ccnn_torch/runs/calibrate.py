@@ -15,10 +15,10 @@ from ccnn_torch.compensation import FORMS, Compensator, fit_compensator, save_mo
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import LEARNERS, Learner, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError
-from ccnn_torch.runs.assemble import assemble, best_method
+from ccnn_torch.runs.assemble import assemble, best_method, plan_of
 from ccnn_torch.runs.config import RunConfig, method_names
 from ccnn_torch.runs.evaluate import Outcome, evaluate, pose_before
-from ccnn_torch.runs.fitting import Plan, fit_method
+from ccnn_torch.runs.fitting import fit_method
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.prepare import Prepared, prepare
 from ccnn_torch.training import Callback, Scaling
@@ -129,8 +129,7 @@ def calibrate(
     prepared = prepared or prepare(config)
     # Looked at before anything is computed, though it is used last.
     _limit(config, len(prepared.mechanism.joints))
-    training = config.training
-    plan = Plan(training.early_stop, training.patience, training.checkpoint_every, config.device)
+    plan = plan_of(config)
     before = pose_before(prepared)
     outcomes: dict[str, Outcome] = {}
     failed: dict[str, str] = {}
@@ -147,10 +146,9 @@ def calibrate(
                 folder,
                 partial(watch, prepared, name),
             )
+            outcomes[name] = evaluate(prepared, fitted)
         except MethodFailedError as problem:
             failed[name] = str(problem)
-            continue
-        outcomes[name] = evaluate(prepared, fitted)
     if not outcomes:
         raise MethodFailedError("; ".join(f"{name}: {sentence}" for name, sentence in failed.items()))
     return Calibration(config, prepared, before, outcomes, failed, assemble(config, prepared, before, outcomes, failed))

@@ -56,13 +56,13 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool) 
         joints = prepared.mechanism.joints
         label = f"{method}: {'choosing how long' if phase == 'choose' else 'training'}"
         board = folder.tensorboard / (method if phase == "fit" else f"{method}-{phase}")
-        return [
-            HeldOut(
-                prepared.dataset, scaling, tuple(j.name for j in joints), share_unit(joints), config.training.log_every
-            ),
-            TensorBoardCallback(board, every=config.training.log_every),
-            ProgressBar(label, quiet),
-        ]
+        every = config.training.log_every
+        shown: list[Callback] = [TensorBoardCallback(board, every=every), ProgressBar(label, quiet)]
+        if phase == "choose":
+            # It has held-out errors of its own, of rows that are there to choose by.
+            return shown
+        names = tuple(joint.name for joint in joints)
+        return [HeldOut(prepared.dataset, scaling, names, share_unit(joints), every), *shown]
 
     calibration: Calibration = calibrate(config, folder, watch, prepared)
     note("writing model files, plots and tables …", quiet)
