@@ -19,6 +19,7 @@ from ccnn_torch.report.results import (
     ratio_to_floor,
     spread,
 )
+from ccnn_torch.runs.auto import Comparison
 from ccnn_torch.runs.choosing import Plan
 from ccnn_torch.runs.config import RunConfig
 from ccnn_torch.runs.dataset import Dataset, Rows, pad_rows
@@ -60,6 +61,7 @@ def assemble(
     before: PoseError,
     outcomes: dict[str, Outcome],
     failed: dict[str, str],
+    comparison: Comparison | None = None,
 ) -> dict[str, Any]:
     """The content of `results.json`.
 
@@ -67,6 +69,7 @@ def assemble(
         before: pose error without compensation, `r x s`.
         outcomes: trained methods by name, at least one.
         failed: sentence of each method that could not be trained.
+        comparison: how the method was chosen, where it was.
     """
     dataset, joints = prepared.dataset, prepared.mechanism.joints
     test, fit = dataset.usable_rows("test"), dataset.usable_rows("fit")
@@ -110,6 +113,7 @@ def assemble(
         "methods": {name: methods[name] for name in [*outcomes, *failed]},
         "constant": {"test": constant, "ratio_to_floor": ratio_to_floor(constant, floor)},
         "floor": floor,
+        "auto": None if comparison is None else comparison.block(best),
         "pose": _pose(config, prepared, before, outcomes[best].after),
         "records": None if prepared.simulated else _records(prepared),
         "data_sha256": prepared.data_hash,
