@@ -70,18 +70,6 @@ def print_tables(results: Results, console: Console) -> None:
     console.print(escape(verdict(results)), style="bold")
 
 
-def print_table(table: Table, console: Console) -> None:
-    """Show one table on a terminal."""
-    shown = RichTable(title=escape(table.title), title_justify="left", title_style="bold", caption_justify="left")
-    shown.caption = escape(table.note) or None
-    for i, column in enumerate(table.columns):
-        shown.add_column(escape(column), justify="left" if i == 0 else "right", overflow="fold")
-    for row in table.rows:
-        # The interval below its median: three such columns then fit into 80 characters.
-        shown.add_row(*(escape(cell.replace(" [", "\n[") if i else cell) for i, cell in enumerate(row)))
-    console.print(shown)
-
-
 def markdown_table(table: Table) -> str:
     """One table as Markdown: title, rows, and the sentence below."""
     head, *lines = (

@@ -16,6 +16,7 @@ from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.grnn import GRNNSettings
+from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.runs._keys import explain, list_keys
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
 from ccnn_torch.runs._yaml import dump_yaml, read_yaml
@@ -222,6 +223,7 @@ class RunConfig(_Part):
     save_models: bool = Field(default=True, description="write model files and their card")
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
     grnn: GRNNSettings = Field(default_factory=GRNNSettings)
+    gp: GPSettings = Field(default_factory=GPSettings)
 
     @model_validator(mode="before")
     @classmethod
