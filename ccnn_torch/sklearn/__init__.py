@@ -1,0 +1,3 @@
+"""The learners as scikit-learn regressors."""
+
+from ccnn_torch.sklearn._regressors import CCNNRegressor as CCNNRegressor
