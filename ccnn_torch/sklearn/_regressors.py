@@ -18,10 +18,10 @@ class CCNNRegressor(SteppedRegressor):
     def __init__(
         self,
         *,
-        hidden: int | Sequence[int] = (8,),
+        hidden: int | Sequence[int] = (12, 12),
         population: int = 40,
         generations: int = 10,
-        members: int = 2,
+        members: int = 3,
         refine_every: int = 0,
         refinement_iterations: int = 20,
         density: float = 0.5,
