@@ -76,9 +76,9 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             `s` or `s x o`, as the y of the training was; with `return_std` a pair of such arrays.
         """
         check_is_fitted(self)
-        X = validate_data(self, X, reset=False, dtype=np.float64)
+        rows: _Floats = validate_data(self, X, reset=False, dtype=np.float64)
         with torch.no_grad():
-            features = self.scaling_.features(_tensor(X))
+            features = self.scaling_.features(_tensor(rows))
             mean = self.scaling_.restore(self.network_(features))
             if not return_std:
                 return self._shaped(mean)
@@ -90,21 +90,24 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         tags.target_tags.multi_output = True
         return tags
 
-    def _check(
-        self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None
-    ) -> tuple[_Floats, _Floats, _Floats]:
+    def _check(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None) -> tuple[_Floats, _Floats, _Floats]:
         """Checked rows, alike ones merged, sorted: `s x i`, `s x o`, `s`."""
-        X, y = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
-        y = check_array(y, dtype=np.float64, ensure_2d=False, input_name="y")
-        self._flat = y.ndim == 1
-        weights = _check_sample_weight(sample_weight, X, dtype=np.float64, ensure_non_negative=True)
+        inputs: _Floats
+        targets: _Floats
+        inputs, found = validate_data(
+            self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2
+        )
+        targets = check_array(found, dtype=np.float64, ensure_2d=False, input_name="y")
+        self._flat = targets.ndim == 1
+        weights: _Floats = _check_sample_weight(sample_weight, inputs, dtype=np.float64, ensure_non_negative=True)
         used = weights > 0
         if used.sum() < 2:
             raise ValueError("sample_weight: at least two weights must be above zero; the others' rows are left out")
-        table = np.concatenate([X, y.reshape(len(y), -1)], axis=1)[used]
+        table = np.concatenate([inputs, targets.reshape(len(targets), -1)], axis=1)[used]
         rows, index = np.unique(table, axis=0, return_inverse=True)
-        merged = np.bincount(index.reshape(-1), weights=weights[used], minlength=len(rows))
-        return rows[:, : X.shape[1]], rows[:, X.shape[1] :], merged
+        merged = np.bincount(index.reshape(-1), weights=weights[used], minlength=len(rows)).astype(np.float64)
+        width = inputs.shape[1]
+        return rows[:, :width], rows[:, width:], merged
 
     def _best_step(
         self, inputs: _Floats, targets: _Floats, weights: _Floats, seed: int, generator: np.random.RandomState
@@ -126,13 +129,11 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         """Train one repeat. held: rows to watch instead of training on them, `s`."""
         every = [_tensor(part).unsqueeze(0) for part in (inputs, targets, weights)]
         rows = every if held is None else [part[:, _tensor(~held)] for part in every]
-        scaling = Scaling.fit(*rows, _tensor(self._periodic()))
+        scaling = Scaling.fit(rows[0], rows[1], rows[2], _tensor(self._periodic()))
         seeds = torch.tensor([seed])
 
         def scaled(parts: list[Tensor], validation: TrainingData | None = None) -> TrainingData:
-            return TrainingData(
-                scaling.features(parts[0]), scaling.standardise(parts[1]), parts[2], seeds, validation
-            )
+            return TrainingData(scaling.features(parts[0]), scaling.standardise(parts[1]), parts[2], seeds, validation)
 
         validation = None if held is None else scaled([part[:, _tensor(held)] for part in every])
         learner = type(self)._learner(self._make_settings())
@@ -143,6 +144,8 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         """The learner's settings from the parameters of the same names, checked as those of a config are."""
         given = self.get_params(deep=False)
         values = {field.name: _plain(given[field.name]) for field in fields(self._settings) if field.name in given}
+        if isinstance(values.get("hidden"), int):
+            values["hidden"] = [values["hidden"]]
         try:
             return TypeAdapter(self._settings).validate_python(values)
         except ValidationError as error:
