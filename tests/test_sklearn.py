@@ -23,16 +23,27 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.sklearn import CCNNRegressor
+from ccnn_torch.sklearn import CCNNRegressor, GRNNRegressor
 from ccnn_torch.sklearn._base import LearnerRegressor, SteppedRegressor
 from ccnn_torch.training import Scaling, train
 
 ROOT = Path(__file__).parent.parent
-ESTIMATORS = [CCNNRegressor]
+ESTIMATORS = [CCNNRegressor, GRNNRegressor]
 STEPPED = [kind for kind in ESTIMATORS if issubclass(kind, SteppedRegressor)]
-SMALL: dict[type[Any], dict[str, Any]] = {CCNNRegressor: {"hidden": 6, "generations": 4, "population": 12}}
+# Settings for the tests that need no good model.
+SMALL: dict[type[Any], dict[str, Any]] = {
+    CCNNRegressor: {"generations": 4, "population": 12, "hidden": 6},
+    GRNNRegressor: {"iterations": 4},
+}
+GRIDS: dict[type[Any], dict[str, Any]] = {
+    CCNNRegressor: {"hidden": [(4,), (6, 6)]},
+    GRNNRegressor: {"widest": [1.0, 5.0]},
+}
 # Parameters whose default is not the run's, as the docstring says.
-OTHER_DEFAULTS = {CCNNRegressor: {"population", "generations", "members", "refine_every"}}
+OTHER_DEFAULTS: dict[type[Any], set[str]] = {
+    CCNNRegressor: {"population", "generations", "members", "refine_every"},
+    GRNNRegressor: set(),
+}
 
 every = pytest.mark.parametrize("kind", ESTIMATORS)
 stepped = pytest.mark.parametrize("kind", STEPPED)
@@ -170,9 +181,6 @@ def test_pipelines_and_searches(kind: Any) -> None:
     assert search.best_params_[f"{kind.__name__.lower()}__{name}"] in values
 
 
-GRIDS: dict[type[Any], dict[str, Any]] = {CCNNRegressor: {"hidden": [(4,), (6, 6)]}}
-
-
 @every
 def test_periodic_inputs_have_no_seam(kind: Any) -> None:
     rng = np.random.default_rng(0)
@@ -216,7 +224,7 @@ def test_what_cannot_be_used_is_named(kind: Any) -> None:
         small(kind).fit(X, scipy.sparse.csr_array(y))
     with pytest.raises(ValueError, match="dim 3"):
         small(kind).fit(X, y[:, :, None])
-    name = next(iter(SMALL[kind].keys() - {"hidden"}))
+    name = next(iter(SMALL[kind]))
     for wrong in ("many", 0):
         with pytest.raises(ValueError, match=f"{kind.__name__}: {name}"):
             small(kind, **{name: wrong}).fit(X, y)

@@ -1,8 +1,7 @@
-"""The estimators: one class a learner, its settings as parameters under their own names.
+"""The estimators: one class a learner, its most useful settings as parameters under their own names.
 
-Where a default is not the run's, that is for speed: cross-validation and searches fit many times, so that an estimator
-with its defaults fits a few hundred rows in well under a second. The settings of a run, `CCNNRegressor(**section)`,
-give the same model as the run.
+Where a default is not that of the settings, it is for speed: cross-validation and searches fit many times, so that an
+estimator with its defaults fits a few hundred rows in well under a second.
 """
 
 from __future__ import annotations
@@ -11,15 +10,16 @@ from collections.abc import Sequence
 from typing import Any
 
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
-from ccnn_torch.sklearn._base import SteppedRegressor
+from ccnn_torch.learners.grnn import GRNN, GRNNSettings
+from ccnn_torch.sklearn._base import LearnerRegressor, SteppedRegressor
 
-__all__ = ["CCNNRegressor"]
+__all__ = ["CCNNRegressor", "GRNNRegressor"]
 
 
 class CCNNRegressor(SteppedRegressor):
     """Cooperative coevolution of a masked network's layers, refined by Levenberg-Marquardt (paper 000, section III).
 
-    A run has by default population=80, generations=30, members=6 and refine_every=10, which takes about ten times as
+    The settings themselves, and a run, have by default population=80, generations=30, members=6 and refine_every=10, which takes about ten times as
     long and predicts somewhat better. All settings: `ccnn_torch.learners.ccnn.CCNNSettings`.
 
     Args:
@@ -89,4 +89,52 @@ class CCNNRegressor(SteppedRegressor):
         self.early_stopping = early_stopping
         self.validation_fraction = validation_fraction
         self.n_iter_no_change = n_iter_no_change
+        self.random_state = random_state
+
+
+class GRNNRegressor(LearnerRegressor):
+    """Kernel regression (Specht's general regression neural network), one bandwidth per input found by leave-one-out.
+
+    Defaults are those of `ccnn_torch.learners.grnn.GRNNSettings`, where all settings are.
+
+    Args:
+        iterations: steps of the search at most; it ends earlier once its moves are small.
+        candidates: bandwidth vectors judged in one step.
+        narrowest, widest: range of bandwidths that the first step looks at; inputs are scaled to -1 .. 1.
+        queries: rows that leave-one-out judges, drawn where there are more.
+        references: rows that they are predicted from, drawn where there are more.
+        periodic: inputs that are angles in rad, by index or by name, to be fed as sine and cosine.
+        random_state: seed, or a RandomState to draw it from; None = draw it from NumPy's global generator.
+
+    Attributes:
+        network_: the trained network with its rows, on scaled inputs and outputs.
+        scaling_: that scaling.
+        n_iter_: steps of the search.
+        loss_curve_: mean squared standardised error on the training rows after each of them.
+        converged_: whether the search ended by itself.
+        n_features_in_, feature_names_in_: as in scikit-learn.
+    """
+
+    _learner = GRNN
+    _settings = GRNNSettings
+
+    def __init__(
+        self,
+        *,
+        iterations: int = 30,
+        candidates: int = 32,
+        narrowest: float = 0.02,
+        widest: float = 5.0,
+        queries: int = 500,
+        references: int = 2000,
+        periodic: Sequence[int | str] | None = None,
+        random_state: Any = 0,
+    ) -> None:
+        self.iterations = iterations
+        self.candidates = candidates
+        self.narrowest = narrowest
+        self.widest = widest
+        self.queries = queries
+        self.references = references
+        self.periodic = periodic
         self.random_state = random_state
