@@ -16,6 +16,7 @@ from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners._registry import LEARNERS
 from ccnn_torch.learners.ccnn import CCNNSettings
+from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.runs._keys import explain, list_keys
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
 from ccnn_torch.runs._yaml import dump_yaml, read_yaml
@@ -157,6 +158,7 @@ class RunConfig(_Part):
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
     save_models: bool = Field(default=True, description="write model files and their card")
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
+    grnn: GRNNSettings = Field(default_factory=GRNNSettings)
 
     @model_validator(mode="before")
     @classmethod
@@ -164,7 +166,7 @@ class RunConfig(_Part):
         """An empty section is one of defaults; a case has its order and the machine tool its variant."""
         if not isinstance(tree, dict):
             return tree
-        sections = ("split", "training", "compensation", "ccnn")
+        sections = ("split", "training", "compensation", "ccnn", "grnn")
         tree = {key: value for key, value in tree.items() if value is not None or key not in sections}
         if tree.get("case") is not None and tree.get("order") is None:
             tree["order"] = "raster"

@@ -148,6 +148,9 @@ class _Run:
         self.history.append({name: value.detach().clone() for name, value in metrics.items()})
 
     def finish(self) -> Training:
+        if self.stop_at is not None and bool((self.stop_at > self.step).any()):
+            # The learner ended by itself before it came so far: its last state is the nearest one.
+            self._keep(self.stop_at > self.step)
         if self.chooses:
             self.learner.load_state_dict({name: value.clone() for name, value in self.kept.items()})
         else:
