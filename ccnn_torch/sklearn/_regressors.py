@@ -19,8 +19,9 @@ __all__ = ["CCNNRegressor", "GRNNRegressor"]
 class CCNNRegressor(SteppedRegressor):
     """Cooperative coevolution of a masked network's layers, refined by Levenberg-Marquardt (paper 000, section III).
 
-    The settings themselves, and a run, have by default population=80, generations=30, members=6 and refine_every=10, which takes about ten times as
-    long and predicts somewhat better. All settings: `ccnn_torch.learners.ccnn.CCNNSettings`.
+    The settings themselves, and so a run, have by default population=80, generations=30, members=6 and refine_every=10,
+    which takes about ten times as long and predicts somewhat better. All settings:
+    `ccnn_torch.learners.ccnn.CCNNSettings`.
 
     Args:
         hidden: nodes of each hidden layer; a number is one layer.
