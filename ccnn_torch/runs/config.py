@@ -15,6 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners._registry import LEARNERS
+from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.runs._keys import explain, list_keys
@@ -158,6 +159,7 @@ class RunConfig(_Part):
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
     save_models: bool = Field(default=True, description="write model files and their card")
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
+    bp_lm: BPLMSettings = Field(default_factory=BPLMSettings)
     grnn: GRNNSettings = Field(default_factory=GRNNSettings)
 
     @model_validator(mode="before")
@@ -166,7 +168,7 @@ class RunConfig(_Part):
         """An empty section is one of defaults; a case has its order and the machine tool its variant."""
         if not isinstance(tree, dict):
             return tree
-        sections = ("split", "training", "compensation", "ccnn", "grnn")
+        sections = ("split", "training", "compensation", "ccnn", "bp_lm", "grnn")
         tree = {key: value for key, value in tree.items() if value is not None or key not in sections}
         if tree.get("case") is not None and tree.get("order") is None:
             tree["order"] = "raster"
