@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -30,9 +30,11 @@ __all__ = [
     "RefinementProblem",
     "RefinementSettings",
     "RefinementState",
+    "SecondOrder",
     "finish_refinement",
     "pose_refinement",
     "refine",
+    "second_order",
     "start_refinement",
     "step_refinement",
 ]
@@ -133,6 +135,13 @@ class RefinementState:
     def from_state_dict(cls, state: dict[str, Tensor]) -> RefinementState:
         """Inverse of `state_dict`."""
         return cls(**{f.name: state[f.name] for f in fields(cls)})
+
+
+class SecondOrder(NamedTuple):
+    """Gradient `b x k` and Gauss-Newton matrix `b x k x k` of the objective, 1 on the diagonal for inactive weights."""
+
+    gradient: Tensor
+    matrix: Tensor
 
 
 @dataclass(frozen=True)
@@ -271,9 +280,15 @@ def start_refinement(problem: RefinementProblem, weights: list[Tensor], waves: W
     return replace(state, noise=_noise(problem, state)) if settings.bayesian else state
 
 
-def step_refinement(problem: RefinementProblem, state: RefinementState) -> RefinementState:
-    """One iteration: a damped step that lowers the objective, or none; then new precisions."""
-    gradient, matrix = _second_order(problem, state)
+def step_refinement(
+    problem: RefinementProblem, state: RefinementState, known: SecondOrder | None = None
+) -> RefinementState:
+    """One iteration: a damped step that lowers the objective, or none; then new precisions.
+
+    Args:
+        known: `second_order` of this state, where the caller has it already.
+    """
+    gradient, matrix = known or second_order(problem, state)
     before = _objective(problem, state, state.weights)
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     weights, damping = state.weights, state.damping
@@ -296,9 +311,9 @@ def step_refinement(problem: RefinementProblem, state: RefinementState) -> Refin
     return _estimate_precisions(problem, moved, matrix)
 
 
-def finish_refinement(problem: RefinementProblem, state: RefinementState) -> Refined:
-    """Weights in their layers and what is known of the fit."""
-    _, matrix = _second_order(problem, state)
+def finish_refinement(problem: RefinementProblem, state: RefinementState, known: SecondOrder | None = None) -> Refined:
+    """Weights in their layers and what is known of the fit; `known` as in `step_refinement`."""
+    _, matrix = known or second_order(problem, state)
     objective = _objective(problem, state, state.weights)
     root, _ = torch.linalg.cholesky_ex(matrix)
     log_determinant = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -324,14 +339,14 @@ def finish_refinement(problem: RefinementProblem, state: RefinementState) -> Ref
     )
 
 
-def _second_order(problem: RefinementProblem, state: RefinementState) -> tuple[Tensor, Tensor]:
-    """Gradient `b x k` and Gauss-Newton matrix `b x k x k` of the objective, 1 for inactive weights."""
+def second_order(problem: RefinementProblem, state: RefinementState) -> SecondOrder:
+    """The objective to second order at a state; most of the work of an iteration."""
     precision = problem.rows.unsqueeze(-1) * state.noise.unsqueeze(1)
     local = linearise(problem.network, state.weights, problem.inputs, problem.targets, problem.metric, precision)
     prior = state.prior[:, problem.groups]
     active = problem.network.active
     gradient = local.gradient + torch.where(active, prior * state.weights, 0)
-    return gradient, local.matrix + torch.diag_embed(torch.where(active, prior, 1))
+    return SecondOrder(gradient, local.matrix + torch.diag_embed(torch.where(active, prior, 1)))
 
 
 def _squares(problem: RefinementProblem, weights: Tensor) -> Tensor:
