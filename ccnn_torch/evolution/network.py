@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -76,7 +77,7 @@ def hidden_signal(
     if waves is None:
         return signal
     periodic = wave_signal(waves, inputs)
-    leading = torch.broadcast_shapes(signal.shape[:-2], periodic.shape[:-2])
+    leading = np.broadcast_shapes(signal.shape[:-2], periodic.shape[:-2])
     return torch.cat([part.expand(*leading, *part.shape[-2:]) for part in (signal, periodic)], -1)
 
 
@@ -120,7 +121,7 @@ def average(masks: Sequence[Tensor], weights: Sequence[Tensor], slots: int = 0) 
                 torch.cat(
                     [_side_by_side(piece[0], layer == 0, True), *(_side_by_side(p, False, True) for p in piece[1:])], -1
                 )
-                for piece in (part.split([hidden, slots, slots], -1) for part in parts[:2])
+                for piece in (torch.split(part, [hidden, slots, slots], -1) for part in parts[:2])
             ]
         else:
             connections = [_side_by_side(part, layer == 0, layer == last) for part in parts[:2]]

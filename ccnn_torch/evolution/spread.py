@@ -141,7 +141,7 @@ def _beside(factors: Tensor, shared: bool, slots: int) -> Tensor:
     `shared`: the members have no hidden layer, so that they all read the same inputs.
     """
     hidden = factors.shape[-1] - 1 - 2 * slots
-    parts = factors.split([hidden, slots, slots, 1], -1)
+    parts = torch.split(factors, [hidden, slots, slots, 1], -1)
     wide = [parts[0] if shared else _apart(parts[0]), _apart(parts[1]), _apart(parts[2]), parts[3]]
     return torch.cat(wide, -1)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -53,7 +54,7 @@ def wave_signal(waves: Waves, inputs: Tensor) -> Tensor:
 
 def wave_inputs(source: Tensor, inputs: Tensor) -> Tensor:
     """The input that each node reads, `... x s x k`."""
-    leading = torch.broadcast_shapes(source.shape[:-1], inputs.shape[:-2])
+    leading = np.broadcast_shapes(source.shape[:-1], inputs.shape[:-2])
     rows = inputs.shape[-2]
     index = source.unsqueeze(-2).expand(*leading, rows, source.shape[-1])
     return inputs.expand(*leading, *inputs.shape[-2:]).gather(-1, index)
@@ -137,7 +138,8 @@ def _left(waves: Waves, residual: Tensor, inputs: Tensor, root: Tensor) -> Tenso
     eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
     # A little more than nothing: two nodes of nearly the same frequency must not cancel each other.
     normal = basis.mT @ basis + (1e-6 * basis.shape[-2] + _RIDGE) * eye
-    return residual - basis @ torch.linalg.solve(normal, basis.mT @ residual)
+    amplitudes: Tensor = torch.linalg.solve(normal, basis.mT @ residual)
+    return residual - basis @ amplitudes
 
 
 def _values(inputs: Tensor, there: Tensor) -> Tensor:

@@ -40,6 +40,8 @@ class TrainingData:
 class Learner(Protocol):
     """`start`, then `step` until `finished`; `predict` and `network` at any time after `start`.
 
+    A learner with the attribute `reads_angles` set gets the scaled angles of turning joints as its last features.
+
     All repeats advance together in one call, as the leading dimension of every tensor. Two learners started on the
     same data with the same seeds give the same tensors; a learner whose state was saved and loaded goes on to the same
     result, bit by bit. No global random state is read or set.

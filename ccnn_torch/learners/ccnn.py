@@ -303,7 +303,7 @@ def _slots(model: _Model, have: int, want: int) -> _Model:
         return nn.functional.pad(values, (0, want - have)) if want > have else values[..., :want]
 
     def columns(values: Tensor, hidden: int) -> Tensor:
-        parts = values.split([hidden, have, have, values.shape[-1] - hidden - 2 * have], -1)
+        parts = torch.split(values, [hidden, have, have, values.shape[-1] - hidden - 2 * have], -1)
         return torch.cat([parts[0], fitted(parts[1]), fitted(parts[2]), parts[3]], -1)
 
     hidden = model.masks[-1].shape[-1] - 2 * have

@@ -117,9 +117,9 @@ def refit(
     watch: WatchPhase,
 ) -> Fitted:
     """The second phase of `fit_method`: train on all training rows, for as long as the choice says."""
-    data, scaling = dataset.scaled("fit", False)
-    data = moved(data, plan.device)
     learner = make()
+    data, scaling = dataset.scaled("fit", False, learner)
+    data = moved(data, plan.device)
     training = train(
         learner,
         data,
