@@ -26,29 +26,40 @@ class Table:
 
 def print_table(table: Table, console: Console) -> None:
     """Show a table, in parts where the terminal is too narrow; each part repeats the first column."""
+    # Measured as on a terminal without an edge: a width is else never more than there is.
+    wide = console.options.update(max_width=10_000)
     parts: list[list[int]] = [[0]]
     for column in range(1, len(table.columns)):
         wider = [*parts[-1], column]
-        fits = console.measure(_shown(table, wider)).maximum <= console.width
+        fits = console.measure(_shown(table, wider), options=wide).maximum <= console.width
         if fits or len(parts[-1]) == 1:
             parts[-1] = wider
         else:
             parts.append([0, column])
     for i, part in enumerate(parts):
-        shown = _shown(table, part)
-        shown.title = escape(table.title + (", continued" if i else ""))
-        # Markup is on in titles and captions, off nowhere: what comes from outside is escaped.
-        shown.caption = (escape(table.note) or None) if i == len(parts) - 1 else None
-        console.print(shown)
+        # Beside the table, not in it: a title or a note is then as wide as the terminal, not as a narrow part.
+        console.print(escape(table.title + (", continued" if i else "")), style="bold")
+        console.print(_shown(table, part))
+    if table.note:
+        console.print(escape(table.note), style="italic dim")
 
 
 def _shown(table: Table, columns: Sequence[int]) -> RichTable:
-    shown = RichTable(title_justify="left", title_style="bold", caption_justify="left")
+    shown = RichTable()
     for i in columns:
-        # Too long a name is broken between words; numbers are folded only where nothing else helps.
-        width = None if i else min(_LONGEST_NAME, max(len(row[0]) for row in (table.columns, *table.rows)))
-        shown.add_column(escape(table.columns[i]), justify="right" if i else "left", overflow="fold", max_width=width)
+        shown.add_column(
+            escape(table.columns[i]), justify="right" if i else "left", overflow="fold", max_width=_width(table, i)
+        )
     for row in table.rows:
         # The interval below its median: three such columns then fit into 80 characters.
         shown.add_row(*(escape(row[i].replace(" [", "\n[") if i else row[i]) for i in columns))
     return shown
+
+
+def _width(table: Table, column: int) -> int:
+    """Room for what may not be broken: numbers, and words of the header; a long name is broken between words."""
+    cells = [row[column] for row in table.rows]
+    if column == 0:
+        return min(_LONGEST_NAME, max(len(cell) for cell in (table.columns[0], *cells)))
+    parts = [part for cell in cells for part in cell.replace(" [", "\n[").split("\n")]
+    return max(len(part) for part in (*table.columns[column].replace(" [", "\n[").split(), *parts))
