@@ -198,7 +198,7 @@ def test_all_errors_at_once_each_with_the_nearest_key(tmp_path: Path) -> None:
         ("covariates=3", ("covariates: must be a list, not 3",)),
         ("compensation.limit=-1", ("compensation.limit", "greater than 0")),
         ("ccnn.hidden=3", ("ccnn.hidden: must be a list, not 3",)),
-        ("case=tripodd", ("case: must be 'tripod' or 'machine_tool', not tripodd",)),
+        ("case=tripodd", ("case: must be 'tripod', 'machine_tool' or 'realistic', not tripodd",)),
         ("case=null", ("no data is named", "records=FILE.csv")),
         ("records=r.csv", ("both case and records",)),
         ("mechanism=machine_tool", ("mechanism: the case tripod brings its own",)),

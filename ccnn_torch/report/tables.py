@@ -18,7 +18,7 @@ from ccnn_torch.report.display import count_text, display_unit, interval_text, n
 from ccnn_torch.report.paper_tables import PAPER, PaperCase
 from ccnn_torch.report.table_form import Table, print_table
 
-__all__ = ["Table", "markdown_text", "print_tables", "result_tables", "verdict"]
+__all__ = ["Table", "markdown_table", "markdown_text", "print_tables", "result_tables", "verdict"]
 
 Results = Mapping[str, Any]
 
@@ -70,16 +70,18 @@ def print_tables(results: Results, console: Console) -> None:
     console.print(escape(verdict(results)), style="bold")
 
 
+def markdown_table(table: Table) -> str:
+    """One table as Markdown: title, rows, and the sentence below."""
+    head, *lines = (
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (table.columns, *table.rows)
+    )
+    rule = "| " + " | ".join(["---", *["---:"] * (len(table.columns) - 1)]) + " |"
+    return "\n\n".join([f"## {table.title}", "\n".join([head, rule, *lines]), *([table.note] if table.note else [])])
+
+
 def markdown_text(results: Results) -> str:
     """The verdict and the tables as Markdown (`results.md`)."""
-    parts = [f"# {results['name']}", verdict(results)]
-    for table in result_tables(results):
-        head, *lines = (
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (table.columns, *table.rows)
-        )
-        rule = "| " + " | ".join(["---", *["---:"] * (len(table.columns) - 1)]) + " |"
-        parts += [f"## {table.title}", "\n".join([head, rule, *lines]), *([table.note] if table.note else [])]
-    parts += failures(results)
+    parts = [f"# {results['name']}", verdict(results), *map(markdown_table, result_tables(results)), *failures(results)]
     return "\n\n".join(parts) + "\n"
 
 

@@ -25,6 +25,7 @@ from ccnn_torch.runs.config import RunConfig
 from ccnn_torch.runs.dataset import Dataset, Rows, pad_rows
 from ccnn_torch.runs.evaluate import Outcome, pose_with_geometry
 from ccnn_torch.runs.prepare import Prepared
+from ccnn_torch.runs.simulation import Simulation
 from ccnn_torch.runs.uncertainty import coverage, inside_domain
 
 __all__ = ["assemble", "best_method", "plan_of", "versions"]
@@ -74,16 +75,7 @@ def assemble(
     dataset, joints = prepared.dataset, prepared.mechanism.joints
     test, fit = dataset.usable_rows("test"), dataset.usable_rows("fit")
     measured, learned = test.take(dataset.deviation), fit.take(dataset.deviation)
-    floor = None
-    if prepared.case is not None and prepared.noise is not None:
-        chirp = prepared.case.unlearnable
-        floor = floor_block(
-            test.take(prepared.noise),
-            test.weights,
-            joints,
-            prepared.case.sigma.square(),
-            test.take(chirp.expand(len(dataset.seeds), -1, -1)) if bool(chirp.any()) else None,
-        )
+    floor = None if prepared.simulation is None else _floor(prepared.simulation, test, joints)
     methods: dict[str, Any] = {name: {"test": None, "failed": sentence} for name, sentence in failed.items()}
     inside = inside_domain(dataset, config.compensation.margin)
     for name, outcome in outcomes.items():
@@ -138,7 +130,7 @@ def _certainty(
     outcome: Outcome, dataset: Dataset, test: Rows, inside: Tensor, joints: tuple[Coordinate, ...]
 ) -> dict[str, Any]:
     """How wide the predictive sd is, and how often what was measured lies within its 95 % interval."""
-    sd = outcome.fitted.sd(test.take(dataset.inputs.expand(len(dataset.seeds), -1, -1)))
+    sd = outcome.fitted.sd(test.take(dataset.inputs))
     residuals = test.take(dataset.deviation) - test.take(outcome.deviation)
     there = (test.weights > 0).unsqueeze(-1)
     typical = sd.masked_fill(~there, torch.nan).nanmedian(1).values
@@ -165,8 +157,22 @@ def _pose_of(prepared: Prepared, outcome: Outcome) -> dict[str, Any]:
 
 
 def case_label(config: RunConfig) -> str:
-    """`tripod`, or `machine_tool:VARIANT`."""
+    """`tripod`, `machine_tool:VARIANT`, or `realistic:MACHINE:CAUSE`."""
+    if config.case == "realistic":
+        return f"realistic:{config.realistic.machine}:{config.realistic.cause}"
     return f"{config.case}:{config.variant}" if config.case == "machine_tool" else str(config.case)
+
+
+def _floor(simulation: Simulation, test: Rows, joints: tuple[Coordinate, ...]) -> dict[str, Any]:
+    variance = test.take(simulation.noise_variance) * test.weights.unsqueeze(-1)
+    unlearnable = simulation.unlearnable
+    return floor_block(
+        test.take(simulation.noise),
+        test.weights,
+        joints,
+        variance.sum(1, keepdim=True) / test.weights.sum(1)[:, None, None],
+        None if unlearnable is None else test.take(unlearnable),
+    )
 
 
 def row_counts(config: RunConfig, dataset: Dataset) -> dict[str, int]:

@@ -72,7 +72,7 @@ class Calibration:
         return fit_compensator(
             fitted.learner.network(repeat).cpu(),
             fitted.scaling.repeat(repeat),
-            prepared.dataset.inputs[there],
+            prepared.dataset.inputs[repeat, there],
             prepared.dataset.deviation[repeat, there],
             prepared.mechanism.joints,
             prepared.covariate_coordinates,

@@ -15,6 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners.ccnn import CCNNSettings
+from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.runs._keys import explain, list_keys
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
 from ccnn_torch.runs._yaml import dump_yaml, read_yaml
@@ -23,6 +24,7 @@ __all__ = [
     "METHODS",
     "AutoConfig",
     "CompensationConfig",
+    "RealisticConfig",
     "RunConfig",
     "SplitConfig",
     "TrainingConfig",
@@ -32,6 +34,7 @@ __all__ = [
     "load_config",
     "make_config",
     "method_names",
+    "validate_tree",
 ]
 
 METHODS = ("ccnn", "bp_lm", "grnn", "enn", "constant", "gp")
@@ -136,6 +139,25 @@ def _checked(methods: list[str], choices: tuple[str, ...]) -> list[str]:
     return methods
 
 
+class RealisticConfig(_Part):
+    """A simulated real machine (case=realistic); every repeat has a machine, poses and noise of its own."""
+
+    machine: Literal["tripod", "machine_tool", "arm"] = Field(
+        default="tripod", description="tripod, machine_tool or arm (six joints)"
+    )
+    cause: Literal["geometry", "compliance", "transmission", "thermal", "backlash", "mixed"] = Field(
+        default="mixed",
+        description="what makes it miss: geometry, compliance, transmission, thermal, backlash, or mixed = all of them",
+    )
+    strength: float = Field(default=1.0, ge=0, description="size of the cause; 1 = 0.05 to 0.3 mm of pose error")
+    rows: int = Field(default=200, ge=20, description="poses measured")
+    noise: float = Field(
+        default=5e-6,
+        gt=0,
+        description="standard deviation of each measured coordinate of the position in m; an angle has it over 0.3 m",
+    )
+
+
 class RunConfig(_Part):
     """A run: data, split, methods and their settings."""
 
@@ -158,9 +180,12 @@ class RunConfig(_Part):
         "speed* where they are there; [] = none",
     )
     split: SplitConfig = Field(default_factory=SplitConfig)
-    case: Literal["tripod", "machine_tool"] | None = Field(
-        default=None, description="a case study of paper 000: tripod or machine_tool; or null and records instead"
+    case: Literal["tripod", "machine_tool", "realistic"] | None = Field(
+        default=None,
+        description="simulated data: a case study of paper 000, tripod or machine_tool; a realistic machine; or null "
+        "and records instead",
     )
+    realistic: RealisticConfig = Field(default_factory=RealisticConfig)
     variant: Literal["printed", "tabulated"] | None = Field(
         default=None,
         description="noise of the machine_tool case: printed (eq. 19) or tabulated (Table III); default printed",
@@ -196,6 +221,7 @@ class RunConfig(_Part):
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
     save_models: bool = Field(default=True, description="write model files and their card")
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
+    grnn: GRNNSettings = Field(default_factory=GRNNSettings)
 
     @model_validator(mode="before")
     @classmethod
@@ -203,9 +229,9 @@ class RunConfig(_Part):
         """An empty section is one of defaults; a case has its order and the machine tool its variant."""
         if not isinstance(tree, dict):
             return tree
-        sections = ("split", "training", "auto", "compensation", "ccnn")
+        sections = [key for key, field in cls.model_fields.items() if field.default_factory is not None]
         tree = {key: value for key, value in tree.items() if value is not None or key not in sections}
-        if tree.get("case") is not None and tree.get("order") is None:
+        if tree.get("case") in ("tripod", "machine_tool") and tree.get("order") is None:
             tree["order"] = "raster"
         if tree.get("case") == "machine_tool" and tree.get("variant") is None:
             tree["variant"] = "printed"
@@ -223,7 +249,9 @@ class RunConfig(_Part):
     def _one_source(self) -> RunConfig:
         if (self.case is None) == (self.records is None):
             both = "both case and records are given; remove one" if self.case else "no data is named"
-            raise ValueError(f"{both}: case=tripod, case=machine_tool, or records=FILE.csv with mechanism=…")
+            raise ValueError(
+                f"{both}: case=tripod, case=machine_tool, case=realistic, or records=FILE.csv with mechanism=…"
+            )
         if self.records is not None and self.mechanism is None:
             raise ValueError(
                 "mechanism: records need it; write mechanism=tripod, machine_tool, a DH file, a URDF or file.py:Name"
@@ -232,6 +260,10 @@ class RunConfig(_Part):
             raise ValueError(f"mechanism: the case {self.case} brings its own; remove the key")
         if self.variant is not None and self.case != "machine_tool":
             raise ValueError("variant: only the case machine_tool has variants; remove the key")
+        if self.realistic != RealisticConfig() and self.case != "realistic":
+            raise ValueError("realistic: these keys need case=realistic; write that, or remove them")
+        if self.order is not None and self.case == "realistic":
+            raise ValueError("order: a realistic machine visits random poses; remove the key")
         if self.order is not None and self.case is None:
             raise ValueError("order: records have the order in which they were measured; remove the key")
         folds = self.training.folds > 1 or self.methods == ["auto"]
@@ -259,7 +291,7 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> RunConfig:
     tree.setdefault("name", path.stem)
     resolve_paths(tree, path.absolute().parent)
     given = apply_overrides(tree, overrides, Path.cwd())
-    return _validate(tree, str(path), given)
+    return validate_tree(tree, str(path), given)
 
 
 def make_config(**keys: Any) -> RunConfig:
@@ -270,10 +302,20 @@ def make_config(**keys: Any) -> RunConfig:
     """
     tree = dict(keys)
     resolve_paths(tree, Path.cwd())
-    return _validate(tree, "config", {})
+    return validate_tree(tree, "config", {})
 
 
-def _validate(tree: dict[str, Any], source: str, given: dict[str, str]) -> RunConfig:
+def validate_tree(tree: dict[str, Any], source: str, given: dict[str, str]) -> RunConfig:
+    """A config from a tree of keys whose paths are absolute.
+
+    Args:
+        tree: keys and sections.
+        source: the config's name, which opens the sentence of an error.
+        given: key -> override, for keys that were set on the command line.
+
+    Raises:
+        InputError: keys are wrong: one line that names them all.
+    """
     try:
         return RunConfig.model_validate(tree)
     except ValidationError as error:

@@ -51,10 +51,9 @@ def _arrays(calibration: Calibration) -> RunArrays:
     """What the pictures of the exported repeat need."""
     prepared, method, k = calibration.prepared, calibration.method, calibration.repeat()
     outcome, mechanism = calibration.outcomes[method], prepared.mechanism
-    rows = len(prepared.joints)
+    rows = prepared.joints.shape[1]
     test = torch.zeros(rows, dtype=torch.bool)
     test[prepared.dataset.splits[k].test] = True
-    pose = prepared.pose[k] if prepared.pose.dim() == 3 else prepared.pose
     # A machine that mostly turns has its errors spread over angles, not over places.
     turns = sum(coordinate.unit == "m" for coordinate in mechanism.pose) < 2
     axes = mechanism.pose if turns else tuple(Coordinate(name, "m") for name in "xyz")
@@ -64,21 +63,21 @@ def _arrays(calibration: Calibration) -> RunArrays:
 
     masks, weights = genome(outcome.fitted.learner, k)
     systematic = outcome.after_systematic
-    case = prepared.case
+    simulation = prepared.simulation
     return RunArrays(
         joints=mechanism.joints,
-        commanded=_numpy(prepared.joints),
+        commanded=_numpy(prepared.joints[k]),
         measured=_numpy(prepared.dataset.deviation[k]),
         predicted=_numpy(outcome.deviation[k]),
         test=test.numpy(),
-        place=place(pose),
+        place=place(prepared.pose[k]),
         position_before=_numpy(calibration.before.position[k]),
         position_after=_numpy(outcome.after.position[k]),
         rotation_before=None if calibration.before.rotation is None else _numpy(calibration.before.rotation[k]),
         rotation_after=None if outcome.after.rotation is None else _numpy(outcome.after.rotation[k]),
         noise=None if prepared.noise is None else _numpy(prepared.noise[k]),
-        map_place=None if case is None else place(case.pose),
-        map_before=None if case is None else _numpy(case.pose_error(case.joints).position),
+        map_place=None if simulation is None else place(simulation.pose[k]),
+        map_before=None if simulation is None else _numpy(simulation.pose_errors(prepared.joints)[1].position[k]),
         map_after=None if systematic is None else _numpy(systematic.position[k]),
         masks=tuple(mask.numpy() for mask in masks),
         weights=tuple(_numpy(weight) for weight in weights),

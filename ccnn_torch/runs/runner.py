@@ -21,8 +21,12 @@ from ccnn_torch.training import Callback, Scaling, past_of
 __all__ = ["resume_run", "start_run"]
 
 
-def start_run(config: RunConfig, quiet: bool = False) -> RunFolder:
+def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> RunFolder:
     """Run a config into a fresh folder.
+
+    Args:
+        quiet: no progress and no tables.
+        tables: show the results when it is done.
 
     Raises:
         InputError: the config or its data cannot be used, or the folder is taken.
@@ -31,12 +35,15 @@ def start_run(config: RunConfig, quiet: bool = False) -> RunFolder:
     prepared = prepare(config)
     folder = RunFolder.create(config.out, config.name)
     folder.write_text("config.yaml", dump_config(config))
-    _run(config, prepared, folder, quiet)
+    _run(config, prepared, folder, quiet, tables)
     return folder
 
 
-def resume_run(path: Path, quiet: bool = False) -> RunFolder:
+def resume_run(path: Path, quiet: bool = False, tables: bool = True) -> RunFolder:
     """Finish the run in a folder; the result is that of a run that was never stopped. A finished one stays as it is.
+
+    Args:
+        quiet, tables: as in `start_run`.
 
     Raises:
         InputError: there is no run in the folder, or its records or checkpoints were changed.
@@ -46,11 +53,11 @@ def resume_run(path: Path, quiet: bool = False) -> RunFolder:
         note(f"{path} is finished; nothing to do", quiet)
         return folder
     config = load_config(folder.config, [])
-    _run(config, prepare(config), folder, quiet)
+    _run(config, prepare(config), folder, quiet, tables)
     return folder
 
 
-def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool) -> None:
+def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, tables: bool) -> None:
     for sentence in prepared.notes:
         note(sentence, quiet)
 
@@ -71,6 +78,6 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool) 
     calibration: Calibration = calibrate(config, folder, watch, prepared)
     note("writing model files, plots and tables …", quiet)
     write_outputs(calibration, folder)
-    if not quiet:
+    if tables and not quiet:
         print_tables(calibration.results, stdout)
         stdout.print(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")

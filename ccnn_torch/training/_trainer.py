@@ -181,6 +181,9 @@ class _Run:
         self.clock.append(self.seconds)
 
     def finish(self) -> Training:
+        if self.stop_at is not None and bool((self.stop_at > self.step).any()):
+            # The learner ended by itself before it came so far: its last state is the nearest one.
+            self._keep(self.stop_at > self.step)
         ended, converged = self.done, getattr(self.learner, "converged", None)
         if converged is not None:
             converged = converged.clone() if self.learner.finished else torch.ones_like(converged)

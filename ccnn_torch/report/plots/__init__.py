@@ -10,5 +10,6 @@ from ccnn_torch.report.plots._progress import progress_plot as progress_plot
 from ccnn_torch.report.plots._style import Plot as Plot
 from ccnn_torch.report.plots._style import inline_svg as inline_svg
 from ccnn_torch.report.plots._style import save_figure as save_figure
+from ccnn_torch.report.plots._suite import suite_plot as suite_plot
 from ccnn_torch.report.plots._workspace import overview_plot as overview_plot
 from ccnn_torch.report.plots._workspace import workspace_plot as workspace_plot
