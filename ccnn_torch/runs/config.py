@@ -15,6 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners.ccnn import CCNNSettings
+from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.runs._keys import explain, list_keys
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
@@ -107,6 +108,25 @@ class CompensationConfig(_Part):
     )
 
 
+class RealisticConfig(_Part):
+    """A simulated real machine (case=realistic); every repeat has a machine, poses and noise of its own."""
+
+    machine: Literal["tripod", "machine_tool", "arm"] = Field(
+        default="tripod", description="tripod, machine_tool or arm (six joints)"
+    )
+    cause: Literal["geometry", "compliance", "transmission", "thermal", "backlash", "mixed"] = Field(
+        default="mixed",
+        description="what makes it miss: geometry, compliance, transmission, thermal, backlash, or mixed = all of them",
+    )
+    strength: float = Field(default=1.0, ge=0, description="size of the cause; 1 = 0.05 to 0.3 mm of pose error")
+    rows: int = Field(default=200, ge=20, description="poses measured")
+    noise: float = Field(
+        default=5e-6,
+        gt=0,
+        description="standard deviation of each measured coordinate of the position in m; an angle has it over 0.3 m",
+    )
+
+
 class AutoConfig(_Part):
     """How `methods=auto` chooses a method."""
 
@@ -137,25 +157,6 @@ def _checked(methods: list[str], choices: tuple[str, ...]) -> list[str]:
         if methods.count(method) > 1:
             raise ValueError(f"'{method}' stands twice")
     return methods
-
-
-class RealisticConfig(_Part):
-    """A simulated real machine (case=realistic); every repeat has a machine, poses and noise of its own."""
-
-    machine: Literal["tripod", "machine_tool", "arm"] = Field(
-        default="tripod", description="tripod, machine_tool or arm (six joints)"
-    )
-    cause: Literal["geometry", "compliance", "transmission", "thermal", "backlash", "mixed"] = Field(
-        default="mixed",
-        description="what makes it miss: geometry, compliance, transmission, thermal, backlash, or mixed = all of them",
-    )
-    strength: float = Field(default=1.0, ge=0, description="size of the cause; 1 = 0.05 to 0.3 mm of pose error")
-    rows: int = Field(default=200, ge=20, description="poses measured")
-    noise: float = Field(
-        default=5e-6,
-        gt=0,
-        description="standard deviation of each measured coordinate of the position in m; an angle has it over 0.3 m",
-    )
 
 
 class RunConfig(_Part):
@@ -222,6 +223,7 @@ class RunConfig(_Part):
     save_models: bool = Field(default=True, description="write model files and their card")
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
     grnn: GRNNSettings = Field(default_factory=GRNNSettings)
+    gp: GPSettings = Field(default_factory=GPSettings)
 
     @model_validator(mode="before")
     @classmethod
