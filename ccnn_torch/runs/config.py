@@ -14,6 +14,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
+from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
@@ -222,6 +223,7 @@ class RunConfig(_Part):
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
     save_models: bool = Field(default=True, description="write model files and their card")
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
+    bp_lm: BPLMSettings = Field(default_factory=BPLMSettings)
     grnn: GRNNSettings = Field(default_factory=GRNNSettings)
     gp: GPSettings = Field(default_factory=GPSettings)
 
