@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from ccnn_torch.report.display import count_text, display_unit, interval_text, number_text
-from ccnn_torch.report.tables import Table, markdown_table, print_table
+from ccnn_torch.report.table_form import Table, print_table
+from ccnn_torch.report.tables import markdown_table
 
 __all__ = ["case_line", "print_suite", "suite_markdown", "suite_tables"]
 
