@@ -180,6 +180,9 @@ class RunConfig(_Part):
     training: TrainingConfig = Field(default_factory=TrainingConfig)
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
     save_models: bool = Field(default=True, description="write model files and their card")
+    save_report: bool = Field(
+        default=True, description="draw plots/ and write report.html; results.json, .csv and .md are always written"
+    )
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
 
     @model_validator(mode="before")
