@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.evolution.genome import Genome, active
 
-__all__ = ["MaskedNetwork", "alive_nodes", "average", "fed_nodes", "forward", "prune"]
+__all__ = ["MaskedNetwork", "alive_nodes", "average", "fed_nodes", "forward", "hidden_signal", "prune"]
 
 
 def fed_nodes(masks: Sequence[Tensor]) -> list[Tensor]:
@@ -58,13 +58,21 @@ def forward(masks: Sequence[Tensor], weights: Sequence[Tensor], inputs: Tensor) 
     Returns:
         `... x s x o`.
     """
+    signal = hidden_signal(masks, weights, inputs)
+    return _affine(signal, _kept(masks[-1], weights[-1]))
+
+
+def hidden_signal(masks: Sequence[Tensor], weights: Sequence[Tensor], inputs: Tensor) -> Tensor:
+    """Output of the last hidden layer, `... x s x h`, or the inputs where there is none; arguments as `forward`."""
     fed = fed_nodes(masks)
     signal = inputs
-    for layer, (mask, weight) in enumerate(zip(masks, weights, strict=True)):
-        signal = _affine(signal, torch.where(active(Genome(mask, weight)), weight, torch.zeros_like(weight)))
-        if layer < len(fed):
-            signal = torch.sigmoid(signal) * fed[layer].unsqueeze(-2)
+    for mask, weight, reached in zip(masks[:-1], weights[:-1], fed, strict=True):
+        signal = torch.sigmoid(_affine(signal, _kept(mask, weight))) * reached.unsqueeze(-2)
     return signal
+
+
+def _kept(mask: Tensor, weight: Tensor) -> Tensor:
+    return torch.where(active(Genome(mask, weight)), weight, torch.zeros_like(weight))
 
 
 def _affine(signal: Tensor, weight: Tensor) -> Tensor:
@@ -144,9 +152,20 @@ class MaskedNetwork(nn.Module):
 
     Args:
         masks, weights: one a layer, `out x in` and `out x (in or in + 1)`; missing connections become zeros.
+        factors, noise: its predictive variance (`evolution.spread.Spread`), `o x q x (h + 1)` and `o`; 1 without them.
     """
 
-    def __init__(self, masks: Sequence[Tensor], weights: Sequence[Tensor]) -> None:
+    factors: Tensor
+    noise: Tensor
+    _sums: Tensor
+
+    def __init__(
+        self,
+        masks: Sequence[Tensor],
+        weights: Sequence[Tensor],
+        factors: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> None:
         super().__init__()
         layers = []
         for mask, weight in zip(*prune(masks, weights), strict=True):
@@ -160,12 +179,23 @@ class MaskedNetwork(nn.Module):
             linear.bias.copy_(weight[:, inputs] if weight.shape[-1] > inputs else torch.zeros_like(weight[:, 0]))
             layers.append(linear)
         self.layers = nn.ModuleList(layers)
+        outputs = layers[-1].out_features
+        if factors is None or noise is None:
+            factors = layers[-1].weight.new_zeros(outputs, 0, layers[-1].in_features + 1)
+            noise = layers[-1].weight.new_ones(outputs)
+        else:
+            factors = _pruned_columns(masks, factors, layers[-1].in_features)
+        self.register_buffer("factors", factors.flatten(0, 1).contiguous())
+        self.register_buffer("noise", noise.clone())
+        # A sum over q as a product: engines with a narrow operator list have no other reduction.
+        each = torch.eye(outputs, dtype=factors.dtype, device=factors.device)
+        self.register_buffer("_sums", each.repeat_interleave(factors.shape[1], 0), persistent=False)
 
     def describe(self) -> dict[str, Any]:
         """What a model file needs to build the module again, beside its tensors."""
         first, *others = cast("list[nn.Linear]", list(self.layers))
         sizes = [first.in_features, first.out_features, *(layer.out_features for layer in others)]
-        return {"kind": "masked", "sizes": sizes}
+        return {"kind": "masked", "sizes": sizes, "spread": len(self.factors) // sizes[-1]}
 
     @classmethod
     def from_description(cls, description: dict[str, Any]) -> MaskedNetwork:
@@ -173,11 +203,38 @@ class MaskedNetwork(nn.Module):
         sizes = [int(size) for size in description["sizes"]]
         shapes = list(zip(sizes[1:], sizes, strict=False))
         masks = [torch.ones(shape, dtype=torch.bool) for shape in shapes]
-        return cls(masks, [torch.zeros(out, width + 1, dtype=torch.float64) for out, width in shapes])
+        factors = torch.zeros(sizes[-1], int(description["spread"]), sizes[-2] + 1, dtype=torch.float64)
+        empty = [torch.zeros(out, width + 1, dtype=torch.float64) for out, width in shapes]
+        network = cls(masks, empty)
+        return network if factors.shape[1] == 0 else cls(masks, empty, factors, network.noise)
 
     def forward(self, inputs: Tensor) -> Tensor:
         """inputs: `... x i` [1]; returns `... x o` [1]."""
+        output: Tensor = self.layers[-1](self._hidden(inputs))
+        return output
+
+    def variance(self, inputs: Tensor) -> Tensor:
+        """Predictive variance of a newly measured output. inputs: `... x i` [1]; returns `... x o` [1]."""
+        if len(self.factors) == 0:
+            return self.noise.expand(*inputs.shape[:-1], len(self.noise))
+        hidden = self._hidden(inputs)
+        scatter = hidden @ self.factors[:, :-1].mT + self.factors[:, -1]
+        return (scatter * scatter) @ self._sums + self.noise
+
+    def _hidden(self, inputs: Tensor) -> Tensor:
         signal = inputs
-        for number, layer in enumerate(self.layers):
-            signal = layer(torch.sigmoid(signal) if number else signal)
+        for layer in self.layers[:-1]:
+            signal = torch.sigmoid(layer(signal))
         return signal
+
+
+def _pruned_columns(masks: Sequence[Tensor], factors: Tensor, width: int) -> Tensor:
+    """Columns of the nodes that `prune` keeps, and the last one."""
+    if len(masks) == 1:
+        return factors
+    alive = alive_nodes(masks)
+    if not bool(alive[0].any()):
+        # One layer without connections is left, from the inputs; what a constant is unsure of is its value.
+        constant = factors[..., -1:]
+        return torch.cat([constant.new_zeros(*constant.shape[:-1], width), constant], -1)
+    return torch.cat([factors[..., :-1][..., alive[-1]], factors[..., -1:]], -1)

@@ -12,6 +12,7 @@ from ccnn_torch.evolution.network import MaskedNetwork, average, forward
 from ccnn_torch.evolution.random import member_seeds
 from ccnn_torch.evolution.refinement import RefinementSettings, refine
 from ccnn_torch.evolution.settings import CCNNSettings
+from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
 from ccnn_torch.learners._protocol import TrainingData
 
 __all__ = ["CCNN", "CCNNSettings"]
@@ -89,6 +90,10 @@ class CCNN:
         masks, weights = self._member_networks()
         return forward(masks, weights, inputs.unsqueeze(1)).mean(1)
 
+    def variance(self, inputs: Tensor) -> Tensor:
+        """Predictive variance of newly measured outputs. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
+        return spread_variance(*average(*self._member_networks()), self._spread(), inputs)
+
     def masks(self) -> list[Tensor]:
         """Connections of the model, one layer each, `r x out x in`, bool."""
         return average(*self._member_networks())[0]
@@ -104,7 +109,8 @@ class CCNN:
 
     def network(self, repeat: int) -> MaskedNetwork:
         """The model of one repeat, pruned of its dead nodes."""
-        return MaskedNetwork(*self.genome(repeat))
+        spread = self._spread()
+        return MaskedNetwork(*self.genome(repeat), spread.factors[repeat], spread.noise[repeat])
 
     def state_dict(self) -> dict[str, Tensor]:
         """Subpopulations with their fitness, the best joined network, the refined one: `r x members x ...`."""
@@ -145,6 +151,10 @@ class CCNN:
         model = _choose(self._evidence > -torch.inf, self._refined, self._state.best)
         masks = [self._by_repeat(part.mask[:, 0]) for part in model]
         return masks, [self._by_repeat(part.weight[:, 0]) for part in model]
+
+    def _spread(self) -> Spread:
+        first = slice(None, None, self.settings.members)
+        return readout_spread(*self._member_networks(), self._inputs[first], self._targets[first], self._rows[first])
 
     def _error(self) -> Tensor:
         """Weighted mean squared error of the model on the training rows, `r`."""

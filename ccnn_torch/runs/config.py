@@ -14,14 +14,16 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
-from ccnn_torch.learners._registry import LEARNERS
 from ccnn_torch.learners.ccnn import CCNNSettings
+from ccnn_torch.learners.gp import GPSettings
+from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.runs._keys import explain, list_keys
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
 from ccnn_torch.runs._yaml import dump_yaml, read_yaml
 
 __all__ = [
     "METHODS",
+    "AutoConfig",
     "CompensationConfig",
     "RealisticConfig",
     "RunConfig",
@@ -78,6 +80,11 @@ class TrainingConfig(_Part):
         default=True,
         description="find the best step on the validation rows, then refit on all training rows for so long",
     )
+    folds: int = Field(
+        default=1,
+        ge=1,
+        description="1 = hold the rows of split.validation out; K > 1 = cross-validate in K folds of the training rows",
+    )
     patience: int | None = Field(
         default=None, ge=1, description="steps without improvement after which that search ends; null = go to the end"
     )
@@ -120,6 +127,38 @@ class RealisticConfig(_Part):
     )
 
 
+class AutoConfig(_Part):
+    """How `methods=auto` chooses a method."""
+
+    methods: Names = Field(
+        default=["constant", "grnn", "gp", "bp_lm", "enn", "ccnn"],
+        min_length=1,
+        description="the methods that methods=auto compares, in the order in which they are tried: cheap ones first",
+    )
+    budget: float = Field(
+        default=300.0,
+        gt=0,
+        description="seconds inside the learners that the comparison may take; the refit comes on top",
+    )
+    folds: int = Field(default=5, ge=2, description="folds of the training rows that the methods are compared by")
+
+    @field_validator("methods")
+    @classmethod
+    def _known(cls, methods: list[str]) -> list[str]:
+        return _checked(methods, METHODS)
+
+
+def _checked(methods: list[str], choices: tuple[str, ...]) -> list[str]:
+    for method in methods:
+        if method not in choices and ".py:" not in method:
+            near = nearest(method, choices)
+            hint = f"did you mean '{near}'?" if near else f"known are {', '.join(choices)} and file.py:Name"
+            raise ValueError(f"there is no method '{method}'; {hint}")
+        if methods.count(method) > 1:
+            raise ValueError(f"'{method}' stands twice")
+    return methods
+
+
 class RunConfig(_Part):
     """A run: data, split, methods and their settings."""
 
@@ -132,7 +171,8 @@ class RunConfig(_Part):
     methods: Names = Field(
         default=["ccnn"],
         min_length=1,
-        description=f"learners: a list of {', '.join(METHODS)}; all = these; auto = all that this version has",
+        description=f"learners: a list of {', '.join(METHODS)}; all = these; auto = the best of auto.methods "
+        "by cross-validation",
     )
     device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?|mps)$", description="cpu, cuda, cuda:N or mps")
     covariates: Names | None = Field(
@@ -178,12 +218,15 @@ class RunConfig(_Part):
         default=None, gt=0, description="rows with a larger joint deviation (SI) are not trained on; null = no bound"
     )
     training: TrainingConfig = Field(default_factory=TrainingConfig)
+    auto: AutoConfig = Field(default_factory=AutoConfig)
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
     save_models: bool = Field(default=True, description="write model files and their card")
     save_report: bool = Field(
         default=True, description="draw plots/ and write report.html; results.json, .csv and .md are always written"
     )
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
+    grnn: GRNNSettings = Field(default_factory=GRNNSettings)
+    gp: GPSettings = Field(default_factory=GPSettings)
 
     @model_validator(mode="before")
     @classmethod
@@ -191,7 +234,7 @@ class RunConfig(_Part):
         """An empty section is one of defaults; a case has its order and the machine tool its variant."""
         if not isinstance(tree, dict):
             return tree
-        sections = ("split", "realistic", "training", "compensation", "ccnn")
+        sections = [key for key, field in cls.model_fields.items() if field.default_factory is not None]
         tree = {key: value for key, value in tree.items() if value is not None or key not in sections}
         if tree.get("case") in ("tripod", "machine_tool") and tree.get("order") is None:
             tree["order"] = "raster"
@@ -202,14 +245,7 @@ class RunConfig(_Part):
     @field_validator("methods")
     @classmethod
     def _known(cls, methods: list[str]) -> list[str]:
-        choices = (*METHODS, "all", "auto")
-        for method in methods:
-            if method not in choices and ".py:" not in method:
-                near = nearest(method, choices)
-                hint = f"did you mean '{near}'?" if near else f"known are {', '.join(choices)} and file.py:Name"
-                raise ValueError(f"there is no method '{method}'; {hint}")
-            if methods.count(method) > 1:
-                raise ValueError(f"'{method}' stands twice")
+        for method in _checked(methods, (*METHODS, "all", "auto")):
             if method in ("all", "auto") and len(methods) > 1:
                 raise ValueError(f"'{method}' stands alone; remove the other names or '{method}'")
         return methods
@@ -235,9 +271,11 @@ class RunConfig(_Part):
             raise ValueError("order: a realistic machine visits random poses; remove the key")
         if self.order is not None and self.case is None:
             raise ValueError("order: records have the order in which they were measured; remove the key")
-        if self.training.early_stop and self.split.validation == 0:
+        folds = self.training.folds > 1 or self.methods == ["auto"]
+        if self.training.early_stop and self.split.validation == 0 and not folds:
             raise ValueError(
-                "training.early_stop: it needs validation rows; write split.validation=0.2 or training.early_stop=false"
+                "training.early_stop: it needs validation rows; write split.validation=0.2, training.folds=5 or "
+                "training.early_stop=false"
             )
         return self
 
@@ -299,7 +337,7 @@ def method_names(config: RunConfig) -> list[str]:
     if config.methods == ["all"]:
         return list(METHODS)
     if config.methods == ["auto"]:
-        return [method for method in METHODS if method in LEARNERS]
+        return list(config.auto.methods)
     return list(config.methods)
 
 

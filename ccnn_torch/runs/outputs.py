@@ -11,10 +11,12 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
 from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.reach import reach_block
 from ccnn_torch.report.run_report import write_report, write_tables
 from ccnn_torch.runs.calibrate import Calibration
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.watch import genome
+from ccnn_torch.training import Training
 
 __all__ = ["write_outputs"]
 
@@ -22,11 +24,13 @@ __all__ = ["write_outputs"]
 def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
     """Model files, arrays, curves, plots, tables, report, and at last `results.json`."""
     path, results = folder.path, calibration.results
+    curves = {name: _history(outcome.fitted.training) for name, outcome in calibration.outcomes.items()}
+    results["reach"] = reach_block(curves)
     if calibration.config.save_models:
         results["notes"] += _save_models(calibration, folder)
     save_arrays(path, _arrays(calibration))
-    for method in calibration.outcomes:
-        save_history(path, method, _history(calibration, method))
+    for method, history in curves.items():
+        save_history(path, method, history)
     if calibration.config.save_report:
         write_report(path, results)
     else:
@@ -85,10 +89,12 @@ def _arrays(calibration: Calibration) -> RunArrays:
     )
 
 
-def _history(calibration: Calibration, method: str) -> dict[str, NDArray[np.float64]]:
-    history = calibration.outcomes[method].fitted.training.history
-    steps = len(next(iter(history.values())))
-    return {"step": np.arange(1.0, steps + 1)} | {name: _numpy(value) for name, value in history.items()}
+def _history(training: Training) -> dict[str, NDArray[np.float64]]:
+    """Training curves for `save_history`; `seconds` are one repeat's share of those inside the learner, `t x r`."""
+    repeats = len(training.best_step)
+    seconds = (training.clock / repeats).unsqueeze(1).expand(-1, repeats)
+    metrics = training.history | {"seconds": seconds}
+    return {"step": np.arange(1.0, len(seconds) + 1)} | {name: _numpy(value) for name, value in metrics.items()}
 
 
 def _numpy(tensor: Tensor) -> NDArray[np.float64]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from ccnn_torch.report.results import share_unit
 from ccnn_torch.report.tables import print_tables
 from ccnn_torch.report.tensorboard import TensorBoardCallback
+from ccnn_torch.runs.assemble import plan_of
 from ccnn_torch.runs.calibrate import Calibration, calibrate, makers
 from ccnn_torch.runs.config import RunConfig, dump_config, load_config
 from ccnn_torch.runs.folder import RunFolder
@@ -14,7 +16,7 @@ from ccnn_torch.runs.outputs import write_outputs
 from ccnn_torch.runs.prepare import Prepared, prepare
 from ccnn_torch.runs.screen import note, stdout
 from ccnn_torch.runs.watch import HeldOut, ProgressBar
-from ccnn_torch.training import Callback, Scaling
+from ccnn_torch.training import Callback, Scaling, past_of
 
 __all__ = ["resume_run", "start_run"]
 
@@ -61,15 +63,17 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, 
 
     def watch(prepared: Prepared, method: str, phase: str, scaling: Scaling) -> list[Callback]:
         joints = prepared.mechanism.joints
-        label = f"{method}: {'choosing how long' if phase == 'choose' else 'training'}"
+        choosing = "cross-validating" if plan_of(config).folds > 1 else "choosing how long"
+        label = f"{method}: {choosing if phase == 'choose' else 'training'}"
         board = folder.tensorboard / (method if phase == "fit" else f"{method}-{phase}")
-        return [
-            HeldOut(
-                prepared.dataset, scaling, tuple(j.name for j in joints), share_unit(joints), config.training.log_every
-            ),
-            TensorBoardCallback(board, every=config.training.log_every),
-            ProgressBar(label, quiet),
-        ]
+        every = config.training.log_every
+        past = partial(past_of, folder.checkpoint(method, phase))
+        shown: list[Callback] = [TensorBoardCallback(board, every=every, past=past), ProgressBar(label, quiet)]
+        if phase == "choose":
+            # It has held-out errors of its own, of rows that are there to choose by.
+            return shown
+        names = tuple(joint.name for joint in joints)
+        return [HeldOut(prepared.dataset, scaling, names, share_unit(joints), every), *shown]
 
     calibration: Calibration = calibrate(config, folder, watch, prepared)
     note("writing model files, plots and tables …", quiet)

@@ -1,0 +1,346 @@
+"""Exact Gaussian process regression: what a practitioner would try first on a few hundred rows.
+
+Wrapped from GPyTorch rather than from scikit-learn. GPyTorch's kernels, priors and constraints take leading batch
+dimensions, so that all repeats and outputs, each with hyperparameters of its own, go through one call; they
+differentiate by autograd, and they leave the steps to the caller, here to the trainer with its early stopping and its
+checkpoints. scikit-learn's `fit` is one process at a time, one length scale set for all outputs, in a loop of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.evolution.random import uniform
+from ccnn_torch.learners._gp_posterior import GPNetwork, covariance, spread_factor
+from ccnn_torch.learners._protocol import TrainingData
+
+if TYPE_CHECKING:
+    from ccnn_torch.learners._gp_evidence import GPPrior
+
+__all__ = ["GPSettings", "GaussianProcess"]
+
+# Numbers in one matrix worked on at a time: what fits into the processor's cache is several times faster than one
+# batch of everything.
+_CHUNK = 1 << 18
+# Steps between two looks at whether the likelihood still rises.
+_LOOK = 10
+# Rprop's step sizes never leave these bounds [nats of a hyperparameter's logarithm].
+_STEP_SIZES = (1e-4, 1.0)
+_ORDER_STREAM = 71
+
+
+@dataclass(frozen=True)
+class GPSettings:
+    """Settings of the Gaussian process.
+
+    Attributes:
+        kernel: matern32, matern52 or rbf, each with one length scale an input.
+        steps: steps of the search for the hyperparameters, at most; each costs one marginal likelihood and its slope.
+        learning_rate: first step in the logarithms of the hyperparameters; Rprop finds its own from there.
+        tolerance: an output's search ends once ten steps raised its log marginal likelihood by less than this.
+        hyperparameter_rows: training rows, drawn at random where there are more, that the marginal likelihood sees; its
+            cost grows with their cube. Predictions before the last step condition on the same rows.
+        max_rows: training rows that the final predictions condition on, drawn at random where there are more.
+        variance_rows: training rows that predictive variances condition on; fewer than all give an upper bound, and a
+            model file holds a matrix of this size for each output.
+        noise_floor: smallest variance of the noise, as a share of the variance of an output; keeps matrices regular.
+
+    Raises:
+        ValueError: a value out of its range, in one sentence with the key.
+    """
+
+    kernel: Literal["matern32", "matern52", "rbf"] = "matern52"
+    steps: int = 100
+    learning_rate: float = 0.1
+    tolerance: float = 0.01
+    hyperparameter_rows: int = 600
+    max_rows: int = 3000
+    variance_rows: int = 256
+    noise_floor: float = 1e-6
+
+    def __post_init__(self) -> None:
+        for key, low in (("steps", 1), ("hyperparameter_rows", 2), ("max_rows", 2), ("variance_rows", 1)):
+            if getattr(self, key) < low:
+                raise ValueError(f"{key}={getattr(self, key)} must be at least {low}")
+        if self.max_rows < self.hyperparameter_rows:
+            raise ValueError(
+                f"max_rows={self.max_rows} must be at least hyperparameter_rows={self.hyperparameter_rows}"
+            )
+        if self.variance_rows > 512:
+            raise ValueError(f"variance_rows={self.variance_rows} must be at most 512: model files hold its square")
+        if not _STEP_SIZES[0] <= self.learning_rate <= _STEP_SIZES[1]:
+            raise ValueError(f"learning_rate={self.learning_rate} must be from {_STEP_SIZES[0]} to {_STEP_SIZES[1]:g}")
+        if not self.tolerance >= 0:
+            raise ValueError(f"tolerance={self.tolerance} must not be negative")
+        if not 1e-10 <= self.noise_floor < 1:
+            raise ValueError(f"noise_floor={self.noise_floor} must be at least 1e-10 and below 1")
+
+
+class GaussianProcess:
+    """One process an output, all rows shared; one step is one step of Rprop up the marginal likelihood.
+
+    Rprop (torch's) follows the signs of the slopes, each hyperparameter with its own step size, which suits them better
+    than a common rate (Blum and Riedmiller, "Optimization of Gaussian Process Hyperparameters using Rprop", ESANN
+    2013); its state is one number a hyperparameter, so it is kept by repeats like everything else. The model has the
+    hyperparameters of the highest marginal likelihood so far (times their prior).
+
+    An output whose covariance has no Cholesky factor falls back to its mean, in that repeat alone, and the repeat then
+    does not count as converged.
+
+    Metrics of a step: `log_likelihood` (of the model, summed over outputs, with the prior), `error_train` (mean square
+    of the model on the rows of the marginal likelihood, standardised), `evaluations` (marginal likelihoods so far).
+
+    While steps are taken, predictions condition on `hyperparameter_rows` rows; after the last step, and once a state
+    was loaded, on `max_rows`. The two differ only where there are more rows than `hyperparameter_rows`.
+    """
+
+    name = "gp"
+
+    def __init__(self, settings: GPSettings | None = None) -> None:
+        self.settings = settings or GPSettings()
+
+    def start(self, data: TrainingData) -> None:
+        """Take the data, draw the rows to work on, and start from wide priors.
+
+        Raises:
+            MethodFailedError: a training row is not finite.
+        """
+        from ccnn_torch.learners._gp_evidence import GPPrior
+
+        settings = self.settings
+        r, _, i = data.inputs.shape
+        o = data.targets.shape[-1]
+        self._shape = r, o
+        order = self._order(data)
+        across = torch.arange(r, device=order.device).unsqueeze(-1)
+        self._weights = data.weights[across, order]
+        there = (self._weights > 0).unsqueeze(-1)
+        # What stands in padded rows must not even reach a sum.
+        self._rows = torch.where(there, data.inputs[across, order], 0.0)
+        self._targets = torch.where(there, data.targets[across, order], 0.0).mT.contiguous()
+        if not bool(self._rows.isfinite().all() and self._targets.isfinite().all()):
+            raise MethodFailedError("the Gaussian process needs training rows that are finite numbers")
+        total = data.weights.sum(1, keepdim=True)
+        shares = (data.weights / total).unsqueeze(-1)
+        kept = torch.where(data.weights.unsqueeze(-1) > 0, data.targets, 0.0)
+        self._mean = (kept * shares).sum(1)
+        self._variance = ((kept - self._mean.unsqueeze(1)).square() * shares).sum(1)
+        self._few = min(settings.hyperparameter_rows, order.shape[1])
+        self._process: GPPrior = GPPrior(settings.kernel, i, settings.noise_floor).to(data.inputs.device)
+        start = self._rows.new_zeros(r, o, i + 3)
+        start[..., i + 1] = -2.0
+        empty = start.new_full((r, o), -torch.inf)
+        self._accept(
+            {
+                "theta": start,
+                "prev": torch.zeros_like(start),
+                "step_size": torch.full_like(start, settings.learning_rate),
+                "best_theta": start,
+                "best": empty,
+                "dual": start.new_zeros(r, o, self._few),
+                "error": self._variance,
+                "seen": empty,
+                "done": torch.zeros(r, o, dtype=torch.bool, device=start.device),
+                "settled": torch.zeros(r, o, dtype=torch.bool, device=start.device),
+                "evaluations": start.new_zeros(r),
+                "step": torch.zeros((), dtype=torch.int64),
+            }
+        )
+        self._stepping = True
+
+    def _order(self, data: TrainingData) -> Tensor:
+        """Which rows to use, `r x n`: all as they stand where they are few, else drawn by the seeds, padding last."""
+        s, device = data.inputs.shape[1], data.inputs.device
+        if s <= min(self.settings.hyperparameter_rows, self.settings.variance_rows):
+            return torch.arange(s, device=device).expand(len(data.seeds), -1)
+        keys = uniform(data.seeds.to(device), _ORDER_STREAM, 0, (s,))
+        return torch.where(data.weights > 0, keys, 2.0).argsort(dim=1, stable=True)[:, : self.settings.max_rows]
+
+    def step(self) -> dict[str, Tensor]:
+        """One marginal likelihood of every output whose search goes on, and one step of Rprop."""
+        from ccnn_torch.learners._gp_evidence import log_evidence
+
+        state, (r, o) = self._state, self._shape
+        slope = torch.zeros_like(state["theta"])
+        weights = self._weights[:, : self._few]
+        going = ~state["done"]
+        for rows, outputs in self._chunks(going):
+            few = self._rows[rows, : self._few], self._targets[rows, outputs, : self._few], weights[rows]
+            found = log_evidence(self._process, state["theta"][rows, outputs], *few)
+            slope[rows, outputs] = found.slope
+            better = found.value > state["best"][rows, outputs]
+            error = (found.residual.square() * few[2]).sum(-1) / few[2].sum(-1)
+            for name, value in (
+                ("best", found.value),
+                ("best_theta", state["theta"][rows, outputs]),
+                ("dual", found.dual),
+                ("error", error),
+            ):
+                take = better if value.dim() == 1 else better.unsqueeze(-1)
+                state[name][rows, outputs] = torch.where(take, value, state[name][rows, outputs])
+            # There is no way on from where the likelihood cannot be evaluated.
+            state["done"][rows, outputs] |= found.value == -torch.inf
+        state["evaluations"] += going.any(1)
+        state["step"] += 1
+        # Where the search has ended a slope of 0 leaves everything as it is.
+        state["theta"].grad = torch.where(state["done"].unsqueeze(-1), 0.0, -slope)
+        self._optimiser.step()
+        if int(state["step"]) % _LOOK == 0:
+            level = going & ~state["done"] & (state["best"] - state["seen"] < self.settings.tolerance)
+            state["settled"] |= level
+            state["done"] |= level
+            state["seen"].copy_(state["best"])
+        self._dual_of_all = self._factors = None
+        self._stepping = not self.finished
+        known = torch.where(state["best"] > -torch.inf, state["best"], 0.0)
+        return {
+            "log_likelihood": known.sum(1),
+            "error_train": state["error"].mean(1),
+            "evaluations": state["evaluations"].clone(),
+        }
+
+    @property
+    def finished(self) -> bool:
+        """True after the last step, or once no output's likelihood rises any more."""
+        return int(self._state["step"]) >= self.settings.steps or bool(self._state["done"].all())
+
+    @property
+    def steps(self) -> int:
+        """Steps, at most."""
+        return self.settings.steps
+
+    @property
+    def converged(self) -> Tensor:
+        """Whether the likelihood of every output had stopped rising, `r`, bool."""
+        return self._state["settled"].all(1)
+
+    def predict(self, inputs: Tensor) -> Tensor:
+        """Mean of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
+        dual = self._state["dual"] if self._stepping else self._final_dual()
+        nothing = dual.new_zeros(*self._shape, 0, 0)
+        return self._by_repeat(inputs, dual, nothing, GPNetwork.forward)
+
+    def variance(self, inputs: Tensor) -> Tensor:
+        """Variance of a newly measured output, noise included; inputs: `r x s x i` [1]; returns `r x s x o` [1].
+
+        It conditions on `variance_rows` rows, hence is an upper bound of that of the process.
+        """
+        return self._by_repeat(inputs, self._state["dual"], self._spread(), GPNetwork.variance)
+
+    def network(self, repeat: int) -> GPNetwork:
+        """The model of one repeat, conditioned on `max_rows` rows."""
+        return self._network(repeat, self._final_dual(), self._spread())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Hyperparameters where the search stands, with Rprop's memory, and those of the model: `r x o x k`."""
+        return {name: value.detach() for name, value in self._state.items()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take back a state; call `start` with the same data first."""
+        self._accept(state)
+        self._stepping = False
+
+    def _accept(self, state: dict[str, Tensor]) -> None:
+        # Steps write in place, and what was given stays as it is.
+        self._state = {name: value.clone() for name, value in state.items()}
+        theta = self._state["theta"]
+        self._optimiser = torch.optim.Rprop(
+            [theta], lr=self.settings.learning_rate, step_sizes=_STEP_SIZES, foreach=False
+        )
+        # The step number is only counted there, never used.
+        self._optimiser.state[theta] = {name: self._state[name] for name in ("prev", "step_size")} | {
+            "step": torch.zeros(())
+        }
+        self._dual_of_all: Tensor | None = None
+        self._factors: Tensor | None = None
+
+    def _chunks(self, going: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Indices of repeats and outputs whose search goes on, a few at a time."""
+        size = max(1, _CHUNK // self._few**2)
+        for part in torch.nonzero(going).split(size):
+            yield part[:, 0], part[:, 1]
+
+    def _model(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Length scales `r x o x i`, variances of function and noise and the mean, `r x o` each, of the model."""
+        theta, known = self._state["best_theta"], self._state["best"] > -torch.inf
+        length_scale, (output_scale, noise, constant) = theta[..., :-3].exp(), theta[..., -3:].unbind(-1)
+        floor = self.settings.noise_floor
+        return (
+            length_scale,
+            torch.where(known, output_scale.exp(), 0.0),
+            torch.where(known, noise.exp() + floor, self._variance + floor),
+            torch.where(known, constant, self._mean),
+        )
+
+    def _network(self, repeat: int, dual: Tensor, spread: Tensor) -> GPNetwork:
+        rows = self._rows[repeat, : dual.shape[-1]]
+        parts = (dual, spread, *self._model())
+        return GPNetwork(self.settings.kernel, rows.clone(), *(part[repeat].clone() for part in parts))
+
+    def _by_repeat(
+        self, inputs: Tensor, dual: Tensor, spread: Tensor, ask: Callable[[GPNetwork, Tensor], Tensor]
+    ) -> Tensor:
+        """Ask the network of every repeat; one at a time and in pieces, since they share no matrix."""
+        size = max(1, 16 * _CHUNK // dual.shape[-1])
+        found = []
+        for repeat, points in enumerate(inputs):
+            network = self._network(repeat, dual, spread)
+            found.append(torch.cat([ask(network, part) for part in points.split(size)]))
+        return torch.stack(found)
+
+    def _final_dual(self) -> Tensor:
+        """Weights of all rows that predictions condition on, `r x o x n`."""
+        if self._dual_of_all is None:
+            dual = self._state["dual"]
+            if self._rows.shape[1] > self._few:
+                dual = self._over_outputs(self._rows.shape[1], self._condition)
+            self._dual_of_all = dual
+        return self._dual_of_all
+
+    def _spread(self) -> Tensor:
+        """Inverse Cholesky factors of the rows that variances condition on, `r x o x v x v`."""
+        if self._factors is None:
+            rows = min(self.settings.variance_rows, self._rows.shape[1])
+            self._factors = self._over_outputs(rows, lambda repeat, output, covariances: spread_factor(covariances))
+        return self._factors
+
+    def _over_outputs(self, rows: int, make: Callable[[int, int, Tensor], Tensor]) -> Tensor:
+        """`make` from the covariance of the first rows, noise included, for every repeat and output, `r x o x ...`.
+
+        One matrix at a time: with 3000 rows each takes 72 MB.
+        """
+        length_scale, output_scale, noise, _ = self._model()
+        r, o = self._shape
+        inputs, weights = self._rows[:, :rows], self._weights[:, :rows]
+        there = weights > 0
+        found = []
+        for repeat in range(r):
+            both = there[repeat].unsqueeze(-1) & there[repeat]
+            for output in range(o):
+                kernel = covariance(
+                    self.settings.kernel,
+                    inputs[repeat],
+                    inputs[repeat],
+                    length_scale[repeat, output],
+                    output_scale[repeat, output],
+                )
+                noises = torch.where(there[repeat], noise[repeat, output] / weights[repeat], 1.0)
+                found.append(make(repeat, output, torch.where(both, kernel, 0.0) + torch.diag(noises)))
+        return torch.stack(found).unflatten(0, (r, o))
+
+    def _condition(self, repeat: int, output: int, covariances: Tensor) -> Tensor:
+        """Weights of all rows, `n`; those of the few where the large matrix has no Cholesky factor."""
+        there = self._weights[repeat] > 0
+        constant = self._model()[3][repeat, output]
+        factor, info = torch.linalg.cholesky_ex(covariances)
+        few = self._state["dual"][repeat, output]
+        if int(info) != 0 or not bool(self._state["best"][repeat, output] > -torch.inf):
+            return torch.cat([few, few.new_zeros(len(there) - len(few))])
+        error = torch.where(there, self._targets[repeat, output] - constant, 0.0)
+        return torch.cholesky_solve(error.unsqueeze(-1), factor).squeeze(-1)
