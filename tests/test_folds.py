@@ -91,7 +91,7 @@ def test_without_early_stopping_folds_judge_the_learners_end() -> None:
     assert choice is not None and choice.best_step.tolist() == [30, 30] and choice.errors.shape == (2, 3)
     plain = fit_method("toy", Descent, dataset, Plan(False, None, 20), None, lambda *_: [])
     folded = fit_method("toy", Descent, dataset, Plan(False, None, 20, folds=3), None, lambda *_: [])
-    inputs = dataset.inputs.expand(2, -1, -1)
+    inputs = dataset.inputs
     assert torch.equal(plain.predict(inputs), folded.predict(inputs))
     assert not torch.equal(plain.score, folded.score)
 

@@ -173,6 +173,7 @@ def fold_dataset(dataset: Dataset, kind: str, folds: int) -> Dataset:
     pairs = zip(dataset.splits, dataset.seeds, strict=True)
     return replace(
         dataset,
+        inputs=dataset.inputs.repeat_interleave(folds, 0),
         deviation=dataset.deviation.repeat_interleave(folds, 0),
         usable=dataset.usable.repeat_interleave(folds, 0),
         splits=[part for split, seed in pairs for part in fold_splits(split, kind, folds, seed)],

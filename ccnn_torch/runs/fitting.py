@@ -134,7 +134,7 @@ def refit(
         score = weighted_mse(learner.predict(data.inputs), data.targets, data.weights).cpu()
         scale, before = torch.ones_like(scaling.deviation), 0.0
     fitted = Fitted(name, learner, scaling, data, training, choice, score, scale, before + training.seconds)
-    inputs = dataset.inputs.expand(len(dataset.seeds), -1, -1)
+    inputs = dataset.inputs
     bad = ~(fitted.predict(inputs).isfinite() & fitted.sd(inputs).isfinite()).all((1, 2))
     if bool(bad.any()):
         which = ", ".join(str(k) for k in torch.nonzero(bad).squeeze(-1).tolist())
