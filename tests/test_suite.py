@@ -171,7 +171,7 @@ def test_best_tied_and_close_are_what_their_definitions_say(tmp_path: Path) -> N
     text = suite_markdown(found)
     assert "ccnn is the best method or tied with it in 2 of 2 cases (100 %)" in text
     assert "gp; ccnn tied and close (1.02)" in text
-    assert "gp failed in case 'b': singular" in text and "case 'c' failed: nothing was measured" in text
+    assert "gp failed in 1 case ('b'): singular" in text and "case 'c' failed: nothing was measured" in text
     console = Console(record=True, width=80)
     print_suite(found, console)
     assert "How often a method is the best" in console.export_text()
