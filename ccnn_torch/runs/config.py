@@ -14,6 +14,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
+from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
@@ -225,6 +226,7 @@ class RunConfig(_Part):
         default=True, description="draw plots/ and write report.html; results.json, .csv and .md are always written"
     )
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
+    bp_lm: BPLMSettings = Field(default_factory=BPLMSettings)
     grnn: GRNNSettings = Field(default_factory=GRNNSettings)
     gp: GPSettings = Field(default_factory=GPSettings)
 

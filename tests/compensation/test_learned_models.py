@@ -17,12 +17,14 @@ from ccnn_torch.compensation._export import to_onnx
 from ccnn_torch.compensation._networks import describe_network, network_from_description
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.learners import Learner, TrainingData
+from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.learners.constant import Constant
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.training import Scaling, train
 
 LEARNERS: dict[str, Callable[[], Learner]] = {
     "constant": Constant,
+    "bp_lm": lambda: BPLM(BPLMSettings(hidden=(4,), restarts=2, iterations=6)),
     "grnn": lambda: GRNN(GRNNSettings(iterations=4, candidates=9)),
 }
 
