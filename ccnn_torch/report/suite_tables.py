@@ -122,9 +122,12 @@ def _methods_table(comparison: Mapping[str, Any]) -> Table:
 
 
 def _failures(comparison: Mapping[str, Any]) -> list[str]:
-    cases = [f"case '{name}' failed: {sentence}" for name, sentence in comparison["failed"].items()]
-    return cases + [
-        f"{method} failed in case '{case['name']}': {sentence}"
-        for case in comparison["cases"]
-        for method, sentence in case["failed_methods"].items()
-    ]
+    told = [f"case '{name}' failed: {sentence}" for name, sentence in comparison["failed"].items()]
+    # A learner that is not there fails alike in every case: said once.
+    where: dict[tuple[str, str], list[str]] = {}
+    for case in comparison["cases"]:
+        for method, sentence in case["failed_methods"].items():
+            where.setdefault((method, sentence), []).append(f"'{case['name']}'")
+    for (method, sentence), cases in where.items():
+        told.append(f"{method} failed in {count_text(len(cases), 'case')} ({', '.join(cases)}): {sentence}")
+    return told
