@@ -13,13 +13,14 @@ Three kinds, each a function of the rows and one seed:
 
 The training rows come first in the draw or along the direction, then the validation rows, last the test rows: a model
 is chosen on rows of the same kind as those it is judged on, in a block split on the block beside the test block.
+Cross-validation (`fold_splits`) keeps to that: groups stay whole, and the folds of a block split are blocks too.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 import numpy as np
@@ -31,10 +32,13 @@ from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
 from ccnn_torch.units import to_si
 
-__all__ = ["DEFAULT_BY", "KINDS", "Column", "Split", "split_rows"]
+__all__ = ["DEFAULT_BY", "KINDS", "Column", "Split", "fold_splits", "split_rows"]
 
 KINDS = ("random", "group", "block")
 DEFAULT_BY = "position:5mm"
+
+_FOLDS = 1
+"""Beside the seed of a repeat, so that folds are not drawn like the split."""
 
 Column = NDArray[np.float64] | Tensor
 """A column to group by, `rows`."""
@@ -43,11 +47,17 @@ _Integers = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Split:
-    """Row indices, each ascending and int64; together every row once."""
+    """Row indices, each ascending and int64; together every row once.
+
+    Attributes:
+        groups: number of each row's group, `rows` int64; those of a block split ascend along its direction. None =
+            every row stands for itself.
+    """
 
     train: Tensor
     validation: Tensor
     test: Tensor
+    groups: Tensor | None = None
 
 
 def split_rows(
@@ -91,8 +101,43 @@ def split_rows(
         raise InputError(f"split.kind: '{kind}' is not one of {', '.join(KINDS)}" + (f"; '{near}'?" if near else ""))
     groups = _groups(positions, DEFAULT_BY if by is None else by, columns or {})
     if kind == "group":
-        return _draw(groups, test, validation, seed, "groups")
+        return replace(_draw(groups, test, validation, seed, "groups"), groups=torch.from_numpy(groups))
     return _block(positions.numpy(), groups, test, validation)
+
+
+def fold_splits(split: Split, kind: str, folds: int, seed: int) -> list[Split]:
+    """Cross-validation within the rows that are not test rows: every one is a validation row once.
+
+    Whole groups are dealt to the folds in a random order; for ``block`` the folds are neighbouring blocks of about
+    equally many rows along the split's direction. Random folds there would choose what interpolates best, and would
+    call an error small that the held-out block, where the model extrapolates, does not keep.
+
+    Args:
+        folds: at least 2.
+        seed: of the draw; it is another than the one `split_rows` makes of the same seed.
+
+    Raises:
+        InputError: there are fewer groups than folds.
+    """
+    rows = torch.cat([split.train, split.validation]).sort().values
+    groups = np.arange(len(rows)) if split.groups is None else split.groups[rows].numpy()
+    numbers, which, size = np.unique(groups, return_inverse=True, return_counts=True)
+    if len(numbers) < folds:
+        what = "rows" if split.groups is None else "groups"
+        raise InputError(f"folds: {len(numbers)} {what} cannot be dealt to {folds} folds; write a smaller number")
+    if kind == "block":
+        middle = np.cumsum(size) - size / 2
+        fold = np.minimum((middle / len(rows) * folds).astype(np.int64), folds - 1)
+    else:
+        fold = np.empty(len(numbers), dtype=np.int64)
+        fold[np.random.default_rng([seed, _FOLDS]).permutation(len(numbers))] = np.arange(len(numbers)) % folds
+    held = torch.from_numpy(fold[which])
+    empty = set(range(folds)) - set(held.tolist())
+    if empty:
+        raise InputError(
+            f"folds: the groups of this block split are too uneven for {folds} folds; write a smaller number"
+        )
+    return [replace(split, train=rows[held != k], validation=rows[held == k]) for k in range(folds)]
 
 
 def _draw(groups: _Integers, test: float, validation: float, seed: int, what: str) -> Split:
@@ -125,7 +170,10 @@ def _block(positions: NDArray[np.float64], groups: _Integers, test: float, valid
     trained = _first(1 - validation, kept)
     part = np.empty(len(size), dtype=np.int64)
     part[order] = np.where(reached <= trained, 0, np.where(reached <= kept, 1, 2))
-    return _collect(part[groups], validation, f"{len(size)} groups of {rows} rows")
+    along = np.empty(len(size), dtype=np.int64)
+    along[order] = np.arange(len(size))
+    split = _collect(part[groups], validation, f"{len(size)} groups of {rows} rows")
+    return replace(split, groups=torch.from_numpy(along[groups]))
 
 
 def _first(share: float, count: int) -> int:

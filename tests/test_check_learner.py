@@ -12,6 +12,7 @@ from toy import Descent
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
 from ccnn_torch.learners.constant import Constant
+from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.testing import check_learner
 
 SMALL = {
@@ -32,8 +33,10 @@ SMALL = {
         lambda: CCNN(CCNNSettings(**{**SMALL, "refinement_iterations": 4, "refine_every": 2, "members": 2})),
         lambda: Descent(steps=8),
         Constant,
+        lambda: GRNN(GRNNSettings(iterations=5, candidates=6)),
+        lambda: GRNN(GRNNSettings(iterations=4, candidates=6, queries=10, references=40)),
     ],
-    ids=["ccnn", "ccnn_without_bias", "ccnn_refined", "descent", "constant"],
+    ids=["ccnn", "ccnn_without_bias", "ccnn_refined", "descent", "constant", "grnn", "grnn_subset"],
 )
 def test_learners_keep_the_contract(factory: Callable[[], Learner]) -> None:
     check_learner(factory)
@@ -95,6 +98,37 @@ class Spoiler(Descent):
         return super().step()
 
 
+class Silent(Descent):
+    def step(self) -> dict[str, Tensor]:
+        return {"error_train": super().step()["error_train"]}
+
+
+class Optimist(Descent):
+    def step(self) -> dict[str, Tensor]:
+        metrics = super().step()
+        return metrics | {"error_train": metrics["error_train"] / 2}
+
+
+class Certain(Descent):
+    """Sure of itself, and the more so the further it is from the rows."""
+
+    def variance(self, inputs: Tensor) -> Tensor:
+        return torch.exp(-self.predict(inputs).square())
+
+
+class Unsure(Descent):
+    """Its networks do not know the variance."""
+
+    def variance(self, inputs: Tensor) -> Tensor:
+        return 1 + self.predict(inputs).square()
+
+
+class Vague(Descent):
+    @property
+    def converged(self) -> bool:
+        return True
+
+
 class NotALearner:
     name = "none"
 
@@ -111,6 +145,11 @@ class NotALearner:
         (ScalarMetric, "metric 'error_train' has shape"),
         (WrongShape, "predict before the first step gives shape"),
         (Spoiler, "changes the data"),
+        (Silent, "no metric 'evaluations'"),
+        (Optimist, "'error_train' of the last step is not"),
+        (Certain, "variance must be finite and above 0"),
+        (Unsure, "lacks variance, which the learner has"),
+        (Vague, "converged must be one bool a repeat"),
     ],
 )
 def test_a_broken_promise_is_named(broken: Callable[..., Learner], sentence: str) -> None:

@@ -10,7 +10,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.learners._registry import LEARNERS
 from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.runs._yaml import dump_yaml, parse_yaml
 from ccnn_torch.runs.config import (
@@ -88,7 +87,7 @@ def test_variant(tmp_path: Path, text: str, variant: str) -> None:
         ("ccnn", ["ccnn"]),
         ("ccnn,constant", ["ccnn", "constant"]),
         ("all", list(METHODS)),
-        ("auto", [name for name in METHODS if name in LEARNERS]),
+        ("auto", ["constant", "grnn", "gp", "bp_lm", "enn", "ccnn"]),
     ],
 )
 def test_methods(tmp_path: Path, methods: str, expected: list[str]) -> None:
@@ -111,6 +110,9 @@ def test_paths_start_from_the_file_or_from_the_current_folder(tmp_path: Path, mo
     assert changed.records == str(tmp_path / "here" / "r: 2.csv") and changed.out == str(tmp_path / "here" / "1e3")
     assert changed.mechanism == f"{tmp_path / 'here' / 'own.py'}:Arm"
     assert changed.methods == [f"{tmp_path / 'here' / 'a.py'}:B"]
+    compared = config(tmp_path / "there", text + "auto: {methods: [gp, own.py:Mine]}\n")
+    assert compared.auto.methods == ["gp", f"{tmp_path / 'there' / 'own.py'}:Mine"]
+    assert config(tmp_path / "there", text, "auto.methods=[a.py:B]").auto.methods == [f"{tmp_path / 'here' / 'a.py'}:B"]
     assert config(tmp_path / "there", text, "mechanism=tripod", "out=null").mechanism == "tripod"
     assert config(tmp_path / "there", text, "out=null").out is None
     assert config(tmp_path / "there", text, f"records={tmp_path / 'a.csv'}").records == str(tmp_path / "a.csv")
@@ -185,6 +187,8 @@ def test_all_errors_at_once_each_with_the_nearest_key(tmp_path: Path) -> None:
         ("split.test=1", ("split.test: must be less than 1, not 1",)),
         ("split.test=.nan", ("split.test: must be a finite number",)),
         ("split.validation=0", ("training.early_stop", "split.validation=0.2")),
+        ("auto.folds=1", ("auto.folds: must be greater than or equal to 2, not 1",)),
+        ("auto.methods=[cnn]", ("auto.methods: there is no method 'cnn'; did you mean 'ccnn'?",)),
         ("methods=[]", ("methods: must have at least 1 item",)),
         ("methods=cnn", ("no method 'cnn'; did you mean 'ccnn'?",)),
         ("methods=transformer", ("no method 'transformer'; known are ccnn, bp_lm",)),
@@ -194,7 +198,7 @@ def test_all_errors_at_once_each_with_the_nearest_key(tmp_path: Path) -> None:
         ("covariates=3", ("covariates: must be a list, not 3",)),
         ("compensation.limit=-1", ("compensation.limit", "greater than 0")),
         ("ccnn.hidden=3", ("ccnn.hidden: must be a list, not 3",)),
-        ("case=tripodd", ("case: must be 'tripod' or 'machine_tool', not tripodd",)),
+        ("case=tripodd", ("case: must be 'tripod', 'machine_tool' or 'realistic', not tripodd",)),
         ("case=null", ("no data is named", "records=FILE.csv")),
         ("records=r.csv", ("both case and records",)),
         ("mechanism=machine_tool", ("mechanism: the case tripod brings its own",)),

@@ -111,13 +111,13 @@ def test_figures_are_those_of_the_held_out_rows() -> None:
     floor = calibration.results["floor"]["realised"]["all"]["mse"]["median"]
     assert floor == pytest.approx(float(noise[0, test].square().mean()), rel=1e-12)
     # What is exported predicts what was judged, to the last digits.
-    exported = calibration.compensator().deviation(prepared.joints[test])
+    exported = calibration.compensator().deviation(prepared.joints[0, test])
     assert float((exported - calibration.outcomes["ccnn"].deviation[0, test]).abs().max()) < 1e-15
 
 
 def test_time_as_a_covariate_reaches_learner_and_card(tmp_path: Path) -> None:
     calibration = calibrate(short(covariates=["t"]))
-    assert calibration.prepared.dataset.inputs.shape == (125, 4)
+    assert calibration.prepared.dataset.inputs.shape == (1, 125, 4)
     calibration.save(tmp_path, forms=["safetensors"])
     card = json.loads((tmp_path / "card.json").read_text())
     assert [c["name"] for c in card["covariates"]] == ["t"]
@@ -125,7 +125,7 @@ def test_time_as_a_covariate_reaches_learner_and_card(tmp_path: Path) -> None:
 
 def test_the_limit_of_the_config_holds_for_every_joint() -> None:
     calibration = calibrate(short(compensation={"limit": 5e-5}))
-    deviation = calibration.compensator().deviation(calibration.prepared.joints)
+    deviation = calibration.compensator().deviation(calibration.prepared.joints[0])
     # The constant part alone is 1e-4 m, so the limit is what is met.
     assert torch.equal(deviation.abs().amax(0), torch.full((3,), 5e-5, dtype=torch.float64))
     with pytest.raises(InputError, match=r"compensation\.limit has 2 numbers"):

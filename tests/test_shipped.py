@@ -42,7 +42,7 @@ FLOORS = [
     ["mechanisms", "pseudoerror"],
     ["learners/_protocol", "training", "evolution", "learners"],
     ["identification", "compensation"],
-    ["testing", "report", "runs"],
+    ["sklearn", "testing", "report", "runs"],
     ["cli", "__init__", "__main__"],
 ]
 

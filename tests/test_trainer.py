@@ -143,3 +143,21 @@ def _repeat(data: TrainingData, k: int) -> TrainingData:
     one = slice(k, k + 1)
     held = None if data.validation is None else _repeat(data.validation, k)
     return TrainingData(data.inputs[one], data.targets[one], data.weights[one], data.seeds[one], held)
+
+
+class Impatient(Descent):
+    """Ends by itself after five steps, whatever was planned."""
+
+    @property
+    def finished(self) -> bool:
+        return int(self._step) >= 5
+
+
+def test_a_refit_that_ends_by_itself_keeps_its_last_state() -> None:
+    data = linear_data()
+    learner, alone = Impatient(), Impatient()
+    training = train(learner, data, stop_at=torch.tensor([2, 5, 9]))
+    train(alone, data)
+    assert training.best_step.tolist() == [2, 5, 5]
+    assert torch.equal(learner.state_dict()["map"][1:], alone.state_dict()["map"][1:])
+    assert not torch.equal(learner.state_dict()["map"][0], alone.state_dict()["map"][0])

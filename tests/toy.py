@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ccnn_torch.learners import TrainingData
+from ccnn_torch.training import weighted_mse
 
 
 class Descent:
@@ -34,7 +35,11 @@ class Descent:
         self._velocity = 0.5 * self._velocity - self._rate * gradient
         self._map = self._map + self._velocity
         self._step = self._step + 1
-        return {"error_train": error.square().sum((1, 2)) / weights.sum((1, 2))}
+        data = self._data
+        return {
+            "error_train": weighted_mse(self.predict(data.inputs), data.targets, data.weights),
+            "evaluations": torch.full_like(weights[:, 0, 0], float(self._step)),
+        }
 
     @property
     def finished(self) -> bool:

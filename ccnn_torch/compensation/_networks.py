@@ -14,6 +14,7 @@ __all__ = ["DescribedNetwork", "describe_network", "network_from_description", "
 # Kind -> the class, or where it stands; imported when a file asks for it.
 _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "constant": "ccnn_torch.learners.constant:ConstantNetwork",
+    "grnn": "ccnn_torch.learners._grnn_network:GRNNNetwork",
     "gp": "ccnn_torch.learners._gp_posterior:GPNetwork",
     "masked": "ccnn_torch.evolution.network:MaskedNetwork",
 }

@@ -40,6 +40,16 @@ class Learner(Protocol):
     All repeats advance together in one call, as the leading dimension of every tensor. Two learners started on the
     same data with the same seeds give the same tensors; a learner whose state was saved and loaded goes on to the same
     result, bit by bit. No global random state is read or set.
+
+    A learner may also have
+        variance(inputs: Tensor) -> Tensor: predictive variance of a *newly measured* standardised output, that of the
+            model and of the noise together, above 0 and finite for every finite input. inputs: `r x s x i` [1]; returns
+            `r x s x o` [1]. Its networks then have a method `variance` that gives the same numbers.
+        converged -> Tensor: property, `r`, bool: False where the learner's own criterion was not met when its steps
+            ended, or where the data let it do no more than the constant.
+
+    A learner that cannot go on in any repeat raises `MethodFailedError` with one sentence; one repeat that fails among
+    others falls back to the constant and counts as not converged. No learner gives NaN.
     """
 
     name: str
@@ -48,7 +58,12 @@ class Learner(Protocol):
         """Take the data and make the initial state."""
 
     def step(self) -> dict[str, Tensor]:
-        """One generation, iteration or candidate step; metrics by name, each `r` or `r x k`."""
+        """One generation, iteration or candidate step; metrics by name, each `r` or `r x k`.
+
+        Of every learner: `error_train`, `r`, the weighted mean squared standardised error of the current model on the
+        training rows, and `evaluations`, `r`, how often so far all training rows were passed through one model: a
+        joined network counts one, a Jacobian one for each output, a leave-one-out error one, a marginal likelihood one.
+        """
 
     @property
     def finished(self) -> bool:
@@ -74,7 +89,8 @@ class Learner(Protocol):
     def network(self, repeat: int) -> nn.Module:
         """The current best model of one repeat as a plain module, `... x i` -> `... x o`, float64.
 
-        Only operators that ONNX Runtime has in double (matmul, add, mul, sigmoid, tanh, relu, exp, sin, cos, where).
+        Only operators that ONNX Runtime has in double (matmul, add, mul, div, sqrt, max, sum, sigmoid, tanh, relu, exp,
+        sin, cos, where). Where the learner has `variance`, so has the module: `... x i` -> `... x o`.
         """
 
 

@@ -10,6 +10,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.learners._protocol import Learner, missing_verbs
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
 from ccnn_torch.learners.constant import Constant
+from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.learners.gp import GaussianProcess, GPSettings
 from ccnn_torch.plugins import is_plugin, load_plugin
 
@@ -17,6 +18,7 @@ __all__ = ["LEARNERS", "make_learner"]
 
 LEARNERS: dict[str, Callable[[dict[str, Any]], Learner]] = {
     "ccnn": lambda settings: CCNN(CCNNSettings(**settings)),
+    "grnn": lambda settings: GRNN(GRNNSettings(**settings)),
     "constant": lambda settings: Constant(),
     "gp": lambda settings: GaussianProcess(GPSettings(**settings)),
 }

@@ -8,22 +8,36 @@ import torch
 from torch import Tensor, nn
 
 from ccnn_torch.learners._protocol import TrainingData
+from ccnn_torch.learners._rows import usable_rows
 
 __all__ = ["Constant", "ConstantNetwork"]
 
+_SMALLEST_VARIANCE = 1e-12
+
 
 class ConstantNetwork(nn.Module):
-    """Returns `value` for every row."""
+    """Returns `value` for every row.
+
+    Args:
+        value: `o` [1].
+        variance: predictive variance of a newly measured output, `o` [1]; 1 when None.
+    """
 
     value: Tensor
+    spread: Tensor
 
-    def __init__(self, value: Tensor) -> None:
+    def __init__(self, value: Tensor, variance: Tensor | None = None) -> None:
         super().__init__()
         self.register_buffer("value", value)
+        self.register_buffer("spread", torch.ones_like(value) if variance is None else variance)
 
     def forward(self, features: Tensor) -> Tensor:
         """features: `... x i`; returns `... x o`."""
         return self.value.expand(*features.shape[:-1], self.value.shape[-1])
+
+    def variance(self, features: Tensor) -> Tensor:
+        """features: `... x i`; returns `... x o`."""
+        return self.spread.expand(*features.shape[:-1], self.spread.shape[-1])
 
     def describe(self) -> dict[str, Any]:
         """What a model file needs to build the module again, beside its tensors."""
@@ -36,7 +50,10 @@ class ConstantNetwork(nn.Module):
 
 
 class Constant:
-    """Weighted mean of the targets; one step."""
+    """Weighted mean of the targets; one step.
+
+    Variance: the unbiased one of the training targets, times (1 + 1 / n) for the error of the mean.
+    """
 
     name = "constant"
 
@@ -45,7 +62,7 @@ class Constant:
         self._step = torch.zeros((), dtype=torch.int64)
 
     def start(self, data: TrainingData) -> None:
-        self._data = data
+        self._data = usable_rows(data)
         self._value = torch.zeros_like(data.targets[:, 0])
         self._step = torch.zeros((), dtype=torch.int64)
 
@@ -53,7 +70,9 @@ class Constant:
         weights = self._data.weights.unsqueeze(-1)
         self._value = (self._data.targets * weights).sum(1) / weights.sum(1)
         self._step = self._step + 1
-        return {"error_train": ((self._data.targets - self._value.unsqueeze(1)).square() * weights).mean((1, 2))}
+        squares = (self._data.targets - self._value.unsqueeze(1)).square() * weights
+        error = squares.sum(1) / weights.sum(1)
+        return {"error_train": error.mean(-1), "evaluations": torch.ones_like(error[:, 0])}
 
     @property
     def finished(self) -> bool:
@@ -66,6 +85,16 @@ class Constant:
     def predict(self, inputs: Tensor) -> Tensor:
         return self._value.unsqueeze(1).expand(-1, inputs.shape[1], -1)
 
+    def variance(self, inputs: Tensor) -> Tensor:
+        """Of a newly measured output. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
+        return self._variance().unsqueeze(1).expand(-1, inputs.shape[1], -1)
+
+    def _variance(self) -> Tensor:
+        weights = self._data.weights.unsqueeze(-1)
+        count = weights.sum(1)
+        squares = ((self._data.targets - self._value.unsqueeze(1)).square() * weights).sum(1)
+        return (squares / (count - 1).clamp_min(1) * (1 + 1 / count)).clamp_min(_SMALLEST_VARIANCE)
+
     def state_dict(self) -> dict[str, Tensor]:
         return {"value": self._value, "step": self._step}
 
@@ -73,4 +102,4 @@ class Constant:
         self._value, self._step = state["value"], state["step"]
 
     def network(self, repeat: int) -> nn.Module:
-        return ConstantNetwork(self._value[repeat].clone())
+        return ConstantNetwork(self._value[repeat].clone(), self._variance()[repeat].clone())

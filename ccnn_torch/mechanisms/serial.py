@@ -159,9 +159,9 @@ class SerialArm(Mechanism):
 
     def flange(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Flange in the arm's own base, without base and tool frame: rotation `... x 3 x 3`, position `... x 3` [m]."""
-        return self._walk(joints, self.resolve(parameters))[-1]
+        return self.link_frames(joints, self.resolve(parameters))[-1]
 
-    def _walk(self, joints: Tensor, values: Tensor) -> list[tuple[Tensor, Tensor]]:
+    def link_frames(self, joints: Tensor, values: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Frames of the links one after the other, n + 1 of them, from the arm's own base to the flange."""
         links = values[..., 6:-6].reshape(*values.shape[:-1], len(self.joints), -1)
         motion = joints * self.signs
@@ -178,7 +178,7 @@ class SerialArm(Mechanism):
         values = self.resolve(parameters)
         base = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3]
         tool = rotation_vector_to_matrix(values[..., -3:]), values[..., -6:-3]
-        rotation, position = compose(compose(base, self._walk(joints, values)[-1]), tool)
+        rotation, position = compose(compose(base, self.link_frames(joints, values)[-1]), tool)
         return position, rotation
 
     def forward_kinematics(
@@ -193,7 +193,7 @@ class SerialArm(Mechanism):
     def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Geometric Jacobian, closed form; see `Mechanism.jacobian`."""
         values = self.resolve(parameters)
-        frames = self._walk(joints, values)
+        frames = self.link_frames(joints, values)
         rotation, position = frames[-1]
         tip = position + (rotation @ values[..., -6:-3, None])[..., 0]
         holders = frames[:-1] if self._axis_before else frames[1:]

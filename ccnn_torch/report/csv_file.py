@@ -26,7 +26,7 @@ def tidy_rows(results: Mapping[str, Any]) -> Iterator[Row]:
             for quantity, spread in block["spread"].items():
                 yield row("before", split, quantity, joint, units[joint], spread)
     blocks: dict[str, Mapping[str, Any] | None] = {name: m["test"] for name, m in results["methods"].items()}
-    blocks["constant"] = results["constant"]["test"]
+    blocks["constant"] = blocks.get("constant") or results["constant"]["test"]
     for kind, floor in (results["floor"] or {}).items():
         blocks[f"floor_{kind}"] = floor
     for method, errors in blocks.items():
@@ -34,10 +34,24 @@ def tidy_rows(results: Mapping[str, Any]) -> Iterator[Row]:
             for quantity, spread in measures.items():
                 unit = units[joint] if quantity == "mae" or units[joint] == "1" else f"{units[joint]}^2"
                 yield row(method, "test", quantity, joint, unit, spread)
-    for method, block in {**results["methods"], "constant": results["constant"]}.items():
-        for quantity, split, unit in (("ratio_to_floor", "test", "1"), ("seconds", "", "s")):
+    trained = {name: block for name, block in results["methods"].items() if block["test"] is not None}
+    for method, block in {"constant": results["constant"], **trained}.items():
+        for quantity, split, unit in (
+            ("ratio_to_floor", "test", "1"),
+            ("coverage", "test", "1"),
+            ("seconds", "", "s"),
+            ("evaluations", "", "1"),
+            ("converged", "", "1"),
+        ):
             if block.get(quantity):
                 yield row(method, split, quantity, "", unit, block[quantity])
+        for joint, spread in (block.get("sd") or {}).items():
+            yield row(method, "test", "sd", joint, units[joint], spread)
+        for name, left in (block.get("pose") or {}).items():
+            # The best method's stands below, beside what there was before.
+            if left and method != results.get("best_method"):
+                for measure in ("rms", "max"):
+                    yield row(method, "test", f"{name}_{measure}", "", left["unit"], left[measure])
     for name, block in results["pose"].items():
         for when in ("before", "after", "geometry", "not_compensable"):
             for measure, spread in ((block or {}).get(when) or {}).items():

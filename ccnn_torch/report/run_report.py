@@ -20,6 +20,7 @@ from ccnn_torch.report.plots import (
     overview_plot,
     population_plot,
     pose_error_plot,
+    progress_plot,
     save_figure,
     workspace_plot,
 )
@@ -81,12 +82,13 @@ def run_plots(folder: str | Path, results: Mapping[str, Any]) -> list[Plot]:
             plots.append(network_plot(arrays.masks, arrays.weights, method, names))
     levels = {"floor": (results["floor"] or {}).get("realised"), "constant": results["constant"]["test"]}
     lines = {name: block["all"]["mse"]["median"] for name, block in levels.items() if block and "all" in block}
-    for method in results["methods"]:
-        path = folder / f"history-{method}.safetensors"
-        if path.is_file():
-            history = load_history(path)
-            plots.append(convergence_plot(history, method, unit=results["joints"][0]["unit"], **lines))
-            plots.append(population_plot(history, method))
+    paths = {method: folder / f"history-{method}.safetensors" for method in results["methods"]}
+    histories = {method: load_history(path) for method, path in paths.items() if path.is_file()}
+    unit = results["joints"][0]["unit"]
+    plots.append(progress_plot(histories, unit=unit, **lines))
+    for method, history in histories.items():
+        plots.append(convergence_plot(history, method, unit=unit, **lines))
+        plots.append(population_plot(history, method))
     return [plot for plot in plots if plot is not None]
 
 

@@ -8,29 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table as RichTable
 
+from ccnn_torch.report.comparison_tables import comparison_table, method_label, pose_by_method_table, reach_table
 from ccnn_torch.report.display import count_text, display_unit, interval_text, number_text, removed_percent
 from ccnn_torch.report.paper_tables import PAPER, PaperCase
+from ccnn_torch.report.table_form import Table, print_table
 
-__all__ = ["Table", "markdown_text", "print_tables", "result_tables", "verdict"]
+__all__ = ["Table", "markdown_table", "markdown_text", "print_table", "print_tables", "result_tables", "verdict"]
 
 Results = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Table:
-    """Title, column headers, rows of text (one entry a column), and a sentence below."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
 
 
 def verdict(results: Results) -> str:
@@ -58,24 +48,21 @@ def verdict(results: Results) -> str:
 def result_tables(results: Results) -> list[Table]:
     """All tables of a run, in reading order."""
     paper = PAPER.get(results.get("case") or "")
-    return [
+    tables = [
         _before_table(results, paper),
+        comparison_table(results),
         *(_after_table(results, paper, measure) for measure in ("mse", "mae", "sse")),
+        reach_table(results),
         _pose_table(results),
+        pose_by_method_table(results),
     ]
+    return [table for table in tables if table is not None]
 
 
 def print_tables(results: Results, console: Console) -> None:
     """Show the verdict and the tables on a terminal."""
     for table in result_tables(results):
-        shown = RichTable(title=escape(table.title), title_justify="left", title_style="bold", caption_justify="left")
-        shown.caption = escape(table.note) or None
-        for i, column in enumerate(table.columns):
-            shown.add_column(escape(column), justify="left" if i == 0 else "right", overflow="fold")
-        for row in table.rows:
-            # The interval below its median: three such columns then fit into 80 characters.
-            shown.add_row(*(escape(cell.replace(" [", "\n[") if i else cell) for i, cell in enumerate(row)))
-        console.print(shown)
+        print_table(table, console)
     for sentence in failures(results):
         console.print(escape(sentence), style="yellow")
     for note in results.get("notes", []):
@@ -83,16 +70,18 @@ def print_tables(results: Results, console: Console) -> None:
     console.print(escape(verdict(results)), style="bold")
 
 
+def markdown_table(table: Table) -> str:
+    """One table as Markdown: title, rows, and the sentence below."""
+    head, *lines = (
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (table.columns, *table.rows)
+    )
+    rule = "| " + " | ".join(["---", *["---:"] * (len(table.columns) - 1)]) + " |"
+    return "\n\n".join([f"## {table.title}", "\n".join([head, rule, *lines]), *([table.note] if table.note else [])])
+
+
 def markdown_text(results: Results) -> str:
     """The verdict and the tables as Markdown (`results.md`)."""
-    parts = [f"# {results['name']}", verdict(results)]
-    for table in result_tables(results):
-        head, *lines = (
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (table.columns, *table.rows)
-        )
-        rule = "| " + " | ".join(["---", *["---:"] * (len(table.columns) - 1)]) + " |"
-        parts += [f"## {table.title}", "\n".join([head, rule, *lines]), *([table.note] if table.note else [])]
-    parts += failures(results)
+    parts = [f"# {results['name']}", verdict(results), *map(markdown_table, result_tables(results)), *failures(results)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -140,31 +129,51 @@ def _after_table(results: Results, paper: PaperCase | None, measure: str) -> Tab
     shared = "all" if "all" in keys else None
     scales = {key: _scale(results, shared or key, measure) for key in keys}
     beside = measure == "mse"
-    ratio = beside and floor is not None and "all" in keys
     columns = ["method", *(f"{'all joints' if key == 'all' else key} [{scales[key][1]}]" for key in keys)]
-    columns += ["ratio to floor [1]"] * ratio + ["time [s]"] * beside
-    lines: list[tuple[str, Mapping[str, Any] | None, Mapping[str, Any]]] = [
-        (name, method["test"], method) for name, method in results["methods"].items()
+    blocks = [*results["methods"].values(), results["constant"]]
+    extras = [
+        (key, column, digits)
+        for key, column, digits in (
+            ("ratio_to_floor", "ratio to floor [1]", 4),
+            ("coverage", "coverage of 95 % [1]", 3),
+            ("seconds", "time [s]", 3),
+        )
+        if beside and (key == "seconds" or any(block.get(key) for block in blocks))
     ]
-    lines.append(("constant", results["constant"]["test"], results["constant"]))
-    if floor and beside:
-        lines.append(("noise floor, realised", floor["realised"], {}))
-        lines.append(("noise floor, expected", floor["expected"], {}))
-        if floor.get("with_unlearnable"):
-            lines.append(("noise floor with what cannot be learned", floor["with_unlearnable"], {}))
-    rows = []
-    for name, errors, method in lines:
+    columns += [column for _, column, _ in extras]
+    printed = dict(paper.methods) if paper and len(keys) == len(paper.symbols) + 1 else {}
+    rows: list[tuple[str, ...]] = []
+
+    def add(label: str, errors: Mapping[str, Any] | None, method: Mapping[str, Any]) -> None:
         cells = [interval_text(errors[key][measure] if errors else None, scales[key][0]) for key in keys]
-        cells += [interval_text(method.get("ratio_to_floor"))] * ratio
-        cells += [interval_text(method.get("seconds"), digits=3)] * beside
-        rows.append((name, *cells))
+        rows.append((label, *cells, *(interval_text(method.get(key), digits=digits) for key, _, digits in extras)))
+
+    def add_printed(name: str) -> None:
+        assert paper is not None
+        values = printed.pop(name)[("mse", "mae", "sse").index(measure)]
+        cells = [number_text(value / scales[key][0]) for key, value in zip(keys, values, strict=True)]
+        rows.append((f"{name}, paper's Table {paper.after}", *cells, *["–"] * len(extras)))
+
+    for name, method in results["methods"].items():
+        add(method_label(results, name), method["test"], method)
+        if name in printed:
+            add_printed(name)
+    if not (results["methods"].get("constant") or {}).get("test"):
+        add("constant", results["constant"]["test"], results["constant"])
+    if floor and beside:
+        add("noise floor, realised", floor["realised"], {})
+        add("noise floor, expected", floor["expected"], {})
+        if floor.get("with_unlearnable"):
+            add("noise floor with what cannot be learned", floor["with_unlearnable"], {})
+    for name in list(printed):
+        add_printed(name)
     note = _repeats(results)
-    if paper and len(keys) == len(paper.symbols) + 1:
-        for name, printed in paper.methods.items():
-            values = printed[("mse", "mae", "sse").index(measure)]
-            cells = [number_text(value / scales[key][0]) for key, value in zip(keys, values, strict=True)]
-            rows.append((f"{name}, paper's Table {paper.after}", *cells, *["–"] * (ratio + beside)))
-    return Table(f"{titles[measure]} on held-out rows, after calibration", tuple(columns), tuple(rows), note)
+    if any(key == "coverage" for key, _, _ in extras):
+        note += (
+            " Coverage: share of the held-out figures inside the domain that lie within 1.96 predictive standard "
+            "deviations of the prediction."
+        )
+    return Table(f"{titles[measure]} on held-out rows, after calibration", tuple(columns), tuple(rows), note.strip())
 
 
 def _scale(results: Results, key: str, measure: str) -> tuple[float, str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["TensorBoardCallback", "tags_of"]
 
 _PER_SUBPOPULATION = ("density", "diversity")
+_CURVES = ("heldout_mse_", "error_")
 _CELL = 16
 """Pixels a connection gets in the picture of a mask."""
 
@@ -28,8 +31,14 @@ class TensorBoardCallback:
     `density/subpopulation_1`) and, when there are several repeats, that of the first one under `repeat_0/…`: a median
     curve hides how a single run moves, thirty curves hide everything.
 
+    Errors (`heldout_mse_…` and `error_…`) stand there twice more, so that methods whose steps are different things can
+    be compared on one axis: `by_evaluations/NAME` with the evaluations so far in place of the step, and `by_time/NAME`
+    with the milliseconds inside the learner (all repeats together). Every event carries the time inside the learner as
+    its wall time, so that TensorBoard's relative axis means the same.
+
     The writer opens at the first step it is given and purges what stood at or after that step, so that a run resumed
-    from a checkpoint shows no step twice.
+    from a checkpoint shows no step twice. That takes points of the other two axes along, whose numbers are not steps;
+    they are written again from `past`.
     """
 
     def __init__(
@@ -39,6 +48,7 @@ class TensorBoardCallback:
         *,
         every: int = 1,
         masks_every: int = 20,
+        past: Callable[[], tuple[Mapping[str, Tensor], Tensor]] | None = None,
     ) -> None:
         """Make the callback.
 
@@ -48,16 +58,23 @@ class TensorBoardCallback:
                 those of the learner, if it has a `genome`.
             every: write scalars each so many steps.
             masks_every: write the masks each so many steps.
+            past: gives the history before a resumed training, metrics `t x r [x k]`, and the seconds inside the
+                learner after each step, `t`.
         """
         self._folder = Path(folder)
         self._masks = masks
         self._every = every
         self._masks_every = masks_every
+        self._past = past
         self._writer: SummaryWriter | None = None
 
     def on_start(self, learner: Any, data: Any, step: int) -> None:
         """Take the learner's masks where it has some; the writer waits for the first step."""
         genome = getattr(learner, "genome", None)
+        self._origin = time.time()
+        if step == 0:
+            # Nothing lies before a fresh start, whatever an older file holds.
+            self._past = None
         if self._masks is None and genome is not None:
             self._masks = lambda: [mask.cpu().numpy() for mask in genome(0)[0]]
 
@@ -73,20 +90,63 @@ class TensorBoardCallback:
             from torch.utils.tensorboard import SummaryWriter
 
             self._writer = SummaryWriter(str(self._folder), purge_step=step)
+            self._origin -= _seconds(metrics) or 0.0
+            self._repeat_past(step)
+        seconds = _seconds(metrics)
         if step % self._every == 0 or step == 1:
             for name, value in metrics.items():
                 for tag, number in tags_of(name, value).items():
-                    self._writer.add_scalar(tag, number, step)
+                    self._writer.add_scalar(tag, number, step, walltime=self._walltime(seconds))
+            self._write_axes(metrics, seconds)
         if self._masks is not None and (step % self._masks_every == 0 or step == 1):
             for layer, mask in enumerate(self._masks(), start=1):
                 picture = np.kron(np.asarray(mask, dtype=np.uint8), np.ones((_CELL, _CELL), dtype=np.uint8)) * 255
                 self._writer.add_image(f"masks/layer_{layer}", picture, step, dataformats="HW")
+
+    def _walltime(self, seconds: float | None) -> float | None:
+        """As if nothing but the learner took time; None = now."""
+        return None if seconds is None else self._origin + seconds
+
+    def _write_axes(self, metrics: Mapping[str, Tensor], seconds: float | None, least: int = 0) -> None:
+        """Errors against evaluations and against time; only points from `least` on."""
+        assert self._writer is not None
+        axes = {} if seconds is None else {"by_time": round(1000 * seconds)}
+        if "evaluations" in metrics:
+            axes["by_evaluations"] = round(_median(metrics["evaluations"]))
+        for name, value in metrics.items():
+            if not name.startswith(_CURVES):
+                continue
+            error = _median(value)
+            for axis, place in axes.items():
+                if place >= least and math.isfinite(error):
+                    self._writer.add_scalar(f"{axis}/{name}", error, place, walltime=self._walltime(seconds))
+
+    def _repeat_past(self, step: int) -> None:
+        """Write again what opening the writer has purged of the other axes: points at or beyond that step's number."""
+        if self._past is None:
+            return
+        history, clock = self._past()
+        for i, seconds in enumerate(clock.tolist()[: step - 1]):
+            if (i + 1) % self._every == 0 or i == 0:
+                self._write_axes({name: values[i] for name, values in history.items()}, seconds, step)
 
     def on_end(self) -> None:
         """Write out and close."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+
+
+def _median(value: Tensor | float) -> float:
+    """Over the repeats that are finite; NaN where none is."""
+    numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu().flatten()
+    finite = numbers[numbers.isfinite()]
+    return float(torch.quantile(finite, 0.5)) if len(finite) else math.nan
+
+
+def _seconds(metrics: Mapping[str, Tensor]) -> float | None:
+    """Time inside the learner so far, the same for all repeats; None where nobody measured it."""
+    return float(metrics["seconds"].max()) if "seconds" in metrics else None
 
 
 def tags_of(name: str, value: Tensor | float) -> dict[str, float]:

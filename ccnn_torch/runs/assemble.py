@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.report.results import (
     before_block,
@@ -18,12 +19,16 @@ from ccnn_torch.report.results import (
     ratio_to_floor,
     spread,
 )
+from ccnn_torch.runs.auto import Comparison
+from ccnn_torch.runs.choosing import Plan
 from ccnn_torch.runs.config import RunConfig
-from ccnn_torch.runs.dataset import Dataset, pad_rows
+from ccnn_torch.runs.dataset import Dataset, Rows, pad_rows
 from ccnn_torch.runs.evaluate import Outcome, pose_with_geometry
 from ccnn_torch.runs.prepare import Prepared
+from ccnn_torch.runs.simulation import Simulation
+from ccnn_torch.runs.uncertainty import coverage, inside_domain
 
-__all__ = ["assemble", "best_method", "versions"]
+__all__ = ["assemble", "best_method", "plan_of", "versions"]
 
 _PACKAGES = ("ccnn-torch", "torch", "numpy", "scipy", "onnx", "onnxruntime", "safetensors")
 
@@ -31,6 +36,19 @@ _PACKAGES = ("ccnn-torch", "torch", "numpy", "scipy", "onnx", "onnxruntime", "sa
 def versions() -> dict[str, str]:
     """Versions of this package and of those that decide its numbers."""
     return {name: version(name) for name in _PACKAGES}
+
+
+def plan_of(config: RunConfig) -> Plan:
+    """How the methods of a config are trained."""
+    training = config.training
+    return Plan(
+        early_stop=training.early_stop,
+        patience=training.patience,
+        checkpoint_every=training.checkpoint_every,
+        device=config.device,
+        folds=config.auto.folds if config.methods == ["auto"] else training.folds,
+        kind=config.split.kind,
+    )
 
 
 def best_method(outcomes: dict[str, Outcome]) -> str:
@@ -44,6 +62,7 @@ def assemble(
     before: PoseError,
     outcomes: dict[str, Outcome],
     failed: dict[str, str],
+    comparison: Comparison | None = None,
 ) -> dict[str, Any]:
     """The content of `results.json`.
 
@@ -51,21 +70,14 @@ def assemble(
         before: pose error without compensation, `r x s`.
         outcomes: trained methods by name, at least one.
         failed: sentence of each method that could not be trained.
+        comparison: how the method was chosen, where it was.
     """
     dataset, joints = prepared.dataset, prepared.mechanism.joints
     test, fit = dataset.usable_rows("test"), dataset.usable_rows("fit")
     measured, learned = test.take(dataset.deviation), fit.take(dataset.deviation)
-    floor = None
-    if prepared.case is not None and prepared.noise is not None:
-        chirp = prepared.case.unlearnable
-        floor = floor_block(
-            test.take(prepared.noise),
-            test.weights,
-            joints,
-            prepared.case.sigma.square(),
-            test.take(chirp.expand(len(dataset.seeds), -1, -1)) if bool(chirp.any()) else None,
-        )
+    floor = None if prepared.simulation is None else _floor(prepared.simulation, test, joints)
     methods: dict[str, Any] = {name: {"test": None, "failed": sentence} for name, sentence in failed.items()}
+    inside = inside_domain(dataset, config.compensation.margin)
     for name, outcome in outcomes.items():
         errors = joint_errors(test.take(outcome.deviation), measured, test.weights, joints)
         each = outcome.fitted.seconds / len(dataset.seeds)
@@ -73,6 +85,10 @@ def assemble(
             "test": errors,
             "ratio_to_floor": ratio_to_floor(errors, floor),
             "seconds": spread([each] * len(dataset.seeds)),
+            **_certainty(outcome, dataset, test, inside, joints),
+            "converged": _spread_or_none(outcome.fitted.converged),
+            "evaluations": _spread_or_none(outcome.fitted.evaluations),
+            "pose": _pose_of(prepared, outcome),
         }
     constant = constant_errors(learned, measured, fit.weights, test.weights, joints)
     best = best_method(outcomes)
@@ -89,23 +105,81 @@ def assemble(
         "methods": {name: methods[name] for name in [*outcomes, *failed]},
         "constant": {"test": constant, "ratio_to_floor": ratio_to_floor(constant, floor)},
         "floor": floor,
+        "auto": None if comparison is None else comparison.block(best),
         "pose": _pose(config, prepared, before, outcomes[best].after),
         "records": None if prepared.simulated else _records(prepared),
         "data_sha256": prepared.data_hash,
-        "notes": prepared.notes,
+        "notes": [*prepared.notes, *_notes(plan_of(config))],
         "versions": versions(),
     }
 
 
+def _notes(plan: Plan) -> list[str]:
+    if not plan.holds_out:
+        return [
+            "No row was held out to choose by: the predictive sd is the learners' own, by no other rows corrected "
+            "(training.folds=5 does that without changing the model)."
+        ]
+    if plan.folds > 1:
+        blocks = "neighbouring blocks" if plan.kind == "block" else "whole groups" * (plan.kind == "group") or "rows"
+        return [f"What was chosen was chosen by cross-validation in {plan.folds} folds of {blocks}."]
+    return []
+
+
+def _certainty(
+    outcome: Outcome, dataset: Dataset, test: Rows, inside: Tensor, joints: tuple[Coordinate, ...]
+) -> dict[str, Any]:
+    """How wide the predictive sd is, and how often what was measured lies within its 95 % interval."""
+    sd = outcome.fitted.sd(test.take(dataset.inputs.expand(len(dataset.seeds), -1, -1)))
+    residuals = test.take(dataset.deviation) - test.take(outcome.deviation)
+    there = (test.weights > 0).unsqueeze(-1)
+    typical = sd.masked_fill(~there, torch.nan).nanmedian(1).values
+    return {
+        "coverage": spread(coverage(residuals, sd, test.weights * test.take(inside))),
+        "sd": {joint.name: spread(typical[:, j]) for j, joint in enumerate(joints)},
+    }
+
+
+def _spread_or_none(values: Tensor | None) -> dict[str, Any] | None:
+    return None if values is None else spread(values)
+
+
+def _pose_of(prepared: Prepared, outcome: Outcome) -> dict[str, Any]:
+    """The pose error that a method leaves, over all test rows."""
+    rows = pad_rows([split.test for split in prepared.dataset.splits])
+    position, rotation = (
+        None if error is None else rows.take(error.expand(len(rows.index), -1))
+        for error in (outcome.after.position, outcome.after.rotation)
+    )
+    assert position is not None
+    block = pose_block(position, position, rows.weights, rotation, rotation)
+    return {name: part and {"unit": part["unit"], **part["after"]} for name, part in block.items()}
+
+
 def case_label(config: RunConfig) -> str:
-    """`tripod`, or `machine_tool:VARIANT`."""
+    """`tripod`, `machine_tool:VARIANT`, or `realistic:MACHINE:CAUSE`."""
+    if config.case == "realistic":
+        return f"realistic:{config.realistic.machine}:{config.realistic.cause}"
     return f"{config.case}:{config.variant}" if config.case == "machine_tool" else str(config.case)
 
 
+def _floor(simulation: Simulation, test: Rows, joints: tuple[Coordinate, ...]) -> dict[str, Any]:
+    variance = test.take(simulation.noise_variance) * test.weights.unsqueeze(-1)
+    unlearnable = simulation.unlearnable
+    return floor_block(
+        test.take(simulation.noise),
+        test.weights,
+        joints,
+        variance.sum(1, keepdim=True) / test.weights.sum(1)[:, None, None],
+        None if unlearnable is None else test.take(unlearnable),
+    )
+
+
 def row_counts(config: RunConfig, dataset: Dataset) -> dict[str, int]:
-    """Rows of the first repeat's split; without early stopping the validation rows are trained on."""
+    """Rows of the first repeat's split; without early stopping, and with folds, the validation rows are trained on."""
     split = dataset.splits[0]
-    held = len(split.validation) if config.training.early_stop else 0
+    plan = plan_of(config)
+    held = len(split.validation) if plan.holds_out and plan.folds == 1 else 0
     return {
         "train": len(split.train) + len(split.validation) - held,
         "validation": held,

@@ -15,10 +15,11 @@ from ccnn_torch.compensation import FORMS, Compensator, fit_compensator, save_mo
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import LEARNERS, Learner, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError
-from ccnn_torch.runs.assemble import assemble, best_method
-from ccnn_torch.runs.config import RunConfig, method_names
+from ccnn_torch.runs.assemble import assemble, best_method, plan_of
+from ccnn_torch.runs.auto import Comparison, compare
+from ccnn_torch.runs.config import METHODS, RunConfig, method_names
 from ccnn_torch.runs.evaluate import Outcome, evaluate, pose_before
-from ccnn_torch.runs.fitting import Plan, fit_method
+from ccnn_torch.runs.fitting import fit_method, refit
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.prepare import Prepared, prepare
 from ccnn_torch.training import Callback, Scaling
@@ -71,7 +72,7 @@ class Calibration:
         return fit_compensator(
             fitted.learner.network(repeat).cpu(),
             fitted.scaling.repeat(repeat),
-            prepared.dataset.inputs[there],
+            prepared.dataset.inputs[repeat, there],
             prepared.dataset.deviation[repeat, there],
             prepared.mechanism.joints,
             prepared.covariate_coordinates,
@@ -129,45 +130,51 @@ def calibrate(
     prepared = prepared or prepare(config)
     # Looked at before anything is computed, though it is used last.
     _limit(config, len(prepared.mechanism.joints))
-    training = config.training
-    plan = Plan(training.early_stop, training.patience, training.checkpoint_every, config.device)
+    plan, dataset = plan_of(config), prepared.dataset
     before = pose_before(prepared)
     outcomes: dict[str, Outcome] = {}
     failed: dict[str, str] = {}
-    for name, make in makers(config).items():
+    found = makers(config)
+    comparison: Comparison | None = None
+    if config.methods == ["auto"]:
+        comparison = compare(
+            found, dataset, plan, config.auto.budget, folder, lambda name: partial(watch, prepared, name)
+        )
+        found = {name: found[name] for name in comparison.order}
+    for name, make in found.items():
         if make is None:
             failed[name] = f"this version has no learner {name!r}"
             continue
+        watched = partial(watch, prepared, name)
         try:
-            fitted = fit_method(
-                name,
-                make,
-                prepared.dataset,
-                plan,
-                folder,
-                partial(watch, prepared, name),
-            )
+            if comparison is None:
+                fitted = fit_method(name, make, dataset, plan, folder, watched)
+            else:
+                fitted = refit(name, make, dataset, plan, comparison.compared[name], folder, watched)
+            outcomes[name] = evaluate(prepared, fitted)
         except MethodFailedError as problem:
             failed[name] = str(problem)
             continue
-        outcomes[name] = evaluate(prepared, fitted)
+        if comparison is not None:
+            break
     if not outcomes:
         raise MethodFailedError("; ".join(f"{name}: {sentence}" for name, sentence in failed.items()))
-    return Calibration(config, prepared, before, outcomes, failed, assemble(config, prepared, before, outcomes, failed))
+    results = assemble(config, prepared, before, outcomes, failed, comparison)
+    return Calibration(config, prepared, before, outcomes, failed, results)
 
 
 def makers(config: RunConfig) -> dict[str, Callable[[], Learner] | None]:
     """What makes the learner of each method, by the name that results and files have for it.
 
-    A user's `path/to/file.py:Name` is called `Name` there. None stands for a learner that `methods=all` asks for and
-    this version does not have.
+    A user's `path/to/file.py:Name` is called `Name` there. None stands for a learner that `methods=all` or `auto`
+    asks for and this version does not have.
 
     Raises:
         InputError: a method that was named is not to be had.
     """
     found: dict[str, Callable[[], Learner] | None] = {}
     for method in method_names(config):
-        if config.methods == ["all"] and method not in LEARNERS:
+        if config.methods in (["all"], ["auto"]) and method in METHODS and method not in LEARNERS:
             found[method] = None
             continue
         settings = config.settings(method)

@@ -14,8 +14,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
-from ccnn_torch.learners._registry import LEARNERS
 from ccnn_torch.learners.ccnn import CCNNSettings
+from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.runs._keys import explain, list_keys
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
@@ -23,7 +23,9 @@ from ccnn_torch.runs._yaml import dump_yaml, read_yaml
 
 __all__ = [
     "METHODS",
+    "AutoConfig",
     "CompensationConfig",
+    "RealisticConfig",
     "RunConfig",
     "SplitConfig",
     "TrainingConfig",
@@ -33,6 +35,7 @@ __all__ = [
     "load_config",
     "make_config",
     "method_names",
+    "validate_tree",
 ]
 
 METHODS = ("ccnn", "bp_lm", "grnn", "enn", "constant", "gp")
@@ -77,6 +80,11 @@ class TrainingConfig(_Part):
         default=True,
         description="find the best step on the validation rows, then refit on all training rows for so long",
     )
+    folds: int = Field(
+        default=1,
+        ge=1,
+        description="1 = hold the rows of split.validation out; K > 1 = cross-validate in K folds of the training rows",
+    )
     patience: int | None = Field(
         default=None, ge=1, description="steps without improvement after which that search ends; null = go to the end"
     )
@@ -100,6 +108,57 @@ class CompensationConfig(_Part):
     )
 
 
+class RealisticConfig(_Part):
+    """A simulated real machine (case=realistic); every repeat has a machine, poses and noise of its own."""
+
+    machine: Literal["tripod", "machine_tool", "arm"] = Field(
+        default="tripod", description="tripod, machine_tool or arm (six joints)"
+    )
+    cause: Literal["geometry", "compliance", "transmission", "thermal", "backlash", "mixed"] = Field(
+        default="mixed",
+        description="what makes it miss: geometry, compliance, transmission, thermal, backlash, or mixed = all of them",
+    )
+    strength: float = Field(default=1.0, ge=0, description="size of the cause; 1 = 0.05 to 0.3 mm of pose error")
+    rows: int = Field(default=200, ge=20, description="poses measured")
+    noise: float = Field(
+        default=5e-6,
+        gt=0,
+        description="standard deviation of each measured coordinate of the position in m; an angle has it over 0.3 m",
+    )
+
+
+class AutoConfig(_Part):
+    """How `methods=auto` chooses a method."""
+
+    methods: Names = Field(
+        default=["constant", "grnn", "gp", "bp_lm", "enn", "ccnn"],
+        min_length=1,
+        description="the methods that methods=auto compares, in the order in which they are tried: cheap ones first",
+    )
+    budget: float = Field(
+        default=300.0,
+        gt=0,
+        description="seconds inside the learners that the comparison may take; the refit comes on top",
+    )
+    folds: int = Field(default=5, ge=2, description="folds of the training rows that the methods are compared by")
+
+    @field_validator("methods")
+    @classmethod
+    def _known(cls, methods: list[str]) -> list[str]:
+        return _checked(methods, METHODS)
+
+
+def _checked(methods: list[str], choices: tuple[str, ...]) -> list[str]:
+    for method in methods:
+        if method not in choices and ".py:" not in method:
+            near = nearest(method, choices)
+            hint = f"did you mean '{near}'?" if near else f"known are {', '.join(choices)} and file.py:Name"
+            raise ValueError(f"there is no method '{method}'; {hint}")
+        if methods.count(method) > 1:
+            raise ValueError(f"'{method}' stands twice")
+    return methods
+
+
 class RunConfig(_Part):
     """A run: data, split, methods and their settings."""
 
@@ -112,7 +171,8 @@ class RunConfig(_Part):
     methods: Names = Field(
         default=["ccnn"],
         min_length=1,
-        description=f"learners: a list of {', '.join(METHODS)}; all = these; auto = all that this version has",
+        description=f"learners: a list of {', '.join(METHODS)}; all = these; auto = the best of auto.methods "
+        "by cross-validation",
     )
     device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?|mps)$", description="cpu, cuda, cuda:N or mps")
     covariates: Names | None = Field(
@@ -121,9 +181,12 @@ class RunConfig(_Part):
         "speed* where they are there; [] = none",
     )
     split: SplitConfig = Field(default_factory=SplitConfig)
-    case: Literal["tripod", "machine_tool"] | None = Field(
-        default=None, description="a case study of paper 000: tripod or machine_tool; or null and records instead"
+    case: Literal["tripod", "machine_tool", "realistic"] | None = Field(
+        default=None,
+        description="simulated data: a case study of paper 000, tripod or machine_tool; a realistic machine; or null "
+        "and records instead",
     )
+    realistic: RealisticConfig = Field(default_factory=RealisticConfig)
     variant: Literal["printed", "tabulated"] | None = Field(
         default=None,
         description="noise of the machine_tool case: printed (eq. 19) or tabulated (Table III); default printed",
@@ -155,9 +218,11 @@ class RunConfig(_Part):
         default=None, gt=0, description="rows with a larger joint deviation (SI) are not trained on; null = no bound"
     )
     training: TrainingConfig = Field(default_factory=TrainingConfig)
+    auto: AutoConfig = Field(default_factory=AutoConfig)
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
     save_models: bool = Field(default=True, description="write model files and their card")
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
+    grnn: GRNNSettings = Field(default_factory=GRNNSettings)
     gp: GPSettings = Field(default_factory=GPSettings)
 
     @model_validator(mode="before")
@@ -166,9 +231,9 @@ class RunConfig(_Part):
         """An empty section is one of defaults; a case has its order and the machine tool its variant."""
         if not isinstance(tree, dict):
             return tree
-        sections = ("split", "training", "compensation", "ccnn", "gp")
+        sections = [key for key, field in cls.model_fields.items() if field.default_factory is not None]
         tree = {key: value for key, value in tree.items() if value is not None or key not in sections}
-        if tree.get("case") is not None and tree.get("order") is None:
+        if tree.get("case") in ("tripod", "machine_tool") and tree.get("order") is None:
             tree["order"] = "raster"
         if tree.get("case") == "machine_tool" and tree.get("variant") is None:
             tree["variant"] = "printed"
@@ -177,14 +242,7 @@ class RunConfig(_Part):
     @field_validator("methods")
     @classmethod
     def _known(cls, methods: list[str]) -> list[str]:
-        choices = (*METHODS, "all", "auto")
-        for method in methods:
-            if method not in choices and ".py:" not in method:
-                near = nearest(method, choices)
-                hint = f"did you mean '{near}'?" if near else f"known are {', '.join(choices)} and file.py:Name"
-                raise ValueError(f"there is no method '{method}'; {hint}")
-            if methods.count(method) > 1:
-                raise ValueError(f"'{method}' stands twice")
+        for method in _checked(methods, (*METHODS, "all", "auto")):
             if method in ("all", "auto") and len(methods) > 1:
                 raise ValueError(f"'{method}' stands alone; remove the other names or '{method}'")
         return methods
@@ -193,7 +251,9 @@ class RunConfig(_Part):
     def _one_source(self) -> RunConfig:
         if (self.case is None) == (self.records is None):
             both = "both case and records are given; remove one" if self.case else "no data is named"
-            raise ValueError(f"{both}: case=tripod, case=machine_tool, or records=FILE.csv with mechanism=…")
+            raise ValueError(
+                f"{both}: case=tripod, case=machine_tool, case=realistic, or records=FILE.csv with mechanism=…"
+            )
         if self.records is not None and self.mechanism is None:
             raise ValueError(
                 "mechanism: records need it; write mechanism=tripod, machine_tool, a DH file, a URDF or file.py:Name"
@@ -202,11 +262,17 @@ class RunConfig(_Part):
             raise ValueError(f"mechanism: the case {self.case} brings its own; remove the key")
         if self.variant is not None and self.case != "machine_tool":
             raise ValueError("variant: only the case machine_tool has variants; remove the key")
+        if self.realistic != RealisticConfig() and self.case != "realistic":
+            raise ValueError("realistic: these keys need case=realistic; write that, or remove them")
+        if self.order is not None and self.case == "realistic":
+            raise ValueError("order: a realistic machine visits random poses; remove the key")
         if self.order is not None and self.case is None:
             raise ValueError("order: records have the order in which they were measured; remove the key")
-        if self.training.early_stop and self.split.validation == 0:
+        folds = self.training.folds > 1 or self.methods == ["auto"]
+        if self.training.early_stop and self.split.validation == 0 and not folds:
             raise ValueError(
-                "training.early_stop: it needs validation rows; write split.validation=0.2 or training.early_stop=false"
+                "training.early_stop: it needs validation rows; write split.validation=0.2, training.folds=5 or "
+                "training.early_stop=false"
             )
         return self
 
@@ -227,7 +293,7 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> RunConfig:
     tree.setdefault("name", path.stem)
     resolve_paths(tree, path.absolute().parent)
     given = apply_overrides(tree, overrides, Path.cwd())
-    return _validate(tree, str(path), given)
+    return validate_tree(tree, str(path), given)
 
 
 def make_config(**keys: Any) -> RunConfig:
@@ -238,10 +304,20 @@ def make_config(**keys: Any) -> RunConfig:
     """
     tree = dict(keys)
     resolve_paths(tree, Path.cwd())
-    return _validate(tree, "config", {})
+    return validate_tree(tree, "config", {})
 
 
-def _validate(tree: dict[str, Any], source: str, given: dict[str, str]) -> RunConfig:
+def validate_tree(tree: dict[str, Any], source: str, given: dict[str, str]) -> RunConfig:
+    """A config from a tree of keys whose paths are absolute.
+
+    Args:
+        tree: keys and sections.
+        source: the config's name, which opens the sentence of an error.
+        given: key -> override, for keys that were set on the command line.
+
+    Raises:
+        InputError: keys are wrong: one line that names them all.
+    """
     try:
         return RunConfig.model_validate(tree)
     except ValidationError as error:
@@ -258,7 +334,7 @@ def method_names(config: RunConfig) -> list[str]:
     if config.methods == ["all"]:
         return list(METHODS)
     if config.methods == ["auto"]:
-        return [method for method in METHODS if method in LEARNERS]
+        return list(config.auto.methods)
     return list(config.methods)
 
 

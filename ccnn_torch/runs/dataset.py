@@ -30,7 +30,7 @@ class Rows:
     weights: Tensor
 
     def take(self, values: Tensor) -> Tensor:
-        """values: `s x ...` (the same for all repeats) or `r x s x ...`; returns `r x t x ...`."""
+        """values: `r x s x ...`; returns `r x t x ...`."""
         repeats = torch.arange(len(self.index)).unsqueeze(-1)
         return values[repeats, self.index]
 
@@ -51,12 +51,12 @@ class Dataset:
     """Commanded joints and covariates against joint deviations, with the splits of every repeat.
 
     Attributes:
-        inputs: joints, then covariates, `s x i` [SI].
+        inputs: joints, then covariates, `r x s x i` [SI]; the repeats of measured records share their rows.
         deviation: pseudoerror, `r x s x n` [SI].
         usable: rows whose pseudoerror is well determined, `r x s` bool; only these are trained on and scored per joint.
         splits: one a repeat.
         seeds: one a repeat.
-        turning: which inputs are revolute joints, `i` bool.
+        periodic: which inputs are fed as sine and cosine, `i` bool: revolute joints that turn by more than a quarter.
         jacobian: of the machine at the commanded joints, `r x s x c x n`: position [m] above rotation [rad], per joint
             unit; learners that can then weigh a row's joint errors by the pose error they cause. None = all alike.
     """
@@ -66,7 +66,7 @@ class Dataset:
     usable: Tensor
     splits: list[Split]
     seeds: list[int]
-    turning: Tensor
+    periodic: Tensor
     jacobian: Tensor | None = None
 
     def usable_rows(self, part: str) -> Rows:
@@ -102,13 +102,13 @@ class Dataset:
                 f"only {fewest} usable rows are left to train on; at least {_SMALLEST_TRAINING_SET} are needed: "
                 "measure more, or lower split.test and split.validation"
             )
-        inputs, targets = rows.take(self._inputs()), rows.take(self.deviation)
-        scaling = Scaling.fit(inputs, targets, rows.weights, self.periodic())
+        inputs, targets = rows.take(self.inputs), rows.take(self.deviation)
+        scaling = Scaling.fit(inputs, targets, rows.weights, self.periodic)
         held = None
         if validate:
             others = self.usable_rows("validation")
             held = TrainingData(
-                scaling.features(others.take(self._inputs())),
+                scaling.features(others.take(self.inputs)),
                 scaling.standardise(others.take(self.deviation)),
                 others.weights,
                 torch.tensor(self.seeds),
@@ -138,11 +138,3 @@ class Dataset:
         scale = torch.cat([part.sqrt().unsqueeze(-1).expand(-1, 3) for part in parts], -1)[:, : jacobian.shape[-2]]
         scale = torch.where(scale > 0, scale, torch.ones_like(scale))
         return jacobian / scale[:, None, :, None] * scaling.deviation[:, None, None, :]
-
-    def periodic(self) -> Tensor:
-        """Revolute joints that turn by more than a quarter: fed as sine and cosine. Returns `i` bool."""
-        span = self.inputs.amax(0) - self.inputs.amin(0)
-        return self.turning & (span > torch.pi / 2)
-
-    def _inputs(self) -> Tensor:
-        return self.inputs.expand(len(self.splits), -1, -1)

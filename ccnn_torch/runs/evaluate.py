@@ -39,9 +39,9 @@ def pose_before(prepared: Prepared) -> PoseError:
     Simulated: the pose reached under the ideal joints against the ideal pose. Recorded: the pose measured against the
     nominal machine's, fitted frames included.
     """
-    if prepared.case is not None:
-        return prepared.mechanism.pose_error(prepared.pose, prepared.case.pose)
-    nominal = prepared.mechanism.forward_kinematics(_joints(prepared), prepared.parameters)
+    if prepared.simulation is not None:
+        return prepared.simulation.pose_errors(prepared.joints)[0]
+    nominal = prepared.mechanism.forward_kinematics(prepared.joints, prepared.parameters)
     return prepared.mechanism.pose_error(prepared.pose, nominal)
 
 
@@ -49,34 +49,27 @@ def pose_with_geometry(prepared: Prepared) -> PoseError | None:
     """Pose error that geometric calibration alone leaves, `r x s`; None where no geometry was fitted."""
     if prepared.identified is None:
         return None
-    reached = prepared.mechanism.forward_kinematics(_joints(prepared), prepared.identified)
+    reached = prepared.mechanism.forward_kinematics(prepared.joints, prepared.identified)
     return prepared.mechanism.pose_error(prepared.pose, reached)
 
 
 def evaluate(prepared: Prepared, fitted: Fitted) -> Outcome:
     """Predict on every row, and find the pose error that is left.
 
-    Simulated: the machine is commanded q with q + δ(q) = q*, and reaches FK(q + its true deviation, noise included).
+    Simulated: the machine is commanded q with q + δ(q) = q*, and the pose that it then reaches is solved.
     Recorded: FK(q + δ(q)) predicts the measured pose.
     """
     mechanism = prepared.mechanism
-    joints = _joints(prepared)
+    joints = prepared.joints
     deviation = _deviation(prepared, fitted, joints)
-    if prepared.case is None:
+    if prepared.simulation is None:
         reached = mechanism.forward_kinematics(joints + deviation, prepared.parameters)
         return Outcome(fitted, deviation, mechanism.pose_error(prepared.pose, reached))
-    case, noise = prepared.case, prepared.noise
-    assert noise is not None
     command = joints
     for _ in range(_COMMAND_ITERATIONS):
         command = joints - _deviation(prepared, fitted, command)
-    return Outcome(fitted, deviation, case.pose_error(command, noise), case.pose_error(command))
-
-
-def _joints(prepared: Prepared) -> Tensor:
-    return prepared.joints.expand(len(prepared.dataset.seeds), -1, -1)
+    return Outcome(fitted, deviation, *prepared.simulation.pose_errors(command))
 
 
 def _deviation(prepared: Prepared, fitted: Fitted, joints: Tensor) -> Tensor:
-    covariates = prepared.covariates.expand(*joints.shape[:-1], -1)
-    return fitted.predict(torch.cat([joints, covariates], -1))
+    return fitted.predict(torch.cat([joints, prepared.covariates], -1))

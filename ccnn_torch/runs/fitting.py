@@ -1,4 +1,4 @@
-"""Train one method on a dataset: choose how long by validation if asked, then refit on all training rows."""
+"""Train one method on a dataset: choose how long by rows held out if asked, then refit on all training rows."""
 
 from __future__ import annotations
 
@@ -8,29 +8,22 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners import Learner, TrainingData
+from ccnn_torch.runs.choosing import (
+    Choice,
+    Plan,
+    WatchPhase,
+    choose,
+    evaluations_until,
+    moved,
+    predictive_variance,
+)
 from ccnn_torch.runs.dataset import Dataset
 from ccnn_torch.runs.folder import RunFolder
-from ccnn_torch.training import Callback, Scaling, Training, train, weighted_mse
+from ccnn_torch.training import Scaling, Training, train, weighted_mse
 
-__all__ = ["Fitted", "Plan", "fit_method"]
-
-_Phase = tuple[Learner, TrainingData, Scaling, Training]
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How to train: with early stopping or without, where, and how often to write a checkpoint.
-
-    Attributes:
-        early_stop: hold the validation rows out, find the best step, then refit on all training rows for so long.
-        patience: steps without improvement after which the search for the best step ends; None = go to the end.
-    """
-
-    early_stop: bool
-    patience: int | None
-    checkpoint_every: int
-    device: str = "cpu"
+__all__ = ["Fitted", "Plan", "fit_method", "refit"]
 
 
 @dataclass
@@ -38,17 +31,23 @@ class Fitted:
     """A trained method: the learner in its chosen state, its scaling, and how it went.
 
     Attributes:
-        training, choice: the fit on all training rows, and the search for the best step before it (or None).
+        data: the training rows that the learner was fitted to.
+        training, choice: the fit on all training rows, and what held-out rows said before it (None = none were).
         score: what repeats and methods are compared by, lower is better, `r`: the mean squared standardised error on
-            the validation rows, or where none were held out on the training rows.
+            the held-out rows, or where none were held out on the training rows.
+        sd_scale: what the learner's predictive sd is multiplied by so that its intervals cover what they claim, by the
+            held-out rows; 1 where there were none. `r x n` [1].
+        seconds: inside the learner, both trainings.
     """
 
     name: str
     learner: Learner
     scaling: Scaling
+    data: TrainingData
     training: Training
-    choice: Training | None
+    choice: Choice | None
     score: Tensor
+    sd_scale: Tensor
     seconds: float
 
     def predict(self, inputs: Tensor) -> Tensor:
@@ -57,6 +56,34 @@ class Fitted:
         with torch.no_grad():
             return self.scaling.restore(self.learner.predict(self.scaling.features(inputs).to(device)).cpu())
 
+    def sd(self, inputs: Tensor) -> Tensor:
+        """Standard deviation of a newly measured joint deviation. inputs: `r x s x i` [SI]; returns `r x s x n` [SI].
+
+        Raises:
+            MethodFailedError: the learner's variance is not finite, or not above 0.
+        """
+        device = self.training.best_step.device
+        with torch.no_grad():
+            features = self.scaling.features(inputs).to(device)
+            variance = predictive_variance(self.learner, self.data, features).cpu()
+        return variance.sqrt() * (self.scaling.deviation * self.sd_scale).unsqueeze(1)
+
+    @property
+    def converged(self) -> Tensor | None:
+        """Whether the learner met its own criterion by its last step, `r` bool; None = it does not say.
+
+        Where rows were held out this is of the training before the refit, since the refit ends where they said.
+        """
+        found = self.training.converged if self.choice is None else self.choice.converged
+        return None if found is None else found.cpu()
+
+    @property
+    def evaluations(self) -> Tensor | None:
+        """Passes of all training rows through one model, both trainings, `r`; None = the learner does not count."""
+        own = evaluations_until(self.training)
+        before = None if self.choice is None else self.choice.evaluations
+        return own if own is None or before is None else own + before
+
 
 def fit_method(
     name: str,
@@ -64,49 +91,52 @@ def fit_method(
     dataset: Dataset,
     plan: Plan,
     folder: RunFolder | None,
-    watch: Callable[[str, Scaling], list[Callback]],
+    watch: WatchPhase,
 ) -> Fitted:
     """Train one method in one or two phases, each with its own checkpoint.
 
     Args:
         make: makes a fresh learner.
         folder: where checkpoints go; None = nowhere.
-        watch: callbacks of a phase (`choose` or `fit`), given that phase's scaling.
+
+    Raises:
+        InputError: too few rows.
+        MethodFailedError: the learner cannot go on, or gives numbers that are not finite.
     """
-
-    def phase(label: str, part: str, validate: bool, stop_at: Tensor | None) -> _Phase:
-        data, scaling = dataset.scaled(part, validate)
-        data = _to(data, plan.device)
-        learner = make()
-        training = train(
-            learner,
-            data,
-            callbacks=watch(label, scaling),
-            checkpoint=folder.checkpoint(name, label) if folder else None,
-            every=plan.checkpoint_every,
-            patience=plan.patience if validate else None,
-            stop_at=stop_at,
-        )
-        return learner, data, scaling, training
-
-    choice, seconds, stop_at = None, 0.0, None
-    if plan.early_stop:
-        *_, choice = phase("choose", "train", True, None)
-        seconds, stop_at = choice.seconds, choice.best_step
-    learner, data, scaling, training = phase("fit", "fit", False, stop_at)
-    if choice is not None:
-        score = choice.best_validation
-    else:
-        score = weighted_mse(learner.predict(data.inputs), data.targets, data.weights)
-    return Fitted(name, learner, scaling, training, choice, score.cpu(), seconds + training.seconds)
+    choice = choose(name, make, dataset, plan, folder, watch) if plan.holds_out else None
+    return refit(name, make, dataset, plan, choice, folder, watch)
 
 
-def _to(data: TrainingData, device: str) -> TrainingData:
-    return TrainingData(
-        data.inputs.to(device),
-        data.targets.to(device),
-        data.weights.to(device),
-        data.seeds.to(device),
-        None if data.validation is None else _to(data.validation, device),
-        None if data.metric is None else data.metric.to(device),
+def refit(
+    name: str,
+    make: Callable[[], Learner],
+    dataset: Dataset,
+    plan: Plan,
+    choice: Choice | None,
+    folder: RunFolder | None,
+    watch: WatchPhase,
+) -> Fitted:
+    """The second phase of `fit_method`: train on all training rows, for as long as the choice says."""
+    data, scaling = dataset.scaled("fit", False)
+    data = moved(data, plan.device)
+    learner = make()
+    training = train(
+        learner,
+        data,
+        callbacks=watch("fit", scaling),
+        checkpoint=folder.checkpoint(name, "fit") if folder else None,
+        every=plan.checkpoint_every,
+        stop_at=choice.best_step.to(plan.device) if choice is not None and plan.early_stop else None,
     )
+    if choice is not None:
+        score, scale, before = choice.best_validation, choice.sd_scale, choice.seconds
+    else:
+        score = weighted_mse(learner.predict(data.inputs), data.targets, data.weights).cpu()
+        scale, before = torch.ones_like(scaling.deviation), 0.0
+    fitted = Fitted(name, learner, scaling, data, training, choice, score, scale, before + training.seconds)
+    inputs = dataset.inputs.expand(len(dataset.seeds), -1, -1)
+    bad = ~(fitted.predict(inputs).isfinite() & fitted.sd(inputs).isfinite()).all((1, 2))
+    if bool(bad.any()):
+        which = ", ".join(str(k) for k in torch.nonzero(bad).squeeze(-1).tolist())
+        raise MethodFailedError(f"{name} gives predictions that are not finite in repeat {which}")
+    return fitted

@@ -57,6 +57,11 @@ class RunFolder:
         return self.path / "results.json"
 
     @property
+    def auto(self) -> Path:
+        """What `methods=auto` has decided so far."""
+        return self.path / "auto.json"
+
+    @property
     def finished(self) -> bool:
         return self.results.is_file()
 

@@ -11,10 +11,12 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
 from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.reach import reach_block
 from ccnn_torch.report.run_report import write_report
 from ccnn_torch.runs.calibrate import Calibration
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.watch import genome
+from ccnn_torch.training import Training
 
 __all__ = ["write_outputs"]
 
@@ -22,11 +24,13 @@ __all__ = ["write_outputs"]
 def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
     """Model files, arrays, curves, plots, tables, report, and at last `results.json`."""
     path, results = folder.path, calibration.results
+    curves = {name: _history(outcome.fitted.training) for name, outcome in calibration.outcomes.items()}
+    results["reach"] = reach_block(curves)
     if calibration.config.save_models:
         results["notes"] += _save_models(calibration, folder)
     save_arrays(path, _arrays(calibration))
-    for method in calibration.outcomes:
-        save_history(path, method, _history(calibration, method))
+    for method, history in curves.items():
+        save_history(path, method, history)
     write_report(path, results)
     write_json(folder.results, results)
 
@@ -47,10 +51,9 @@ def _arrays(calibration: Calibration) -> RunArrays:
     """What the pictures of the exported repeat need."""
     prepared, method, k = calibration.prepared, calibration.method, calibration.repeat()
     outcome, mechanism = calibration.outcomes[method], prepared.mechanism
-    rows = len(prepared.joints)
+    rows = prepared.joints.shape[1]
     test = torch.zeros(rows, dtype=torch.bool)
     test[prepared.dataset.splits[k].test] = True
-    pose = prepared.pose[k] if prepared.pose.dim() == 3 else prepared.pose
     # A machine that mostly turns has its errors spread over angles, not over places.
     turns = sum(coordinate.unit == "m" for coordinate in mechanism.pose) < 2
     axes = mechanism.pose if turns else tuple(Coordinate(name, "m") for name in "xyz")
@@ -60,21 +63,21 @@ def _arrays(calibration: Calibration) -> RunArrays:
 
     masks, weights = genome(outcome.fitted.learner, k)
     systematic = outcome.after_systematic
-    case = prepared.case
+    simulation = prepared.simulation
     return RunArrays(
         joints=mechanism.joints,
-        commanded=_numpy(prepared.joints),
+        commanded=_numpy(prepared.joints[k]),
         measured=_numpy(prepared.dataset.deviation[k]),
         predicted=_numpy(outcome.deviation[k]),
         test=test.numpy(),
-        place=place(pose),
+        place=place(prepared.pose[k]),
         position_before=_numpy(calibration.before.position[k]),
         position_after=_numpy(outcome.after.position[k]),
         rotation_before=None if calibration.before.rotation is None else _numpy(calibration.before.rotation[k]),
         rotation_after=None if outcome.after.rotation is None else _numpy(outcome.after.rotation[k]),
         noise=None if prepared.noise is None else _numpy(prepared.noise[k]),
-        map_place=None if case is None else place(case.pose),
-        map_before=None if case is None else _numpy(case.pose_error(case.joints).position),
+        map_place=None if simulation is None else place(simulation.pose[k]),
+        map_before=None if simulation is None else _numpy(simulation.pose_errors(prepared.joints)[1].position[k]),
         map_after=None if systematic is None else _numpy(systematic.position[k]),
         masks=tuple(mask.numpy() for mask in masks),
         weights=tuple(_numpy(weight) for weight in weights),
@@ -83,10 +86,12 @@ def _arrays(calibration: Calibration) -> RunArrays:
     )
 
 
-def _history(calibration: Calibration, method: str) -> dict[str, NDArray[np.float64]]:
-    history = calibration.outcomes[method].fitted.training.history
-    steps = len(next(iter(history.values())))
-    return {"step": np.arange(1.0, steps + 1)} | {name: _numpy(value) for name, value in history.items()}
+def _history(training: Training) -> dict[str, NDArray[np.float64]]:
+    """Training curves for `save_history`; `seconds` are one repeat's share of those inside the learner, `t x r`."""
+    repeats = len(training.best_step)
+    seconds = (training.clock / repeats).unsqueeze(1).expand(-1, repeats)
+    metrics = training.history | {"seconds": seconds}
+    return {"step": np.arange(1.0, len(seconds) + 1)} | {name: _numpy(value) for name, value in metrics.items()}
 
 
 def _numpy(tensor: Tensor) -> NDArray[np.float64]:

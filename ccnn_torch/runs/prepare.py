@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Any
 
 import torch
@@ -18,9 +19,11 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.mechanisms.frames import fit_frames
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import check_rows, load_records
-from ccnn_torch.runs.cases import CaseStudy, build_case
+from ccnn_torch.runs.cases import build_case
 from ccnn_torch.runs.config import RunConfig
 from ccnn_torch.runs.dataset import Dataset, pad_rows
+from ccnn_torch.runs.machines import build_machine
+from ccnn_torch.runs.simulation import CaseSimulation, Simulation, simulate_realistic
 from ccnn_torch.splits import Column, Split, split_rows
 
 __all__ = ["Prepared", "prepare"]
@@ -33,12 +36,13 @@ class Prepared:
     Attributes:
         parameters: geometry with the fitted frames of each repeat, `r x 1 x k` (`r x s x k` where frames are per group
             of rows), or None for a nominal machine.
-        joints: commanded joints, `s x n` [SI].
-        pose: measured poses, `r x s x p` or `s x p` [SI].
+        joints: commanded joints, `r x s x n` [SI]; the repeats of measured records share their rows.
+        covariates: `r x s x m` [SI].
+        pose: measured poses, `r x s x p` [SI].
         pseudoerror: what the poses say about the joints.
         identified: geometry with links and frames fitted to the training rows of each repeat, like `parameters`: what a
             geometric calibration would command by, to be compared with; None where it was not fitted.
-        case: the case study behind simulated rows (its noise is `noise`, `r x s x n`), or None for measured records.
+        simulation: the machine behind simulated rows, or None for measured records.
         notes: sentences for the person who reads the results.
     """
 
@@ -52,13 +56,17 @@ class Prepared:
     dataset: Dataset
     data_hash: str
     identified: Tensor | None = None
-    case: CaseStudy | None = None
-    noise: Tensor | None = None
+    simulation: Simulation | None = None
     notes: list[str] = field(default_factory=list)
 
     @property
     def simulated(self) -> bool:
-        return self.case is not None
+        return self.simulation is not None
+
+    @property
+    def noise(self) -> Tensor | None:
+        """What noise adds to the joint deviations, `r x s x n` [SI]; None where that is not known."""
+        return None if self.simulation is None else self.simulation.noise
 
     def set_aside(self) -> dict[str, int]:
         """How many rows are not trained on in the first repeat, by reason."""
@@ -81,6 +89,8 @@ def prepare(config: RunConfig) -> Prepared:
         InputError: the config names no data, or the data cannot be used; the sentence says what to change.
     """
     seeds = [config.seed + k for k in range(config.repeats)]
+    if config.case == "realistic":
+        return _from_realistic(config, seeds)
     if config.case is not None:
         return _from_case(config, seeds)
     return _from_records(config, seeds)
@@ -113,17 +123,58 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
     return Prepared(
         mechanism=mechanism,
         parameters=None,
-        joints=case.joints,
-        covariates=covariates,
+        joints=_by_repeat(case.joints, seeds),
+        covariates=_by_repeat(covariates, seeds),
         covariate_coordinates=tuple(coordinate for _, coordinate in chosen),
         pose=pose,
         pseudoerror=deviations,
         dataset=_dataset(mechanism, case.joints, covariates, deviations, splits, seeds),
         data_hash=_hash(case.joints, covariates, pose),
-        case=case,
-        noise=noise,
+        simulation=CaseSimulation(case, noise),
         notes=notes,
     )
+
+
+def _from_realistic(config: RunConfig, seeds: list[int]) -> Prepared:
+    about = config.realistic
+    machine = build_machine(about.machine, about.cause, about.strength, about.rows, about.noise, seeds)
+    mechanism, joints = machine.mechanism, machine.joints
+    chosen = _choose(list(machine.columns), config.covariates, f"{about.machine} with the cause {about.cause}")
+    covariates = torch.stack([machine.columns[c] for c in chosen], -1) if chosen else joints[..., :0]
+
+    def solved(pose: Tensor) -> Pseudoerror:
+        return joint_deviations(mechanism, joints, pose, **_pseudoerror_settings(config, mechanism))
+
+    deviations = solved(machine.measured)
+    splits = [
+        _splits(config, positions, {c.name: values[k] for c, values in machine.columns.items()}, [seed])[0]
+        for k, (seed, positions) in enumerate(zip(seeds, mechanism.frame(machine.pose)[0], strict=True))
+    ]
+    jacobian = mechanism.jacobian(joints, guess=machine.measured)
+    return Prepared(
+        mechanism=mechanism,
+        parameters=None,
+        joints=joints,
+        covariates=covariates,
+        covariate_coordinates=tuple(chosen),
+        pose=machine.measured,
+        pseudoerror=deviations,
+        dataset=_dataset(mechanism, joints, covariates, deviations, splits, seeds, jacobian, machine.turns_far),
+        data_hash=_hash(joints, covariates, machine.measured),
+        simulation=simulate_realistic(machine, lambda pose: solved(pose).deviation, deviations.deviation),
+        notes=deviations.notes(),
+    )
+
+
+def _choose(there: list[Coordinate], wanted: list[str] | None, what: str) -> list[Coordinate]:
+    """The columns that names or patterns ask for, in the order recorded; all of them where nothing is asked."""
+    if wanted is None:
+        return there
+    for pattern in wanted:
+        if not any(fnmatchcase(coordinate.name, pattern) for coordinate in there):
+            known = ", ".join(coordinate.name for coordinate in there) or "no covariates"
+            raise InputError(f"covariates: {pattern!r} is no column of the {what}; it has {known}")
+    return [coordinate for coordinate in there if any(fnmatchcase(coordinate.name, p) for p in wanted)]
 
 
 def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
@@ -164,10 +215,10 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
     return Prepared(
         mechanism=mechanism,
         parameters=parameters,
-        joints=records.joints,
-        covariates=records.covariates,
+        joints=_by_repeat(records.joints, seeds),
+        covariates=_by_repeat(records.covariates, seeds),
         covariate_coordinates=records.covariate_coordinates,
-        pose=records.pose,
+        pose=_by_repeat(records.pose, seeds),
         pseudoerror=deviations,
         dataset=_dataset(mechanism, records.joints, records.covariates, deviations, splits, seeds, jacobian),
         data_hash=records.data_hash,
@@ -209,20 +260,35 @@ def _dataset(
     splits: list[Split],
     seeds: list[int],
     jacobian: Tensor | None = None,
+    turns_far: Tensor | None = None,
 ) -> Dataset:
-    """Measured records are judged by the pose, so they bring the Jacobian; the paper's cases by the joints alone."""
-    repeats, rows = len(seeds), len(joints)
-    turning = [joint.unit == "rad" for joint in mechanism.joints] + [False] * covariates.shape[-1]
+    """Put a dataset together.
+
+    Args:
+        joints, covariates: `[r x] s x n`, `[r x] s x m` [SI].
+        jacobian: `[r x] s x c x n`. Measured records and realistic machines are judged by the pose, so they bring it;
+            the paper's cases are judged by the joints alone.
+        turns_far: joints that move by more than a quarter turn, `n` bool; by the rows themselves when None.
+    """
+    repeats, rows = len(seeds), joints.shape[-2]
+    if turns_far is None:
+        turns_far = joints.amax(-2) - joints.amin(-2) > torch.pi / 2
+    turning = torch.tensor([joint.unit == "rad" for joint in mechanism.joints])
     return Dataset(
-        inputs=torch.cat([joints, covariates], -1),
+        inputs=_by_repeat(torch.cat([joints, covariates], -1), seeds),
         deviation=deviations.deviation.expand(repeats, rows, -1),
         usable=deviations.usable.expand(repeats, rows),
         splits=splits,
         seeds=seeds,
-        turning=torch.tensor(turning),
+        periodic=torch.cat([turning & turns_far, torch.zeros(covariates.shape[-1], dtype=torch.bool)]),
         # Singular rows are not trained on; their Jacobian must only not spoil sums with weight 0.
         jacobian=None if jacobian is None else torch.nan_to_num(jacobian).expand(repeats, rows, -1, -1),
     )
+
+
+def _by_repeat(rows: Tensor, seeds: list[int]) -> Tensor:
+    """Rows of every repeat, `r x s x d`, whether they have repeats or share them."""
+    return rows.expand(len(seeds), *rows.shape[-2:])
 
 
 def _hash(*tensors: Tensor) -> str:

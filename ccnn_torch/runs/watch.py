@@ -70,7 +70,7 @@ class HeldOut:
     def on_start(self, learner: Learner, data: TrainingData, step: int) -> None:
         rows = self.dataset.usable_rows("test")
         device = data.inputs.device
-        inputs = rows.take(self.dataset.inputs.expand(len(rows.index), -1, -1))
+        inputs = rows.take(self.dataset.inputs)
         self._learner = learner
         self._features = self.scaling.features(inputs).to(device)
         self._truth = rows.take(self.dataset.deviation)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners._protocol import missing_verbs
+from ccnn_torch.training import weighted_mse
 
 __all__ = ["check_learner"]
 
@@ -37,8 +38,11 @@ def check_learner(factory: Callable[[], Learner], rows: int = 40) -> None:
         for part, expected in ((data.inputs, untouched.inputs), (data.targets, untouched.targets)):
             _require(torch.equal(part, expected), "training changes the data it was given")
         _check_network(learner, data)
+        _check_variance(learner, data)
+        _check_converged(learner, data)
         _check_same(learner, _train(factory(), data), data, "two learners on the same data and seeds differ")
         _check_padding(factory, data)
+        _check_training_error(factory, data)
         _check_resume(factory, learner, data)
 
 
@@ -73,10 +77,16 @@ def _check_training(factory: Callable[[], Learner], data: TrainingData) -> Learn
     planned = learner.steps
     _require(isinstance(planned, int) and planned >= 1, f"steps must be a whole number of at least 1, is {planned!r}")
     taken = 0
+    evaluations = torch.zeros(len(data.seeds), dtype=torch.float64)
     while not learner.finished:
         _require(taken < planned, f"the learner is not finished after the {planned} steps that it planned")
-        _check_metrics(learner.step(), len(data.seeds))
+        before = evaluations
+        metrics = learner.step()
+        _check_metrics(metrics, len(data.seeds))
+        evaluations = metrics["evaluations"]
+        _require(bool((evaluations >= before).all()), "metric 'evaluations' falls; it counts all evaluations so far")
         taken += 1
+    _require(bool((evaluations >= 1).all()), "metric 'evaluations' ends below 1; it counts passes of the training rows")
     _check_prediction(learner, data, "after the last step")
     return learner
 
@@ -89,6 +99,10 @@ def _check_metrics(metrics: dict[str, Tensor], repeats: int) -> None:
             f"metric {name!r} has shape {shape}; write r or r x k, here r = {repeats}",
         )
         _require(not bool(value.isnan().any()), f"metric {name!r} is NaN")
+    for name in ("error_train", "evaluations"):
+        _require(
+            name in metrics and metrics[name].dim() == 1, f"step gives no metric {name!r} with one number a repeat"
+        )
 
 
 def _check_prediction(learner: Learner, data: TrainingData, when: str) -> None:
@@ -125,6 +139,52 @@ def _check_network(learner: Learner, data: TrainingData) -> None:
             )
             worst = float((got - expected).abs().max())
             _require(worst <= 1e-9, f"network({repeat}) differs from predict by {worst:.3g}")
+
+
+def _check_training_error(factory: Callable[[], Learner], data: TrainingData) -> None:
+    learner, metrics = factory(), {"error_train": torch.zeros(0)}
+    learner.start(data)
+    while not learner.finished:
+        metrics = learner.step()
+    error = weighted_mse(learner.predict(data.inputs), data.targets, data.weights)
+    _require(
+        bool(torch.isclose(metrics["error_train"], error, rtol=1e-9, atol=1e-12).all()),
+        "metric 'error_train' of the last step is not the model's weighted mean squared error on the training rows",
+    )
+
+
+def _check_variance(learner: Learner, data: TrainingData) -> None:
+    """The optional method `variance`, near the data and far from them."""
+    if not hasattr(type(learner), "variance"):
+        return
+    variance: Callable[[Tensor], Tensor] = getattr(learner, "variance")  # noqa: B009 - no verb of Learner
+    for inputs in (data.inputs, 30 * data.inputs[:, :5], 1e6 * data.inputs[:, :1]):
+        found = variance(inputs)
+        expected = (len(data.seeds), inputs.shape[1], data.targets.shape[-1])
+        _require(
+            tuple(found.shape) == expected and found.dtype == torch.float64,
+            f"variance gives {found.dtype} of shape {tuple(found.shape)}; must be float64 of shape {expected}",
+        )
+        _require(bool((found.isfinite() & (found > 0)).all()), "variance must be finite and above 0 everywhere")
+    for inputs in (data.inputs, 30 * data.inputs[:, :5]):
+        found = variance(inputs)
+        for repeat in range(len(data.seeds)):
+            network = learner.network(repeat)
+            _require(hasattr(network, "variance"), f"network({repeat}) lacks variance, which the learner has")
+            of_network: Callable[[Tensor], Tensor] = getattr(network, "variance")  # noqa: B009 - no method of Module
+            worst = float((of_network(inputs[repeat]) / found[repeat] - 1).abs().max())
+            _require(worst <= 1e-9, f"network({repeat}).variance differs from variance by a share of {worst:.3g}")
+
+
+def _check_converged(learner: Learner, data: TrainingData) -> None:
+    """The optional property `converged`."""
+    if not hasattr(type(learner), "converged"):
+        return
+    found = getattr(learner, "converged")  # noqa: B009 - no verb of Learner
+    _require(
+        isinstance(found, Tensor) and found.dtype == torch.bool and tuple(found.shape) == (len(data.seeds),),
+        f"converged must be one bool a repeat, shape ({len(data.seeds)},)",
+    )
 
 
 def _check_padding(factory: Callable[[], Learner], data: TrainingData) -> None:

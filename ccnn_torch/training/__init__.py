@@ -7,5 +7,6 @@ from ccnn_torch.training._checkpoint import tensor_digest as tensor_digest
 from ccnn_torch.training._checkpoint import write_whole as write_whole
 from ccnn_torch.training._scaling import Scaling as Scaling
 from ccnn_torch.training._trainer import Training as Training
+from ccnn_torch.training._trainer import past_of as past_of
 from ccnn_torch.training._trainer import train as train
 from ccnn_torch.training._trainer import weighted_mse as weighted_mse

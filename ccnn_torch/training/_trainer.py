@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners._protocol import Learner, TrainingData
 from ccnn_torch.training._callbacks import Callback
 from ccnn_torch.training._checkpoint import load_checkpoint, save_checkpoint
 
-__all__ = ["Training", "train", "weighted_mse"]
+__all__ = ["Training", "past_of", "train", "weighted_mse"]
 
 
 @dataclass
@@ -29,6 +30,10 @@ class Training:
         best_validation: validation error of that state, `r` (mean square of standardised outputs); inf without any.
         history: metrics by name, `steps x r [x k]`.
         seconds: time spent inside the learner.
+        clock: the same after each step, `steps` [s].
+        converged: what the learner says of itself after its last step, before the chosen state is taken, `r` bool; a
+            training that was ended before the learner's own end counts as converged. None = it does not say.
+        ended: false where the budget ended it before the learner, `stop_at` or `patience` did.
     """
 
     step: int
@@ -36,6 +41,9 @@ class Training:
     best_validation: Tensor
     history: dict[str, Tensor] = field(default_factory=dict)
     seconds: float = 0.0
+    clock: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
+    converged: Tensor | None = None
+    ended: bool = True
 
 
 def weighted_mse(predicted: Tensor, targets: Tensor, weights: Tensor) -> Tensor:
@@ -53,6 +61,8 @@ def train(
     every: int = 20,
     patience: int | None = None,
     stop_at: Tensor | None = None,
+    folds: int = 1,
+    budget: float | None = None,
 ) -> Training:
     """Drive a learner to its end and leave it in the chosen state of every repeat.
 
@@ -60,17 +70,26 @@ def train(
     once no repeat has improved for `patience` steps. With `stop_at`, each repeat is left in the state after that many
     steps (a refit on all rows for as long as validation found best). Else the last state stays.
 
+    Callbacks see the seconds inside the learner so far as the metric `seconds`, `r`; the history does not keep it, as
+    it differs from run to run (`Training.clock` has it).
+
     Args:
         checkpoint: file to write every `every` steps and before the first; if it is there, the training goes on from
             it and ends in the same tensors as one that was never stopped.
         stop_at: steps of each repeat, `r` int64.
+        folds: so many neighbouring repeats are the folds of one: they share the step of their lowest mean validation
+            error.
+        budget: seconds inside the learner after which no further step begins.
 
     Raises:
         InputError: the checkpoint is damaged or belongs to other data.
+        MethodFailedError: the learner cannot go on.
     """
-    learner.start(data)
+    began = time.perf_counter()
+    with _told(learner, "at the start"):
+        learner.start(data)
     repeats = data.inputs.shape[0]
-    run = _Run(learner, data, repeats, patience, stop_at)
+    run = _Run(learner, data, repeats, patience, stop_at, folds, time.perf_counter() - began)
     if checkpoint is not None and checkpoint.exists():
         run.restore(checkpoint)
     elif checkpoint is not None:
@@ -78,10 +97,13 @@ def train(
     for callback in callbacks:
         callback.on_start(learner, data, run.step)
     try:
-        while not run.done:
-            metrics = run.advance()
+        while not run.done and (budget is None or run.seconds < budget):
+            with _told(learner, f"in step {run.step + 1}"):
+                metrics = run.advance()
+            metrics["seconds"] = torch.full((repeats,), run.seconds, dtype=torch.float64)
             for callback in callbacks:
                 callback.on_step(run.step, metrics)
+            del metrics["seconds"]
             run.note(metrics)
             if checkpoint is not None and run.step % every == 0:
                 run.save(checkpoint)
@@ -98,11 +120,20 @@ class _Run:
     states of different steps can be mixed, one step a repeat."""
 
     def __init__(
-        self, learner: Learner, data: TrainingData, repeats: int, patience: int | None, stop_at: Tensor | None
+        self,
+        learner: Learner,
+        data: TrainingData,
+        repeats: int,
+        patience: int | None,
+        stop_at: Tensor | None,
+        folds: int,
+        seconds: float,
     ) -> None:
         self.learner, self.data, self.patience, self.stop_at = learner, data, patience, stop_at
+        self.folds = folds
         self.step = 0
-        self.seconds = 0.0
+        self.seconds = seconds
+        self.clock: list[float] = []
         device = data.inputs.device
         self.best_step = torch.zeros(repeats, dtype=torch.int64, device=device)
         self.best_validation = torch.full((repeats,), torch.inf, dtype=data.inputs.dtype, device=device)
@@ -134,6 +165,7 @@ class _Run:
             held = self.data.validation
             error = weighted_mse(self.learner.predict(held.inputs), held.targets, held.weights)
             metrics["error_validation"] = error
+            error = error.view(-1, self.folds).mean(1).repeat_interleave(self.folds)
             improved = error < self.best_validation
             if self.patience is not None:
                 # A repeat that would have stopped by itself takes nothing more, whatever runs beside it.
@@ -146,13 +178,30 @@ class _Run:
 
     def note(self, metrics: dict[str, Tensor]) -> None:
         self.history.append({name: value.detach().clone() for name, value in metrics.items()})
+        self.clock.append(self.seconds)
 
     def finish(self) -> Training:
+        if self.stop_at is not None and bool((self.stop_at > self.step).any()):
+            # The learner ended by itself before it came so far: its last state is the nearest one.
+            self._keep(self.stop_at > self.step)
+        ended, converged = self.done, getattr(self.learner, "converged", None)
+        if converged is not None:
+            converged = converged.clone() if self.learner.finished else torch.ones_like(converged)
         if self.chooses:
             self.learner.load_state_dict({name: value.clone() for name, value in self.kept.items()})
         else:
             self.best_step = torch.full_like(self.best_step, self.step)
-        return Training(self.step, self.best_step, self.best_validation, _stack(self.history), self.seconds)
+        clock = torch.tensor(self.clock, dtype=torch.float64)
+        return Training(
+            self.step,
+            self.best_step,
+            self.best_validation,
+            _stack(self.history),
+            self.seconds,
+            clock,
+            converged,
+            ended,
+        )
 
     def save(self, path: Path) -> None:
         tensors = {f"state.{name}": value for name, value in self.learner.state_dict().items()}
@@ -160,7 +209,9 @@ class _Run:
         tensors |= {"best_step": self.best_step, "best_validation": self.best_validation}
         if self.chooses:
             tensors |= {f"kept.{name}": value for name, value in self.kept.items()}
-        save_checkpoint(path, tensors, {**self._identity(), "step": self.step, "seconds": self.seconds})
+        save_checkpoint(
+            path, tensors, {**self._identity(), "step": self.step, "seconds": self.seconds, "clock": self.clock}
+        )
 
     def restore(self, path: Path) -> None:
         tensors, about = load_checkpoint(path)
@@ -177,7 +228,7 @@ class _Run:
         self.best_step, self.best_validation = tensors["best_step"], tensors["best_validation"]
         if self.chooses:
             self.kept = _part(tensors, "kept.")
-        self.step, self.seconds = int(about["step"]), float(about["seconds"])
+        self.step, self.seconds, self.clock = int(about["step"]), float(about["seconds"]), list(about["clock"])
         history = _part(tensors, "history.")
         self.history = [{name: value[i] for name, value in history.items()} for i in range(self.step)]
 
@@ -202,6 +253,27 @@ class _Run:
                 chosen = improved.view(-1, *([1] * (value.dim() - 1)))
                 self.kept[name] = torch.where(chosen, value, self.kept[name])
         self.best_step = torch.where(improved, torch.full_like(self.best_step, self.step), self.best_step)
+
+
+def past_of(path: Path) -> tuple[dict[str, Tensor], Tensor]:
+    """The history that a checkpoint holds, metrics `steps x r [x k]`, and the seconds after each step, `steps`.
+
+    Raises:
+        InputError: the checkpoint is damaged.
+    """
+    tensors, about = load_checkpoint(path)
+    return _part(tensors, "history."), torch.tensor(about["clock"], dtype=torch.float64)
+
+
+@contextmanager
+def _told(learner: Learner, when: str) -> Iterator[None]:
+    """A factorisation that fails inside a learner is the learner's failure, not the run's."""
+    try:
+        yield
+    except torch.linalg.LinAlgError as problem:  # type: ignore[attr-defined]
+        # Its first line says what; the others are for those who call the routine.
+        sentence = str(problem).splitlines()[0].removeprefix("linalg.")
+        raise MethodFailedError(f"{learner.name} met a matrix that cannot be factorised {when} ({sentence})") from None
 
 
 def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

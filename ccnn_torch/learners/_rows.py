@@ -1,0 +1,27 @@
+"""Training rows without what stands in padded ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.learners._protocol import TrainingData
+
+__all__ = ["usable_rows"]
+
+
+def usable_rows(data: TrainingData) -> TrainingData:
+    """The same rows with zeros in those of weight 0, which may hold anything, NaN included.
+
+    Raises:
+        MethodFailedError: a row that counts is not finite.
+    """
+    there = (data.weights > 0).unsqueeze(-1)
+    inputs, targets = (torch.where(there, part, 0.0) for part in (data.inputs, data.targets))
+    metric = None if data.metric is None else torch.where(there.unsqueeze(-1), data.metric, 0.0)
+    for part, name in ((inputs, "inputs"), (targets, "outputs"), (metric, "metric")):
+        if part is not None and not bool(part.isfinite().all()):
+            raise MethodFailedError(f"the training rows' {name} are not all finite; remove those rows")
+    return replace(data, inputs=inputs, targets=targets, metric=metric)

@@ -1,0 +1,65 @@
+"""What a table is, and how it is shown on a terminal that may be too narrow for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+__all__ = ["Table", "print_table"]
+
+_LONGEST_NAME = 28
+
+
+@dataclass(frozen=True)
+class Table:
+    """Title, column headers, rows of text (one entry a column), and a sentence below."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+
+def print_table(table: Table, console: Console) -> None:
+    """Show a table, in parts where the terminal is too narrow; each part repeats the first column."""
+    # Measured as on a terminal without an edge: a width is else never more than there is.
+    wide = console.options.update(max_width=10_000)
+    parts: list[list[int]] = [[0]]
+    for column in range(1, len(table.columns)):
+        wider = [*parts[-1], column]
+        fits = console.measure(_shown(table, wider), options=wide).maximum <= console.width
+        if fits or len(parts[-1]) == 1:
+            parts[-1] = wider
+        else:
+            parts.append([0, column])
+    for i, part in enumerate(parts):
+        # Beside the table, not in it: a title or a note is then as wide as the terminal, not as a narrow part.
+        console.print(escape(table.title + (", continued" if i else "")), style="bold")
+        console.print(_shown(table, part))
+    if table.note:
+        console.print(escape(table.note), style="italic dim")
+
+
+def _shown(table: Table, columns: Sequence[int]) -> RichTable:
+    shown = RichTable()
+    for i in columns:
+        shown.add_column(
+            escape(table.columns[i]), justify="right" if i else "left", overflow="fold", max_width=_width(table, i)
+        )
+    for row in table.rows:
+        # The interval below its median: three such columns then fit into 80 characters.
+        shown.add_row(*(escape(row[i].replace(" [", "\n[") if i else row[i]) for i in columns))
+    return shown
+
+
+def _width(table: Table, column: int) -> int:
+    """Room for what may not be broken: numbers, and words of the header; a long name is broken between words."""
+    cells = [row[column] for row in table.rows]
+    if column == 0:
+        return min(_LONGEST_NAME, max(len(cell) for cell in (table.columns[0], *cells)))
+    parts = [part for cell in cells for part in cell.replace(" [", "\n[").split("\n")]
+    return max(len(part) for part in (*table.columns[column].replace(" [", "\n[").split(), *parts))

@@ -1,0 +1,4 @@
+"""The learners as scikit-learn regressors."""
+
+from ccnn_torch.sklearn._regressors import CCNNRegressor as CCNNRegressor
+from ccnn_torch.sklearn._regressors import GRNNRegressor as GRNNRegressor

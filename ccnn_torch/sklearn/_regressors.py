@@ -1,0 +1,141 @@
+"""The estimators: one class a learner, its most useful settings as parameters under their own names.
+
+Where a default is not that of the settings, it is for speed: cross-validation and searches fit many times, so that an
+estimator with its defaults fits a few hundred rows in well under a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.learners.grnn import GRNN, GRNNSettings
+from ccnn_torch.sklearn._base import LearnerRegressor, SteppedRegressor
+
+__all__ = ["CCNNRegressor", "GRNNRegressor"]
+
+
+class CCNNRegressor(SteppedRegressor):
+    """Cooperative coevolution of a masked network's layers, refined by Levenberg-Marquardt (paper 000, section III).
+
+    The settings themselves, and so a run, have by default population=80, generations=30, members=6 and refine_every=10,
+    which takes about ten times as long and predicts somewhat better. All settings:
+    `ccnn_torch.learners.ccnn.CCNNSettings`.
+
+    Args:
+        hidden: nodes of each hidden layer; a number is one layer.
+        population: individuals of each subpopulation, one a layer.
+        generations: steps.
+        members: independent coevolutions, whose networks are averaged.
+        refine_every: generations between refinements; 0 = only after the last.
+        refinement_iterations: Levenberg-Marquardt iterations of one refinement; 0 = none, as in the paper.
+        crossover, structural_mutation, weight_mutation: probabilities of the operators.
+        density: share of connections that exist at the start.
+        weight_range: weights start and mutate in -weight_range .. weight_range.
+        bias: whether nodes have a bias.
+        periodic: inputs that are angles in rad, by index or by name, to be fed as sine and cosine.
+        early_stopping: hold rows out, find the step of the lowest error on them, then train on all rows for so long.
+        validation_fraction: share of the rows that are then held out.
+        n_iter_no_change: steps without improvement after which that search ends; None = go to the end.
+        random_state: seed, or a RandomState to draw it from; None = draw it from NumPy's global generator.
+
+    Attributes:
+        network_: the trained network, on scaled inputs and outputs.
+        scaling_: that scaling.
+        n_iter_: steps of the model.
+        loss_curve_: mean squared standardised error on the training rows after each of them.
+        validation_curve_: with early_stopping, that on the rows held out, after each step of the search.
+        converged_: whether the learner's own criterion was met; None where it has none.
+        n_features_in_, feature_names_in_: as in scikit-learn.
+    """
+
+    _learner = CCNN
+    _settings = CCNNSettings
+
+    def __init__(
+        self,
+        *,
+        hidden: int | Sequence[int] = (12, 12),
+        population: int = 40,
+        generations: int = 10,
+        members: int = 2,
+        refine_every: int = 0,
+        refinement_iterations: int = 20,
+        crossover: float = 0.72,
+        structural_mutation: float = 0.0015,
+        weight_mutation: float = 0.0025,
+        density: float = 0.5,
+        weight_range: float = 2.0,
+        bias: bool = True,
+        periodic: Sequence[int | str] | None = None,
+        early_stopping: bool = False,
+        validation_fraction: float = 0.2,
+        n_iter_no_change: int | None = None,
+        random_state: Any = 0,
+    ) -> None:
+        self.hidden = hidden
+        self.population = population
+        self.generations = generations
+        self.members = members
+        self.refine_every = refine_every
+        self.refinement_iterations = refinement_iterations
+        self.crossover = crossover
+        self.structural_mutation = structural_mutation
+        self.weight_mutation = weight_mutation
+        self.density = density
+        self.weight_range = weight_range
+        self.bias = bias
+        self.periodic = periodic
+        self.early_stopping = early_stopping
+        self.validation_fraction = validation_fraction
+        self.n_iter_no_change = n_iter_no_change
+        self.random_state = random_state
+
+
+class GRNNRegressor(LearnerRegressor):
+    """Kernel regression (Specht's general regression neural network), one bandwidth per input found by leave-one-out.
+
+    Defaults are those of `ccnn_torch.learners.grnn.GRNNSettings`, where all settings are.
+
+    Args:
+        iterations: steps of the search at most; it ends earlier once its moves are small.
+        candidates: bandwidth vectors judged in one step.
+        narrowest, widest: range of bandwidths that the first step looks at; inputs are scaled to -1 .. 1.
+        queries: rows that leave-one-out judges, drawn where there are more.
+        references: rows that they are predicted from, drawn where there are more.
+        periodic: inputs that are angles in rad, by index or by name, to be fed as sine and cosine.
+        random_state: seed, or a RandomState to draw it from; None = draw it from NumPy's global generator.
+
+    Attributes:
+        network_: the trained network with its rows, on scaled inputs and outputs.
+        scaling_: that scaling.
+        n_iter_: steps of the search.
+        loss_curve_: mean squared standardised error on the training rows after each of them.
+        converged_: whether the search ended by itself.
+        n_features_in_, feature_names_in_: as in scikit-learn.
+    """
+
+    _learner = GRNN
+    _settings = GRNNSettings
+
+    def __init__(
+        self,
+        *,
+        iterations: int = 30,
+        candidates: int = 32,
+        narrowest: float = 0.02,
+        widest: float = 5.0,
+        queries: int = 500,
+        references: int = 2000,
+        periodic: Sequence[int | str] | None = None,
+        random_state: Any = 0,
+    ) -> None:
+        self.iterations = iterations
+        self.candidates = candidates
+        self.narrowest = narrowest
+        self.widest = widest
+        self.queries = queries
+        self.references = references
+        self.periodic = periodic
+        self.random_state = random_state

@@ -1,0 +1,73 @@
+"""The network of every learner, variance included, goes through a compensator into model files and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from stand_ins import fields, tripod_joints
+from torch import Tensor, nn
+
+from ccnn_torch.compensation import FORMS, fit_compensator, load_model, save_model
+from ccnn_torch.compensation._export import to_onnx
+from ccnn_torch.compensation._networks import describe_network, network_from_description
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.learners import Learner, TrainingData
+from ccnn_torch.learners.constant import Constant
+from ccnn_torch.learners.grnn import GRNN, GRNNSettings
+from ccnn_torch.training import Scaling, train
+
+LEARNERS: dict[str, Callable[[], Learner]] = {
+    "constant": Constant,
+    "grnn": lambda: GRNN(GRNNSettings(iterations=4, candidates=9)),
+}
+
+
+class _Variance(nn.Module):
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, features: Tensor) -> Tensor:
+        variance: Callable[[Tensor], Tensor] = getattr(self.network, "variance")  # noqa: B009 - no method of Module
+        return variance(features)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_trained_model_goes_into_files_and_back(name: str, tmp_path: Path) -> None:
+    joints = tripod_joints(60)
+    generator = torch.Generator().manual_seed(4)
+    deviations = 1e-4 * torch.sin(8 * joints) + 1e-5 * torch.randn(joints.shape, generator=generator).double()
+    rows = torch.ones(1, len(joints), dtype=torch.float64)
+    scaling = Scaling.fit(joints[None], deviations[None], rows, torch.zeros(3, dtype=torch.bool))
+    data = TrainingData(
+        scaling.features(joints[None]), scaling.standardise(deviations[None]), rows, torch.arange(1000, 1001)
+    )
+    learner = LEARNERS[name]()
+    train(learner, data)
+    network = learner.network(0)
+    names = [Coordinate(f"q{i}", "m") for i in (1, 2, 3)]
+    compensator = fit_compensator(network, scaling.repeat(0), joints, deviations, names)
+    # Each file is compared with the eager model as it is written; masked networks have their own tests of all forms.
+    forms = FORMS if name == "grnn" else ("safetensors", "onnx")
+    paths = save_model(tmp_path, compensator, fields(), forms=forms)
+    assert set(paths) == {*forms, "card"}
+    master = load_model(paths["safetensors"])
+    expected = compensator.solve(joints)
+    np.testing.assert_allclose(master(joints.numpy())["command"], expected.command.detach().numpy(), rtol=0, atol=1e-15)
+    # The description and the tensors alone give the same module, variance included, in double in ONNX Runtime too.
+    again = network_from_description(describe_network(network))
+    again.load_state_dict(network.state_dict())
+    features = data.inputs[0] * 1.3
+    wanted = _Variance(network)(features).detach()
+    assert torch.equal(again(features), network(features))
+    assert torch.equal(_Variance(again)(features), wanted)
+    model = to_onnx(_Variance(network).eval(), (features,), ["variance"], 20, "{}")
+    session = onnxruntime.InferenceSession(model.SerializeToString())
+    (found,) = session.run(None, {entry.name: features.numpy() for entry in session.get_inputs()})
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, wanted.numpy(), rtol=1e-9)

@@ -1,0 +1,173 @@
+"""Methods side by side in one run: curves on one axis, effort to the same error, tables that fit a terminal."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_run import short
+
+from ccnn_torch.report.arrays import load_history
+from ccnn_torch.report.csv_file import tidy_rows
+from ccnn_torch.report.json_files import load_schema
+from ccnn_torch.report.plots import progress_plot
+from ccnn_torch.report.reach import reach_block
+from ccnn_torch.report.tables import print_tables, result_tables
+from ccnn_torch.runs import start_run
+
+COUNTING = """
+import importlib.util
+import torch
+
+spec = importlib.util.spec_from_file_location("toy_for_comparison", {toy!r})
+toy = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(toy)
+
+
+class Line(toy.Descent):
+    '''A line by descent, one pass of the rows a step.'''
+
+    def step(self):
+        found = super().step()
+        return found | {{"evaluations": torch.full_like(found["error_train"], int(self._step))}}
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three methods, to be read only."""
+    folder = tmp_path_factory.mktemp("comparison")
+    learner = folder / "line.py"
+    learner.write_text(COUNTING.format(toy=str(Path(__file__).parent / "toy.py")))
+    methods = ["ccnn", f"{learner}:Line", "constant"]
+    made = short(out=str(folder / "run"), repeats=3, methods=methods, save_models=False)
+    return start_run(made, quiet=True).path
+
+
+@pytest.fixture
+def results(run: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((run / "results.json").read_text())
+    return found
+
+
+def test_every_methods_folder_has_the_same_tags_for_what_is_compared(run: Path) -> None:
+    for method in ("ccnn", "Line"):
+        events = EventAccumulator(str(run / "tensorboard" / method), size_guidance={"scalars": 0}).Reload()
+        history = load_history(run / f"history-{method}.safetensors")
+        tags = events.Tags()["scalars"]
+        for tag in ("heldout/mse_all", "error/train", "training/evaluations", "training/seconds"):
+            assert tag in tags, (method, tag)
+        curve = np.median(history["heldout_mse_all"], axis=1)
+        by_evaluations = events.Scalars("by_evaluations/heldout_mse_all")
+        assert [s.step for s in by_evaluations] == list(np.median(history["evaluations"], axis=1))
+        assert [s.value for s in by_evaluations] == pytest.approx(list(curve), rel=1e-6)
+        milliseconds = 1000 * history["seconds"].sum(axis=1)
+        by_time = events.Scalars("by_time/heldout_mse_all")
+        assert [s.step for s in by_time] == [round(v) for v in milliseconds]
+        elapsed = [s.wall_time - by_time[0].wall_time for s in by_time]
+        assert elapsed == pytest.approx(list((milliseconds - milliseconds[0]) / 1000), abs=1e-3)
+    constant = EventAccumulator(str(run / "tensorboard" / "constant")).Reload().Tags()["scalars"]
+    assert {"heldout/mse_all", "by_time/heldout_mse_all", "training/seconds"} <= set(constant)
+
+
+def test_results_hold_the_schema_and_tell_the_effort(run: Path, results: dict[str, Any]) -> None:
+    jsonschema.validate(results, load_schema("results"))
+    reach = results["reach"]
+    assert set(reach["methods"]) == {"ccnn", "Line", "constant"} and reach["set_by"] in ("ccnn", "Line")
+    # The lowest point of the worse of the two, found again in its curve.
+    curves = {
+        name: np.median(load_history(run / f"history-{name}.safetensors")["heldout_mse_all"], axis=1)
+        for name in ("ccnn", "Line")
+    }
+    assert reach["level"] == max(curve.min() for curve in curves.values())
+    for name, curve in curves.items():
+        step = reach["methods"][name]["step"]
+        assert curve[step - 1] <= reach["level"] and (curve[: step - 1] > reach["level"]).all()
+        assert reach["methods"][name]["seconds"] > 0
+    assert reach["methods"]["constant"] is None
+    for name in ("ccnn", "Line", "constant"):
+        block = results["methods"][name]
+        assert block["pose"]["position"]["unit"] == "m" and block["pose"]["rotation"]["rms"]["median"] > 0
+    best = results["best_method"]
+    assert results["methods"][best]["pose"]["position"]["rms"] == results["pose"]["position"]["after"]["rms"]
+    assert (run / "plots" / "progress.svg").is_file()
+    assert "Effort to reach the same held-out error" in (run / "results.md").read_text()
+    assert '<figure id="progress">' in (run / "report.html").read_text()
+
+
+def history(errors: list[float], seconds: float, evaluations: float | None) -> dict[str, np.ndarray]:
+    """Three repeats about a median curve."""
+    steps = np.arange(1.0, len(errors) + 1)[:, None]
+    curve = np.array(errors)[:, None] * np.array([[0.5, 1.0, 3.0]])
+    found = {"heldout_mse_all": curve, "seconds": steps * seconds * np.ones(3)}
+    return found if evaluations is None else found | {"evaluations": steps * evaluations * np.ones(3)}
+
+
+def test_the_effort_of_made_up_curves() -> None:
+    found = reach_block(
+        {
+            "quick": history([9, 3, 2, 4], 0.1, 10),
+            "good": history([9, 8, 7, 2, 1], 1.0, 100),
+            "worst": history([8, 5, 4, 2.5], 2.0, None),
+            "constant": history([2.6], 0.01, 1),
+        }
+    )
+    assert found is not None and (found["level"], found["set_by"]) == (2.5, "worst")
+    assert found["methods"]["quick"] == {"step": 3, "seconds": pytest.approx(0.3), "evaluations": 30}
+    assert found["methods"]["good"] == {"step": 4, "seconds": 4.0, "evaluations": 400}
+    assert found["methods"]["worst"] == {"step": 4, "seconds": 8.0, "evaluations": None}
+    assert found["methods"]["constant"] is None
+    assert reach_block({"constant": history([1], 1, 1)}) is None
+    assert reach_block({"ccnn": history([1], 1, 1)}) is None
+    assert reach_block({"ccnn": {"seconds": np.ones((1, 1))}, "enn": {"seconds": np.ones((1, 1))}}) is None
+
+
+def test_the_effort_of_made_up_curves_as_a_table(results: dict[str, Any]) -> None:
+    made = reach_block(
+        {"ccnn": history([9, 3], 0.25, 10), "Line": history([5, 4], 2.0, None), "constant": history([6], 1, 1)}
+    )
+    table = next(t for t in result_tables(results | {"reach": made}) if t.title.startswith("Effort"))
+    assert table.rows == (("ccnn", "2", "0.500", "20"), ("Line", "2", "4.00", "–"), ("constant", *["never"] * 3))
+    assert "4.000 m² or less, the lowest that Line reaches" in table.note
+
+
+def test_what_is_plotted_needs_two_methods() -> None:
+    curves = {"a": history([3, 2], 1, 10), "b": history([2, 1], 2, None)}
+    plot = progress_plot(curves, floor=0.5, constant=2.5, unit="m")
+    assert plot is not None and len(plot.figure.axes) == 2
+    time, evaluations = plot.figure.axes
+    assert len(time.lines) == 6 and len(evaluations.lines) == 4
+    assert time.get_xscale() == time.get_yscale() == "log"
+    assert progress_plot({"a": history([3], 1, 1)}) is None
+
+
+@pytest.mark.parametrize("width", [80, 110])
+def test_tables_fit_the_terminal_without_folding_numbers(results: dict[str, Any], width: int) -> None:
+    screen = io.StringIO()
+    print_tables(results, Console(file=screen, width=width))
+    lines = screen.getvalue().splitlines()
+    assert max(len(line) for line in lines) <= width
+    mse = next(table for table in result_tables(results) if table.title.startswith("Mean squared"))
+    text = " ".join(lines)
+    for row in mse.rows:
+        for cell in row[1:]:
+            for part in cell.replace(" [", "\n[").split("\n"):
+                assert part in text, part
+
+
+def test_the_main_table_has_papers_figures_beside_and_one_constant(results: dict[str, Any]) -> None:
+    mse = next(table for table in result_tables(results) if table.title.startswith("Mean squared"))
+    names = [row[0] for row in mse.rows]
+    assert names[:2] == ["ccnn", "ccnn, paper's Table II"] and names.count("constant") == 1
+    assert mse.columns[-3:] == ("ratio to floor [1]", "coverage of 95 % [1]", "time [s]")
+    rows = {(row[0], row[2], row[3]) for row in tidy_rows(results)}
+    assert {("Line", "sd", "q1"), ("Line", "coverage", ""), ("constant", "seconds", "")} <= rows
+    keys = [row[:4] for row in tidy_rows(results)]
+    assert len(set(keys)) == len(keys)

@@ -1,0 +1,103 @@
+"""A learner that fails, or does not converge, is told by name and never takes the run down."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from test_run import short
+
+from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.report.json_files import load_schema, plain
+from ccnn_torch.report.tables import failures, markdown_text
+from ccnn_torch.runs import calibrate
+
+LEARNERS = '''
+import torch
+from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.learners.constant import Constant
+
+
+class GivesUp(Constant):
+    """Cannot go on."""
+
+    def step(self):
+        raise MethodFailedError("the curvature is not finite")
+
+
+class Singular(Constant):
+    """Meets a singular matrix."""
+
+    def step(self):
+        torch.linalg.inv(torch.zeros(2, 2))
+
+
+class NotANumber(Constant):
+    """Ends in numbers that are not finite, in its second repeat."""
+
+    def predict(self, inputs):
+        found = super().predict(inputs).clone()
+        found[1:] = torch.nan
+        return found
+
+
+class Descending(Constant):
+    """Says that two of its repeats have not converged."""
+
+    @property
+    def converged(self):
+        return torch.arange(len(self._value)) > 1
+
+
+class Bug(Constant):
+    """Has a plain mistake."""
+
+    def step(self):
+        return self.nothing
+'''
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "mine.py"
+    path.write_text(LEARNERS)
+    return path
+
+
+def run(file: Path, *names: str, **keys: Any) -> dict[str, Any]:
+    return calibrate(short(methods=[f"{file}:{name}" for name in names] + ["constant"], repeats=3, **keys)).results
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [{}, {"training": {"early_stop": True}, "split": {"test": 0.2, "validation": 0.2}}, {"training": {"folds": 3}}],
+)
+def test_what_fails_is_told_and_the_others_go_on(file: Path, keys: dict[str, Any]) -> None:
+    results = run(file, "GivesUp", "Singular", "NotANumber", **keys)
+    methods = results["methods"]
+    assert methods["GivesUp"] == {"test": None, "failed": "the curvature is not finite"}
+    assert methods["Singular"]["failed"].startswith("constant met a matrix that cannot be factorised in step 1 (inv: ")
+    assert "not finite" in methods["NotANumber"]["failed"]
+    assert methods["constant"]["test"]["all"]["mse"]["median"] > 0
+    assert len(failures(results)) == 3
+    jsonschema.validate(plain(results), load_schema("results"))
+
+
+def test_when_all_fail_the_run_says_why(file: Path) -> None:
+    with pytest.raises(MethodFailedError, match="GivesUp: the curvature is not finite; Singular: "):
+        calibrate(short(methods=[f"{file}:GivesUp", f"{file}:Singular"]))
+
+
+def test_a_mistake_in_a_learner_is_not_hidden(file: Path) -> None:
+    with pytest.raises(AttributeError, match="nothing"):
+        run(file, "Bug")
+
+
+def test_what_did_not_converge_is_marked_in_the_tables(file: Path) -> None:
+    results = run(file, "Descending")
+    assert results["methods"]["Descending"]["converged"]["values"] == [0.0, 0.0, 1.0]
+    assert results["methods"]["constant"]["converged"] is None
+    text = markdown_text(results)
+    assert "| Descending (2 of 3 repeats not converged) |" in text and "| constant |" in text

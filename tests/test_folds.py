@@ -1,0 +1,111 @@
+"""Cross-validation: folds as repeats of one training give what they give one by one."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_uncertainty import linear_dataset
+from toy import Descent
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.runs.choosing import Plan, choose, fold_dataset
+from ccnn_torch.runs.fitting import fit_method
+from ccnn_torch.splits import Split, fold_splits, split_rows
+from ccnn_torch.training import train, weighted_mse
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    kind=st.sampled_from(["random", "group", "block"]),
+    rows=st.integers(40, 90),
+    folds=st.integers(2, 6),
+    seed=st.integers(0, 99),
+)
+def test_every_training_row_is_held_out_once_and_groups_stay_whole(kind: str, rows: int, folds: int, seed: int) -> None:
+    positions = torch.rand(rows, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    group = torch.arange(rows) % 24
+    by = None if kind == "random" else "which"
+    split = split_rows(positions, kind, by, {"which": group.double()}, 0.3, 0.2, seed)
+    parts = fold_splits(split, kind, folds, seed)
+    kept = torch.cat([split.train, split.validation]).sort().values
+    assert torch.equal(torch.cat([part.validation for part in parts]).sort().values, kept)
+    for part in parts:
+        assert torch.equal(torch.cat([part.train, part.validation]).sort().values, kept)
+        assert torch.equal(part.test, split.test)
+        if kind != "random":
+            assert not set(group[part.train].tolist()) & set(group[part.validation].tolist())
+    again = fold_splits(split, kind, folds, seed)
+    assert all(torch.equal(a.validation, b.validation) for a, b in zip(parts, again, strict=True))
+
+
+def test_the_folds_of_a_block_split_are_blocks() -> None:
+    positions = torch.stack([torch.linspace(0, 1, 100, dtype=torch.float64)] * 3, -1)
+    split = split_rows(positions, "block", "position:1mm", {}, 0.3, 0.2)
+    blocks = [part.validation for part in fold_splits(split, "block", 5, 0)]
+    assert [int(block[-1] - block[0]) + 1 for block in blocks] == [len(block) for block in blocks] == [14] * 5
+    with pytest.raises(InputError, match="70 groups cannot be dealt to 71 folds"):
+        fold_splits(split, "block", 71, 0)
+
+
+def test_folds_side_by_side_are_those_run_one_by_one() -> None:
+    dataset = linear_dataset(repeats=2, train=40, held=11, test=20)
+    small = CCNNSettings(hidden=(3,), population=8, generations=6, members=1, refinement_iterations=0)
+    together = CCNN(small)
+    plan = Plan(True, None, 20, folds=4)
+    folded = fold_dataset(dataset, "random", 4)
+    data, _ = folded.scaled("train", True)
+    training = train(together, data, folds=4)
+    errors = training.history["error_validation"]
+    assert errors.shape == (6, 8)
+    for k in range(8):
+        alone = dataclasses.replace(
+            folded, deviation=folded.deviation[k : k + 1], usable=folded.usable[k : k + 1],
+            splits=folded.splits[k : k + 1], seeds=folded.seeds[k : k + 1],
+        )  # fmt: skip
+        single = train(CCNN(small), alone.scaled("train", True)[0])
+        assert torch.allclose(single.history["error_validation"][:, 0], errors[:, k], rtol=1e-9)
+    # The folds of a repeat share one step, that of their lowest mean error, and are left in their states there.
+    best = errors.view(6, 2, 4).mean(2).argmin(0) + 1
+    assert torch.equal(training.best_step.view(2, 4), best.unsqueeze(1).expand(2, 4))
+    held = data.validation
+    assert held is not None
+    reached = weighted_mse(together.predict(held.inputs), held.targets, held.weights)
+    assert torch.allclose(reached, errors.gather(0, (training.best_step - 1).unsqueeze(0))[0], rtol=1e-12)
+    choice = choose("ccnn", lambda: CCNN(small), dataset, plan, None, lambda *_: [])
+    assert choice is not None and torch.equal(choice.best_step, best)
+    assert torch.allclose(choice.errors, reached.view(2, 4), rtol=1e-12)
+    counted = training.history["evaluations"][-1].double().view(2, 4).sum(1)
+    assert choice.evaluations is not None and torch.equal(choice.evaluations, counted)
+    fitted = fit_method("ccnn", lambda: CCNN(small), dataset, plan, None, lambda *_: [])
+    assert torch.equal(fitted.training.best_step, best) and torch.equal(fitted.score, choice.best_validation)
+
+
+def test_without_early_stopping_folds_judge_the_learners_end() -> None:
+    dataset = linear_dataset(repeats=2)
+    choice = choose("toy", Descent, dataset, Plan(False, None, 20, folds=3), None, lambda *_: [])
+    assert choice is not None and choice.best_step.tolist() == [30, 30] and choice.errors.shape == (2, 3)
+    plain = fit_method("toy", Descent, dataset, Plan(False, None, 20), None, lambda *_: [])
+    folded = fit_method("toy", Descent, dataset, Plan(False, None, 20, folds=3), None, lambda *_: [])
+    inputs = dataset.inputs.expand(2, -1, -1)
+    assert torch.equal(plain.predict(inputs), folded.predict(inputs))
+    assert not torch.equal(plain.score, folded.score)
+
+
+def test_a_budget_ends_a_training_between_two_steps() -> None:
+    dataset = linear_dataset(repeats=2)
+    plan = Plan(True, None, 20)
+    assert choose("toy", Descent, dataset, plan, None, lambda *_: [], budget=0.0) is None
+    choice = choose("toy", Descent, dataset, plan, None, lambda *_: [], budget=1e-9)
+    assert choice is None
+    whole = choose("toy", Descent, dataset, plan, None, lambda *_: [], budget=1e9)
+    assert whole is not None and whole.ended and whole.step == 30
+
+
+def test_rows_that_stand_for_themselves_have_no_groups() -> None:
+    assert split_rows(torch.zeros(20, 3), "random").groups is None
+    assert Split(torch.arange(3), torch.arange(3, 4), torch.arange(4, 5)).groups is None
