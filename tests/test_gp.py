@@ -254,7 +254,7 @@ def test_a_repeat_without_a_cholesky_factor_is_a_constant_and_the_others_are_not
 def test_rows_that_are_no_numbers_are_refused() -> None:
     data = wavy(2, 30)
     data.inputs[1, 4, 0] = torch.nan
-    with pytest.raises(MethodFailedError, match="finite numbers"):
+    with pytest.raises(MethodFailedError, match="not all finite"):
         GaussianProcess().start(data)
 
 

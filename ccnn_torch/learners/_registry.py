@@ -10,8 +10,8 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.learners._protocol import Learner, missing_verbs
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
 from ccnn_torch.learners.constant import Constant
-from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.learners.gp import GaussianProcess, GPSettings
+from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.plugins import is_plugin, load_plugin
 
 __all__ = ["LEARNERS", "make_learner"]

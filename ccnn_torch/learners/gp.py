@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.learners._gp_posterior import GPNetwork, covariance, spread_factor
 from ccnn_torch.learners._protocol import TrainingData
+from ccnn_torch.learners._rows import usable_rows
 
 if TYPE_CHECKING:
     from ccnn_torch.learners._gp_evidence import GPPrior
@@ -117,24 +117,17 @@ class GaussianProcess:
         """
         from ccnn_torch.learners._gp_evidence import GPPrior
 
-        settings = self.settings
+        settings, data = self.settings, usable_rows(data)
         r, _, i = data.inputs.shape
         o = data.targets.shape[-1]
         self._shape = r, o
         order = self._order(data)
         across = torch.arange(r, device=order.device).unsqueeze(-1)
         self._weights = data.weights[across, order]
-        there = (self._weights > 0).unsqueeze(-1)
-        # What stands in padded rows must not even reach a sum.
-        self._rows = torch.where(there, data.inputs[across, order], 0.0)
-        self._targets = torch.where(there, data.targets[across, order], 0.0).mT.contiguous()
-        if not bool(self._rows.isfinite().all() and self._targets.isfinite().all()):
-            raise MethodFailedError("the Gaussian process needs training rows that are finite numbers")
-        total = data.weights.sum(1, keepdim=True)
-        shares = (data.weights / total).unsqueeze(-1)
-        kept = torch.where(data.weights.unsqueeze(-1) > 0, data.targets, 0.0)
-        self._mean = (kept * shares).sum(1)
-        self._variance = ((kept - self._mean.unsqueeze(1)).square() * shares).sum(1)
+        self._rows, self._targets = data.inputs[across, order], data.targets[across, order].mT.contiguous()
+        shares = (data.weights / data.weights.sum(1, keepdim=True)).unsqueeze(-1)
+        self._mean = (data.targets * shares).sum(1)
+        self._variance = ((data.targets - self._mean.unsqueeze(1)).square() * shares).sum(1)
         self._few = min(settings.hyperparameter_rows, order.shape[1])
         self._process: GPPrior = GPPrior(settings.kernel, i, settings.noise_floor).to(data.inputs.device)
         start = self._rows.new_zeros(r, o, i + 3)

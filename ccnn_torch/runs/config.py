@@ -15,8 +15,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners.ccnn import CCNNSettings
-from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.learners.gp import GPSettings
+from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.runs._keys import explain, list_keys
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
 from ccnn_torch.runs._yaml import dump_yaml, read_yaml

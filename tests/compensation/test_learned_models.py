@@ -18,11 +18,13 @@ from ccnn_torch.compensation._networks import describe_network, network_from_des
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.constant import Constant
+from ccnn_torch.learners.gp import GaussianProcess, GPSettings
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.training import Scaling, train
 
 LEARNERS: dict[str, Callable[[], Learner]] = {
     "constant": Constant,
+    "gp": lambda: GaussianProcess(GPSettings(steps=20, variance_rows=40)),
     "grnn": lambda: GRNN(GRNNSettings(iterations=4, candidates=9)),
 }
 
