@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import pickle
+import re
 import subprocess
 import sys
 from dataclasses import fields
@@ -23,25 +24,28 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.sklearn import CCNNRegressor, GRNNRegressor
+from ccnn_torch.sklearn import BPLMRegressor, CCNNRegressor, GRNNRegressor
 from ccnn_torch.sklearn._base import LearnerRegressor, SteppedRegressor
 from ccnn_torch.training import Scaling, train
 
 ROOT = Path(__file__).parent.parent
-ESTIMATORS = [CCNNRegressor, GRNNRegressor]
+ESTIMATORS = [CCNNRegressor, BPLMRegressor, GRNNRegressor]
 STEPPED = [kind for kind in ESTIMATORS if issubclass(kind, SteppedRegressor)]
 # Settings for the tests that need no good model.
 SMALL: dict[type[Any], dict[str, Any]] = {
     CCNNRegressor: {"generations": 4, "population": 12, "hidden": 6},
+    BPLMRegressor: {"iterations": 6, "restarts": 2, "hidden": 4},
     GRNNRegressor: {"iterations": 4},
 }
 GRIDS: dict[type[Any], dict[str, Any]] = {
     CCNNRegressor: {"hidden": [(4,), (6, 6)]},
+    BPLMRegressor: {"hidden": [(3,), (3, 3)]},
     GRNNRegressor: {"widest": [1.0, 5.0]},
 }
-# Parameters whose default is not the run's, as the docstring says.
+# Parameters whose default may be another than the run's, as the docstring says.
 OTHER_DEFAULTS: dict[type[Any], set[str]] = {
-    CCNNRegressor: {"population", "generations", "members", "refine_every"},
+    CCNNRegressor: {"hidden", "population", "generations", "members", "refine_every", "refinement_iterations"},
+    BPLMRegressor: {"hidden", "restarts"},
     GRNNRegressor: set(),
 }
 
@@ -79,11 +83,10 @@ def test_parameters_are_settings_of_the_learner_with_the_defaults_that_the_docst
     if kind in STEPPED:
         bookkeeping |= {"early_stopping", "validation_fraction", "n_iter_no_change"}
     own = {name: value for name, value in kind().get_params().items() if name not in bookkeeping}
-    assert {name for name, value in own.items() if value != settings[name]} == OTHER_DEFAULTS[kind]
-    documented = inspect.getdoc(kind) or ""
-    assert all(name in documented for name in own)
-    for name in OTHER_DEFAULTS[kind]:
-        assert f"{name}={settings[name]}" in " ".join(documented.split())
+    assert {name for name, value in own.items() if value != settings[name]} <= OTHER_DEFAULTS[kind]
+    summary, _, described = (inspect.getdoc(kind) or "").partition("Args:")
+    assert all(re.search(rf"\b{name}\b", described) for name in own)
+    assert all(re.search(rf"\b{name}\b", summary) for name in OTHER_DEFAULTS[kind])
 
 
 @every
@@ -211,6 +214,20 @@ def test_early_stopping_takes_the_step_of_lowest_error_on_the_rows_held_out(kind
             small(kind, early_stopping=True, **wrong).fit(X, y)
     with pytest.raises(ValueError, match="of 2 different rows, 1 would be held out"):
         small(kind, early_stopping=True).fit(X[:2], y[:2])
+
+
+@stepped
+def test_intervals_are_as_wide_as_the_errors_on_rows_held_out(kind: Any) -> None:
+    X, y = smooth(60)
+    fresh, truth = smooth(400, seed=1)
+    regressor = small(kind, early_stopping=True, validation_fraction=0.4).fit(X, y)
+    mean, deviation = regressor.predict(fresh, return_std=True)
+    covered, narrow = ((np.abs(mean - truth) < 1.96 * share * deviation).mean() for share in (1, 0.4))
+    assert covered > 0.9 and narrow < 0.9
+    scale = regressor.sd_scale_.copy()
+    assert scale.shape == (2,)
+    regressor.sd_scale_ = np.array([1.0, 3.0])
+    np.testing.assert_allclose(regressor.predict(fresh, return_std=True)[1], deviation / scale * [1.0, 3.0])
 
 
 @every
