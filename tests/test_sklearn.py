@@ -24,29 +24,32 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.sklearn import BPLMRegressor, CCNNRegressor, GRNNRegressor
+from ccnn_torch.sklearn import BPLMRegressor, CCNNRegressor, ENNRegressor, GRNNRegressor
 from ccnn_torch.sklearn._base import LearnerRegressor, SteppedRegressor
 from ccnn_torch.training import Scaling, train
 
 ROOT = Path(__file__).parent.parent
-ESTIMATORS = [CCNNRegressor, BPLMRegressor, GRNNRegressor]
+ESTIMATORS = [CCNNRegressor, BPLMRegressor, GRNNRegressor, ENNRegressor]
 STEPPED = [kind for kind in ESTIMATORS if issubclass(kind, SteppedRegressor)]
 # Settings for the tests that need no good model.
 SMALL: dict[type[Any], dict[str, Any]] = {
     CCNNRegressor: {"generations": 4, "population": 12, "hidden": 6},
     BPLMRegressor: {"iterations": 6, "restarts": 2, "hidden": 4},
     GRNNRegressor: {"iterations": 4},
+    ENNRegressor: {"generations": 5, "population": 12},
 }
 GRIDS: dict[type[Any], dict[str, Any]] = {
     CCNNRegressor: {"hidden": [(4,), (6, 6)]},
     BPLMRegressor: {"hidden": [(3,), (3, 3)]},
     GRNNRegressor: {"widest": [1.0, 5.0]},
+    ENNRegressor: {"hidden": [4, (6, 6)]},
 }
 # Parameters whose default may be another than the run's, as the docstring says.
 OTHER_DEFAULTS: dict[type[Any], set[str]] = {
     CCNNRegressor: {"hidden", "population", "generations", "members", "refine_every", "refinement_iterations"},
     BPLMRegressor: {"hidden", "restarts"},
     GRNNRegressor: set(),
+    ENNRegressor: {"population", "generations"},
 }
 
 every = pytest.mark.parametrize("kind", ESTIMATORS)

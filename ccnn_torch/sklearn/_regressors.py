@@ -11,10 +11,11 @@ from typing import Any
 
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.learners.enn import ENN, ENNSettings
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.sklearn._base import LearnerRegressor, SteppedRegressor
 
-__all__ = ["BPLMRegressor", "CCNNRegressor", "GRNNRegressor"]
+__all__ = ["BPLMRegressor", "CCNNRegressor", "ENNRegressor", "GRNNRegressor"]
 
 
 class CCNNRegressor(SteppedRegressor):
@@ -149,6 +150,75 @@ class BPLMRegressor(SteppedRegressor):
         self.iterations = iterations
         self.tolerance = tolerance
         self.patience = patience
+        self.periodic = periodic
+        self.early_stopping = early_stopping
+        self.validation_fraction = validation_fraction
+        self.n_iter_no_change = n_iter_no_change
+        self.random_state = random_state
+
+
+class ENNRegressor(SteppedRegressor):
+    """One evolved population of whole networks, without cooperation and without refinement: the paper's comparison.
+
+    By default population and generations stay far below what a run has, so that the network is coarse. All settings:
+    `ccnn_torch.learners.enn.ENNSettings`.
+
+    Args:
+        hidden: nodes of each hidden layer; a number is one layer.
+        population: networks.
+        generations: steps.
+        crossover, structural_mutation, weight_mutation: probabilities of the operators.
+        density: share of connections that exist at the start.
+        weight_range: weights start and mutate in -weight_range .. weight_range.
+        bias: whether nodes have a bias.
+        periodic: inputs that are angles in rad, by index or by name, to be fed as sine and cosine.
+        early_stopping: hold rows out, find the step of the lowest error on them and how wide intervals must be to cover
+            them, then train on all rows for so long; nothing else holds noise back here.
+        validation_fraction: share of the rows that are then held out.
+        n_iter_no_change: steps without improvement after which that search ends; None = go to the end.
+        random_state: seed, or a RandomState to draw it from; None = draw it from NumPy's global generator.
+
+    Attributes:
+        network_: the trained network, on scaled inputs and outputs.
+        scaling_: that scaling.
+        sd_scale_: factor on the learner's own standard deviation, per output; 1 where no rows were held out.
+        n_iter_: steps of the model.
+        loss_curve_: mean squared standardised error on the training rows after each of them.
+        validation_curve_: with early_stopping, that on the rows held out, after each step of the search.
+        converged_: whether the learner's own criterion was met; None where it has none.
+        n_features_in_, feature_names_in_: as in scikit-learn.
+    """
+
+    _learner = ENN
+    _settings = ENNSettings
+
+    def __init__(
+        self,
+        *,
+        hidden: int | Sequence[int] = ENNSettings.hidden,
+        population: int = 100,
+        generations: int = 60,
+        crossover: float = ENNSettings.crossover,
+        structural_mutation: float = ENNSettings.structural_mutation,
+        weight_mutation: float = ENNSettings.weight_mutation,
+        density: float = ENNSettings.density,
+        weight_range: float = ENNSettings.weight_range,
+        bias: bool = ENNSettings.bias,
+        periodic: Sequence[int | str] | None = None,
+        early_stopping: bool = False,
+        validation_fraction: float = 0.2,
+        n_iter_no_change: int | None = None,
+        random_state: Any = 0,
+    ) -> None:
+        self.hidden = hidden
+        self.population = population
+        self.generations = generations
+        self.crossover = crossover
+        self.structural_mutation = structural_mutation
+        self.weight_mutation = weight_mutation
+        self.density = density
+        self.weight_range = weight_range
+        self.bias = bias
         self.periodic = periodic
         self.early_stopping = early_stopping
         self.validation_fraction = validation_fraction
