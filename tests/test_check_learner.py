@@ -13,6 +13,7 @@ from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
 from ccnn_torch.learners.constant import Constant
+from ccnn_torch.learners.enn import ENN, ENNSettings
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.testing import check_learner
 
@@ -36,6 +37,10 @@ FACTORIES: dict[str, Callable[[], Learner]] = {
     "bp_lm_at_rest": lambda: BPLM(BPLMSettings(hidden=(2, 3), restarts=1, iterations=8, tolerance=0.1, patience=1)),
     "grnn": lambda: GRNN(GRNNSettings(iterations=5, candidates=6)),
     "grnn_some_rows": lambda: GRNN(GRNNSettings(iterations=4, candidates=6, queries=10, references=40)),
+    "enn": lambda: ENN(ENNSettings(hidden=(3, 2), population=10, generations=6)),
+    "enn_without_bias": lambda: ENN(
+        ENNSettings(hidden=(4,), population=9, generations=5, bias=False, elites=3, crossover_kind="uniform")
+    ),
     "constant": Constant,
     "descent": lambda: Descent(steps=8),
 }

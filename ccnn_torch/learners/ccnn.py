@@ -78,8 +78,8 @@ class CCNN:
                 (1, 2)
             ),
             "error_train": self._error(),
-            "density": self._by_repeat(density(state)).mean(1),
-            "diversity": self._by_repeat(diversity(state, settings)).mean(1),
+            "density": self._by_repeat(density(state.populations)).mean(1),
+            "diversity": self._by_repeat(diversity(state.populations, settings.weight_range)).mean(1),
             "evaluations": torch.full_like(best[:, 0], judged * settings.members),
         }
 

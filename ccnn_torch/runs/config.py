@@ -16,6 +16,7 @@ from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.ccnn import CCNNSettings
+from ccnn_torch.learners.enn import ENNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.runs._keys import explain, list_keys
@@ -228,6 +229,7 @@ class RunConfig(_Part):
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
     bp_lm: BPLMSettings = Field(default_factory=BPLMSettings)
     grnn: GRNNSettings = Field(default_factory=GRNNSettings)
+    enn: ENNSettings = Field(default_factory=ENNSettings)
     gp: GPSettings = Field(default_factory=GPSettings)
 
     @model_validator(mode="before")
