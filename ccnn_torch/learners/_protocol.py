@@ -23,6 +23,8 @@ class TrainingData:
         metric: in which channels the error of a row is judged, `r x s x c x o`: this matrix times (output - target),
             such as the pose error that joint deviations cause. None = the outputs themselves. Learners may leave it
             aside.
+        angles: how many of the features, the last ones, are scaled angles that stand among the others by their sines
+            and cosines; 0 unless the learner's `reads_angles` asks for them.
     """
 
     inputs: Tensor
@@ -31,6 +33,7 @@ class TrainingData:
     seeds: Tensor
     validation: TrainingData | None = None
     metric: Tensor | None = None
+    angles: int = 0
 
 
 @runtime_checkable

@@ -9,7 +9,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.network import MaskedNetwork, forward
+from ccnn_torch.evolution.masked_network import MaskedNetwork
+from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.refinement import (
     RefinementSettings,
