@@ -42,6 +42,8 @@ __all__ = [
 _PRECISION_RANGE = (1e-8, 1e12)
 _DAMPING_RANGE = (1e-12, 1e12)
 _VAGUE = 1e-4
+# Calm iterations after which a network is done.
+_CALM = 3
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,8 @@ class RefinementSettings:
             what the estimate of gamma alone would let through; with many rows it makes no difference.
         damping: first damping, relative to the diagonal of H.
         trials: dampings tried in an iteration before it is given up.
+        tolerance: a network whose objective falls by less than this share in each of three iterations running is done;
+            0 = all iterations are made.
     """
 
     iterations: int = 50
@@ -76,6 +80,7 @@ class RefinementSettings:
     prior_rate: float = 0.1
     damping: float = 1e-2
     trials: int = 6
+    tolerance: float = 1e-5
 
 
 @dataclass(frozen=True)
@@ -117,6 +122,7 @@ class RefinementState:
         prior: precision of each prior group, `b x g`.
         noise: precision of each channel's noise, `b x c`.
         effective: weights determined by the data, per prior group, `b x g`.
+        calm: iterations running that lowered the objective by less than the tolerance, `b` int64.
         iteration: iterations done, 0-d, int64.
     """
 
@@ -125,7 +131,13 @@ class RefinementState:
     prior: Tensor
     noise: Tensor
     effective: Tensor
+    calm: Tensor
     iteration: Tensor
+
+    @property
+    def done(self) -> Tensor:
+        """Networks that do not move any more, `b` bool."""
+        return self.calm >= _CALM
 
     def state_dict(self) -> dict[str, Tensor]:
         """All tensors by name."""
@@ -202,7 +214,11 @@ def refine(
     problem = pose_refinement(masks, weights, inputs, targets, row_weights, settings, row_metric, waves)
     state = start = start_refinement(problem, weights, waves)
     for _ in range(problem.settings.iterations):
-        state = step_refinement(problem, state)
+        going = torch.nonzero(~state.done).flatten()
+        if len(going) == 0:
+            break
+        # Networks do not know of each other, so that those which are done need not be worked on for the others' sake.
+        state = _put(state, going, step_refinement(_part(problem, going), _take(state, going)))
     worse = ~(_objective(problem, state, state.weights) <= _objective(problem, state, start.weights))
     state = replace(state, weights=torch.where(worse.unsqueeze(-1), start.weights, state.weights))
     return finish_refinement(problem, state)
@@ -275,6 +291,7 @@ def start_refinement(problem: RefinementProblem, weights: list[Tensor], waves: W
         prior=prior,
         noise=noise,
         effective=effective,
+        calm=torch.zeros(batch, dtype=torch.int64, device=flat.device),
         iteration=torch.zeros((), dtype=torch.int64, device=flat.device),
     )
     return replace(state, noise=_noise(problem, state)) if settings.bayesian else state
@@ -292,20 +309,29 @@ def step_refinement(
     before = _objective(problem, state, state.weights)
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     weights, damping = state.weights, state.damping
-    done = torch.zeros_like(before, dtype=torch.bool)
+    reached = before
+    todo = torch.arange(len(before), device=before.device)
     for _ in range(problem.settings.trials):
-        damped = matrix + torch.diag_embed(diagonal * damping.unsqueeze(-1))
+        damped = matrix[todo] + torch.diag_embed(diagonal[todo] * damping[todo].unsqueeze(-1))
         root, failed = torch.linalg.cholesky_ex(damped)
-        step = torch.cholesky_solve(gradient.unsqueeze(-1), root).squeeze(-1)
-        candidate = state.weights - step
-        after = _objective(problem, state, candidate)
-        good = (failed == 0) & (after < before) & ~done
-        weights = torch.where(good.unsqueeze(-1), candidate, weights)
-        damping = torch.where(good, damping / 10, torch.where(done, damping, damping * 10))
-        done = done | good
-        if bool(done.all()):
+        step = torch.cholesky_solve(gradient[todo].unsqueeze(-1), root).squeeze(-1)
+        candidate = state.weights[todo] - step
+        after = _objective(_part(problem, todo), _take(state, todo), candidate)
+        good = (failed == 0) & (after < before[todo])
+        taken = todo[good]
+        weights = weights.index_copy(0, taken, candidate[good])
+        reached = reached.index_copy(0, taken, after[good])
+        damping = damping.index_copy(0, todo, torch.where(good, damping[todo] / 10, damping[todo] * 10))
+        todo = todo[~good]
+        if len(todo) == 0:
             break
-    moved = replace(state, weights=weights, damping=damping.clamp(*_DAMPING_RANGE), iteration=state.iteration + 1)
+    moved = replace(
+        state,
+        weights=weights,
+        damping=damping.clamp(*_DAMPING_RANGE),
+        calm=torch.where(before - reached < problem.settings.tolerance * before, state.calm + 1, 0),
+        iteration=state.iteration + 1,
+    )
     if not problem.settings.bayesian or int(moved.iteration) <= problem.settings.warm_up:
         return moved
     return _estimate_precisions(problem, moved, matrix)
@@ -347,6 +373,39 @@ def second_order(problem: RefinementProblem, state: RefinementState) -> SecondOr
     active = problem.network.active
     gradient = local.gradient + torch.where(active, prior * state.weights, 0)
     return SecondOrder(gradient, local.matrix + torch.diag_embed(torch.where(active, prior, 1)))
+
+
+def _part(problem: RefinementProblem, index: Tensor) -> RefinementProblem:
+    """The problem of some of the networks."""
+    if len(index) == len(problem.rows):
+        return problem
+    network = problem.network
+    return replace(
+        problem,
+        network=replace(
+            network,
+            masks=[mask[index] for mask in network.masks],
+            alive=[alive[index] for alive in network.alive],
+            active=network.active[index],
+            source=network.source[index],
+        ),
+        inputs=problem.inputs[index],
+        targets=problem.targets[index],
+        rows=problem.rows[index],
+        metric=None if problem.metric is None else problem.metric[index],
+    )
+
+
+def _take(state: RefinementState, index: Tensor) -> RefinementState:
+    tensors = state.state_dict()
+    return RefinementState(**{name: value[index] if value.dim() else value for name, value in tensors.items()})
+
+
+def _put(state: RefinementState, index: Tensor, part: RefinementState) -> RefinementState:
+    old, new = state.state_dict(), part.state_dict()
+    return RefinementState(
+        **{name: old[name].index_copy(0, index, new[name]) if old[name].dim() else new[name] for name in old}
+    )
 
 
 def _squares(problem: RefinementProblem, weights: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ccnn_torch.evolution.coevolution import Coevolution, advance, density, diversity, keep_refined, start
 from ccnn_torch.evolution.evaluation import fitness, joined_errors, make_task
@@ -240,17 +240,21 @@ class CCNN:
 
     def _descend(self, model: _Model) -> tuple[_Model, Tensor]:
         """The refined model and its log evidence, `(r members)`."""
+        # Slots are filled from the first on: those that are free in every network need not be carried along.
+        used = int((model.waves.frequency != 0).sum(-1).max()) if self._slots else 0
+        small = _slots(model, self._slots, used)
         refined = refine(
-            model.masks,
-            model.weights,
+            small.masks,
+            small.weights,
             self._inputs,
             self._targets,
             self._rows,
             RefinementSettings(iterations=self.settings.refinement_iterations),
             self._metric,
-            model.waves,
+            small.waves,
         )
-        return _Model(model.masks, refined.weights, refined.waves), refined.log_evidence
+        found = _slots(_Model(small.masks, refined.weights, refined.waves), used, self._slots)
+        return found, refined.log_evidence
 
     def _with_waves(self, model: _Model, evidence: Tensor) -> tuple[_Model, Tensor]:
         """Periodic nodes found in what the members of a repeat leave together, and all refined once more."""
@@ -290,6 +294,24 @@ class _Model(NamedTuple):
     masks: list[Tensor]
     weights: list[Tensor]
     waves: Waves
+
+
+def _slots(model: _Model, have: int, want: int) -> _Model:
+    """The same networks with fewer free slots for periodic nodes, or more."""
+
+    def fitted(values: Tensor) -> Tensor:
+        return nn.functional.pad(values, (0, want - have)) if want > have else values[..., :want]
+
+    def columns(values: Tensor, hidden: int) -> Tensor:
+        parts = values.split([hidden, have, have, values.shape[-1] - hidden - 2 * have], -1)
+        return torch.cat([parts[0], fitted(parts[1]), fitted(parts[2]), parts[3]], -1)
+
+    hidden = model.masks[-1].shape[-1] - 2 * have
+    return _Model(
+        [*model.masks[:-1], columns(model.masks[-1], hidden)],
+        [*model.weights[:-1], columns(model.weights[-1], hidden)],
+        Waves(*(fitted(part) for part in model.waves)),
+    )
 
 
 def _choose(first: Tensor, one: _Model, other: _Model) -> _Model:
