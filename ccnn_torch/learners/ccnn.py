@@ -255,6 +255,8 @@ class CCNN:
             self._metric,
             small.waves,
         )
+        # Networks that were done earlier made fewer iterations; this counts those of the last one.
+        self._passes = self._passes + refined.iterations * (self._targets.shape[-1] + 1)
         found = _slots(_Model(small.masks, refined.weights, refined.waves), used, self._slots)
         return found, refined.log_evidence
 
