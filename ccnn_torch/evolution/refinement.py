@@ -32,7 +32,10 @@ __all__ = [
     "RefinementState",
     "SecondOrder",
     "finish_refinement",
+    "part_of_problem",
+    "part_of_state",
     "pose_refinement",
+    "put_part",
     "refine",
     "second_order",
     "start_refinement",
@@ -218,7 +221,7 @@ def refine(
         if len(going) == 0:
             break
         # Networks do not know of each other, so that those which are done need not be worked on for the others' sake.
-        state = _put(state, going, step_refinement(_part(problem, going), _take(state, going)))
+        state = put_part(state, going, step_refinement(part_of_problem(problem, going), part_of_state(state, going)))
     worse = ~(_objective(problem, state, state.weights) <= _objective(problem, state, start.weights))
     state = replace(state, weights=torch.where(worse.unsqueeze(-1), start.weights, state.weights))
     return finish_refinement(problem, state)
@@ -316,7 +319,7 @@ def step_refinement(
         root, failed = torch.linalg.cholesky_ex(damped)
         step = torch.cholesky_solve(gradient[todo].unsqueeze(-1), root).squeeze(-1)
         candidate = state.weights[todo] - step
-        after = _objective(_part(problem, todo), _take(state, todo), candidate)
+        after = _objective(part_of_problem(problem, todo), part_of_state(state, todo), candidate)
         good = (failed == 0) & (after < before[todo])
         taken = todo[good]
         weights = weights.index_copy(0, taken, candidate[good])
@@ -375,13 +378,14 @@ def second_order(problem: RefinementProblem, state: RefinementState) -> SecondOr
     return SecondOrder(gradient, local.matrix + torch.diag_embed(torch.where(active, prior, 1)))
 
 
-def _part(problem: RefinementProblem, index: Tensor) -> RefinementProblem:
-    """The problem of some of the networks."""
+def part_of_problem(problem: RefinementProblem, index: Tensor) -> RefinementProblem:
+    """The problem of some of the networks, numbered as they stand in the batch; they lead in one dimension."""
     if len(index) == len(problem.rows):
         return problem
     network = problem.network
     return replace(
         problem,
+        leading=(len(index),),
         network=replace(
             network,
             masks=[mask[index] for mask in network.masks],
@@ -396,12 +400,14 @@ def _part(problem: RefinementProblem, index: Tensor) -> RefinementProblem:
     )
 
 
-def _take(state: RefinementState, index: Tensor) -> RefinementState:
+def part_of_state(state: RefinementState, index: Tensor) -> RefinementState:
+    """The state of some of the networks."""
     tensors = state.state_dict()
     return RefinementState(**{name: value[index] if value.dim() else value for name, value in tensors.items()})
 
 
-def _put(state: RefinementState, index: Tensor, part: RefinementState) -> RefinementState:
+def put_part(state: RefinementState, index: Tensor, part: RefinementState) -> RefinementState:
+    """A state with that of some of the networks renewed."""
     old, new = state.state_dict(), part.state_dict()
     return RefinementState(
         **{name: old[name].index_copy(0, index, new[name]) if old[name].dim() else new[name] for name in old}

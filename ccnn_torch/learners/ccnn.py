@@ -32,7 +32,8 @@ class CCNN:
     coevolutions, and its model is the mean of their networks.
 
     Metrics of a step: `fitness_best`, `fitness_mean` (over all individuals), `error_train` (mean square of the model,
-    standardised), `evaluations` (joined networks so far), each `r`; `density` and `diversity`, `r x layers`.
+    standardised), `evaluations` (joined networks so far, and of each iteration of a refinement as many as there are
+    outputs for its Jacobian and one for the steps tried), each `r`; `density` and `diversity`, `r x layers`.
     """
 
     name = "ccnn"
@@ -60,6 +61,7 @@ class CCNN:
         sizes = (self._read, *self.settings.hidden, data.targets.shape[-1])
         self._state = start(sizes, self._task, self.settings, self._seeds)
         self._evidence = torch.full_like(self._state.best_fitness, -torch.inf)
+        self._passes = torch.zeros_like(self._evidence)
         self._refined = self._evolved()
 
     def step(self) -> dict[str, Tensor]:
@@ -80,7 +82,7 @@ class CCNN:
             "error_train": self._error(),
             "density": self._by_repeat(density(state.populations)).mean(1),
             "diversity": self._by_repeat(diversity(state.populations, settings.weight_range)).mean(1),
-            "evaluations": torch.full_like(best[:, 0], judged * settings.members),
+            "evaluations": judged * settings.members + self._by_repeat(self._passes).sum(1),
         }
 
     @property
@@ -134,7 +136,7 @@ class CCNN:
     def state_dict(self) -> dict[str, Tensor]:
         """Subpopulations with their fitness, the best joined network, the refined one: `r x members x ...`."""
         state = self._state
-        tensors = {"best_fitness": state.best_fitness, "refined_evidence": self._evidence}
+        tensors = {"best_fitness": state.best_fitness, "refined_evidence": self._evidence, "passes": self._passes}
         for name, parts in (("population", state.populations), ("best", state.best)):
             for layer, part in enumerate(parts):
                 tensors[f"{name}_mask_{layer}"] = part.mask
@@ -167,7 +169,7 @@ class CCNN:
             [flat[f"refined_weight_{n}"] for n in layers],
             Waves(flat["refined_source"], flat["refined_frequency"]),
         )
-        self._evidence = flat["refined_evidence"]
+        self._evidence, self._passes = flat["refined_evidence"], flat["passes"]
 
     def _by_repeat(self, tensor: Tensor) -> Tensor:
         """`(r members) x ...` to `r x members x ...`."""
@@ -253,6 +255,8 @@ class CCNN:
             self._metric,
             small.waves,
         )
+        # Networks that were done earlier made fewer iterations; this counts those of the last one.
+        self._passes = self._passes + refined.iterations * (self._targets.shape[-1] + 1)
         found = _slots(_Model(small.masks, refined.weights, refined.waves), used, self._slots)
         return found, refined.log_evidence
 
