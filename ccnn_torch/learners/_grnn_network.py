@@ -14,7 +14,8 @@ __all__ = ["GRNNNetwork", "KernelVariance"]
 
 # Rows' worth of belief in the overall variance: a few squared residuals scatter by a factor of several.
 _PRIOR_ROWS = 10.0
-_SMALLEST_VARIANCE = 1e-12
+# A power of two: the ONNX exporter rounds numbers in the code to single precision.
+_SMALLEST_VARIANCE = 2.0**-40
 
 
 class KernelVariance(NamedTuple):
