@@ -285,13 +285,13 @@ class GaussianProcess:
     def _network(self, repeat: int, dual: Tensor, spread: Tensor) -> GPNetwork:
         rows = self._rows[repeat, : dual.shape[-1]]
         parts = (dual, spread, *self._model())
-        return GPNetwork(self.settings.kernel, rows.clone(), *(part[repeat].clone() for part in parts))
+        return GPNetwork(self.settings.kernel, rows, *(part[repeat] for part in parts))
 
     def _by_repeat(
         self, inputs: Tensor, dual: Tensor, spread: Tensor, ask: Callable[[GPNetwork, Tensor], Tensor]
     ) -> Tensor:
         """Ask the network of every repeat; one at a time and in pieces, since they share no matrix."""
-        size = max(1, 16 * _CHUNK // dual.shape[-1])
+        size = max(1, 4 * _CHUNK // (self._shape[1] * dual.shape[-1]))
         found = []
         for repeat, points in enumerate(inputs):
             network = self._network(repeat, dual, spread)
@@ -311,7 +311,9 @@ class GaussianProcess:
         """Inverse Cholesky factors of the rows that variances condition on, `r x o x v x v`."""
         if self._factors is None:
             rows = min(self.settings.variance_rows, self._rows.shape[1])
-            self._factors = self._over_outputs(rows, lambda repeat, output, covariances: spread_factor(covariances))
+            # Rows that do not exist tell nothing.
+            there = self._weights[:, :rows] > 0
+            self._factors = self._over_outputs(rows, lambda repeat, _, matrix: spread_factor(matrix) * there[repeat])
         return self._factors
 
     def _over_outputs(self, rows: int, make: Callable[[int, int, Tensor], Tensor]) -> Tensor:
@@ -327,13 +329,8 @@ class GaussianProcess:
         for repeat in range(r):
             both = there[repeat].unsqueeze(-1) & there[repeat]
             for output in range(o):
-                kernel = covariance(
-                    self.settings.kernel,
-                    inputs[repeat],
-                    inputs[repeat],
-                    length_scale[repeat, output],
-                    output_scale[repeat, output],
-                )
+                scales = length_scale[repeat, output], output_scale[repeat, output]
+                kernel = covariance(self.settings.kernel, inputs[repeat], *scales)
                 noises = torch.where(there[repeat], noise[repeat, output] / weights[repeat], 1.0)
                 found.append(make(repeat, output, torch.where(both, kernel, 0.0) + torch.diag(noises)))
         return torch.stack(found).reshape(r, o, *found[0].shape)
