@@ -4,17 +4,17 @@ from sklearn.dummy import DummyRegressor
 from sklearn.model_selection import GridSearchCV, KFold, cross_val_score
 
 from ccnn_torch.runs.cases import build_case
-from ccnn_torch.sklearn import CCNNRegressor
+from ccnn_torch.sklearn import BPLMRegressor, CCNNRegressor, ENNRegressor, GRNNRegressor
 
 case = build_case("tripod")
 X = case.joints.numpy()  # q1, q2, q3 [m]
 y = (case.learnable + case.noise([0])[0]).numpy()  # deviation of each joint [m]
 
 folds = KFold(5, shuffle=True, random_state=0)
-for regressor in (DummyRegressor(), CCNNRegressor()):
+for regressor in (DummyRegressor(), CCNNRegressor(), BPLMRegressor(), GRNNRegressor(), ENNRegressor()):
     error = -cross_val_score(regressor, X, y, cv=folds, scoring="neg_root_mean_squared_error").mean()
     print(f"{type(regressor).__name__}: {1e6 * error:.1f} µm held out")
 
-search = GridSearchCV(CCNNRegressor(), {"hidden": [(6, 6), (12, 12)]}, cv=folds).fit(X, y)
+search = GridSearchCV(BPLMRegressor(), {"hidden": [(3,), (10,)], "restarts": [1, 3]}, cv=folds).fit(X, y)
 deviation, sd = search.best_estimator_.predict(X[:1], return_std=True)
-print(f"best {search.best_params_}; first pose {1e6 * deviation[0]} µm, sd {1e6 * sd[0]} µm")
+print(f"best {search.best_params_}; first pose {(1e6 * deviation[0]).round(1)} µm, sd {(1e6 * sd[0]).round(1)} µm")

@@ -10,8 +10,10 @@ from torch import Tensor, nn
 from toy import Descent
 
 from ccnn_torch.learners import Learner, TrainingData
+from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
 from ccnn_torch.learners.constant import Constant
+from ccnn_torch.learners.enn import ENN, ENNSettings
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.testing import check_learner
 
@@ -25,19 +27,26 @@ SMALL = {
 }
 
 
-@pytest.mark.parametrize(
-    "factory",
-    [
-        lambda: CCNN(CCNNSettings(**SMALL)),
-        lambda: CCNN(CCNNSettings(**SMALL, bias=False, elites=3, crossover_kind="uniform")),
-        lambda: CCNN(CCNNSettings(**{**SMALL, "refinement_iterations": 4, "refine_every": 2, "members": 2})),
-        lambda: Descent(steps=8),
-        Constant,
-        lambda: GRNN(GRNNSettings(iterations=5, candidates=6)),
-        lambda: GRNN(GRNNSettings(iterations=4, candidates=6, queries=10, references=40)),
-    ],
-    ids=["ccnn", "ccnn_without_bias", "ccnn_refined", "descent", "constant", "grnn", "grnn_subset"],
-)
+FACTORIES: dict[str, Callable[[], Learner]] = {
+    "ccnn": lambda: CCNN(CCNNSettings(**SMALL)),
+    "ccnn_without_bias": lambda: CCNN(CCNNSettings(**SMALL, bias=False, elites=3, crossover_kind="uniform")),
+    "ccnn_refined": lambda: CCNN(
+        CCNNSettings(**{**SMALL, "refinement_iterations": 4, "refine_every": 2, "members": 2})
+    ),
+    "bp_lm": lambda: BPLM(BPLMSettings(hidden=(3,), restarts=2, iterations=5)),
+    "bp_lm_at_rest": lambda: BPLM(BPLMSettings(hidden=(2, 3), restarts=1, iterations=8, tolerance=0.1, patience=1)),
+    "grnn": lambda: GRNN(GRNNSettings(iterations=5, candidates=6)),
+    "grnn_some_rows": lambda: GRNN(GRNNSettings(iterations=4, candidates=6, queries=10, references=40)),
+    "enn": lambda: ENN(ENNSettings(hidden=(3, 2), population=10, generations=6)),
+    "enn_without_bias": lambda: ENN(
+        ENNSettings(hidden=(4,), population=9, generations=5, bias=False, elites=3, crossover_kind="uniform")
+    ),
+    "constant": Constant,
+    "descent": lambda: Descent(steps=8),
+}
+
+
+@pytest.mark.parametrize("factory", FACTORIES.values(), ids=FACTORIES)
 def test_learners_keep_the_contract(factory: Callable[[], Learner]) -> None:
     check_learner(factory)
 

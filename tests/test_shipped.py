@@ -42,7 +42,7 @@ FLOORS = [
     ["mechanisms", "pseudoerror"],
     ["learners/_protocol", "training", "evolution", "learners"],
     ["identification", "compensation"],
-    ["sklearn", "testing", "report", "runs"],
+    ["testing", "report", "runs", "sklearn"],
     ["cli", "__init__", "__main__"],
 ]
 

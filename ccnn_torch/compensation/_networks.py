@@ -16,7 +16,7 @@ _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "constant": "ccnn_torch.learners.constant:ConstantNetwork",
     "grnn": "ccnn_torch.learners._grnn_network:GRNNNetwork",
     "gp": "ccnn_torch.learners._gp_posterior:GPNetwork",
-    "masked": "ccnn_torch.evolution.network:MaskedNetwork",
+    "masked": "ccnn_torch.evolution.masked_network:MaskedNetwork",
 }
 
 

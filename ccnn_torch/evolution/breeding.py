@@ -1,9 +1,14 @@
-"""The next generation of one subpopulation: elites, selection, crossover, hybrid mutation (paper 000, III-D and F)."""
+"""The next generation of a population: elites, selection, crossover, hybrid mutation (paper 000, III-D and F).
+
+Individuals are single layers (a subpopulation of the coevolution) or, in several layers with shared parents, whole
+networks.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -18,9 +23,45 @@ from ccnn_torch.evolution.operators import (
     weakest_draw,
 )
 from ccnn_torch.evolution.random import uniform
-from ccnn_torch.evolution.settings import CCNNSettings
 
-__all__ = ["BreedingDraws", "breed", "breeding_shapes", "initial_population", "with_elites"]
+__all__ = [
+    "BreedingDraws",
+    "BreedingSettings",
+    "breed",
+    "breed_networks",
+    "breeding_shapes",
+    "initial_population",
+    "with_elites",
+]
+
+
+class BreedingSettings(Protocol):
+    """What breeding reads of a learner's settings; the names of `CCNNSettings`."""
+
+    @property
+    def population(self) -> int: ...
+    @property
+    def elites(self) -> int: ...
+    @property
+    def tournament(self) -> int: ...
+    @property
+    def crossover(self) -> float: ...
+    @property
+    def crossover_kind(self) -> Literal["point", "uniform"]: ...
+    @property
+    def cuts(self) -> int: ...
+    @property
+    def structural_mutation(self) -> float: ...
+    @property
+    def weight_mutation(self) -> float: ...
+    @property
+    def nonuniform_exponent(self) -> float: ...
+    @property
+    def weight_range(self) -> float: ...
+    @property
+    def density(self) -> float: ...
+    @property
+    def bias(self) -> bool: ...
 
 
 class BreedingDraws(NamedTuple):
@@ -43,7 +84,7 @@ class BreedingDraws(NamedTuple):
     steps: Tensor
 
 
-def breeding_shapes(population: Genome, settings: CCNNSettings) -> list[tuple[int, ...]]:
+def breeding_shapes(population: Genome, settings: BreedingSettings) -> list[tuple[int, ...]]:
     """Shapes of `BreedingDraws` for one repeat."""
     half = (settings.population - settings.elites + 1) // 2
     bits, reals = tuple(population.mask.shape[2:]), tuple(population.weight.shape[2:])
@@ -59,7 +100,7 @@ def breeding_shapes(population: Genome, settings: CCNNSettings) -> list[tuple[in
     ]
 
 
-def initial_population(outputs: int, inputs: int, settings: CCNNSettings, seeds: Tensor, stream: int) -> Genome:
+def initial_population(outputs: int, inputs: int, settings: BreedingSettings, seeds: Tensor, stream: int) -> Genome:
     """Random structures of the stated density, weights uniform in the range; `r x population x out x in (+ 1)`."""
     size = settings.population
     draws = uniform(seeds, stream, 0, (size, outputs, 2 * inputs + settings.bias))
@@ -68,26 +109,58 @@ def initial_population(outputs: int, inputs: int, settings: CCNNSettings, seeds:
     return Genome(mask, torch.where(active(Genome(mask, weight)), weight, torch.zeros_like(weight)))
 
 
-def breed(population: Genome, fitness: Tensor, settings: CCNNSettings, progress: float, draws: BreedingDraws) -> Genome:
+def breed(
+    population: Genome, fitness: Tensor, settings: BreedingSettings, progress: float, draws: BreedingDraws
+) -> Genome:
     """Children of one subpopulation, `r x (population - elites) x ...`.
-
-    Two parents give two children. The first of each pair goes to structural mutation, the second to non-uniform
-    mutation of its weights: the paper's hybrid search, half and half.
 
     Args:
         population: `r x p x ...`.
         fitness: `r x p`.
         progress: t / T of eq. 13.
     """
-    half = draws.pairs.shape[1]
-    parents = select(population, tournament(fitness, draws.contestants))
+    return breed_networks([population], fitness, settings, progress, [draws])[0]
+
+
+def breed_networks(
+    layers: Sequence[Genome],
+    fitness: Tensor,
+    settings: BreedingSettings,
+    progress: float,
+    draws: Sequence[BreedingDraws],
+) -> list[Genome]:
+    """Children whose layers come from the same two parents: a whole network is crossed or not, and cut in every layer.
+
+    Args:
+        layers: `r x p x ...` each.
+        fitness: `r x p`.
+        progress: t / T of eq. 13.
+        draws: one a layer; contestants and pairs are those of the first.
+    """
+    chosen, crossed = tournament(fitness, draws[0].contestants), draws[0].pairs < settings.crossover
+    return [
+        _children(select(layer, chosen), crossed, settings, progress, numbers)
+        for layer, numbers in zip(layers, draws, strict=True)
+    ]
+
+
+def _children(
+    parents: Genome, crossed: Tensor, settings: BreedingSettings, progress: float, draws: BreedingDraws
+) -> Genome:
+    """Two parents give two children. The first of each pair goes to structural mutation, the second to non-uniform
+    mutation of its weights: the paper's hybrid search, half and half.
+
+    Args:
+        parents: mothers, then as many fathers, `r x 2h x ...`.
+        crossed: which pairs are crossed, `r x h`.
+    """
+    half = crossed.shape[1]
     mothers, fathers = (
         Genome(parents.mask[:, part], parents.weight[:, part]) for part in (slice(0, half), slice(half, None))
     )
-    shape = population.weight.shape[2:]
+    shape = parents.weight.shape[2:]
     swap = swap_genes(settings.crossover_kind, draws.places, math.prod(shape)).reshape(-1, half, *shape)
-    swap = swap & (draws.pairs < settings.crossover)[..., None, None]
-    first, second = crossover(mothers, fathers, swap)
+    first, second = crossover(mothers, fathers, swap & crossed[..., None, None])
     limit = settings.weight_range
     first = flip_connections(first, draws.flips < settings.structural_mutation, (draws.fresh * 2 - 1) * limit)
     chosen = (draws.genes < settings.weight_mutation) | weakest_draw(second, draws.genes)
@@ -96,7 +169,9 @@ def breed(population: Genome, fitness: Tensor, settings: CCNNSettings, progress:
     return Genome(*(torch.cat(pair, dim=1)[:, :count] for pair in zip(first, second, strict=True)))
 
 
-def with_elites(children: Genome, population: Genome, fitness: Tensor, best: Genome, settings: CCNNSettings) -> Genome:
+def with_elites(
+    children: Genome, population: Genome, fitness: Tensor, best: Genome, settings: BreedingSettings
+) -> Genome:
     """Elites before the children: the part of the best joined network, then the best of the population.
 
     Individuals as fit as the best of their subpopulation are copies of that part and not taken twice.

@@ -7,7 +7,6 @@ The subpopulations take turns within a generation: each is renewed and judged be
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -18,7 +17,7 @@ from torch import Tensor
 from ccnn_torch.evolution.breeding import BreedingDraws, breed, breeding_shapes, initial_population, with_elites
 from ccnn_torch.evolution.evaluation import Task, fitness, joined_errors
 from ccnn_torch.evolution.genome import Genome, active, select
-from ccnn_torch.evolution.random import uniform
+from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import CCNNSettings
 
 __all__ = ["Coevolution", "advance", "density", "diversity", "keep_refined", "start"]
@@ -66,7 +65,7 @@ def start(sizes: Sequence[int], task: Task, settings: CCNNSettings, seeds: Tenso
         best_fitness=task.inputs.new_zeros(len(seeds)),
         generation=0,
     )
-    company = _numbers([_company_shape(state, settings)], seeds, 0)[0]
+    company = uniform_parts(seeds, _GENERATIONS, 0, [_company_shape(state, settings)])[0]
     for layer, population in enumerate(populations):
         state = _judge(state, layer, population, company[:, layer], task, settings)
     return state
@@ -77,7 +76,8 @@ def advance(state: Coevolution, task: Task, settings: CCNNSettings, seeds: Tenso
     state = replace(state, generation=state.generation + 1)
     progress = state.generation / settings.generations
     shapes = [breeding_shapes(population, settings) for population in state.populations]
-    company, *numbers = _numbers([_company_shape(state, settings), *itertools.chain(*shapes)], seeds, state.generation)
+    all_shapes = [_company_shape(state, settings), *itertools.chain(*shapes)]
+    company, *numbers = uniform_parts(seeds, _GENERATIONS, state.generation, all_shapes)
     for layer, (population, scores) in enumerate(zip(state.populations, state.fitness, strict=True)):
         taken = sum(len(before) for before in shapes[:layer])
         draws = BreedingDraws(*numbers[taken : taken + len(shapes[layer])])
@@ -90,13 +90,6 @@ def advance(state: Coevolution, task: Task, settings: CCNNSettings, seeds: Tenso
 def _company_shape(state: Coevolution, settings: CCNNSettings) -> tuple[int, ...]:
     layers = len(state.populations)
     return layers, layers, settings.representatives
-
-
-def _numbers(shapes: Sequence[tuple[int, ...]], seeds: Tensor, generation: int) -> list[Tensor]:
-    """All random numbers of a generation in one call, cut to the shapes; each `r x shape`."""
-    sizes = [math.prod(shape) for shape in shapes]
-    parts = torch.split(uniform(seeds, _GENERATIONS, generation, (sum(sizes),)), sizes, dim=1)
-    return [part.reshape(len(seeds), *shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 def _judge(
@@ -158,19 +151,18 @@ def _keep_best(state: Coevolution, joined: Sequence[Genome], scores: Tensor) -> 
     return replace(state, best=best, best_fitness=torch.where(better, scores, state.best_fitness))
 
 
-def density(state: Coevolution) -> Tensor:
-    """Share of the possible connections that exist, mean over each subpopulation, `r x layers`."""
-    return torch.stack([genome.mask.to(genome.weight.dtype).mean((1, 2, 3)) for genome in state.populations], dim=-1)
+def density(populations: Sequence[Genome]) -> Tensor:
+    """Share of the possible connections that exist, mean over the individuals of each layer, `r x layers`."""
+    return torch.stack([genome.mask.to(genome.weight.dtype).mean((1, 2, 3)) for genome in populations], dim=-1)
 
 
-def diversity(state: Coevolution, settings: CCNNSettings) -> Tensor:
-    """Spread of each subpopulation, `r x layers` [1].
+def diversity(populations: Sequence[Genome], weight_range: float) -> Tensor:
+    """Spread of the individuals of each layer, `r x layers` [1].
 
     Standard deviation of a gene over the individuals, mean over genes, in units of the weight range; a missing
     connection counts as weight 0. Uniform random weights have about 0.58, a subpopulation of copies 0.
     """
-    spreads = [genome.weight.std(1).mean((1, 2)) for genome in state.populations]
-    return torch.stack(spreads, dim=-1) / settings.weight_range
+    return torch.stack([genome.weight.std(1).mean((1, 2)) for genome in populations], dim=-1) / weight_range
 
 
 def _put(values: tuple[_T, ...], index: int, value: _T) -> tuple[_T, ...]:

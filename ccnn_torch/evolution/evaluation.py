@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ccnn_torch.evolution.genome import Genome
 
-__all__ = ["Task", "fitness", "joined_errors", "make_task"]
+__all__ = ["Task", "fitness", "joined_errors", "make_task", "network_errors"]
 
 # Input of an unfed node: sigmoid(-1e4) is exactly 0, and unlike -inf it never makes a NaN.
 _FORCED_OFF = -1e4
@@ -114,13 +114,47 @@ def joined_errors(
     return torch.cat(parts)
 
 
-def _errors(layer: int, population: Genome, representatives: Sequence[Genome], task: Task) -> Tensor:
-    repeats, individuals = population.mask.shape[:2]
+def network_errors(networks: Sequence[Genome], task: Task, block: int | None = None) -> Tensor:
+    """Mean Euclidean output error of whole networks: sets of representatives without an individual among them.
+
+    Args:
+        networks: one layer of all networks each, `r x p x ...`.
+        block: as in `joined_errors`.
+
+    Returns:
+        `r x p` [1].
+    """
+    repeats, count = networks[0].mask.shape[:2]
+    each = max(genome.mask.shape[-2] for genome in networks) * task.inputs.shape[-1]
+    block = block or _BLOCK.get(task.inputs.device.type, _BLOCK_ELSEWHERE)
+    columns = min(count, max(1, block // each))
+    rows = max(1, block // (each * columns))
+    parts = []
+    for start in range(0, repeats, rows):
+        here = slice(start, start + rows)
+        rows_task = Task(*(part[here] for part in task))
+        pieces = [
+            _errors(
+                None,
+                None,
+                [Genome(g.mask[here, c : c + columns], g.weight[here, c : c + columns]) for g in networks],
+                rows_task,
+            )
+            for c in range(0, count, columns)
+        ]
+        parts.append(torch.cat(pieces, dim=-1))
+    return torch.cat(parts)[:, 0]
+
+
+def _errors(layer: int | None, population: Genome | None, representatives: Sequence[Genome], task: Task) -> Tensor:
+    """Errors of the individuals of one layer with every set, or (no layer) of the sets themselves: `r x p x k`."""
+    repeats = len(task.inputs)
+    individuals = 1 if population is None else population.mask.shape[1]
     sets, samples = representatives[0].mask.shape[1], task.inputs.shape[-1]
     signal = _Signal(task.inputs, task.inputs.new_ones(repeats, task.inputs.shape[1], 1), True)
     last = len(representatives) - 1
     for number, genome in enumerate(representatives):
-        if number == layer:
+        if population is not None and number == layer:
             step = _individuals(population, 1 if signal.shared else sets)
         else:
             step = _sets(genome, signal.shared)

@@ -8,11 +8,12 @@ OOPSLA 2014), written in wrapping int64, which torch has on every device.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-__all__ = ["member_seeds", "uniform"]
+__all__ = ["member_seeds", "uniform", "uniform_parts"]
 
 
 def _signed(word: int) -> int:
@@ -54,6 +55,13 @@ def uniform(seeds: Tensor, stream: int, counter: int, shape: tuple[int, ...]) ->
     halves = _mix_(key.unsqueeze(-1) + words).view(torch.int32)[:, :count]
     # Half a step is added so that neither 0 nor 1 appears: logarithms and powers of the numbers stay finite.
     return halves.to(torch.float64).mul_(2.0**-32).add_(0.5 + 2.0**-33).reshape(len(seeds), *shape)
+
+
+def uniform_parts(seeds: Tensor, stream: int, counter: int, shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
+    """The numbers of one call of `uniform`, cut to several shapes; each `r x shape`."""
+    sizes = [math.prod(shape) for shape in shapes]
+    parts = torch.split(uniform(seeds, stream, counter, (sum(sizes),)), sizes, dim=1)
+    return [part.reshape(len(seeds), *shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 def member_seeds(seeds: Tensor, members: int) -> Tensor:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-__all__ = ["CCNNSettings"]
+__all__ = ["CCNNSettings", "check_evolution"]
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,9 @@ class CCNNSettings:
         members: independent coevolutions of each repeat; the model is the mean of their networks, itself one masked
             network with their hidden layers side by side (paper: 1).
         refine_every: generations between refinements of the best joined network; 0 = only after the last one.
+        waves: slots for periodic nodes, each a sine and a cosine of one input found in what the refined network leaves,
+            since gears and screws repeat their errors; 0 = none (paper: none). They need refinement.
+        wave_searches: how often to look for them, each time followed by a refinement.
         refinement_iterations: Levenberg-Marquardt iterations of one refinement; 0 = none, as in the paper.
 
     Raises:
@@ -63,32 +66,44 @@ class CCNNSettings:
     target_error: float = 0.0
     members: int = 6
     refine_every: int = 10
+    waves: int = 24
+    wave_searches: int = 3
     refinement_iterations: int = 20
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
-        if not all(width >= 1 for width in self.hidden):
-            raise ValueError(f"hidden={list(self.hidden)}: every hidden layer needs at least one node")
         for key, low in (
-            ("generations", 1),
-            ("tournament", 1),
-            ("cuts", 1),
             ("representatives", 0),
-            ("elites", 1),
             ("members", 1),
             ("refine_every", 0),
             ("refinement_iterations", 0),
+            ("waves", 0),
+            ("wave_searches", 0),
         ):
             if getattr(self, key) < low:
                 raise ValueError(f"{key}={getattr(self, key)} must be at least {low}")
-        if self.population < self.elites + 2:
-            raise ValueError(f"population={self.population} must be at least elites + 2 = {self.elites + 2}")
-        for key in ("crossover", "structural_mutation", "weight_mutation", "density"):
-            if not 0 <= getattr(self, key) <= 1:
-                raise ValueError(f"{key}={getattr(self, key)} is a probability: write a number from 0 to 1")
-        for key in ("weight_range", "epsilon"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"{key}={getattr(self, key)} must be above 0")
-        for key in ("nonuniform_exponent", "target_error"):
-            if not getattr(self, key) >= 0:
-                raise ValueError(f"{key}={getattr(self, key)} must not be negative")
+        check_evolution(self)
+
+
+def check_evolution(settings: Any) -> None:
+    """Check the keys that every evolution of networks has.
+
+    Raises:
+        ValueError: a value out of its range, in one sentence with the key.
+    """
+    if not all(width >= 1 for width in settings.hidden):
+        raise ValueError(f"hidden={list(settings.hidden)}: every hidden layer needs at least one node")
+    for key in ("generations", "tournament", "cuts", "elites"):
+        if getattr(settings, key) < 1:
+            raise ValueError(f"{key}={getattr(settings, key)} must be at least 1")
+    if settings.population < settings.elites + 2:
+        raise ValueError(f"population={settings.population} must be at least elites + 2 = {settings.elites + 2}")
+    for key in ("crossover", "structural_mutation", "weight_mutation", "density"):
+        if not 0 <= getattr(settings, key) <= 1:
+            raise ValueError(f"{key}={getattr(settings, key)} is a probability: write a number from 0 to 1")
+    for key in ("weight_range", "epsilon"):
+        if not getattr(settings, key) > 0:
+            raise ValueError(f"{key}={getattr(settings, key)} must be above 0")
+    for key in ("nonuniform_exponent", "target_error"):
+        if not getattr(settings, key) >= 0:
+            raise ValueError(f"{key}={getattr(settings, key)} must not be negative")

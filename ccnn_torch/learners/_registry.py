@@ -8,8 +8,10 @@ from typing import Any, cast
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners._protocol import Learner, missing_verbs
+from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
 from ccnn_torch.learners.constant import Constant
+from ccnn_torch.learners.enn import ENN, ENNSettings
 from ccnn_torch.learners.gp import GaussianProcess, GPSettings
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.plugins import is_plugin, load_plugin
@@ -18,7 +20,9 @@ __all__ = ["LEARNERS", "make_learner"]
 
 LEARNERS: dict[str, Callable[[dict[str, Any]], Learner]] = {
     "ccnn": lambda settings: CCNN(CCNNSettings(**settings)),
+    "bp_lm": lambda settings: BPLM(BPLMSettings(**settings)),
     "grnn": lambda settings: GRNN(GRNNSettings(**settings)),
+    "enn": lambda settings: ENN(ENNSettings(**settings)),
     "constant": lambda settings: Constant(),
     "gp": lambda settings: GaussianProcess(GPSettings(**settings)),
 }

@@ -1,15 +1,16 @@
-"""Training rows without what stands in padded ones."""
+"""Training rows without what stands in padded ones, and the error on them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners._protocol import TrainingData
 
-__all__ = ["usable_rows"]
+__all__ = ["mean_square", "usable_rows"]
 
 
 def usable_rows(data: TrainingData) -> TrainingData:
@@ -25,3 +26,8 @@ def usable_rows(data: TrainingData) -> TrainingData:
         if part is not None and not bool(part.isfinite().all()):
             raise MethodFailedError(f"the training rows' {name} are not all finite; remove those rows")
     return replace(data, inputs=inputs, targets=targets, metric=metric)
+
+
+def mean_square(error: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean over rows, mean over outputs. error: `... x s x o`; weights: `... x s`; returns `...`."""
+    return (error.square().mean(-1) * weights).sum(-1) / weights.sum(-1)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ccnn_torch.learners._protocol import TrainingData
-from ccnn_torch.learners._rows import usable_rows
+from ccnn_torch.learners._rows import mean_square, usable_rows
 
 __all__ = ["Constant", "ConstantNetwork"]
 
@@ -70,9 +70,8 @@ class Constant:
         weights = self._data.weights.unsqueeze(-1)
         self._value = (self._data.targets * weights).sum(1) / weights.sum(1)
         self._step = self._step + 1
-        squares = (self._data.targets - self._value.unsqueeze(1)).square() * weights
-        error = squares.sum(1) / weights.sum(1)
-        return {"error_train": error.mean(-1), "evaluations": torch.ones_like(error[:, 0])}
+        error = mean_square(self._data.targets - self._value.unsqueeze(1), self._data.weights)
+        return {"error_train": error, "evaluations": torch.ones_like(error)}
 
     @property
     def finished(self) -> bool:

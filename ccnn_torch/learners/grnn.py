@@ -13,7 +13,7 @@ from ccnn_torch.evolution.random import uniform
 from ccnn_torch.learners._grnn_network import GRNNNetwork, KernelVariance
 from ccnn_torch.learners._kernel import FARTHEST, blocked_means
 from ccnn_torch.learners._protocol import TrainingData
-from ccnn_torch.learners._rows import usable_rows
+from ccnn_torch.learners._rows import mean_square, usable_rows
 
 __all__ = ["GRNN", "GRNNSettings"]
 
@@ -280,10 +280,10 @@ class GRNN:
         """Mean squared error of the model on all training rows, or on the judged ones where there are more; `r`."""
         judged, rows = self._judged, self._data
         if rows.weights.shape[1] <= self.settings.references:
-            return _mean_squares(self.predict(rows.inputs) - rows.targets, rows.weights)
+            return mean_square(self.predict(rows.inputs) - rows.targets, rows.weights)
         here = slice(0, judged.queries)
         error = self.predict(judged.inputs[:, here]) - judged.targets[:, here]
-        return _mean_squares(error, judged.weights[:, here])
+        return mean_square(error, judged.weights[:, here])
 
     def _narrowed(self, inverse: Tensor) -> Tensor:
         """1 / h for the use of all rows, `r x i`: bandwidths shrink as rows ** (-1 / (4 + inputs that are on))."""
@@ -314,8 +314,3 @@ class GRNN:
         targets = judged.targets[repeat, :count][queried]
         whole = ((targets - (targets * shares).sum(0)).square() * shares).sum(0)
         return KernelVariance(judged.inputs[repeat, :count][queried], weights.log(), squares, whole)
-
-
-def _mean_squares(error: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean over rows and channels. error: `... x s x o`; weights: `... x s`; returns `...`."""
-    return (error.square().mean(-1) * weights).sum(-1) / weights.sum(-1)

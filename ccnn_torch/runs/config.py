@@ -14,7 +14,9 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
+from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.ccnn import CCNNSettings
+from ccnn_torch.learners.enn import ENNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.runs._keys import explain, list_keys
@@ -221,8 +223,13 @@ class RunConfig(_Part):
     auto: AutoConfig = Field(default_factory=AutoConfig)
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
     save_models: bool = Field(default=True, description="write model files and their card")
+    save_report: bool = Field(
+        default=True, description="draw plots/ and write report.html; results.json, .csv and .md are always written"
+    )
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
+    bp_lm: BPLMSettings = Field(default_factory=BPLMSettings)
     grnn: GRNNSettings = Field(default_factory=GRNNSettings)
+    enn: ENNSettings = Field(default_factory=ENNSettings)
     gp: GPSettings = Field(default_factory=GPSettings)
 
     @model_validator(mode="before")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -16,11 +16,26 @@ from sklearn.utils.validation import _check_sample_weight, check_is_fitted, vali
 from torch import Tensor, nn
 
 from ccnn_torch.learners import Learner, TrainingData
+from ccnn_torch.runs.uncertainty import sd_scale
 from ccnn_torch.training import Scaling, Training, train
 
 __all__ = ["LearnerRegressor", "SteppedRegressor"]
 
 _Floats = NDArray[np.float64]
+
+
+class _Choice(NamedTuple):
+    """What rows held out of a first training tell.
+
+    Attributes:
+        steps: of lowest error on them, `1` int64.
+        inputs: of these rows, `h x i`.
+        residuals: that the first training left there, `h x o`.
+    """
+
+    steps: Tensor
+    inputs: _Floats
+    residuals: Tensor
 
 
 class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
@@ -56,14 +71,15 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         inputs, targets, weights = self._check(X, y, sample_weight)
         generator = check_random_state(self.random_state)
         seed = int(generator.randint(np.iinfo(np.int32).max))
-        steps = self._best_step(inputs, targets, weights, seed, generator)
-        learner, scaling, training = self._train(inputs, targets, weights, seed, stop_at=steps)
+        choice = self._choose(inputs, targets, weights, seed, generator)
+        learner, scaling, training = self._train(inputs, targets, weights, seed, stop_at=choice and choice.steps)
         self.network_ = learner.network(0).requires_grad_(False)
         self.scaling_ = scaling.repeat(0)
         self.n_iter_ = int(training.best_step[0])
         self.loss_curve_ = training.history["error_train"][: self.n_iter_, 0].tolist()
         converged = getattr(learner, "converged", None)
         self.converged_ = None if converged is None else bool(converged[0])
+        self.sd_scale_ = np.ones(targets.shape[1]) if choice is None else self._sd_scale(choice)
         return self
 
     def predict(self, X: ArrayLike, return_std: bool = False) -> Any:
@@ -77,13 +93,10 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         """
         check_is_fitted(self)
         rows: _Floats = validate_data(self, X, reset=False, dtype=np.float64)
+        features = self.scaling_.features(_tensor(rows))
         with torch.no_grad():
-            features = self.scaling_.features(_tensor(rows))
-            mean = self.scaling_.restore(self.network_(features))
-            if not return_std:
-                return self._shaped(mean)
-            variance: Tensor = self.network_.variance(features)  # type: ignore[operator]
-            return self._shaped(mean), self._shaped(variance.sqrt() * self.scaling_.deviation)
+            mean = self._shaped(self.scaling_.restore(self.network_(features)))
+        return (mean, self._shaped(self._sd(features) * _tensor(self.sd_scale_))) if return_std else mean
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
@@ -109,11 +122,26 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         width = inputs.shape[1]
         return rows[:, :width], rows[:, width:], merged
 
-    def _best_step(
+    def _choose(
         self, inputs: _Floats, targets: _Floats, weights: _Floats, seed: int, generator: np.random.RandomState
-    ) -> Tensor | None:
-        """Steps to train for, `1`; None = to the end."""
+    ) -> _Choice | None:
+        """Hold rows out of a first training; None where that is not asked for."""
         return None
+
+    def _sd(self, features: Tensor) -> Tensor:
+        """The learner's own standard deviation. features: `s x i` [1]; returns `s x o`."""
+        with torch.no_grad():
+            variance: Tensor = self.network_.variance(features)  # type: ignore[operator]
+        return variance.sqrt() * self.scaling_.deviation
+
+    def _sd_scale(self, choice: _Choice) -> _Floats:
+        """What makes intervals of the model as wide as held-out residuals are.
+
+        These are set against the standard deviation of the model that is kept, not of the one that left them: how sure
+        the two are can differ by half, while their errors hardly differ.
+        """
+        sd = self._sd(self.scaling_.features(_tensor(choice.inputs)))
+        return sd_scale(choice.residuals[None], sd[None], torch.ones(1, len(sd), dtype=sd.dtype))[0].numpy()
 
     def _train(
         self,
@@ -129,14 +157,16 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         """Train one repeat. held: rows to watch instead of training on them, `s`."""
         every = [_tensor(part).unsqueeze(0) for part in (inputs, targets, weights)]
         rows = every if held is None else [part[:, _tensor(~held)] for part in every]
-        scaling = Scaling.fit(rows[0], rows[1], rows[2], _tensor(self._periodic()))
+        learner = type(self)._learner(self._make_settings())
+        angles = getattr(learner, "reads_angles", False)
+        scaling = Scaling.fit(rows[0], rows[1], rows[2], _tensor(self._periodic()), angles)
         seeds = torch.tensor([seed])
 
         def scaled(parts: list[Tensor], validation: TrainingData | None = None) -> TrainingData:
-            return TrainingData(scaling.features(parts[0]), scaling.standardise(parts[1]), parts[2], seeds, validation)
+            features, targets = scaling.features(parts[0]), scaling.standardise(parts[1])
+            return TrainingData(features, targets, parts[2], seeds, validation, angles=scaling.angle_count)
 
         validation = None if held is None else scaled([part[:, _tensor(held)] for part in every])
-        learner = type(self)._learner(self._make_settings())
         training = train(learner, scaled(rows, validation), patience=patience, stop_at=stop_at)
         return learner, scaling, training
 
@@ -182,9 +212,9 @@ class SteppedRegressor(LearnerRegressor):
     validation_fraction: float
     n_iter_no_change: int | None
 
-    def _best_step(
+    def _choose(
         self, inputs: _Floats, targets: _Floats, weights: _Floats, seed: int, generator: np.random.RandomState
-    ) -> Tensor | None:
+    ) -> _Choice | None:
         if not self.early_stopping:
             return None
         if not 0 < self.validation_fraction < 1:
@@ -199,9 +229,14 @@ class SteppedRegressor(LearnerRegressor):
             )
         held = np.zeros(len(weights), dtype=bool)
         held[generator.permutation(len(weights))[:count]] = True
-        *_, training = self._train(inputs, targets, weights, seed, held=held, patience=self.n_iter_no_change)
+        learner, scaling, training = self._train(
+            inputs, targets, weights, seed, held=held, patience=self.n_iter_no_change
+        )
         self.validation_curve_ = training.history["error_validation"][:, 0].tolist()
-        return training.best_step
+        with torch.no_grad():
+            found = learner.network(0)(scaling.features(_tensor(inputs[held]).unsqueeze(0)))
+            residuals = _tensor(targets[held]) - scaling.restore(found)[0]
+        return _Choice(training.best_step, inputs[held], residuals)
 
 
 def _tensor(values: NDArray[Any]) -> Tensor:

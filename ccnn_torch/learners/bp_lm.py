@@ -1,0 +1,239 @@
+"""BP-LM as a learner: fully connected sigmoid networks from many starts, trained by Levenberg-Marquardt."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.evolution.masked_network import MaskedNetwork
+from ccnn_torch.evolution.network import forward
+from ccnn_torch.evolution.random import uniform
+from ccnn_torch.evolution.refinement import (
+    RefinementSettings,
+    RefinementState,
+    SecondOrder,
+    finish_refinement,
+    part_of_problem,
+    part_of_state,
+    pose_refinement,
+    put_part,
+    second_order,
+    start_refinement,
+    step_refinement,
+)
+from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
+from ccnn_torch.learners._protocol import TrainingData
+from ccnn_torch.learners._rows import mean_square, usable_rows
+
+__all__ = ["BPLM", "BPLMSettings"]
+
+_STARTS = 0
+
+
+@dataclass(frozen=True)
+class BPLMSettings:
+    """Settings of BP-LM; paper 000 gives none of its own.
+
+    Attributes:
+        hidden: nodes of each hidden layer. Bayesian regularisation switches off what the rows do not ask for, so that
+            more nodes cost time rather than accuracy.
+        restarts: networks from independent starts, trained side by side.
+        iterations: Levenberg-Marquardt iterations at most; training ends earlier once every network is at rest.
+        tolerance: a network is at rest, and is left there, once its log evidence changed by at most this per measured
+            value in each of `patience` iterations.
+        patience: see `tolerance`.
+
+    Raises:
+        ValueError: a value out of its range, in one sentence with the key.
+    """
+
+    hidden: tuple[int, ...] = (20,)
+    restarts: int = 6
+    iterations: int = 60
+    tolerance: float = 1e-3
+    patience: int = 3
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hidden", tuple(self.hidden))
+        if not self.hidden or not all(width >= 1 for width in self.hidden):
+            raise ValueError(f"hidden={list(self.hidden)}: at least one hidden layer, each with at least one node")
+        for key in ("restarts", "iterations", "patience"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"{key}={getattr(self, key)} must be at least 1")
+        if not 0 < self.tolerance < math.inf:
+            raise ValueError(f"tolerance={self.tolerance} must be above 0")
+
+
+class BPLM:
+    """Levenberg-Marquardt with Bayesian regularisation (`evolution.refinement`); a step is an iteration of all starts.
+
+    The Jacobian is in closed form (`evolution._gauss_newton`), which is faster than `torch.func` and held to it by a
+    test. Starts are those of Nguyen and Widrow (IJCNN 1990), put to the logistic sigmoid: directions and places of the
+    nodes drawn from the seed, slopes such that the nodes share out the range of the inputs; output weights are small.
+
+    The model is the network of highest evidence so far, of whichever start and iteration. On case one (seeds 1000 to
+    1009) the average of ten networks was as good (0.648 and 0.646 of the constant's error), and it would have ten times
+    the nodes. Errors are judged in the channels of `data.metric` where there is one.
+
+    Metrics of a step: `error_train`, `evidence_best` (logarithm, per measured value; highest now),
+    `evaluations` (a Jacobian counts as many as there are outputs, the steps
+    tried in an iteration count one), each `r`.
+    """
+
+    name = "bp_lm"
+
+    def __init__(self, settings: BPLMSettings | None = None) -> None:
+        self.settings = settings or BPLMSettings()
+
+    def start(self, data: TrainingData) -> None:
+        """Take the data and draw the starts; until the first step the model is the mean.
+
+        Raises:
+            MethodFailedError: training rows are not finite.
+        """
+        self._data = data = usable_rows(data)
+        sizes = (data.inputs.shape[-1], *self.settings.hidden, data.targets.shape[-1])
+        leading = (len(data.seeds), self.settings.restarts)
+        shapes = list(pairwise(sizes))
+        self._masks = [data.seeds.new_ones(leading[0], 1, out, into, dtype=torch.bool) for into, out in shapes]
+        weights = _nguyen_widrow(sizes, data.seeds, self.settings.restarts)
+        self._problem = pose_refinement(
+            self._masks,
+            weights,
+            data.inputs.unsqueeze(1),
+            data.targets.unsqueeze(1),
+            data.weights.unsqueeze(1),
+            RefinementSettings(iterations=self.settings.iterations),
+            None if data.metric is None else data.metric.unsqueeze(1),
+        )
+        self._state = start_refinement(self._problem, weights)
+        self._evidence = data.inputs.new_full(leading, -torch.inf)
+        # Zeros: the mean, until some evidence is known.
+        self._best = torch.zeros_like(self._state.weights.reshape(*leading, -1)[:, 0])
+        self._best_evidence = self._evidence[:, 0].clone()
+        self._rest = torch.zeros(leading, dtype=torch.int64, device=data.inputs.device)
+        self._iterations = torch.zeros_like(self._evidence)
+        self._known = second_order(self._problem, self._state)
+
+    def step(self) -> dict[str, Tensor]:
+        """One iteration of every network."""
+        data = self._data
+        going = torch.nonzero(self._rest.flatten() < self.settings.patience).flatten()
+        problem = part_of_problem(self._problem, going)
+        moved = step_refinement(
+            problem, part_of_state(self._state, going), SecondOrder(*(part[going] for part in self._known))
+        )
+        known = second_order(problem, moved)
+        refined = finish_refinement(problem, moved, known)
+        self._state = put_part(self._state, going, moved)
+        self._known = SecondOrder(*(old.index_copy(0, going, new) for old, new in zip(self._known, known, strict=True)))
+        channels = data.targets.shape[-1] if data.metric is None else data.metric.shape[-2]
+        values = (data.weights.sum(-1, keepdim=True) * channels).expand_as(self._evidence).flatten()[going]
+        evidence = refined.log_evidence.flatten() / values
+        evidence = torch.where(evidence.isfinite(), evidence, -torch.inf)
+        calm = (evidence - self._evidence.flatten()[going]).abs() <= self.settings.tolerance
+        rest = torch.where(calm, self._rest.flatten()[going] + 1, 0)
+        self._rest = self._rest.flatten().index_copy(0, going, rest).view_as(self._rest)
+        self._evidence = self._evidence.flatten().index_copy(0, going, evidence).view_as(self._evidence)
+        self._iterations = (
+            self._iterations.flatten().index_add(0, going, torch.ones_like(evidence)).view_as(self._evidence)
+        )
+        highest, which = self._evidence.max(-1)
+        repeats = torch.arange(len(which), device=which.device)
+        candidate = self._state.weights.reshape(*self._evidence.shape, -1)[repeats, which]
+        better = highest > self._best_evidence
+        self._best = torch.where(better.unsqueeze(-1), candidate, self._best)
+        self._best_evidence = torch.where(better, highest, self._best_evidence)
+        return {
+            "error_train": mean_square(self.predict(data.inputs) - data.targets, data.weights),
+            "evidence_best": highest,
+            "evaluations": self._iterations.sum(-1) * (data.targets.shape[-1] + 1),
+        }
+
+    @property
+    def finished(self) -> bool:
+        """True once every network is at rest, or after the last iteration."""
+        at_rest = bool((self._rest >= self.settings.patience).all())
+        return at_rest or int(self._state.iteration) >= self.settings.iterations
+
+    @property
+    def converged(self) -> Tensor:
+        """Whether the network of highest evidence is at rest, `r`, bool."""
+        best = self._evidence.argmax(-1, keepdim=True)
+        at_rest: Tensor = self._rest.gather(-1, best).squeeze(-1) >= self.settings.patience
+        return at_rest
+
+    @property
+    def steps(self) -> int:
+        """Iterations at most."""
+        return self.settings.iterations
+
+    def predict(self, inputs: Tensor) -> Tensor:
+        """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
+        masks, weights = self._model()
+        return forward(masks, weights, inputs.unsqueeze(1)).squeeze(1)
+
+    def variance(self, inputs: Tensor) -> Tensor:
+        """Predictive variance of newly measured outputs. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
+        masks, weights = self._model()
+        return spread_variance([m[:, 0] for m in masks], [w[:, 0] for w in weights], self._spread(), inputs)
+
+    def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
+        """Masks and weights of one repeat's model: `out x in` and `out x (in + 1)`, biases last."""
+        masks, weights = self._model()
+        return [mask[repeat, 0] for mask in masks], [weight[repeat, 0] for weight in weights]
+
+    def network(self, repeat: int) -> MaskedNetwork:
+        """The model of one repeat."""
+        spread = self._spread()
+        return MaskedNetwork(*self.genome(repeat), spread.factors[repeat], spread.noise[repeat])
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The networks with their precisions, `r x restarts x ...`, and what is known of each."""
+        leading = self._evidence.shape
+        tensors = {
+            name: value.reshape(*leading, *value.shape[1:]) if value.dim() else value
+            for name, value in self._state.state_dict().items()
+        }
+        known = {"log_evidence": self._evidence, "rest": self._rest, "iterations_made": self._iterations}
+        return tensors | known | {"best": self._best, "best_evidence": self._best_evidence}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take back a state; call `start` with the same data first."""
+        self._evidence, self._rest = state["log_evidence"], state["rest"]
+        self._iterations = state["iterations_made"]
+        self._best, self._best_evidence = state["best"], state["best_evidence"]
+        names = self._state.state_dict().keys()
+        self._state = RefinementState.from_state_dict(
+            {name: state[name].flatten(0, 1) if state[name].dim() else state[name] for name in names}
+        )
+        self._known = second_order(self._problem, self._state)
+
+    def _model(self) -> tuple[list[Tensor], list[Tensor]]:
+        """Masks and weights of the model, `r x 1 x ...`."""
+        return self._masks, [layer.unsqueeze(1) for layer in self._problem.network.split(self._best)]
+
+    def _spread(self) -> Spread:
+        return readout_spread(*self._model(), self._data.inputs, self._data.targets, self._data.weights)
+
+
+def _nguyen_widrow(sizes: tuple[int, ...], seeds: Tensor, restarts: int) -> list[Tensor]:
+    """First weights, one a layer, `r x restarts x out x (in + 1)` with the biases last."""
+    shapes = [(out, into + 1) for into, out in pairwise(sizes)]
+    draws = 2 * uniform(seeds, _STARTS, 0, (restarts, sum(out * width for out, width in shapes))) - 1
+    parts = torch.split(draws, [out * width for out, width in shapes], dim=-1)
+    layers = []
+    for number, (part, (out, width)) in enumerate(zip(parts, shapes, strict=True)):
+        drawn = part.reshape(len(seeds), restarts, out, width)
+        if number == len(shapes) - 1:
+            layers.append(drawn / 2)
+            continue
+        direction = drawn[..., :-1] / torch.linalg.vector_norm(drawn[..., :-1], dim=-1, keepdim=True)
+        # Twice the slope for tanh: the logistic sigmoid is (1 + tanh(x / 2)) / 2.
+        slope = 2 * 0.7 * out ** (1 / (width - 1))
+        layers.append(slope * torch.cat([direction, drawn[..., -1:]], -1))
+    return layers

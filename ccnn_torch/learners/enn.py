@@ -1,0 +1,212 @@
+"""The evolutionary neural network (ENN) of paper 000, one population of whole networks, as a learner."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.evolution.breeding import (
+    BreedingDraws,
+    breed_networks,
+    breeding_shapes,
+    initial_population,
+    with_elites,
+)
+from ccnn_torch.evolution.coevolution import density, diversity
+from ccnn_torch.evolution.evaluation import fitness, make_task, network_errors
+from ccnn_torch.evolution.genome import Genome, select
+from ccnn_torch.evolution.masked_network import MaskedNetwork
+from ccnn_torch.evolution.network import forward
+from ccnn_torch.evolution.random import uniform_parts
+from ccnn_torch.evolution.settings import check_evolution
+from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
+from ccnn_torch.learners._protocol import TrainingData
+from ccnn_torch.learners._rows import mean_square, usable_rows
+
+__all__ = ["ENN", "ENNSettings"]
+
+# Streams of random numbers: one for the generations, one for each layer's first individuals.
+_GENERATIONS, _FIRST = 0, 1
+
+
+@dataclass(frozen=True)
+class ENNSettings:
+    """Settings of the ENN, named as those of the CCNN. Paper 000 gives none for its ENN: probabilities are its CCNN's.
+
+    Attributes:
+        hidden: nodes of each hidden layer, those of the paper's CCNN.
+        population: networks. With `generations`, as many networks are evaluated as by the CCNN's defaults.
+        generations: generations.
+        crossover: probability that a pair of parents is crossed.
+        structural_mutation: probability that a bit of a structural offspring flips.
+        weight_mutation: probability that a weight of a weight offspring mutates; one of each layer always does.
+        tournament: contestants of one tournament.
+        crossover_kind: point (cuts at random places of every layer) or uniform.
+        cuts: cut points of a point crossover in each layer; 1 = single-point.
+        elites: networks that survive unchanged.
+        weight_range: weights start and mutate in -weight_range .. weight_range.
+        density: share of connections that exist at the start.
+        bias: whether nodes have a bias, an input that is always on.
+        epsilon: added to the error in eq. 11, on standardised outputs.
+        nonuniform_exponent: b of eq. 13.
+        target_error: end once the training error of eq. 11 (standardised) of every repeat is at most this; 0 = never.
+
+    Raises:
+        ValueError: a value out of its range, in one sentence with the key.
+    """
+
+    hidden: tuple[int, ...] = (6, 6)
+    population: int = 480
+    generations: int = 360
+    crossover: float = 0.72
+    structural_mutation: float = 0.0015
+    weight_mutation: float = 0.0025
+    tournament: int = 3
+    crossover_kind: Literal["point", "uniform"] = "point"
+    cuts: int = 2
+    elites: int = 2
+    weight_range: float = 2.0
+    density: float = 0.5
+    bias: bool = True
+    epsilon: float = 1e-6
+    nonuniform_exponent: float = 2.0
+    target_error: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hidden", tuple(self.hidden))
+        check_evolution(self)
+
+
+class ENN:
+    """The CCNN's genomes, operators and fitness (eq. 11) without its cooperation; a step is one generation.
+
+    An individual is a whole network: its layers have the same parents, and one number is its fitness. The model is the
+    fittest network so far. Nothing is refined and nothing regularised, so that whatever a network is fitter by counts,
+    noise included.
+
+    Metrics of a step: `fitness_best`, `fitness_mean`, `error_train`, `evaluations` (networks so far), each `r`;
+    `density` and `diversity`, `r x layers`.
+    """
+
+    name = "enn"
+
+    def __init__(self, settings: ENNSettings | None = None) -> None:
+        self.settings = settings or ENNSettings()
+
+    def start(self, data: TrainingData) -> None:
+        """Take the data and judge the random first generation.
+
+        Raises:
+            MethodFailedError: training rows are not finite.
+        """
+        self._data = data = usable_rows(data)
+        self._task = make_task(data.inputs, data.targets, data.weights)
+        sizes = (data.inputs.shape[-1], *self.settings.hidden, data.targets.shape[-1])
+        self._layers = [
+            initial_population(after, before, self.settings, data.seeds, _FIRST + layer)
+            for layer, (before, after) in enumerate(itertools.pairwise(sizes))
+        ]
+        self._generation = 0
+        self._best = [Genome(layer.mask[:, :1].clone(), layer.weight[:, :1].clone()) for layer in self._layers]
+        self._best_fitness = torch.zeros_like(data.weights[:, 0])
+        self._judge()
+
+    def step(self) -> dict[str, Tensor]:
+        """One generation."""
+        settings, data = self.settings, self._data
+        self._generation += 1
+        shapes = [breeding_shapes(layer, settings) for layer in self._layers]
+        numbers = iter(uniform_parts(data.seeds, _GENERATIONS, self._generation, list(itertools.chain(*shapes))))
+        draws = [BreedingDraws(*itertools.islice(numbers, len(own))) for own in shapes]
+        progress = self._generation / settings.generations
+        children = breed_networks(self._layers, self._fitness, settings, progress, draws)
+        self._layers = [
+            with_elites(new, old, self._fitness, best, settings)
+            for new, old, best in zip(children, self._layers, self._best, strict=True)
+        ]
+        self._judge()
+        judged = (self._generation + 1) * settings.population
+        return {
+            "fitness_best": self._best_fitness,
+            "fitness_mean": self._fitness.mean(-1),
+            "error_train": mean_square(self.predict(data.inputs) - data.targets, data.weights),
+            "density": density(self._layers),
+            "diversity": diversity(self._layers, settings.weight_range),
+            "evaluations": torch.full_like(self._best_fitness, judged),
+        }
+
+    @property
+    def finished(self) -> bool:
+        """True after the last generation, or once every repeat has reached the target error."""
+        settings = self.settings
+        error = 1 / self._best_fitness - settings.epsilon
+        reached = settings.target_error > 0 and bool((error <= settings.target_error).all())
+        return reached or self._generation >= settings.generations
+
+    @property
+    def steps(self) -> int:
+        """Generations."""
+        return self.settings.generations
+
+    def predict(self, inputs: Tensor) -> Tensor:
+        """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
+        masks, weights = self._model()
+        return forward(masks, weights, inputs.unsqueeze(1)).squeeze(1)
+
+    def variance(self, inputs: Tensor) -> Tensor:
+        """Predictive variance of newly measured outputs. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
+        masks, weights = self._model()
+        return spread_variance([m[:, 0] for m in masks], [w[:, 0] for w in weights], self._spread(), inputs)
+
+    def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
+        """Masks and weights of one repeat's model, dead nodes included: `out x in` and `out x (in or in + 1)`."""
+        masks, weights = self._model()
+        return [mask[repeat, 0] for mask in masks], [weight[repeat, 0] for weight in weights]
+
+    def network(self, repeat: int) -> MaskedNetwork:
+        """The model of one repeat, pruned of its dead nodes."""
+        spread = self._spread()
+        return MaskedNetwork(*self.genome(repeat), spread.factors[repeat], spread.noise[repeat])
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The population with its fitness, and the fittest network so far."""
+        tensors = {"fitness": self._fitness, "best_fitness": self._best_fitness}
+        for name, layers in (("population", self._layers), ("best", self._best)):
+            for number, layer in enumerate(layers):
+                tensors[f"{name}_mask_{number}"] = layer.mask
+                tensors[f"{name}_weight_{number}"] = layer.weight
+        return tensors | {"generation": torch.tensor(self._generation, dtype=torch.int64)}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take back a state; call `start` with the same data first."""
+
+        def layers(name: str) -> list[Genome]:
+            return [Genome(state[f"{name}_mask_{n}"], state[f"{name}_weight_{n}"]) for n in range(len(self._layers))]
+
+        self._layers, self._best = layers("population"), layers("best")
+        self._fitness, self._best_fitness = state["fitness"], state["best_fitness"]
+        self._generation = int(state["generation"])
+
+    def _judge(self) -> None:
+        """Fitness of the population, and the best network where one beats it."""
+        self._fitness = fitness(network_errors(self._layers, self._task), self.settings.epsilon)
+        highest, which = self._fitness.max(-1, keepdim=True)
+        better = highest > self._best_fitness.unsqueeze(-1)
+        take = better[..., None, None]
+        found = [select(layer, which) for layer in self._layers]
+        self._best = [
+            Genome(torch.where(take, new.mask, old.mask), torch.where(take, new.weight, old.weight))
+            for new, old in zip(found, self._best, strict=True)
+        ]
+        self._best_fitness = torch.maximum(self._best_fitness, highest.squeeze(-1))
+
+    def _model(self) -> tuple[list[Tensor], list[Tensor]]:
+        """Masks and weights of the model, one a layer, `r x 1 x ...`."""
+        return [layer.mask for layer in self._best], [layer.weight for layer in self._best]
+
+    def _spread(self) -> Spread:
+        return readout_spread(*self._model(), self._data.inputs, self._data.targets, self._data.weights)
