@@ -104,7 +104,7 @@ def test_it_agrees_with_scikit_learn(kernel: str) -> None:
     # scikit-learn counts the white noise of a new point in.
     np.testing.assert_allclose(learner.variance(given[None])[0, :, 1], deviation**2, rtol=1e-9)
     # Search: our maximum has no lower likelihood than where it began, by the peer's measure.
-    start = np.log([1.0, *np.full(2, math.exp(0.7)), math.exp(-1.0) + FLOOR])
+    start = np.log([1.0, *np.full(2, math.exp(0.7)), math.exp(-3.0) + FLOOR])
     assert peer.log_marginal_likelihood(peer.kernel_.theta) > peer.log_marginal_likelihood(start) + 5
 
 

@@ -19,8 +19,8 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.learners.constant import Constant
-from ccnn_torch.learners.gp import GaussianProcess, GPSettings
 from ccnn_torch.learners.enn import ENN, ENNSettings
+from ccnn_torch.learners.gp import GaussianProcess, GPSettings
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.training import Scaling, train
 
