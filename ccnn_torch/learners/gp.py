@@ -32,9 +32,9 @@ _CHUNK = 1 << 18
 _LOOK = 10
 # Rprop's step sizes never leave these bounds [nats of a hyperparameter's logarithm].
 _STEP_SIZES = (1e-4, 1.0)
-# Logarithms that a search starts from: length scales of the inputs' whole range, a twentieth of the variance noise. From
-# a third it ended where some of a UR10's joints are taken for noise (validation error 0.09 instead of 0.06); where little
-# can be learned the start makes no difference.
+# Logarithms that a search starts from: length scales of the inputs' whole range, a twentieth of the variance noise.
+# From a third it ended where some joints of a UR10 are taken for noise (validation error 0.09 instead of 0.06); where
+# little can be learned the start makes no difference.
 _SMOOTH, _NOISY = 0.7, -3.0
 _ORDER_STREAM = 71
 
