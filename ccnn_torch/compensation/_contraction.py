@@ -19,7 +19,7 @@ STEEPEST_DEVIATION = 0.2
 TOLERANCE = 1e-12
 
 _POINTS = 2048
-_AT_ONCE = 512
+_AT_ONCE = 256
 _CLIMBERS = 64
 _ROUNDS = 12
 # The steepest of the points tried is not the steepest of all.

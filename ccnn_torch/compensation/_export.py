@@ -1,8 +1,9 @@
 """The compensator as ONNX and as `.pt2`: whole graphs, verified against the eager model when they are made.
 
 In double, ONNX Runtime has kernels for Gemm, Sigmoid, Tanh, Exp, Sin, Cos, Min, Max, Where, comparisons and arithmetic,
-and none for Tan, Asin, Acos, Atan, Softplus, Elu, Gelu and Erf: a network made of those cannot be exported. The exporter
-rounds a number that stands in the code (0.01 * x) to single precision; one that is not exact there must be a buffer.
+and none for Tan, Asin, Acos, Atan, Softplus, Elu, Gelu and Erf: a network made of those cannot be exported. The
+exporter rounds a number that stands in the code (0.01 * x) to single precision: one that is not exact there has to be a
+buffer.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A Gaussian process that was conditioned on its rows, as plain tensors: mean, variance, and the module for export.
 
-Everything here is made of matrix products, exponentials, square roots and maxima, which ONNX Runtime has in double.
+Made of matrix products, sums, exponentials, square roots and maxima, which ONNX Runtime has in double.
 """
 
 from __future__ import annotations
@@ -18,29 +18,28 @@ KERNELS = ("matern32", "matern52", "rbf")
 _NO_DISTANCE = 1e-30
 
 
-def covariance(kernel: str, inputs: Tensor, rows: Tensor, length_scale: Tensor, output_scale: Tensor) -> Tensor:
-    """Covariance of the function at two sets of points (Rasmussen and Williams 2006, eq. 4.17 and 4.9).
+def covariance(kernel: str, rows: Tensor, length_scale: Tensor, output_scale: Tensor) -> Tensor:
+    """Covariance of the function among its rows, without noise, `n x n`.
 
     Args:
         kernel: one of `KERNELS`.
-        inputs: `... x s x i` [1], or `i` for a single point.
-        rows: `... x n x i` [1].
-        length_scale: one an input, `... x 1 x i`, or `i`.
-        output_scale: variance of the function, `... x 1 x 1`, or 0-d.
-
-    Returns:
-        `... x s x n`, or `n` for a single point.
+        rows: `n x i` [1].
+        length_scale: one an input, `i`.
+        output_scale: variance of the function, 0-d.
     """
-    one, other = inputs / length_scale, rows / length_scale
-    squared = (one * one).sum(-1, keepdim=True) + (other * other).sum(-1).unsqueeze(-2) - 2 * (one @ other.mT)
-    if one.dim() == 1:
-        squared = squared.squeeze(0)
+    scaled = rows / length_scale
+    own = (scaled * scaled).sum(-1)
+    return output_scale * _correlation(kernel, own.unsqueeze(-1) + own - 2 * (scaled @ scaled.mT))
+
+
+def _correlation(kernel: str, squared: Tensor) -> Tensor:
+    """Of squared distances in units of the length scales (Rasmussen and Williams 2006, eq. 4.9 and 4.17), any shape."""
     squared = squared.clamp_min(_NO_DISTANCE)
     if kernel == "rbf":
-        return output_scale * torch.exp(-0.5 * squared)
+        return torch.exp(-0.5 * squared)
     scaled = torch.sqrt((3.0 if kernel == "matern32" else 5.0) * squared)
     polynomial = 1 + scaled if kernel == "matern32" else 1 + scaled + scaled * scaled / 3
-    return output_scale * polynomial * torch.exp(-scaled)
+    return polynomial * torch.exp(-scaled)
 
 
 def spread_factor(covariances: Tensor) -> Tensor:
@@ -62,12 +61,16 @@ def spread_factor(covariances: Tensor) -> Tensor:
 class GPNetwork(nn.Module):
     """Mean and variance of `o` independent Gaussian processes on shared rows, for one repeat.
 
+    All outputs go through the same few operations, which keeps the graph of a model file small: with squared distances
+    as |x / l|² + |row / l|² - 2 x · (row / l²), rows and length scales are needed in three combinations only.
+
     Attributes:
         kernel: one of `KERNELS`.
-        rows: training rows, `n x i` [1]; the variance knows of the first `v` alone.
-        dual: weights of the rows, `o x n` [1].
-        spread: inverse Cholesky factors of the first `v` rows' covariances, `o x v x v`.
-        length_scale: `o x i` [1].
+        inverse_squares: 1 / l², `i x o` [1].
+        points: row / l², `i x (o n)` [1].
+        own: |row / l|², `o x n` [1].
+        dual: weights of the rows times the variance of the function, `o x n` [1].
+        spread: inverse Cholesky factors of the covariance of the first `v` rows, times the same, `o x v x v` [1].
         output_scale, noise, constant: variance of the function, of the noise, and the mean far from all rows, `o` [1].
     """
 
@@ -75,10 +78,11 @@ class GPNetwork(nn.Module):
     # fewer digits than for a network of some nodes.
     export_tolerance = 1e-9
 
-    rows: Tensor
+    inverse_squares: Tensor
+    points: Tensor
+    own: Tensor
     dual: Tensor
     spread: Tensor
-    length_scale: Tensor
     output_scale: Tensor
     noise: Tensor
     constant: Tensor
@@ -94,49 +98,64 @@ class GPNetwork(nn.Module):
         noise: Tensor,
         constant: Tensor,
     ) -> None:
+        """From one repeat's process.
+
+        Args:
+            rows: training rows, `n x i` [1]; the variance knows of the first `v` alone.
+            dual: weights of the rows, `o x n` [1].
+            spread: inverse Cholesky factors (`spread_factor`) of the first `v` rows' covariances, `o x v x v`.
+            length_scale: `o x i` [1].
+            output_scale, noise, constant: `o` [1].
+        """
         super().__init__()
         self.kernel = kernel
-        self.register_buffer("rows", rows)
-        self.register_buffer("dual", dual)
-        self.register_buffer("spread", spread)
-        self.register_buffer("length_scale", length_scale)
-        self.register_buffer("output_scale", output_scale)
-        self.register_buffer("noise", noise)
-        self.register_buffer("constant", constant)
+        inverse = 1 / (length_scale * length_scale)
+        points = rows * inverse.unsqueeze(1)
+        for name, value in (
+            ("inverse_squares", inverse.mT.contiguous()),
+            ("points", points.flatten(0, 1).mT.contiguous()),
+            ("own", (rows * points).sum(-1)),
+            ("dual", dual * output_scale.unsqueeze(-1)),
+            ("spread", spread * output_scale[:, None, None]),
+            ("output_scale", output_scale.clone()),
+            ("noise", noise.clone()),
+            ("constant", constant.clone()),
+        ):
+            self.register_buffer(name, value)
 
     def forward(self, features: Tensor) -> Tensor:
         """features: `... x i`; returns `... x o`."""
-        # One output at a time: a derivative of one then costs nothing for the others, and the matrices stay small.
-        means = [
-            self._covariance(features, self.rows, k) @ self.dual[k] + self.constant[k] for k in range(len(self.dual))
-        ]
-        return torch.stack(means, -1)
+        correlation = self._correlation(features, self.points, self.own)
+        return (correlation * self.dual).sum(-1) + self.constant
 
     def variance(self, features: Tensor) -> Tensor:
         """Variance of a newly measured output, noise included; features: `... x i`; returns `... x o`, above 0.
 
         An upper bound of that of the process: leaving out rows never lowers a variance.
         """
-        known = self.rows[: self.spread.shape[-1]]
-        variances = []
-        for k in range(len(self.dual)):
-            told = self._covariance(features, known, k) @ self.spread[k].mT
-            left = self.output_scale[k] - (told * told).sum(-1)
-            variances.append(left.clamp_min(0.0) + self.noise[k])
-        return torch.stack(variances, -1)
+        known = self.spread.shape[-1]
+        points = self.points.reshape(-1, *self.own.shape)[..., :known].flatten(1)
+        correlation = self._correlation(features, points, self.own[:, :known])
+        # One output at a time: a product of all at once would copy the factors for every row of the features.
+        told = [correlation[..., k, :] @ factor.mT for k, factor in enumerate(self.spread)]
+        explained = torch.stack([(part * part).sum(-1) for part in told], -1)
+        return (self.output_scale - explained).clamp_min(0.0) + self.noise
 
-    def _covariance(self, features: Tensor, rows: Tensor, output: int) -> Tensor:
-        return covariance(self.kernel, features, rows, self.length_scale[output], self.output_scale[output])
+    def _correlation(self, features: Tensor, points: Tensor, own: Tensor) -> Tensor:
+        """With the rows that `points` and `own` tell of, `... x o x n`."""
+        across = (features @ points).reshape(*features.shape[:-1], *own.shape)
+        square = ((features * features) @ self.inverse_squares).unsqueeze(-1)
+        return _correlation(self.kernel, square + own - 2 * across)
 
     def describe(self) -> dict[str, Any]:
         """What a model file needs to build the module again, beside its tensors."""
-        n, i = self.rows.shape
+        inputs, outputs = self.inverse_squares.shape
         return {
             "kind": "gp",
             "kernel": self.kernel,
-            "inputs": i,
-            "outputs": len(self.dual),
-            "rows": n,
+            "inputs": inputs,
+            "outputs": outputs,
+            "rows": self.own.shape[-1],
             "variance_rows": self.spread.shape[-1],
         }
 
