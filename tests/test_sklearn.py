@@ -50,7 +50,7 @@ OTHER_DEFAULTS: dict[type[Any], set[str]] = {
     CCNNRegressor: {"hidden", "population", "generations", "members", "refine_every", "refinement_iterations"},
     BPLMRegressor: {"hidden", "restarts"},
     GRNNRegressor: set(),
-    ENNRegressor: {"population", "generations"},
+    ENNRegressor: {"hidden", "population", "generations"},
 }
 
 every = pytest.mark.parametrize("kind", ESTIMATORS)
@@ -227,7 +227,7 @@ def test_intervals_are_as_wide_as_the_errors_on_rows_held_out(kind: Any) -> None
     regressor = small(kind, early_stopping=True, validation_fraction=0.4).fit(X, y)
     mean, deviation = regressor.predict(fresh, return_std=True)
     covered, narrow = ((np.abs(mean - truth) < 1.96 * share * deviation).mean() for share in (1, 0.4))
-    assert covered > 0.9 and narrow < 0.9
+    assert covered > 0.85 and narrow < 0.85
     scale = regressor.sd_scale_.copy()
     assert scale.shape == (2,)
     regressor.sd_scale_ = np.array([1.0, 3.0])

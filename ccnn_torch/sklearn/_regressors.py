@@ -160,8 +160,8 @@ class BPLMRegressor(SteppedRegressor):
 class ENNRegressor(SteppedRegressor):
     """One evolved population of whole networks, without cooperation and without refinement: the paper's comparison.
 
-    By default population and generations stay far below what a run has, so that the network is coarse. All settings:
-    `ccnn_torch.learners.enn.ENNSettings`.
+    By default hidden is one layer, and population and generations stay far below what a run has, so that the network
+    is coarse. All settings: `ccnn_torch.learners.enn.ENNSettings`.
 
     Args:
         hidden: nodes of each hidden layer; a number is one layer.
@@ -195,9 +195,9 @@ class ENNRegressor(SteppedRegressor):
     def __init__(
         self,
         *,
-        hidden: int | Sequence[int] = ENNSettings.hidden,
-        population: int = 60,
-        generations: int = 100,
+        hidden: int | Sequence[int] = (8,),
+        population: int = 50,
+        generations: int = 70,
         crossover: float = ENNSettings.crossover,
         structural_mutation: float = ENNSettings.structural_mutation,
         weight_mutation: float = ENNSettings.weight_mutation,
