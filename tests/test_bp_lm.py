@@ -119,10 +119,10 @@ def test_a_repeat_that_fails_is_the_mean_and_does_not_spoil_the_others() -> None
 def test_on_case_one_it_is_far_below_the_constant_and_the_papers_own_figure() -> None:
     config = load_config("experiments/tripod.yaml", ["seed=1000", "repeats=4"])
     dataset = prepare(config).dataset
-    data, scaling = dataset.scaled("fit", False)
+    learner = BPLM(BPLMSettings(restarts=3, iterations=25))
+    data, scaling = dataset.scaled("fit", False, learner)
     rows = dataset.usable_rows("test")
     joints, deviation = rows.take(dataset.inputs.expand(4, -1, -1)), rows.take(dataset.deviation)
-    learner = BPLM(BPLMSettings(restarts=3, iterations=25))
     train(learner, data)
     found = scaling.restore(learner.predict(scaling.features(joints)))
     errors = [(guess - deviation).square().mean((1, 2)) for guess in (found, scaling.mean.unsqueeze(1))]

@@ -58,16 +58,17 @@ def test_folds_side_by_side_are_those_run_one_by_one() -> None:
     together = CCNN(small)
     plan = Plan(True, None, 20, folds=4)
     folded = fold_dataset(dataset, "random", 4)
-    data, _ = folded.scaled("train", True)
+    data, _ = folded.scaled("train", True, CCNN(small))
     training = train(together, data, folds=4)
     errors = training.history["error_validation"]
     assert errors.shape == (6, 8)
     for k in range(8):
         alone = dataclasses.replace(
-            folded, deviation=folded.deviation[k : k + 1], usable=folded.usable[k : k + 1],
+            folded, inputs=folded.inputs[k : k + 1], deviation=folded.deviation[k : k + 1],
+            usable=folded.usable[k : k + 1],
             splits=folded.splits[k : k + 1], seeds=folded.seeds[k : k + 1],
         )  # fmt: skip
-        single = train(CCNN(small), alone.scaled("train", True)[0])
+        single = train(CCNN(small), alone.scaled("train", True, CCNN(small))[0])
         assert torch.allclose(single.history["error_validation"][:, 0], errors[:, k], rtol=1e-9)
     # The folds of a repeat share one step, that of their lowest mean error, and are left in their states there.
     best = errors.view(6, 2, 4).mean(2).argmin(0) + 1
@@ -91,7 +92,7 @@ def test_without_early_stopping_folds_judge_the_learners_end() -> None:
     assert choice is not None and choice.best_step.tolist() == [30, 30] and choice.errors.shape == (2, 3)
     plain = fit_method("toy", Descent, dataset, Plan(False, None, 20), None, lambda *_: [])
     folded = fit_method("toy", Descent, dataset, Plan(False, None, 20, folds=3), None, lambda *_: [])
-    inputs = dataset.inputs.expand(2, -1, -1)
+    inputs = dataset.inputs
     assert torch.equal(plain.predict(inputs), folded.predict(inputs))
     assert not torch.equal(plain.score, folded.score)
 

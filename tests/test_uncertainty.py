@@ -94,7 +94,7 @@ def linear_dataset(repeats: int = 30, train: int = 80, held: int = 20, test: int
     order = torch.arange(rows)
     split = Split(order[:train], order[train : train + held], order[train + held :])
     return Dataset(
-        inputs,
+        inputs.expand(repeats, -1, -1),
         1e-4 * (inputs @ slope + noise * 0.3 * (0.2 + inputs[:, :1].abs())),
         torch.ones(repeats, rows, dtype=torch.bool),
         [split] * repeats,
@@ -105,7 +105,7 @@ def linear_dataset(repeats: int = 30, train: int = 80, held: int = 20, test: int
 
 def covered(dataset: Dataset, fitted: Fitted) -> Tensor:
     rows = dataset.usable_rows("test")
-    inputs = rows.take(dataset.inputs.expand(len(rows.index), -1, -1))
+    inputs = rows.take(dataset.inputs)
     return coverage(rows.take(dataset.deviation) - fitted.predict(inputs), fitted.sd(inputs), rows.weights)
 
 
@@ -123,7 +123,7 @@ def test_nothing_held_out_leaves_the_sd_as_the_learner_says() -> None:
     dataset = linear_dataset(repeats=4)
     fitted = fit_method("toy", Overconfident, dataset, Plan(False, None, 20), None, lambda *_: [])
     assert torch.equal(fitted.sd_scale, torch.ones(4, 2, dtype=torch.float64))
-    inputs = dataset.inputs.expand(4, -1, -1)
+    inputs = dataset.inputs
     features = fitted.scaling.features(inputs)
     own = fitted.learner.variance(features).sqrt() * fitted.scaling.deviation.unsqueeze(1)  # type: ignore[attr-defined]
     assert torch.allclose(fitted.sd(inputs), own, rtol=1e-12)
@@ -150,7 +150,7 @@ def test_the_domain_is_that_of_the_compensator() -> None:
     dataset = calibration.prepared.dataset
     inside = inside_domain(dataset, calibration.config.compensation.margin)
     domain = calibration.compensator().domain
-    expected = domain.excess(domain.cage(dataset.inputs)).squeeze(-1) == 0
+    expected = domain.excess(domain.cage(dataset.inputs[calibration.repeat()])).squeeze(-1) == 0
     assert torch.equal(inside[calibration.repeat()], expected)
     assert not bool(inside_domain(dataset, 0.0).all()) or math.isclose(float(expected.double().mean()), 1.0)
 

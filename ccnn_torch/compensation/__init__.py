@@ -9,5 +9,6 @@ from ccnn_torch.compensation._loaded import load_model as load_model
 from ccnn_torch.compensation._model_file import FORMS as FORMS
 from ccnn_torch.compensation._model_file import card_name as card_name
 from ccnn_torch.compensation._model_file import save_model as save_model
+from ccnn_torch.compensation._networks import UncertainNetwork as UncertainNetwork
 from ccnn_torch.compensation._networks import network_from_description as network_from_description
 from ccnn_torch.compensation._networks import register_network as register_network

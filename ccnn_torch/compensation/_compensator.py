@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.compensation._contraction import STEEPEST_DEVIATION, iterations_needed, steepest
 from ccnn_torch.compensation._domain import Domain
+from ccnn_torch.compensation._networks import UncertainNetwork
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, OutsideDomainWarning
 from ccnn_torch.training import Scaling
@@ -31,6 +32,7 @@ class Solution(NamedTuple):
         inside_domain: whether that command is inside the domain, `...`, bool.
         ideal: ideal joints, were the joints given a command, `... x n` [SI].
         ideal_inside_domain: whether the joints given are inside the domain, `...`, bool.
+        deviation_sd: standard deviation of a newly measured δ at the command, `... x n` [SI].
     """
 
     command: Tensor
@@ -38,14 +40,17 @@ class Solution(NamedTuple):
     inside_domain: Tensor
     ideal: Tensor
     ideal_inside_domain: Tensor
+    deviation_sd: Tensor
 
 
 class _Deviation(NamedTuple):
-    """δ `... x n` [SI]; its weight against the safe correction, and the guard's excess, `... x 1` [1] each."""
+    """δ `... x n` [SI]; its weight against the safe correction, and the guard's excess, `... x 1` [1] each; and the
+    network's features there, `... x i` [1]."""
 
     value: Tensor
     weight: Tensor
     excess: Tensor
+    features: Tensor
 
     @property
     def inside(self) -> Tensor:
@@ -61,11 +66,17 @@ class Compensator(nn.Module):
     ± `limit`, faded by the domain's guard into the constant `safe`. Inputs that are no number give the command of the
     domain's centre, infinite ones that of its edge, both with `safe` and outside the domain.
 
+    How far a newly measured δ may be from this one is told by `sd`: inside the domain by the network's own `variance`
+    and `sd_scale`, outside by how the training deviations scatter about `safe`, between the two by the guard's weight.
+
     Attributes:
-        network: features -> standardised deviation; operators that ONNX Runtime has in double.
+        network: features -> standardised deviation; operators that ONNX Runtime has in double. Its method `variance`
+            gives the variance of a newly measured standardised deviation; without one that is 1 everywhere.
         scaling: of one repeat.
         limit: hard limit of |δ|, `n` [SI].
         safe: correction outside the domain, `n` [SI].
+        sd_scale: what the network's standard deviation is multiplied by, as held-out rows demand, `n` [1].
+        safe_sd: standard deviation outside the domain, `n` [SI].
         joints, covariates: coordinates in order.
         lipschitz: bound of |∂δ/∂q| with joints in units of their limits (maximum row sum), 1.
         iterations: smallest k with lipschitzᵏ · max|δ| below 1e-12 of the limit.
@@ -73,6 +84,8 @@ class Compensator(nn.Module):
 
     limit: Tensor
     safe: Tensor
+    sd_scale: Tensor
+    safe_sd: Tensor
 
     def __init__(
         self,
@@ -85,6 +98,8 @@ class Compensator(nn.Module):
         covariates: Sequence[Coordinate],
         lipschitz: float,
         iterations: int,
+        sd_scale: Tensor | None = None,
+        safe_sd: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.network = network
@@ -92,6 +107,10 @@ class Compensator(nn.Module):
         self.domain = domain
         self.register_buffer("limit", limit)
         self.register_buffer("safe", safe)
+        # The training deviations are seldom at hand where a compensator is put together by hand; their standard
+        # deviation about their mean is in the scaling.
+        self.register_buffer("sd_scale", torch.ones_like(safe) if sd_scale is None else sd_scale)
+        self.register_buffer("safe_sd", scaling.deviation.clone() if safe_sd is None else safe_sd)
         self.joints = tuple(joints)
         self.covariates = tuple(covariates)
         self.lipschitz = lipschitz
@@ -107,12 +126,21 @@ class Compensator(nn.Module):
         Raises:
             InputError: covariates are missing, or a last dimension is wrong.
         """
-        return self.solve(joints, covariates)[:3]
+        _, command, last, _ = self._solve(joints, covariates)
+        return command, last.value, last.inside
 
     def deviation(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Guarded and limited δ at *commanded* joints, `... x n` [SI]; arguments and errors as `forward`."""
         joints, covariates, strange = self._inputs(joints, covariates)
         return self._deviation(joints, covariates, strange).value
+
+    def sd(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
+        """Standard deviation of a newly measured δ at *commanded* joints, model and noise, `... x n` [SI].
+
+        Finite for every input; arguments and errors as `forward`.
+        """
+        joints, covariates, strange = self._inputs(joints, covariates)
+        return self._sd(self._deviation(joints, covariates, strange))
 
     def back(self, command: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Ideal joints of a command (or of the joints fed back), `... x n` [SI]; arguments and errors as `forward`."""
@@ -121,13 +149,8 @@ class Compensator(nn.Module):
 
     def solve(self, joints: Tensor, covariates: Tensor | None = None) -> Solution:
         """Command of ideal joints, and the ideal joints were they a command; arguments and errors as `forward`."""
-        joints, covariates, strange = self._inputs(joints, covariates)
-        first = last = self._deviation(joints, covariates, strange)
-        command = joints
-        for _ in range(self.iterations):
-            command = joints - last.value
-            last = self._deviation(command, covariates, strange)
-        return Solution(command, last.value, last.inside, joints + first.value, first.inside)
+        joints, command, last, first = self._solve(joints, covariates)
+        return Solution(command, last.value, last.inside, joints + first.value, first.inside, self._sd(last))
 
     def guarded(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As `solve`, told by deviations and weights instead of joints, which single precision cannot hold.
@@ -190,16 +213,38 @@ class Compensator(nn.Module):
         finite = self.domain.clean(torch.cat([joints, covariates.to(joints.dtype)], -1))
         return finite.inputs[..., :n], finite.inputs[..., n:], finite.strange
 
+    def _solve(self, joints: Tensor, covariates: Tensor | None) -> tuple[Tensor, Tensor, _Deviation, _Deviation]:
+        """Finite joints, their command, δ at the command, and δ at the joints themselves."""
+        joints, covariates, strange = self._inputs(joints, covariates)
+        first = last = self._deviation(joints, covariates, strange)
+        command = joints
+        for _ in range(self.iterations):
+            command = joints - last.value
+            last = self._deviation(command, covariates, strange)
+        return joints, command, last, first
+
     def _deviation(self, joints: Tensor, covariates: Tensor, strange: Tensor) -> _Deviation:
         """δ at commanded, finite joints."""
         inputs = torch.cat([joints, covariates], -1) if self.covariates else joints
         caged = self.domain.cage(inputs)
-        raw = self.scaling.restore(self.network(self.scaling.features(caged)))
+        features = self.scaling.features(caged)
+        raw = self.scaling.restore(self.network(features))
         excess = self.domain.excess(caged) + strange
         fade = torch.relu(1 - excess)
         weight = fade * fade
         # Two products instead of safe + weight · (limited - safe): each end is then exact.
-        return _Deviation(self._limited(weight * self._limited(raw) + (1 - weight) * self.safe), weight, excess)
+        value = self._limited(weight * self._limited(raw) + (1 - weight) * self.safe)
+        return _Deviation(value, weight, excess, features)
+
+    def _sd(self, deviation: _Deviation) -> Tensor:
+        """Of a newly measured δ, where this one was found."""
+        weight = deviation.weight
+        scale = self.scaling.deviation * self.sd_scale
+        variance = scale * scale
+        if isinstance(self.network, UncertainNetwork):
+            variance = variance * self.network.variance(deviation.features)
+        outside = (1 - weight) * self.safe_sd
+        return torch.sqrt(weight * weight * variance + outside * outside)
 
     def _limited(self, deviation: Tensor) -> Tensor:
         return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)
@@ -215,6 +260,7 @@ def fit_compensator(
     limit: Tensor | None = None,
     margin: float = 0.1,
     transition: float = 0.5,
+    sd_scale: Tensor | None = None,
 ) -> Compensator:
     """Put guard, limit and fixed point around a trained network.
 
@@ -227,9 +273,10 @@ def fit_compensator(
         limit: hard limit of |δ|, `n` [SI]; 1.5 times the largest training deviation of each joint when None.
         margin: how far beyond the training inputs δ is trusted, as a share of their half range.
         transition: width over which it then fades into the safe correction, as a share of the half range.
+        sd_scale: what the network's standard deviation is multiplied by, `n` [1]; 1 when None.
 
     Raises:
-        InputError: shapes do not fit together, or a limit is not positive.
+        InputError: shapes do not fit together, or a limit or a scale is out of its range.
         MethodFailedError: δ is so steep that the command cannot be solved for.
     """
     n = len(joints)
@@ -243,12 +290,16 @@ def fit_compensator(
     limit = 1.5 * largest if limit is None else limit.detach()
     if limit.shape != (n,) or not bool((limit >= 0).all() & torch.isfinite(limit).all()):
         raise InputError(f"limit must be one finite number of at least 0 for each of the {n} joints")
+    sd_scale = torch.ones_like(largest) if sd_scale is None else sd_scale.detach().clone()
+    if sd_scale.shape != (n,) or not bool((sd_scale > 0).all() & torch.isfinite(sd_scale).all()):
+        raise InputError(f"sd_scale must be one finite number above 0 for each of the {n} joints")
     safe = torch.minimum(torch.maximum(deviations.mean(0), -limit), limit)
+    safe_sd = (deviations - safe).square().mean(0).sqrt()
     reach = torch.cat([limit, limit.new_zeros(len(covariates))])
     domain = Domain.fit(inputs, reach, margin, transition)
     # A copy: what is compensated with does not change when the learner trains on.
     frozen = copy.deepcopy(network).requires_grad_(False)
-    compensator = Compensator(frozen, scaling, domain, limit, safe, joints, covariates, 0.0, 1)
+    compensator = Compensator(frozen, scaling, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale, safe_sd)
     found = steepest(compensator.deviation, inputs, domain, limit)
     if not math.isfinite(found.lipschitz):
         raise MethodFailedError("the trained network gives values that are not finite within its domain")

@@ -19,6 +19,7 @@ STEEPEST_DEVIATION = 0.2
 TOLERANCE = 1e-12
 
 _POINTS = 2048
+_AT_ONCE = 512
 _CLIMBERS = 64
 _ROUNDS = 12
 # The steepest of the points tried is not the steepest of all.
@@ -51,6 +52,11 @@ def steepest(
     scale = torch.where(limit > 0, limit, positive.min() if len(positive) else torch.ones_like(limit))
 
     def slope(points: Tensor) -> tuple[Tensor, Tensor]:
+        # In pieces: a network that compares each point with thousands of rows keeps a matrix for every operation.
+        slopes, sizes = zip(*(slope_of_few(part) for part in torch.split(points, _AT_ONCE)), strict=True)
+        return torch.cat(slopes), torch.cat(sizes)
+
+    def slope_of_few(points: Tensor) -> tuple[Tensor, Tensor]:
         joints = points[:, :n].clone().requires_grad_()
         value = deviation(joints, points[:, n:])
         # One row of the Jacobian of every point at once, since the points do not know of each other.

@@ -21,7 +21,8 @@ from ccnn_torch.training import tensor_digest
 
 __all__ = ["FORMAT", "check_keys", "check_tensors", "coordinates", "facts_of", "to_json"]
 
-FORMAT = "ccnn_torch compensator 1"
+FORMAT = "ccnn_torch compensator 2"
+_FORMATS = "ccnn_torch compensator "
 
 _REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
 _PACKAGES = ("torch", "onnx", "onnxscript", "onnxruntime", "safetensors", "numpy")
@@ -41,7 +42,7 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
         raise InputError(f"a model's fields lack {', '.join(missing)}; needed are {', '.join(_REQUIRED)}")
     mechanism = fields["mechanism"]
     pose = mechanism.get("pose", []) if isinstance(mechanism, Mapping) else []
-    limits = compensator.limit.tolist(), compensator.safe.tolist()
+    limits = (v.tolist() for v in (compensator.limit, compensator.safe, compensator.safe_sd, compensator.sd_scale))
     facts: dict[str, Any] = {
         "format": FORMAT,
         **{key: fields[key] for key in _REQUIRED},
@@ -51,8 +52,8 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
         "network": describe_network(compensator.network),
         "domain": compensator.domain.describe(compensator.joints + compensator.covariates),
         "limits": {
-            c.name: {"unit": c.unit, "limit": limit, "safe_correction": safe}
-            for c, limit, safe in zip(compensator.joints, *limits, strict=True)
+            c.name: {"unit": c.unit, "limit": limit, "safe_correction": safe, "safe_sd": sd, "sd_scale": scale}
+            for c, limit, safe, sd, scale in zip(compensator.joints, *limits, strict=True)
         },
         "lipschitz": compensator.lipschitz,
         "iterations": compensator.iterations,
@@ -70,7 +71,13 @@ def check_keys(facts: Any) -> dict[str, Any]:
     Raises:
         ModelFileError: they are not.
     """
-    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
+    written = str(facts.get("format")) if isinstance(facts, dict) else ""
+    if written != FORMAT and written.startswith(_FORMATS):
+        raise ModelFileError(
+            f"it has the form '{written}' of another version of this package, which reads '{FORMAT}'; write it again "
+            "with this version (ccnn run …, or save_model)"
+        )
+    if not isinstance(facts, dict) or written != FORMAT:
         raise ModelFileError(f"it says nothing of the form '{FORMAT}', so this package did not write it" + TAKE_AGAIN)
     stated = facts.get("sha256")
     if not isinstance(stated, dict) or stated.get("keys") != _digest(facts):

@@ -80,7 +80,8 @@ class LoadedModel:
             covariates: `... x m` [SI] in the order of `covariates`; None where there are none.
 
         Returns:
-            `command`, `deviation` and `ideal`, `... x n` [SI]; `inside_domain` and `ideal_inside_domain`, `...`, bool.
+            `command`, `deviation`, `ideal` and `deviation_sd`, `... x n` [SI]; `inside_domain` and
+            `ideal_inside_domain`, `...`, bool.
 
         Raises:
             InputError: covariates are missing, or a last dimension is wrong.
@@ -278,6 +279,8 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
         coordinates(facts["covariates"]),
         facts["lipschitz"],
         facts["iterations"],
+        tensors["sd_scale"],
+        tensors["safe_sd"],
     )
 
 

@@ -56,7 +56,7 @@ def save_model(
 
     Raises:
         InputError: a field is missing or no JSON, or the network cannot be described.
-        MethodFailedError: an export is not right to 1e-12 of the limit.
+        MethodFailedError: an export does not give the model's numbers, to 1e-12 of the limit or what the network needs.
     """
     facts = facts_of(compensator, fields)
     text = to_json(facts)

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
-from torch import nn
+from torch import Tensor, nn
 
 from ccnn_torch.errors import InputError, ModelFileError
 
-__all__ = ["DescribedNetwork", "describe_network", "network_from_description", "register_network"]
+__all__ = ["DescribedNetwork", "UncertainNetwork", "describe_network", "network_from_description", "register_network"]
 
 # Kind -> the class, or where it stands; imported when a file asks for it.
 _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "constant": "ccnn_torch.learners.constant:ConstantNetwork",
     "grnn": "ccnn_torch.learners._grnn_network:GRNNNetwork",
     "gp": "ccnn_torch.learners._gp_posterior:GPNetwork",
-    "masked": "ccnn_torch.evolution.network:MaskedNetwork",
+    "masked": "ccnn_torch.evolution.masked_network:MaskedNetwork",
 }
 
 
@@ -29,6 +29,14 @@ class DescribedNetwork(Protocol):
     @classmethod
     def from_description(cls, description: dict[str, Any]) -> nn.Module:
         """A network of the described shape, whatever its values: its `state_dict` is loaded afterwards."""
+
+
+@runtime_checkable
+class UncertainNetwork(Protocol):
+    """A network that knows how sure it is."""
+
+    def variance(self, features: Tensor) -> Tensor:
+        """Variance of a newly measured standardised output, above 0 and finite: `... x i` -> `... x o`."""
 
 
 def register_network(kind: str, network: type[DescribedNetwork]) -> None:

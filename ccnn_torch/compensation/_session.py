@@ -33,7 +33,7 @@ Array = NDArray[Any]
 TAKE_AGAIN = "; take it again from where it was written"
 
 METADATA_KEY = "ccnn_torch"
-OUTPUTS = ("command", "deviation", "inside_domain", "ideal", "ideal_inside_domain")
+OUTPUTS = ("command", "deviation", "inside_domain", "ideal", "ideal_inside_domain", "deviation_sd")
 
 
 def open_onnx(content: bytes) -> onnxruntime.InferenceSession:

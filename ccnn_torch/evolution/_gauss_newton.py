@@ -1,4 +1,4 @@
-"""Outputs, gradient and Gauss-Newton matrix of masked sigmoid networks, in closed form.
+"""Outputs, gradient and Gauss-Newton matrix of masked sigmoid networks with periodic nodes, in closed form.
 
 The derivative of output k with respect to weight (a, b) of layer l is a product, D[k, a] h[b], of what flows back to
 node a and what flows in from node b. The sum over samples of its outer products is therefore one matrix product of
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ccnn_torch.evolution.waves import Waves, wave_inputs
+
 __all__ = ["Linearised", "Network", "dense_jacobian", "linearise", "network_of", "residual"]
 
 
@@ -25,23 +27,44 @@ class Network:
         alive: per hidden layer `b x 1 x out`, float64, 0 where a node is dead and its output forced to 0.
         active: `b x k`, bool, the weights that take part: connected, and on a way from an input to an output.
         bias: whether the last column of every weight matrix is a bias.
+        source: which input each periodic node reads, `b x waves` int64; the output's mask has two columns for each
+            behind those of the last hidden layer, and the flat weights end with the frequencies.
     """
 
     masks: list[Tensor]
     alive: list[Tensor]
     active: Tensor
     bias: bool
+    source: Tensor
+
+    @property
+    def slots(self) -> int:
+        """Periodic nodes of each network."""
+        return self.source.shape[-1]
+
+    @property
+    def hidden(self) -> int:
+        """Nodes of the last hidden layer, or inputs where there is none."""
+        return self.masks[-1].shape[-1] - 2 * self.slots
 
     def split(self, flat: Tensor) -> list[Tensor]:
         """flat: `b x k`; returns the weights per layer, `b x out x in (+ 1)`."""
         shapes = [(m.shape[-2], m.shape[-1] + int(self.bias)) for m in self.masks]
-        parts = torch.split(flat, [rows * columns for rows, columns in shapes], dim=-1)
+        parts = torch.split(flat[:, : flat.shape[-1] - self.slots], [rows * columns for rows, columns in shapes], -1)
         return [p.reshape(-1, *shape) for p, shape in zip(parts, shapes, strict=True)]
 
+    def frequencies(self, flat: Tensor) -> Tensor:
+        """flat: `b x k`; returns `b x waves`."""
+        return flat[:, flat.shape[-1] - self.slots :]
 
-def network_of(masks: list[Tensor], bias: bool) -> Network:
+
+def network_of(masks: list[Tensor], bias: bool, waves: Waves | None = None) -> Network:
     """masks: per layer `b x out x in`, bool. A node without inputs (bias not counted) or without outputs is dead."""
-    counts = [m.to(torch.float64) for m in masks]
+    source = masks[0].new_zeros(len(masks[0]), 0, dtype=torch.int64) if waves is None else waves.source
+    slots = source.shape[-1]
+    hidden = masks[-1].shape[-1] - 2 * slots
+    periodic = masks[-1][..., hidden:].to(torch.float64)
+    counts = [m.to(torch.float64) for m in (*masks[:-1], masks[-1][..., :hidden])]
     fed = [torch.ones_like(counts[0][:, 0, :])]
     for mask in counts:
         fed.append(((mask @ fed[-1].unsqueeze(-1)).squeeze(-1) > 0).to(torch.float64))
@@ -53,12 +76,14 @@ def network_of(masks: list[Tensor], bias: bool) -> Network:
     effective = [
         mask * alive[index + 1].unsqueeze(-1) * alive[index].unsqueeze(-2) for index, mask in enumerate(counts)
     ]
+    effective[-1] = torch.cat([effective[-1], periodic], -1)
     columns = [
         torch.cat([mask, node.unsqueeze(-1)], dim=-1) if bias else mask
         for mask, node in zip(effective, alive[1:], strict=True)
     ]
-    active = torch.cat([c.flatten(1) for c in columns], dim=-1) > 0
-    return Network(effective, [a.unsqueeze(1) for a in alive[1:-1]], active, bias)
+    read = periodic.sum(-2)
+    active = torch.cat([*(c.flatten(1) for c in columns), read[:, :slots] + read[:, slots:]], dim=-1) > 0
+    return Network(effective, [a.unsqueeze(1) for a in alive[1:-1]], active, bias, source)
 
 
 @dataclass(frozen=True)
@@ -77,10 +102,13 @@ class Linearised:
 def _activations(network: Network, flat: Tensor, inputs: Tensor) -> list[Tensor]:
     """What flows into each layer, then the output: `b x s x nodes (+ 1)` each, the last without the constant 1."""
     flows = []
-    signal = inputs
-    one = inputs.new_ones(inputs.shape[0], inputs.shape[1], 1)
     weights = network.split(torch.where(network.active, flat, 0))
+    signal = inputs[..., : network.hidden if len(weights) == 1 else network.masks[0].shape[-1]]
+    one = inputs.new_ones(inputs.shape[0], inputs.shape[1], 1)
     for index, weight in enumerate(weights):
+        if network.slots and index == len(weights) - 1:
+            phase = wave_inputs(network.source, inputs) * network.frequencies(flat).unsqueeze(-2)
+            signal = torch.cat([signal, torch.sin(phase), torch.cos(phase)], dim=-1)
         if network.bias:
             signal = torch.cat([signal, one], dim=-1)
         flows.append(signal)
@@ -107,16 +135,31 @@ def residual(network: Network, flat: Tensor, inputs: Tensor, targets: Tensor, fa
     return error if factor is None else (factor @ error.unsqueeze(-1)).squeeze(-1)
 
 
-def _backward(network: Network, flat: Tensor, flows: list[Tensor], seed: Tensor) -> list[Tensor]:
-    """Derivative of `seed` times the output with respect to each layer's sums: `b x s x c x out` per layer."""
+def _backward(
+    network: Network, flat: Tensor, flows: list[Tensor], seed: Tensor, inputs: Tensor
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Derivative of `seed` times the output with respect to each layer's sums, `b x s x c x out`, and what flows in.
+
+    Where there are periodic nodes, one more pair stands at the end: the derivative with respect to the frequencies,
+    beside an inflow of 1.
+    """
     weights = network.split(torch.where(network.active, flat, 0))
     back = [seed]
     for index in range(len(weights) - 1, 0, -1):
-        count = weights[index].shape[-1] - int(network.bias)
+        count = network.masks[index - 1].shape[-2]
         signal = flows[index][..., :count]
         slope = signal * (1 - signal)
         back.insert(0, (back[0] @ weights[index][..., :count].unsqueeze(1)) * slope.unsqueeze(-2))
-    return back
+    inflows = flows[:-1]
+    if network.slots:
+        sine, cosine = flows[-2][..., network.hidden : network.hidden + 2 * network.slots].chunk(2, -1)
+        to_sine, to_cosine = weights[-1][..., network.hidden : network.hidden + 2 * network.slots].chunk(2, -1)
+        rate = (seed @ to_sine.unsqueeze(1)) * cosine.unsqueeze(-2) - (seed @ to_cosine.unsqueeze(1)) * sine.unsqueeze(
+            -2
+        )
+        back.append(rate * wave_inputs(network.source, inputs).unsqueeze(-2))
+        inflows = [*inflows, torch.ones_like(sine[..., :1])]
+    return back, inflows
 
 
 def _seed(targets: Tensor, factor: Tensor | None) -> Tensor:
@@ -144,15 +187,15 @@ def linearise(
     if factor is not None:
         error = (factor @ error.unsqueeze(-1)).squeeze(-1)
     root = precision.sqrt()
-    back = _backward(network, flat, flows, _seed(targets, factor) * root.unsqueeze(-1))
+    back, inflows = _backward(network, flat, flows, _seed(targets, factor) * root.unsqueeze(-1), inputs)
     error = (error * root).unsqueeze(-2)
     gradient = torch.cat(
-        [((error @ b).squeeze(-2).mT @ f).flatten(1) for b, f in zip(back, flows[:-1], strict=True)], dim=-1
+        [((error @ b).squeeze(-2).mT @ f).flatten(1) for b, f in zip(back, inflows, strict=True)], dim=-1
     )
     rows: list[list[Tensor]] = []
-    for i, (back_i, flow_i) in enumerate(zip(back, flows[:-1], strict=True)):
+    for i, (back_i, flow_i) in enumerate(zip(back, inflows, strict=True)):
         blocks: list[Tensor] = []
-        for j, (back_j, flow_j) in enumerate(zip(back, flows[:-1], strict=True)):
+        for j, (back_j, flow_j) in enumerate(zip(back, inflows, strict=True)):
             if j < i:
                 blocks.append(rows[j][i].mT)
                 continue
@@ -172,8 +215,6 @@ def dense_jacobian(
 ) -> Tensor:
     """Derivative of `residual` with respect to the weights, laid out in full: `b x s x c x k`. Costly; for checks."""
     flows = _activations(network, flat, inputs)
-    back = _backward(network, flat, flows, _seed(targets, factor))
-    parts = [
-        (b.unsqueeze(-1) * f.unsqueeze(-2).unsqueeze(-2)).flatten(-2) for b, f in zip(back, flows[:-1], strict=True)
-    ]
+    back, inflows = _backward(network, flat, flows, _seed(targets, factor), inputs)
+    parts = [(b.unsqueeze(-1) * f.unsqueeze(-2).unsqueeze(-2)).flatten(-2) for b, f in zip(back, inflows, strict=True)]
     return torch.cat(parts, dim=-1) * network.active.unsqueeze(1).unsqueeze(1)

@@ -1,16 +1,17 @@
-"""Masked networks: forward pass, dead nodes (paper 000, section III-E), pruning, and the plain module for export."""
+"""Masked networks: forward pass, dead nodes (paper 000, section III-E), averages and pruning."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
 
+import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ccnn_torch.evolution.genome import Genome, active
+from ccnn_torch.evolution.waves import Waves, wave_signal
 
-__all__ = ["MaskedNetwork", "alive_nodes", "average", "fed_nodes", "forward", "hidden_signal", "prune"]
+__all__ = ["alive_nodes", "average", "average_waves", "fed_nodes", "forward", "hidden_signal", "prune"]
 
 
 def fed_nodes(masks: Sequence[Tensor]) -> list[Tensor]:
@@ -40,35 +41,49 @@ def alive_nodes(masks: Sequence[Tensor]) -> list[Tensor]:
     """
     alive = fed_nodes(masks)
     for layer in range(len(alive) - 1, -1, -1):
-        after = masks[layer + 1]
+        # Behind the nodes of the last hidden layer, the output's connections to periodic nodes may stand.
+        after = masks[layer + 1][..., : masks[layer].shape[-2]]
         if layer + 1 < len(alive):
             after = after & alive[layer + 1].unsqueeze(-1)
         alive[layer] = alive[layer] & after.any(-2)
     return alive
 
 
-def forward(masks: Sequence[Tensor], weights: Sequence[Tensor], inputs: Tensor) -> Tensor:
+def forward(masks: Sequence[Tensor], weights: Sequence[Tensor], inputs: Tensor, waves: Waves | None = None) -> Tensor:
     """Sigmoid hidden layers, linear output; unfed nodes give 0.
 
     Args:
         masks, weights: one a layer, `... x out x in` and `... x out x (in or in + 1)`; weights without a connection
             are ignored.
-        inputs: `... x s x i`.
+        inputs: `... x s x i`; the first layer reads as many of them, from the first on, as its mask has columns.
+        waves: periodic nodes beside the last hidden layer, `... x k`, for which the output's mask and weights have
+            columns behind those of that layer: k sines, then k cosines.
 
     Returns:
         `... x s x o`.
     """
-    signal = hidden_signal(masks, weights, inputs)
+    signal = hidden_signal(masks, weights, inputs, waves)
     return _affine(signal, _kept(masks[-1], weights[-1]))
 
 
-def hidden_signal(masks: Sequence[Tensor], weights: Sequence[Tensor], inputs: Tensor) -> Tensor:
-    """Output of the last hidden layer, `... x s x h`, or the inputs where there is none; arguments as `forward`."""
+def hidden_signal(
+    masks: Sequence[Tensor], weights: Sequence[Tensor], inputs: Tensor, waves: Waves | None = None
+) -> Tensor:
+    """What the output layer reads, `... x s x h`: last hidden layer (or inputs), then waves; arguments as `forward`."""
     fed = fed_nodes(masks)
-    signal = inputs
+    signal = inputs[..., : masks[0].shape[-1]] if len(masks) > 1 else inputs[..., : _width(masks, waves)]
     for mask, weight, reached in zip(masks[:-1], weights[:-1], fed, strict=True):
         signal = torch.sigmoid(_affine(signal, _kept(mask, weight))) * reached.unsqueeze(-2)
-    return signal
+    if waves is None:
+        return signal
+    periodic = wave_signal(waves, inputs)
+    leading = np.broadcast_shapes(signal.shape[:-2], periodic.shape[:-2])
+    return torch.cat([part.expand(*leading, *part.shape[-2:]) for part in (signal, periodic)], -1)
+
+
+def _width(masks: Sequence[Tensor], waves: Waves | None) -> int:
+    """Columns of the output's mask that are not of waves."""
+    return masks[-1].shape[-1] - (0 if waves is None else 2 * waves.frequency.shape[-1])
 
 
 def _kept(mask: Tensor, weight: Tensor) -> Tensor:
@@ -81,11 +96,12 @@ def _affine(signal: Tensor, weight: Tensor) -> Tensor:
     return product + weight[..., width].unsqueeze(-2) if weight.shape[-1] > width else product
 
 
-def average(masks: Sequence[Tensor], weights: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+def average(masks: Sequence[Tensor], weights: Sequence[Tensor], slots: int = 0) -> tuple[list[Tensor], list[Tensor]]:
     """The mean of several networks of one shape as one masked network: their hidden nodes stand side by side.
 
     Args:
         masks, weights: one a layer, `... x m x out x in` and `... x m x out x (in or in + 1)`, m = networks.
+        slots: slots for periodic nodes of each network; the wide network has them side by side too (`average_waves`).
 
     Returns:
         The same without the dimension `m`; a hidden layer has m times the nodes, blocks of zeros between networks.
@@ -99,11 +115,25 @@ def average(masks: Sequence[Tensor], weights: Sequence[Tensor]) -> tuple[list[Te
         if layer == last:
             # Outputs are summed, so every share is divided.
             parts = [mask, kept[..., :width] / members, kept[..., width:].mean(-3)]
-        connections = [_side_by_side(part, layer == 0, layer == last) for part in parts[:2]]
+        if layer == last and slots:
+            hidden = width - 2 * slots
+            connections = [
+                torch.cat(
+                    [_side_by_side(piece[0], layer == 0, True), *(_side_by_side(p, False, True) for p in piece[1:])], -1
+                )
+                for piece in (torch.split(part, [hidden, slots, slots], -1) for part in parts[:2])
+            ]
+        else:
+            connections = [_side_by_side(part, layer == 0, layer == last) for part in parts[:2]]
         bias = parts[2] if layer == last else parts[2].flatten(-3, -2)
         wide_masks.append(connections[0] > 0)
         wide_weights.append(torch.cat([connections[1], bias], dim=-1))
     return wide_masks, wide_weights
+
+
+def average_waves(waves: Waves) -> Waves:
+    """Periodic nodes of several networks side by side: `... x m x k` to `... x (m k)`."""
+    return Waves(waves.source.flatten(-2), waves.frequency.flatten(-2))
 
 
 def _side_by_side(blocks: Tensor, first: bool, last: bool) -> Tensor:
@@ -132,109 +162,18 @@ def prune(masks: Sequence[Tensor], weights: Sequence[Tensor]) -> tuple[list[Tens
     alive = alive_nodes(masks)
     if alive and not bool(alive[0].any()):
         outputs, inputs = len(masks[-1]), masks[0].shape[-1]
-        bias = weights[-1][:, masks[-1].shape[-1] :]
+        behind = weights[-1][:, masks[-2].shape[-2] :]
+        waves = masks[-1][:, masks[-2].shape[-2] :]
         return (
-            [masks[-1].new_zeros(outputs, inputs)],
-            [torch.cat([bias.new_zeros(outputs, inputs), bias], dim=-1)],
+            [torch.cat([waves.new_zeros(outputs, inputs), waves], dim=-1)],
+            [torch.cat([behind.new_zeros(outputs, inputs), behind], dim=-1)],
         )
     small_masks, small_weights = [], []
     for layer, (mask, weight) in enumerate(zip(masks, weights, strict=True)):
         rows = alive[layer] if layer < len(alive) else mask.new_ones(len(mask))
         columns = alive[layer - 1] if layer > 0 else mask.new_ones(mask.shape[-1])
+        columns = torch.cat([columns, columns.new_ones(mask.shape[-1] - len(columns))])
         with_bias = torch.cat([columns, columns.new_ones(weight.shape[-1] - mask.shape[-1])])
         small_masks.append(mask[rows][:, columns])
         small_weights.append(weight[rows][:, with_bias])
     return small_masks, small_weights
-
-
-class MaskedNetwork(nn.Module):
-    """A pruned network as dense double-precision linear layers with sigmoids between, ready for export.
-
-    Args:
-        masks, weights: one a layer, `out x in` and `out x (in or in + 1)`; missing connections become zeros.
-        factors, noise: its predictive variance (`evolution.spread.Spread`), `o x q x (h + 1)` and `o`; 1 without them.
-    """
-
-    factors: Tensor
-    noise: Tensor
-    _sums: Tensor
-
-    def __init__(
-        self,
-        masks: Sequence[Tensor],
-        weights: Sequence[Tensor],
-        factors: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> None:
-        super().__init__()
-        layers = []
-        for mask, weight in zip(*prune(masks, weights), strict=True):
-            outputs, inputs = mask.shape
-            # Without its usual start values: those would be drawn from the global random state.
-            with torch.device("meta"):
-                linear = nn.Linear(inputs, outputs, dtype=torch.float64)
-            linear.to_empty(device=weight.device)
-            linear.requires_grad_(False)
-            linear.weight.copy_(weight[:, :inputs])
-            linear.bias.copy_(weight[:, inputs] if weight.shape[-1] > inputs else torch.zeros_like(weight[:, 0]))
-            layers.append(linear)
-        self.layers = nn.ModuleList(layers)
-        outputs = layers[-1].out_features
-        if factors is None or noise is None:
-            factors = layers[-1].weight.new_zeros(outputs, 0, layers[-1].in_features + 1)
-            noise = layers[-1].weight.new_ones(outputs)
-        else:
-            factors = _pruned_columns(masks, factors, layers[-1].in_features)
-        self.register_buffer("factors", factors.flatten(0, 1).contiguous())
-        self.register_buffer("noise", noise.clone())
-        # A sum over q as a product: engines with a narrow operator list have no other reduction.
-        each = torch.eye(outputs, dtype=factors.dtype, device=factors.device)
-        self.register_buffer("_sums", each.repeat_interleave(factors.shape[1], 0), persistent=False)
-
-    def describe(self) -> dict[str, Any]:
-        """What a model file needs to build the module again, beside its tensors."""
-        first, *others = cast("list[nn.Linear]", list(self.layers))
-        sizes = [first.in_features, first.out_features, *(layer.out_features for layer in others)]
-        return {"kind": "masked", "sizes": sizes, "spread": len(self.factors) // sizes[-1]}
-
-    @classmethod
-    def from_description(cls, description: dict[str, Any]) -> MaskedNetwork:
-        """A module of the described shape, for its tensors to be loaded into."""
-        sizes = [int(size) for size in description["sizes"]]
-        shapes = list(zip(sizes[1:], sizes, strict=False))
-        masks = [torch.ones(shape, dtype=torch.bool) for shape in shapes]
-        factors = torch.zeros(sizes[-1], int(description["spread"]), sizes[-2] + 1, dtype=torch.float64)
-        empty = [torch.zeros(out, width + 1, dtype=torch.float64) for out, width in shapes]
-        network = cls(masks, empty)
-        return network if factors.shape[1] == 0 else cls(masks, empty, factors, network.noise)
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        """inputs: `... x i` [1]; returns `... x o` [1]."""
-        output: Tensor = self.layers[-1](self._hidden(inputs))
-        return output
-
-    def variance(self, inputs: Tensor) -> Tensor:
-        """Predictive variance of a newly measured output. inputs: `... x i` [1]; returns `... x o` [1]."""
-        if len(self.factors) == 0:
-            return self.noise.expand(*inputs.shape[:-1], len(self.noise))
-        hidden = self._hidden(inputs)
-        scatter = hidden @ self.factors[:, :-1].mT + self.factors[:, -1]
-        return (scatter * scatter) @ self._sums + self.noise
-
-    def _hidden(self, inputs: Tensor) -> Tensor:
-        signal = inputs
-        for layer in self.layers[:-1]:
-            signal = torch.sigmoid(layer(signal))
-        return signal
-
-
-def _pruned_columns(masks: Sequence[Tensor], factors: Tensor, width: int) -> Tensor:
-    """Columns of the nodes that `prune` keeps, and the last one."""
-    if len(masks) == 1:
-        return factors
-    alive = alive_nodes(masks)
-    if not bool(alive[0].any()):
-        # One layer without connections is left, from the inputs; what a constant is unsure of is its value.
-        constant = factors[..., -1:]
-        return torch.cat([constant.new_zeros(*constant.shape[:-1], width), constant], -1)
-    return torch.cat([factors[..., :-1][..., alive[-1]], factors[..., -1:]], -1)

@@ -22,6 +22,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution._gauss_newton import Network, linearise, network_of, residual
+from ccnn_torch.evolution._priors import prior_groups, wave_groups
+from ccnn_torch.evolution.waves import Waves
 
 __all__ = [
     "Refined",
@@ -30,7 +32,10 @@ __all__ = [
     "RefinementState",
     "SecondOrder",
     "finish_refinement",
+    "part_of_problem",
+    "part_of_state",
     "pose_refinement",
+    "put_part",
     "refine",
     "second_order",
     "start_refinement",
@@ -39,6 +44,9 @@ __all__ = [
 
 _PRECISION_RANGE = (1e-8, 1e12)
 _DAMPING_RANGE = (1e-12, 1e12)
+_VAGUE = 1e-4
+# Calm iterations after which a network is done.
+_CALM = 3
 
 
 @dataclass(frozen=True)
@@ -60,6 +68,8 @@ class RefinementSettings:
             what the estimate of gamma alone would let through; with many rows it makes no difference.
         damping: first damping, relative to the diagonal of H.
         trials: dampings tried in an iteration before it is given up.
+        tolerance: a network whose objective falls by less than this share in each of three iterations running is done;
+            0 = all iterations are made.
     """
 
     iterations: int = 50
@@ -73,6 +83,7 @@ class RefinementSettings:
     prior_rate: float = 0.1
     damping: float = 1e-2
     trials: int = 6
+    tolerance: float = 1e-5
 
 
 @dataclass(frozen=True)
@@ -88,6 +99,7 @@ class RefinementProblem:
         groups: prior group of every weight, `k`, int64; the last group is never held back.
         leading: the leading dimensions as given.
         group_count: number of prior groups, that last one included.
+        wave_groups: which of them are of periodic nodes, int64.
         settings: as given.
     """
 
@@ -99,6 +111,7 @@ class RefinementProblem:
     groups: Tensor
     leading: tuple[int, ...]
     group_count: int
+    wave_groups: Tensor
     settings: RefinementSettings
 
 
@@ -112,6 +125,7 @@ class RefinementState:
         prior: precision of each prior group, `b x g`.
         noise: precision of each channel's noise, `b x c`.
         effective: weights determined by the data, per prior group, `b x g`.
+        calm: iterations running that lowered the objective by less than the tolerance, `b` int64.
         iteration: iterations done, 0-d, int64.
     """
 
@@ -120,7 +134,13 @@ class RefinementState:
     prior: Tensor
     noise: Tensor
     effective: Tensor
+    calm: Tensor
     iteration: Tensor
+
+    @property
+    def done(self) -> Tensor:
+        """Networks that do not move any more, `b` bool."""
+        return self.calm >= _CALM
 
     def state_dict(self) -> dict[str, Tensor]:
         """All tensors by name."""
@@ -145,6 +165,7 @@ class Refined:
 
     Attributes:
         weights: per layer `... x out x in (+ 1)`; those that take no part are as they were given.
+        waves: periodic nodes with their refined frequencies, `... x k`.
         error: weighted mean square of the residual in its channels, on the rows refined on, `...`.
         objective: misfit and penalty under the last precisions, `...`.
         effective_parameters: weights determined by the data, `...`.
@@ -155,6 +176,7 @@ class Refined:
     """
 
     weights: list[Tensor]
+    waves: Waves
     error: Tensor
     objective: Tensor
     effective_parameters: Tensor
@@ -171,6 +193,7 @@ def refine(
     row_weights: Tensor,
     settings: RefinementSettings | None = None,
     row_metric: Tensor | None = None,
+    waves: Waves | None = None,
 ) -> Refined:
     """Refine the weights of masked sigmoid networks with linear output; masks stay as they are.
 
@@ -186,13 +209,19 @@ def refine(
         settings: defaults where None.
         row_metric: `... x s x c x o`: the residual of a row is this matrix times (output - target), so that errors
             are judged in other channels than the outputs' own, as the pose error that joint deviations cause.
+        waves: periodic nodes `... x k`, whose columns stand last in the output's mask and weights; their frequencies
+            are refined as well.
 
     Leading dimensions of all arguments broadcast against each other.
     """
-    problem = pose_refinement(masks, weights, inputs, targets, row_weights, settings, row_metric)
-    state = start = start_refinement(problem, weights)
+    problem = pose_refinement(masks, weights, inputs, targets, row_weights, settings, row_metric, waves)
+    state = start = start_refinement(problem, weights, waves)
     for _ in range(problem.settings.iterations):
-        state = step_refinement(problem, state)
+        going = torch.nonzero(~state.done).flatten()
+        if len(going) == 0:
+            break
+        # Networks do not know of each other, so that those which are done need not be worked on for the others' sake.
+        state = put_part(state, going, step_refinement(part_of_problem(problem, going), part_of_state(state, going)))
     worse = ~(_objective(problem, state, state.weights) <= _objective(problem, state, start.weights))
     state = replace(state, weights=torch.where(worse.unsqueeze(-1), start.weights, state.weights))
     return finish_refinement(problem, state)
@@ -206,6 +235,7 @@ def pose_refinement(
     row_weights: Tensor,
     settings: RefinementSettings | None = None,
     row_metric: Tensor | None = None,
+    waves: Waves | None = None,
 ) -> RefinementProblem:
     """The fixed part of a refinement; arguments as in `refine`."""
     metrics = [] if row_metric is None else [row_metric.shape[:-3]]
@@ -221,27 +251,36 @@ def pose_refinement(
     rows = _flatten(row_weights, leading, 1)
     there = rows > 0
     bias = weights[0].shape[-1] == masks[0].shape[-1] + 1
-    groups = _prior_groups([m.shape[-2:] for m in masks], bias, settings.groups)
+    slots = 0 if waves is None else waves.frequency.shape[-1]
+    groups = prior_groups([m.shape[-2:] for m in masks], bias, settings.groups, slots)
     flat_metric = None
     if row_metric is not None:
         flat_metric = _flatten(row_metric, leading, 3).masked_fill(~there[..., None, None], 0)
     return RefinementProblem(
-        network=network_of([_flatten(m, leading, 2) for m in masks], bias),
+        network=network_of(
+            [_flatten(m, leading, 2) for m in masks],
+            bias,
+            None if waves is None else Waves(*(_flatten(part, leading, 1) for part in waves)),
+        ),
         inputs=_flatten(inputs, leading, 2).masked_fill(~there.unsqueeze(-1), 0),
         targets=_flatten(targets, leading, 2).masked_fill(~there.unsqueeze(-1), 0),
         rows=rows,
         metric=flat_metric,
         groups=groups.to(rows.device),
         leading=leading,
-        group_count=int(groups.max()) + (1 if bias else 2),
+        group_count=int(groups.max()) + (1 if bias or slots else 2),
+        wave_groups=wave_groups(int(groups.max()), masks[-1].shape[-2], slots),
         settings=settings,
     )
 
 
-def start_refinement(problem: RefinementProblem, weights: list[Tensor]) -> RefinementState:
-    """State before the first iteration. weights: per layer `... x out x in (+ 1)`."""
+def start_refinement(problem: RefinementProblem, weights: list[Tensor], waves: Waves | None = None) -> RefinementState:
+    """State before the first iteration. weights: per layer `... x out x in (+ 1)`; waves as in `refine`."""
     settings = problem.settings
-    flat = torch.cat([_flatten(w, problem.leading, 2).flatten(1) for w in weights], dim=-1)
+    parts = [_flatten(w, problem.leading, 2).flatten(1) for w in weights]
+    if waves is not None:
+        parts.append(_flatten(waves.frequency, problem.leading, 1))
+    flat = torch.cat(parts, dim=-1)
     batch = flat.shape[0]
     group_count = problem.group_count
     prior = flat.new_full((batch, group_count), settings.first_prior if settings.bayesian else settings.ridge)
@@ -255,6 +294,7 @@ def start_refinement(problem: RefinementProblem, weights: list[Tensor]) -> Refin
         prior=prior,
         noise=noise,
         effective=effective,
+        calm=torch.zeros(batch, dtype=torch.int64, device=flat.device),
         iteration=torch.zeros((), dtype=torch.int64, device=flat.device),
     )
     return replace(state, noise=_noise(problem, state)) if settings.bayesian else state
@@ -272,20 +312,29 @@ def step_refinement(
     before = _objective(problem, state, state.weights)
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     weights, damping = state.weights, state.damping
-    done = torch.zeros_like(before, dtype=torch.bool)
+    reached = before
+    todo = torch.arange(len(before), device=before.device)
     for _ in range(problem.settings.trials):
-        damped = matrix + torch.diag_embed(diagonal * damping.unsqueeze(-1))
+        damped = matrix[todo] + torch.diag_embed(diagonal[todo] * damping[todo].unsqueeze(-1))
         root, failed = torch.linalg.cholesky_ex(damped)
-        step = torch.cholesky_solve(gradient.unsqueeze(-1), root).squeeze(-1)
-        candidate = state.weights - step
-        after = _objective(problem, state, candidate)
-        good = (failed == 0) & (after < before) & ~done
-        weights = torch.where(good.unsqueeze(-1), candidate, weights)
-        damping = torch.where(good, damping / 10, torch.where(done, damping, damping * 10))
-        done = done | good
-        if bool(done.all()):
+        step = torch.cholesky_solve(gradient[todo].unsqueeze(-1), root).squeeze(-1)
+        candidate = state.weights[todo] - step
+        after = _objective(part_of_problem(problem, todo), part_of_state(state, todo), candidate)
+        good = (failed == 0) & (after < before[todo])
+        taken = todo[good]
+        weights = weights.index_copy(0, taken, candidate[good])
+        reached = reached.index_copy(0, taken, after[good])
+        damping = damping.index_copy(0, todo, torch.where(good, damping[todo] / 10, damping[todo] * 10))
+        todo = todo[~good]
+        if len(todo) == 0:
             break
-    moved = replace(state, weights=weights, damping=damping.clamp(*_DAMPING_RANGE), iteration=state.iteration + 1)
+    moved = replace(
+        state,
+        weights=weights,
+        damping=damping.clamp(*_DAMPING_RANGE),
+        calm=torch.where(before - reached < problem.settings.tolerance * before, state.calm + 1, 0),
+        iteration=state.iteration + 1,
+    )
     if not problem.settings.bayesian or int(moved.iteration) <= problem.settings.warm_up:
         return moved
     return _estimate_precisions(problem, moved, matrix)
@@ -306,6 +355,10 @@ def finish_refinement(problem: RefinementProblem, state: RefinementState, known:
     leading = problem.leading
     return Refined(
         weights=[w.reshape(*leading, *w.shape[-2:]) for w in problem.network.split(state.weights)],
+        waves=Waves(
+            problem.network.source.reshape(*leading, -1),
+            problem.network.frequencies(state.weights).reshape(*leading, -1),
+        ),
         error=(squares.sum(-1) / (_row_count(problem) * squares.shape[-1])).reshape(leading),
         objective=objective.reshape(leading),
         effective_parameters=state.effective.sum(-1).reshape(leading),
@@ -323,6 +376,42 @@ def second_order(problem: RefinementProblem, state: RefinementState) -> SecondOr
     active = problem.network.active
     gradient = local.gradient + torch.where(active, prior * state.weights, 0)
     return SecondOrder(gradient, local.matrix + torch.diag_embed(torch.where(active, prior, 1)))
+
+
+def part_of_problem(problem: RefinementProblem, index: Tensor) -> RefinementProblem:
+    """The problem of some of the networks, numbered as they stand in the batch; they lead in one dimension."""
+    if len(index) == len(problem.rows):
+        return problem
+    network = problem.network
+    return replace(
+        problem,
+        leading=(len(index),),
+        network=replace(
+            network,
+            masks=[mask[index] for mask in network.masks],
+            alive=[alive[index] for alive in network.alive],
+            active=network.active[index],
+            source=network.source[index],
+        ),
+        inputs=problem.inputs[index],
+        targets=problem.targets[index],
+        rows=problem.rows[index],
+        metric=None if problem.metric is None else problem.metric[index],
+    )
+
+
+def part_of_state(state: RefinementState, index: Tensor) -> RefinementState:
+    """The state of some of the networks."""
+    tensors = state.state_dict()
+    return RefinementState(**{name: value[index] if value.dim() else value for name, value in tensors.items()})
+
+
+def put_part(state: RefinementState, index: Tensor, part: RefinementState) -> RefinementState:
+    """A state with that of some of the networks renewed."""
+    old, new = state.state_dict(), part.state_dict()
+    return RefinementState(
+        **{name: old[name].index_copy(0, index, new[name]) if old[name].dim() else new[name] for name in old}
+    )
 
 
 def _squares(problem: RefinementProblem, weights: Tensor) -> Tensor:
@@ -368,7 +457,10 @@ def _estimate_precisions(problem: RefinementProblem, state: RefinementState, mat
     determined = 1 - state.prior[:, problem.groups] * variance
     effective = _group_sums(problem, determined, group_count).clamp_min(0)
     squares = _group_sums(problem, state.weights.square(), group_count)
-    shape, rate = problem.settings.prior_shape, problem.settings.prior_rate
+    # A periodic node is there or it is not: nothing is known of its amplitude, and the data alone may switch it off.
+    known = torch.ones(group_count, dtype=squares.dtype, device=squares.device)
+    known[problem.wave_groups] = _VAGUE
+    shape, rate = problem.settings.prior_shape * known, problem.settings.prior_rate * known
     prior = ((effective + 2 * shape) / (squares + 2 * rate)).clamp(*_PRECISION_RANGE)
     prior[:, -1] = _PRECISION_RANGE[0]
     usable = ((failed == 0) & effective.isfinite().all(-1)).unsqueeze(-1)
@@ -378,22 +470,6 @@ def _estimate_precisions(problem: RefinementProblem, state: RefinementState, mat
         effective=torch.where(usable, effective, state.effective),
     )
     return replace(estimated, noise=_noise(problem, estimated))
-
-
-def _prior_groups(shapes: list[torch.Size], bias: bool, kind: str) -> Tensor:
-    """Group of every weight in the flat order, `k`, int64; the last group holds the output's biases."""
-    last = len(shapes) - 1
-    labels: list[tuple[int, int, int]] = []
-    for layer, (outputs, inputs) in enumerate(shapes):
-        for row in range(outputs):
-            by_output = row if kind == "unit" and layer == last else 0
-            for column in range(inputs):
-                by_input = column if kind == "unit" and layer == 0 else 0
-                labels.append((0 if kind == "network" else 2 * layer, by_output, by_input))
-            if bias:
-                labels.append((-1, 0, 0) if layer == last else (0 if kind == "network" else 2 * layer + 1, 0, 0))
-    order = {label: index for index, label in enumerate(sorted(set(labels) - {(-1, 0, 0)}))}
-    return torch.tensor([order.get(label, len(order)) for label in labels])
 
 
 def _flatten(tensor: Tensor, leading: tuple[int, ...], trailing: int) -> Tensor:

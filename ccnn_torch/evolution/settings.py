@@ -38,6 +38,9 @@ class CCNNSettings:
         members: independent coevolutions of each repeat; the model is the mean of their networks, itself one masked
             network with their hidden layers side by side (paper: 1).
         refine_every: generations between refinements of the best joined network; 0 = only after the last one.
+        waves: slots for periodic nodes, each a sine and a cosine of one input found in what the refined network leaves,
+            since gears and screws repeat their errors; 0 = none (paper: none). They need refinement.
+        wave_searches: how often to look for them, each time followed by a refinement.
         refinement_iterations: Levenberg-Marquardt iterations of one refinement; 0 = none, as in the paper.
 
     Raises:
@@ -63,11 +66,20 @@ class CCNNSettings:
     target_error: float = 0.0
     members: int = 6
     refine_every: int = 10
+    waves: int = 24
+    wave_searches: int = 3
     refinement_iterations: int = 20
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
-        for key, low in (("representatives", 0), ("members", 1), ("refine_every", 0), ("refinement_iterations", 0)):
+        for key, low in (
+            ("representatives", 0),
+            ("members", 1),
+            ("refine_every", 0),
+            ("refinement_iterations", 0),
+            ("waves", 0),
+            ("wave_searches", 0),
+        ):
             if getattr(self, key) < low:
                 raise ValueError(f"{key}={getattr(self, key)} must be at least {low}")
         check_evolution(self)

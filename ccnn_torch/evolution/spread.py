@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ccnn_torch.evolution.genome import Genome, active
 from ccnn_torch.evolution.network import forward, hidden_signal
+from ccnn_torch.evolution.waves import Waves
 
 __all__ = ["Spread", "readout_spread", "spread_variance"]
 
@@ -42,7 +43,12 @@ class Spread(NamedTuple):
 
 
 def readout_spread(
-    masks: Sequence[Tensor], weights: Sequence[Tensor], inputs: Tensor, targets: Tensor, rows: Tensor
+    masks: Sequence[Tensor],
+    weights: Sequence[Tensor],
+    inputs: Tensor,
+    targets: Tensor,
+    rows: Tensor,
+    waves: Waves | None = None,
 ) -> Spread:
     """The spread of the mean of `m` networks, from the rows they were trained on.
 
@@ -51,14 +57,15 @@ def readout_spread(
         inputs: `... x s x i` [1].
         targets: `... x s x o` [1].
         rows: row weights, `... x s`; rows of weight 0 are left out, whatever stands in them.
+        waves: periodic nodes, `... x m x k`.
     """
     there = (rows > 0).unsqueeze(-1)
     inputs, targets = inputs.masked_fill(~there, 0), targets.masked_fill(~there, 0)
-    hidden = hidden_signal(masks, weights, inputs.unsqueeze(-3))
+    hidden = hidden_signal(masks, weights, inputs.unsqueeze(-3), waves)
     basis = torch.cat([hidden, torch.ones_like(hidden[..., :1])], -1)
     readout, determined = _readout(masks[-1], weights[-1])
     # Averaged over the networks, of each output and each row.
-    residual = forward(masks, weights, inputs.unsqueeze(-3)).mean(-3) - targets
+    residual = forward(masks, weights, inputs.unsqueeze(-3), waves).mean(-3) - targets
     squares = (residual.square() * rows.unsqueeze(-1)).sum(-2)
     count = rows.sum(-1, keepdim=True)
     noise = (squares / count).clamp_min(_SMALLEST_NOISE)
@@ -73,17 +80,21 @@ def readout_spread(
     root = torch.linalg.cholesky(_posterior(gram, noise, prior, determined))
     eye = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device)
     factors = torch.linalg.solve_triangular(root, eye.expand_as(root), upper=False) * determined.unsqueeze(-2)
-    return Spread(_combine(factors, readout, shared=len(masks) == 1), noise)
+    slots = 0 if waves is None else waves.frequency.shape[-1]
+    return Spread(_combine(factors, readout, len(masks) == 1, slots), noise)
 
 
-def spread_variance(masks: Sequence[Tensor], weights: Sequence[Tensor], spread: Spread, inputs: Tensor) -> Tensor:
+def spread_variance(
+    masks: Sequence[Tensor], weights: Sequence[Tensor], spread: Spread, inputs: Tensor, waves: Waves | None = None
+) -> Tensor:
     """Predictive variance of every row, `... x s x o` [1].
 
     Args:
         masks, weights: of the averaged network (`average`), one a layer, `... x out x in`.
         inputs: `... x s x i` [1].
+        waves: of the averaged network, `... x k`.
     """
-    hidden = hidden_signal(masks, weights, inputs)
+    hidden = hidden_signal(masks, weights, inputs, waves)
     basis = torch.cat([hidden, torch.ones_like(hidden[..., :1])], -1)
     scatter = basis.unsqueeze(-3) @ spread.factors.mT
     return scatter.square().sum(-1).mT + spread.noise.unsqueeze(-2)
@@ -113,22 +124,30 @@ def _posterior(gram: Tensor, noise: Tensor, prior: Tensor, determined: Tensor) -
     return fitted + torch.diag_embed(torch.where(determined > 0, prior, 1.0))
 
 
-def _combine(factors: Tensor, readout: Tensor, shared: bool) -> Tensor:
+def _combine(factors: Tensor, readout: Tensor, shared: bool, slots: int) -> Tensor:
     """Factors of each network (`... x m x o x q x (h + 1)`) and their scatter, in the averaged network's last layer."""
     members = factors.shape[-4]
-    own = _beside(factors / members**0.5, shared).movedim(-4, -3).flatten(-3, -2)
+    own = _beside(factors / members**0.5, shared, slots).movedim(-4, -3).flatten(-3, -2)
     if members == 1:
         return own
-    outputs = _beside(readout.unsqueeze(-2), shared)
+    outputs = _beside(readout.unsqueeze(-2), shared, slots)
     apart = (outputs - outputs.mean(-4, keepdim=True)) / (members - 1) ** 0.5
     return torch.cat([own, apart.movedim(-4, -3).flatten(-3, -2)], -2)
 
 
-def _beside(factors: Tensor, shared: bool) -> Tensor:
-    """`... x m x o x q x (h + 1)` to columns of the averaged network, `... x m x o x q x (m h + 1)`."""
-    if shared:
-        return factors
+def _beside(factors: Tensor, shared: bool, slots: int) -> Tensor:
+    """`... x m x o x q x (h + 1)` to columns of the averaged network: hidden nodes, sines and cosines, each by member.
+
+    `shared`: the members have no hidden layer, so that they all read the same inputs.
+    """
+    hidden = factors.shape[-1] - 1 - 2 * slots
+    parts = torch.split(factors, [hidden, slots, slots, 1], -1)
+    wide = [parts[0] if shared else _apart(parts[0]), _apart(parts[1]), _apart(parts[2]), parts[3]]
+    return torch.cat(wide, -1)
+
+
+def _apart(factors: Tensor) -> Tensor:
+    """`... x m x o x q x h` to `... x m x o x q x (m h)`, zero in the columns of the other members."""
     members = factors.shape[-4]
     eye = torch.eye(members, dtype=factors.dtype, device=factors.device)
-    own = factors[..., :-1].unsqueeze(-2) * eye[:, None, None, :, None]
-    return torch.cat([own.flatten(-2), factors[..., -1:]], -1)
+    return (factors.unsqueeze(-2) * eye[:, None, None, :, None]).flatten(-2)

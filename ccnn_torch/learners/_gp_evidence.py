@@ -20,7 +20,13 @@ with warnings.catch_warnings():
     from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
     from gpytorch.likelihoods import GaussianLikelihood
     from gpytorch.means import ConstantMean
-    from gpytorch.priors import LogNormalPrior
+    from gpytorch.priors import NormalPrior
+
+# Priors: of length scales the median, in units of the square root of the number of inputs, and the spread of the
+# logarithm; of the variances of function and noise the mean and the spread of the logarithm.
+_LENGTH, _LENGTH_SPREAD = 4.0, 1.0
+_SCALE = (-1.0, 1.5)
+_NOISE = (-2.0, 2.0)
 
 __all__ = ["Evidence", "GPPrior", "log_evidence"]
 
@@ -47,33 +53,26 @@ class GPPrior(nn.Module):
     The hyperparameters of one process are `k = i + 3` numbers: the logarithms of `i` length scales and of the variance
     of the function, the logarithm of (the variance of the noise - `noise_floor`), and the mean.
 
-    Priors, for features in [-1, 1] and standardised targets: length scales log-normal about a few times the square root
-    of the number of inputs (Hvarfner, Hellsten and Nardi, "Vanilla Bayesian Optimization Performs Great in High
-    Dimensions", ICML 2024, there for [0, 1]), so that few rows give a smooth function; variances log-normal and wide.
+    Priors, for features in [-1, 1] and standardised targets, are normal in the logarithms, so that the most probable
+    value is the median: in the values themselves the density of a wide log-normal peaks far below it, and with short
+    length scales sixty rows of noise alone cost 5 % of an output's variance instead of 1 %. Length scales grow with the
+    square root of the number of inputs, as distances do (Hvarfner, Hellsten and Nardi, "Vanilla Bayesian Optimization
+    Performs Great in High Dimensions", ICML 2024).
     """
 
     def __init__(self, kernel: str, inputs: int, noise_floor: float) -> None:
         super().__init__()
         logarithm = {"transform": torch.exp, "inv_transform": torch.log}
-        shared = {
-            "ard_num_dims": inputs,
-            "batch_shape": torch.Size([1]),
-            "lengthscale_prior": LogNormalPrior(math.sqrt(2) + math.log(2) + math.log(inputs) / 2, math.sqrt(3)),
-            "lengthscale_constraint": Positive(**logarithm),
-        }
+        one = {"batch_shape": torch.Size([1])}
+        shape = {"ard_num_dims": inputs, "lengthscale_constraint": Positive(**logarithm), **one}
         nu = {"matern32": 1.5, "matern52": 2.5}
-        base = RBFKernel(**shared) if kernel == "rbf" else MaternKernel(nu=nu[kernel], **shared)
-        self.kernel = ScaleKernel(
-            base,
-            batch_shape=torch.Size([1]),
-            outputscale_prior=LogNormalPrior(0.0, 1.5),
-            outputscale_constraint=Positive(**logarithm),
-        )
-        self.noise = GaussianLikelihood(
-            batch_shape=torch.Size([1]),
-            noise_prior=LogNormalPrior(-2.0, 2.0),
-            noise_constraint=GreaterThan(noise_floor, **logarithm),
-        )
+        base = RBFKernel(**shape) if kernel == "rbf" else MaternKernel(nu=nu[kernel], **shape)
+        self.kernel = ScaleKernel(base, outputscale_constraint=Positive(**logarithm), **one)
+        self.noise = GaussianLikelihood(noise_constraint=GreaterThan(noise_floor, **logarithm), **one)
+        smooth = math.log(_LENGTH) + math.log(inputs) / 2
+        base.register_prior("length_prior", _normal(smooth, _LENGTH_SPREAD), lambda module: module.lengthscale.log())
+        self.kernel.register_prior("scale_prior", _normal(*_SCALE), lambda module: module.outputscale.log())
+        self.noise.register_prior("noise_prior", _normal(*_NOISE), lambda module: module.noise.log())
         self.mean = ConstantMean(batch_shape=torch.Size([1]))
         self.inputs = inputs
         self.double()
@@ -97,6 +96,11 @@ class GPPrior(nn.Module):
             for _, module, prior, value, _ in part.named_priors()
         ]
         return self.kernel(inputs).to_dense(), self.mean(inputs), self.noise.noise, torch.stack(terms).sum(0)
+
+
+def _normal(location: float, scale: float) -> NormalPrior:
+    """In double from the start: GPyTorch would round plain numbers to single precision."""
+    return NormalPrior(*(torch.tensor(number, dtype=torch.float64) for number in (location, scale)))
 
 
 def log_evidence(process: GPPrior, theta: Tensor, inputs: Tensor, targets: Tensor, weights: Tensor) -> Evidence:
@@ -124,7 +128,7 @@ def log_evidence(process: GPPrior, theta: Tensor, inputs: Tensor, targets: Tenso
         error = torch.where(there, targets - mean, 0.0)
         dual = torch.cholesky_solve(error.unsqueeze(-1), factor).squeeze(-1)
         half_logdet = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        fit = -0.5 * (error * dual).sum(-1) - half_logdet - 0.5 * math.log(2 * math.pi) * there.sum(-1)
+        fit = -0.5 * (error * dual).sum(-1) - half_logdet - 0.5 * math.log(2 * math.pi) * there.to(mean.dtype).sum(-1)
         slope = 0.5 * (dual.unsqueeze(-1) * dual.unsqueeze(-2) - torch.cholesky_inverse(factor))
     carried = (slope * covariances).sum() + (dual * mean).sum() + prior.sum()
     (gradient,) = torch.autograd.grad(carried, theta)

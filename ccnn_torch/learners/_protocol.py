@@ -23,6 +23,8 @@ class TrainingData:
         metric: in which channels the error of a row is judged, `r x s x c x o`: this matrix times (output - target),
             such as the pose error that joint deviations cause. None = the outputs themselves. Learners may leave it
             aside.
+        angles: how many of the features, the last ones, are scaled angles that stand among the others by their sines
+            and cosines; 0 unless the learner's `reads_angles` asks for them.
     """
 
     inputs: Tensor
@@ -31,11 +33,14 @@ class TrainingData:
     seeds: Tensor
     validation: TrainingData | None = None
     metric: Tensor | None = None
+    angles: int = 0
 
 
 @runtime_checkable
 class Learner(Protocol):
     """`start`, then `step` until `finished`; `predict` and `network` at any time after `start`.
+
+    A learner with the attribute `reads_angles` set gets the scaled angles of turning joints as its last features.
 
     All repeats advance together in one call, as the leading dimension of every tensor. Two learners started on the
     same data with the same seeds give the same tensors; a learner whose state was saved and loaded goes on to the same

@@ -9,13 +9,18 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.network import MaskedNetwork, forward
+from ccnn_torch.evolution.masked_network import MaskedNetwork
+from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.refinement import (
     RefinementSettings,
     RefinementState,
+    SecondOrder,
     finish_refinement,
+    part_of_problem,
+    part_of_state,
     pose_refinement,
+    put_part,
     second_order,
     start_refinement,
     step_refinement,
@@ -38,8 +43,8 @@ class BPLMSettings:
             more nodes cost time rather than accuracy.
         restarts: networks from independent starts, trained side by side.
         iterations: Levenberg-Marquardt iterations at most; training ends earlier once every network is at rest.
-        tolerance: a network is at rest once its log evidence changed by at most this per measured value in each of
-            `patience` iterations.
+        tolerance: a network is at rest, and is left there, once its log evidence changed by at most this per measured
+            value in each of `patience` iterations.
         patience: see `tolerance`.
 
     Raises:
@@ -74,8 +79,8 @@ class BPLM:
     1009) the average of ten networks was as good (0.648 and 0.646 of the constant's error), and it would have ten times
     the nodes. Errors are judged in the channels of `data.metric` where there is one.
 
-    Metrics of a step: `error_train`, `evidence_best` (logarithm, per measured value; highest of this iteration),
-    `parameters_effective` (of that network), `evaluations` (a Jacobian counts as many as there are outputs, the steps
+    Metrics of a step: `error_train`, `evidence_best` (logarithm, per measured value; highest now),
+    `evaluations` (a Jacobian counts as many as there are outputs, the steps
     tried in an iteration count one), each `r`.
     """
 
@@ -111,32 +116,42 @@ class BPLM:
         self._best = torch.zeros_like(self._state.weights.reshape(*leading, -1)[:, 0])
         self._best_evidence = self._evidence[:, 0].clone()
         self._rest = torch.zeros(leading, dtype=torch.int64, device=data.inputs.device)
+        self._iterations = torch.zeros_like(self._evidence)
         self._known = second_order(self._problem, self._state)
 
     def step(self) -> dict[str, Tensor]:
         """One iteration of every network."""
         data = self._data
-        self._state = step_refinement(self._problem, self._state, self._known)
-        self._known = second_order(self._problem, self._state)
-        refined = finish_refinement(self._problem, self._state, self._known)
+        going = torch.nonzero(self._rest.flatten() < self.settings.patience).flatten()
+        problem = part_of_problem(self._problem, going)
+        moved = step_refinement(
+            problem, part_of_state(self._state, going), SecondOrder(*(part[going] for part in self._known))
+        )
+        known = second_order(problem, moved)
+        refined = finish_refinement(problem, moved, known)
+        self._state = put_part(self._state, going, moved)
+        self._known = SecondOrder(*(old.index_copy(0, going, new) for old, new in zip(self._known, known, strict=True)))
         channels = data.targets.shape[-1] if data.metric is None else data.metric.shape[-2]
-        values = data.weights.sum(-1, keepdim=True) * channels
-        evidence = torch.where(refined.log_evidence.isfinite(), refined.log_evidence / values, -torch.inf)
-        moved = (evidence - self._evidence).abs()
-        self._rest = torch.where(moved <= self.settings.tolerance, self._rest + 1, 0)
-        self._evidence = evidence
-        highest, which = evidence.max(-1)
+        values = (data.weights.sum(-1, keepdim=True) * channels).expand_as(self._evidence).flatten()[going]
+        evidence = refined.log_evidence.flatten() / values
+        evidence = torch.where(evidence.isfinite(), evidence, -torch.inf)
+        calm = (evidence - self._evidence.flatten()[going]).abs() <= self.settings.tolerance
+        rest = torch.where(calm, self._rest.flatten()[going] + 1, 0)
+        self._rest = self._rest.flatten().index_copy(0, going, rest).view_as(self._rest)
+        self._evidence = self._evidence.flatten().index_copy(0, going, evidence).view_as(self._evidence)
+        self._iterations = (
+            self._iterations.flatten().index_add(0, going, torch.ones_like(evidence)).view_as(self._evidence)
+        )
+        highest, which = self._evidence.max(-1)
         repeats = torch.arange(len(which), device=which.device)
-        candidate = self._state.weights.reshape(*evidence.shape, -1)[repeats, which]
+        candidate = self._state.weights.reshape(*self._evidence.shape, -1)[repeats, which]
         better = highest > self._best_evidence
         self._best = torch.where(better.unsqueeze(-1), candidate, self._best)
         self._best_evidence = torch.where(better, highest, self._best_evidence)
-        each = self.settings.restarts * (data.targets.shape[-1] + 1)
         return {
             "error_train": mean_square(self.predict(data.inputs) - data.targets, data.weights),
             "evidence_best": highest,
-            "parameters_effective": refined.effective_parameters[repeats, which],
-            "evaluations": torch.full_like(values[:, 0], each * int(self._state.iteration)),
+            "evaluations": self._iterations.sum(-1) * (data.targets.shape[-1] + 1),
         }
 
     @property
@@ -184,12 +199,13 @@ class BPLM:
             name: value.reshape(*leading, *value.shape[1:]) if value.dim() else value
             for name, value in self._state.state_dict().items()
         }
-        known = {"log_evidence": self._evidence, "rest": self._rest}
+        known = {"log_evidence": self._evidence, "rest": self._rest, "iterations_made": self._iterations}
         return tensors | known | {"best": self._best, "best_evidence": self._best_evidence}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take back a state; call `start` with the same data first."""
         self._evidence, self._rest = state["log_evidence"], state["rest"]
+        self._iterations = state["iterations_made"]
         self._best, self._best_evidence = state["best"], state["best_evidence"]
         names = self._state.state_dict().keys()
         self._state = RefinementState.from_state_dict(

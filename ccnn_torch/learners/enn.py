@@ -19,7 +19,8 @@ from ccnn_torch.evolution.breeding import (
 from ccnn_torch.evolution.coevolution import density, diversity
 from ccnn_torch.evolution.evaluation import fitness, make_task, network_errors
 from ccnn_torch.evolution.genome import Genome, select
-from ccnn_torch.evolution.network import MaskedNetwork, forward
+from ccnn_torch.evolution.masked_network import MaskedNetwork
+from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import check_evolution
 from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance

@@ -26,9 +26,15 @@ from ccnn_torch.report.plots import (
 )
 from ccnn_torch.report.tables import markdown_text
 
-__all__ = ["make_picture", "run_plots", "write_report"]
+__all__ = ["make_picture", "run_plots", "write_report", "write_tables"]
 
 _LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "model.onnx", "model.pt2", "config.yaml")
+
+
+def write_tables(folder: Path, results: Mapping[str, Any]) -> None:
+    """Write `results.csv` and `results.md`."""
+    write_csv(folder / "results.csv", results)
+    (folder / "results.md").write_text(markdown_text(results), encoding="utf-8")
 
 
 def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -> Path:
@@ -49,8 +55,7 @@ def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -
     """
     folder = Path(folder)
     results = read_json(folder / "results.json") if results is None else results
-    write_csv(folder / "results.csv", results)
-    (folder / "results.md").write_text(markdown_text(results), encoding="utf-8")
+    write_tables(folder, results)
     plots = run_plots(folder, results)
     (folder / "plots").mkdir(exist_ok=True)
     figures = []

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from ccnn_torch.report.display import count_text, display_unit, interval_text, number_text
-from ccnn_torch.report.tables import Table, markdown_table, print_table
+from ccnn_torch.report.table_form import Table, print_table
+from ccnn_torch.report.tables import markdown_table
 
 __all__ = ["case_line", "print_suite", "suite_markdown", "suite_tables"]
 
@@ -121,9 +122,12 @@ def _methods_table(comparison: Mapping[str, Any]) -> Table:
 
 
 def _failures(comparison: Mapping[str, Any]) -> list[str]:
-    cases = [f"case '{name}' failed: {sentence}" for name, sentence in comparison["failed"].items()]
-    return cases + [
-        f"{method} failed in case '{case['name']}': {sentence}"
-        for case in comparison["cases"]
-        for method, sentence in case["failed_methods"].items()
-    ]
+    told = [f"case '{name}' failed: {sentence}" for name, sentence in comparison["failed"].items()]
+    # A learner that is not there fails alike in every case: said once.
+    where: dict[tuple[str, str], list[str]] = {}
+    for case in comparison["cases"]:
+        for method, sentence in case["failed_methods"].items():
+            where.setdefault((method, sentence), []).append(f"'{case['name']}'")
+    for (method, sentence), cases in where.items():
+        told.append(f"{method} failed in {count_text(len(cases), 'case')} ({', '.join(cases)}): {sentence}")
+    return told

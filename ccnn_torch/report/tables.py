@@ -18,7 +18,7 @@ from ccnn_torch.report.display import count_text, display_unit, interval_text, n
 from ccnn_torch.report.paper_tables import PAPER, PaperCase
 from ccnn_torch.report.table_form import Table, print_table
 
-__all__ = ["Table", "markdown_table", "markdown_text", "print_table", "print_tables", "result_tables", "verdict"]
+__all__ = ["Table", "markdown_table", "markdown_text", "print_tables", "result_tables", "verdict"]
 
 Results = Mapping[str, Any]
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation import FORMS, Compensator, fit_compensator, save_model
+from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import LEARNERS, Learner, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError
@@ -69,8 +69,13 @@ class Calibration:
         rows = prepared.dataset.usable_rows("fit")
         there = rows.index[repeat][rows.weights[repeat] > 0]
         fitted = self.outcomes[method].fitted
+        network = fitted.learner.network(repeat).cpu()
+        sd_scale = fitted.sd_scale[repeat]
+        if not isinstance(network, UncertainNetwork):
+            # A learner without a variance of its own has one standard deviation everywhere, here as in the results.
+            sd_scale = fitted.sd(prepared.dataset.inputs[:, :1])[repeat, 0] / fitted.scaling.deviation[repeat]
         return fit_compensator(
-            fitted.learner.network(repeat).cpu(),
+            network,
             fitted.scaling.repeat(repeat),
             prepared.dataset.inputs[repeat, there],
             prepared.dataset.deviation[repeat, there],
@@ -78,6 +83,7 @@ class Calibration:
             prepared.covariate_coordinates,
             limit=_limit(self.config, len(prepared.mechanism.joints)),
             margin=self.config.compensation.margin,
+            sd_scale=sd_scale,
         )
 
     def save(

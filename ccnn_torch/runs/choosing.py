@@ -111,11 +111,11 @@ def choose(
         InputError: too few rows to hold some out.
         MethodFailedError: the learner cannot go on, or gives numbers that are not finite.
     """
-    data, scaling = fold_dataset(dataset, plan.kind, plan.folds).scaled("train", True)
+    learner = make()
+    data, scaling = fold_dataset(dataset, plan.kind, plan.folds).scaled("train", True, learner)
     data = moved(data, plan.device)
     held = data.validation
     assert held is not None
-    learner = make()
     training = train(
         learner,
         data if plan.early_stop else replace(data, validation=None),
@@ -173,6 +173,7 @@ def fold_dataset(dataset: Dataset, kind: str, folds: int) -> Dataset:
     pairs = zip(dataset.splits, dataset.seeds, strict=True)
     return replace(
         dataset,
+        inputs=dataset.inputs.repeat_interleave(folds, 0),
         deviation=dataset.deviation.repeat_interleave(folds, 0),
         usable=dataset.usable.repeat_interleave(folds, 0),
         splits=[part for split, seed in pairs for part in fold_splits(split, kind, folds, seed)],
@@ -209,6 +210,7 @@ def moved(data: TrainingData, device: str) -> TrainingData:
         data.seeds.to(device),
         None if data.validation is None else moved(data.validation, device),
         None if data.metric is None else data.metric.to(device),
+        data.angles,
     )
 
 

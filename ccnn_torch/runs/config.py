@@ -223,6 +223,9 @@ class RunConfig(_Part):
     auto: AutoConfig = Field(default_factory=AutoConfig)
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
     save_models: bool = Field(default=True, description="write model files and their card")
+    save_report: bool = Field(
+        default=True, description="draw plots/ and write report.html; results.json, .csv and .md are always written"
+    )
     ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
     bp_lm: BPLMSettings = Field(default_factory=BPLMSettings)
     grnn: GRNNSettings = Field(default_factory=GRNNSettings)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.learners import TrainingData
+from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.splits import Split
 from ccnn_torch.training import Scaling
 
@@ -88,12 +88,13 @@ class Dataset:
         rows: Tensor = getattr(split, part)
         return rows.sort().values
 
-    def scaled(self, part: str, validate: bool) -> tuple[TrainingData, Scaling]:
+    def scaled(self, part: str, validate: bool, learner: Learner) -> tuple[TrainingData, Scaling]:
         """What a learner takes, scaled by its own training rows.
 
         Args:
             part: `train` (validation rows held out) or `fit` (both).
             validate: give the learner the validation rows to look at.
+            learner: may ask for the angles of turning joints beside their sines and cosines (`reads_angles`).
         """
         rows = self.usable_rows(part)
         fewest = int(rows.weights.sum(-1).min())
@@ -103,7 +104,7 @@ class Dataset:
                 "measure more, or lower split.test and split.validation"
             )
         inputs, targets = rows.take(self.inputs), rows.take(self.deviation)
-        scaling = Scaling.fit(inputs, targets, rows.weights, self.periodic)
+        scaling = Scaling.fit(inputs, targets, rows.weights, self.periodic, getattr(learner, "reads_angles", False))
         held = None
         if validate:
             others = self.usable_rows("validation")
@@ -112,6 +113,7 @@ class Dataset:
                 scaling.standardise(others.take(self.deviation)),
                 others.weights,
                 torch.tensor(self.seeds),
+                angles=scaling.angle_count,
             )
         data = TrainingData(
             scaling.features(inputs),
@@ -120,6 +122,7 @@ class Dataset:
             torch.tensor(self.seeds),
             held,
             self._metric(rows, targets, scaling),
+            scaling.angle_count,
         )
         return data, scaling
 

@@ -117,9 +117,9 @@ def refit(
     watch: WatchPhase,
 ) -> Fitted:
     """The second phase of `fit_method`: train on all training rows, for as long as the choice says."""
-    data, scaling = dataset.scaled("fit", False)
-    data = moved(data, plan.device)
     learner = make()
+    data, scaling = dataset.scaled("fit", False, learner)
+    data = moved(data, plan.device)
     training = train(
         learner,
         data,
@@ -134,8 +134,7 @@ def refit(
         score = weighted_mse(learner.predict(data.inputs), data.targets, data.weights).cpu()
         scale, before = torch.ones_like(scaling.deviation), 0.0
     fitted = Fitted(name, learner, scaling, data, training, choice, score, scale, before + training.seconds)
-    inputs = dataset.inputs.expand(len(dataset.seeds), -1, -1)
-    bad = ~(fitted.predict(inputs).isfinite() & fitted.sd(inputs).isfinite()).all((1, 2))
+    bad = ~(fitted.predict(dataset.inputs).isfinite() & fitted.sd(dataset.inputs).isfinite()).all((1, 2))
     if bool(bad.any()):
         which = ", ".join(str(k) for k in torch.nonzero(bad).squeeze(-1).tolist())
         raise MethodFailedError(f"{name} gives predictions that are not finite in repeat {which}")

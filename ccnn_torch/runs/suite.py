@@ -28,6 +28,8 @@ __all__ = ["Suite", "load_suite", "run_suite"]
 
 # Keys of the suite itself, where they come from the command line.
 _OWN = ("name", "out")
+# Both take longer than many a case, and what a suite is for is the comparison.
+_DEFAULTS = {"save_models": False, "save_report": False}
 
 
 class _File(BaseModel):
@@ -39,7 +41,10 @@ class _File(BaseModel):
     out: str | None = Field(default=None, description="folder to write; default runs/NAME")
     base: dict[str, Any] = Field(default_factory=dict, description="keys that all cases share, as in a config of a run")
     cases: list[dict[str, Any]] = Field(
-        min_length=1, description="cases: a name each, and the keys in which it differs from base"
+        default=[],
+        validate_default=True,
+        min_length=1,
+        description="a name each, and the keys in which it differs from base",
     )
 
 
@@ -60,7 +65,8 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
     """Read a suite's file and put overrides over every case.
 
     A case is `base` with the case's keys over it (sections are merged, lists replaced), then the overrides. `name=…`
-    and `out=…` are those of the suite. Model files are not written unless a config says `save_models: true`.
+    and `out=…` are those of the suite. Model files, plots and reports of the cases are not written unless the keys
+    `save_models: true`, `save_report: true` say so.
 
     Raises:
         InputError: the file, a case or an override cannot be used; names the case.
@@ -81,7 +87,7 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
     cases: dict[str, RunConfig] = {}
     for number, keys in enumerate(file.cases, 1):
         name = _name(keys, f"{path}: case {number}", cases)
-        case = _merged({"save_models": False}, _merged(file.base, keys)) | {"name": name}
+        case = _merged(_DEFAULTS, _merged(file.base, keys)) | {"name": name}
         resolve_paths(case, path.absolute().parent)
         changed = apply_overrides(case, others, Path.cwd())
         cases[name] = validate_tree(case | {"out": str(out / name)}, f"{path}, case '{name}'", changed)

@@ -79,10 +79,10 @@ def inside_domain(dataset: Dataset, margin: float) -> Tensor:
     """
     rows = dataset.usable_rows("fit")
     inside = []
-    for index, weights in zip(rows.index, rows.weights, strict=True):
-        trained = dataset.inputs[index[weights > 0]]
+    for inputs, index, weights in zip(dataset.inputs, rows.index, rows.weights, strict=True):
+        trained = inputs[index[weights > 0]]
         domain = Domain.fit(trained, torch.zeros_like(trained[0]), margin)
-        inside.append(domain.excess(domain.cage(dataset.inputs)).squeeze(-1) == 0)
+        inside.append(domain.excess(domain.cage(inputs)).squeeze(-1) == 0)
     return torch.stack(inside)
 
 

@@ -157,14 +157,16 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         """Train one repeat. held: rows to watch instead of training on them, `s`."""
         every = [_tensor(part).unsqueeze(0) for part in (inputs, targets, weights)]
         rows = every if held is None else [part[:, _tensor(~held)] for part in every]
-        scaling = Scaling.fit(rows[0], rows[1], rows[2], _tensor(self._periodic()))
+        learner = type(self)._learner(self._make_settings())
+        angles = getattr(learner, "reads_angles", False)
+        scaling = Scaling.fit(rows[0], rows[1], rows[2], _tensor(self._periodic()), angles)
         seeds = torch.tensor([seed])
 
         def scaled(parts: list[Tensor], validation: TrainingData | None = None) -> TrainingData:
-            return TrainingData(scaling.features(parts[0]), scaling.standardise(parts[1]), parts[2], seeds, validation)
+            features, targets = scaling.features(parts[0]), scaling.standardise(parts[1])
+            return TrainingData(features, targets, parts[2], seeds, validation, angles=scaling.angle_count)
 
         validation = None if held is None else scaled([part[:, _tensor(held)] for part in every])
-        learner = type(self)._learner(self._make_settings())
         training = train(learner, scaled(rows, validation), patience=patience, stop_at=stop_at)
         return learner, scaling, training
 

@@ -13,11 +13,13 @@ class Scaling(nn.Module):
 
     A linear input x becomes (x - centre) / half_range; a periodic one (a revolute joint that turns far) becomes the
     two features sin x and cos x, so that a full turn is no jump. Features stand in the order: linear inputs, then the
-    sines, then the cosines of the periodic ones.
+    sines, then the cosines of the periodic ones, and then, for a learner that reads angles, the periodic ones scaled as
+    the linear ones are.
 
     Attributes:
         linear, periodic: indices of the inputs of either kind, int64.
-        centre, half_range: `[r x] len(linear)` [the input's SI unit].
+        centre, half_range: `[r x] len(linear)` [the input's SI unit]; for a learner that reads angles those of the
+            periodic inputs behind them.
         mean, deviation: `[r x] o` [the output's SI unit].
     """
 
@@ -40,7 +42,7 @@ class Scaling(nn.Module):
         self.register_buffer("deviation", deviation)
 
     @classmethod
-    def fit(cls, inputs: Tensor, targets: Tensor, weights: Tensor, periodic: Tensor) -> Scaling:
+    def fit(cls, inputs: Tensor, targets: Tensor, weights: Tensor, periodic: Tensor, angles: bool = False) -> Scaling:
         """Fit to training rows.
 
         Args:
@@ -48,10 +50,12 @@ class Scaling(nn.Module):
             targets: `r x s x o` [SI].
             weights: `r x s` [1]; rows of weight 0 are ignored.
             periodic: `i`, bool, which inputs are angles to be fed as sine and cosine.
+            angles: whether the learner reads these angles themselves as well.
         """
         there = (weights > 0).unsqueeze(-1)
         linear = torch.nonzero(~periodic).squeeze(-1)
-        values = inputs[..., linear]
+        turning = torch.nonzero(periodic).squeeze(-1)
+        values = inputs[..., torch.cat([linear, turning]) if angles else linear]
         low = values.masked_fill(~there, torch.inf).amin(-2)
         high = values.masked_fill(~there, -torch.inf).amax(-2)
         half = (high - low) / 2
@@ -62,7 +66,7 @@ class Scaling(nn.Module):
         # A constant output keeps scale 1: its standardised value is then exactly 0 and is learned as such.
         return cls(
             linear,
-            torch.nonzero(periodic).squeeze(-1),
+            turning,
             (high + low) / 2,
             torch.where(half > 0, half, torch.ones_like(half)),
             mean,
@@ -72,7 +76,12 @@ class Scaling(nn.Module):
     @property
     def feature_count(self) -> int:
         """Number of features that a learner sees."""
-        return len(self.linear) + 2 * len(self.periodic)
+        return len(self.linear) + 2 * len(self.periodic) + self.angle_count
+
+    @property
+    def angle_count(self) -> int:
+        """Number of features, the last ones, that are scaled angles."""
+        return self.centre.shape[-1] - len(self.linear)
 
     def repeat(self, index: int) -> Scaling:
         """The scaling of one repeat, without the leading dimension."""
@@ -85,12 +94,17 @@ class Scaling(nn.Module):
     def features(self, inputs: Tensor) -> Tensor:
         """inputs: `[r x] ... x i` [SI]; returns `[r x] ... x feature_count` [1]."""
         # Without a periodic input nothing is picked: exported graphs stay free of gather.
-        linear = inputs[..., self.linear] if len(self.periodic) else inputs
-        scaled = (linear - _align(self.centre, inputs)) / _align(self.half_range, inputs)
         if len(self.periodic) == 0:
-            return scaled
+            return self._scaled(inputs, slice(None))
+        count = len(self.linear)
         angles = inputs[..., self.periodic]
-        return torch.cat([scaled, torch.sin(angles), torch.cos(angles)], dim=-1)
+        parts = [self._scaled(inputs[..., self.linear], slice(None, count)), torch.sin(angles), torch.cos(angles)]
+        if self.angle_count:
+            parts.append(self._scaled(angles, slice(count, None)))
+        return torch.cat(parts, dim=-1)
+
+    def _scaled(self, values: Tensor, which: slice) -> Tensor:
+        return (values - _align(self.centre[..., which], values)) / _align(self.half_range[..., which], values)
 
     def standardise(self, targets: Tensor) -> Tensor:
         """targets: `[r x] ... x o` [SI]; returns the same shape [1]."""

@@ -26,6 +26,10 @@ class Sigmoids(nn.Module):
         hidden = torch.sigmoid(features @ self.weights[0].mT)
         return hidden @ self.weights[1].mT
 
+    def variance(self, features: Tensor) -> Tensor:
+        hidden = torch.sigmoid(features @ self.weights[0].mT)
+        return 0.015625 + (hidden * hidden) @ (self.weights[1] * self.weights[1]).mT
+
     def describe(self) -> dict[str, Any]:
         return {"kind": "sigmoids", "sizes": self.sizes}
 
@@ -54,7 +58,8 @@ def tripod_compensator(gain: float = 0.5, size: float = 2e-4, **keys: Any) -> Co
     with torch.no_grad():
         deviations = scaling.restore(network(scaling.features(joints)))
     names = [Coordinate(f"q{i}", "m") for i in (1, 2, 3)]
-    return fit_compensator(network, scaling, joints, deviations, names, **keys)
+    scales = torch.tensor([1.0, 0.5, 2.0], dtype=torch.float64)
+    return fit_compensator(network, scaling, joints, deviations, names, **{"sd_scale": scales} | keys)
 
 
 def arm_compensator() -> Compensator:

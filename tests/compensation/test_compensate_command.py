@@ -77,6 +77,24 @@ def test_commands_and_the_way_back(folder: Path, tmp_path: Path, ideal: Path, fo
     np.testing.assert_allclose(columns(again, "ideal_q1", "ideal_q2", "ideal_q3"), joints, rtol=1e-15)
 
 
+@pytest.mark.parametrize("form", ["safetensors", "onnx", "pt2"])
+def test_standard_deviations_stand_after_the_other_columns(
+    folder: Path, tmp_path: Path, ideal: Path, tripod: Compensator, form: str
+) -> None:
+    plain, out = tmp_path / "plain.csv", tmp_path / "out.csv"
+    compensate(folder / f"model.{form}", ideal, plain)
+    compensate(folder / f"model.{form}", ideal, out, sd=True)
+    before, table = read_table(plain), read_table(out)
+    added = {"deviation_sd_q1": "m", "deviation_sd_q2": "mm", "deviation_sd_q3": "m"}
+    assert list(table.units.items()) == [*before.units.items(), *added.items()]
+    command = torch.from_numpy(columns(out, "command_q1", "command_q2", "command_q3"))
+    expected = tripod.sd(command).detach().numpy()
+    np.testing.assert_allclose(columns(out, *added), expected, rtol=1e-9)
+    np.testing.assert_allclose(expected[-1], tripod.safe_sd, rtol=1e-15)
+    with pytest.raises(InputError, match="--sd and --back exclude each other"):
+        compensate(folder / f"model.{form}", ideal, out, sd=True, back=True)
+
+
 def test_it_says_how_many_rows_are_outside(folder: Path, tmp_path: Path, ideal: Path) -> None:
     app = typer.Typer()
     app.command()(compensate)

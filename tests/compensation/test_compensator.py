@@ -88,12 +88,49 @@ def test_no_input_gives_nan_or_more_than_the_limit(values: list[float]) -> None:
     solution = ARM.solve(inputs[:2], inputs[2:])
     assert bool((solution.deviation.abs() <= ARM.limit).all())
     assert all(bool(torch.isfinite(value).all()) for value in solution)
+    assert bool((solution.deviation_sd > 0).all())
+    torch.testing.assert_close(ARM.sd(solution.command, inputs[2:]), solution.deviation_sd, rtol=1e-9, atol=0)
     moved = solution.command + solution.deviation
     finite = inputs.abs() < ARM.domain.huge
     clean = torch.where(finite[:2], inputs[:2], moved)
     torch.testing.assert_close(moved, clean, rtol=1e-15, atol=1e-15)
     if not bool(finite.all()):
         assert not bool(solution.inside_domain) and not bool(solution.ideal_inside_domain)
+
+
+def test_the_standard_deviation_inside_outside_and_between(tripod: Compensator) -> None:
+    joints = around(tripod, 500, 2.0)
+    features = tripod.scaling.features(tripod.domain.cage(joints))
+    network = tripod.network
+    assert isinstance(network, Sigmoids)
+    inside = 2e-4 * torch.tensor([1.0, 0.5, 2.0], dtype=torch.float64) * network.variance(features).sqrt()
+    weight = tripod.guarded(joints)[3]
+    expected = (weight**2 * inside**2 + (1 - weight) ** 2 * tripod.safe_sd**2).sqrt()
+    found = tripod.sd(joints)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
+    assert bool((weight == 1).any() and (weight == 0).any() and ((weight > 0) & (weight < 1)).any())
+    far = torch.tensor([[50.0, 1, 1], [NAN, 1, 1], [1, INF, 1], [1e300, -1e308, 0]], dtype=torch.float64)
+    assert torch.equal(tripod.sd(far), tripod.safe_sd.expand(4, 3))
+    assert torch.equal(tripod.solve(far).deviation_sd, tripod.safe_sd.expand(4, 3))
+    deviations = tripod.deviation(tripod_joints())
+    torch.testing.assert_close(tripod.safe_sd, (deviations - tripod.safe).square().mean(0).sqrt())
+
+
+def test_a_network_without_a_variance_has_that_of_its_training_deviations() -> None:
+    class Plain(torch.nn.Module):
+        def forward(self, features: Tensor) -> Tensor:
+            return 0.1 * features
+
+    joints = tripod_joints()
+    scaling = _scaling(joints)
+    scaling.deviation.copy_(torch.tensor([1e-4, 2e-4, 3e-4]))
+    deviations = scaling.restore(0.1 * scaling.features(joints))
+    scale = torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64)
+    compensator = fit_compensator(Plain(), scaling, joints, deviations, JOINTS, sd_scale=scale)
+    torch.testing.assert_close(compensator.sd(joints), (scaling.deviation * scale).expand_as(joints))
+    for wrong in (scale[:2], -scale, scale * NAN):
+        with pytest.raises(InputError, match="sd_scale must be one finite number above 0 for each of the 3 joints"):
+            fit_compensator(Plain(), scaling, joints, deviations, JOINTS, sd_scale=wrong)
 
 
 def test_strange_joints_go_to_the_domain(tripod: Compensator) -> None:

@@ -20,12 +20,14 @@ from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.learners.constant import Constant
 from ccnn_torch.learners.enn import ENN, ENNSettings
+from ccnn_torch.learners.gp import GaussianProcess, GPSettings
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.training import Scaling, train
 
 LEARNERS: dict[str, Callable[[], Learner]] = {
     "constant": Constant,
     "bp_lm": lambda: BPLM(BPLMSettings(hidden=(4,), restarts=2, iterations=6)),
+    "gp": lambda: GaussianProcess(GPSettings(steps=20, variance_rows=40)),
     "enn": lambda: ENN(ENNSettings(hidden=(4,), population=12, generations=10)),
     "grnn": lambda: GRNN(GRNNSettings(iterations=4, candidates=9)),
 }

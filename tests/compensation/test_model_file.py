@@ -89,6 +89,7 @@ def test_no_form_gives_nan_or_breaks_the_limit(folder: Path, form: str, values: 
     limit = np.array([entry["limit"] for entry in loaded.facts["limits"].values()])
     assert np.isfinite(found["command"]).all() and np.isfinite(found["ideal"]).all()
     assert (np.abs(found["deviation"]) <= limit).all()
+    assert np.isfinite(found["deviation_sd"]).all() and (found["deviation_sd"] > 0).all()
     if np.isfinite(joints).all() and (np.abs(joints) < 1e3).all():
         tolerance = 1e-12 * limit + 2 * np.spacing(np.abs(joints))
         assert (np.abs(loaded.back(found["command"]) - joints) <= tolerance).all()
@@ -264,6 +265,17 @@ def test_edited_metadata_is_refused_also_where_the_card_was_forged(copied: Path)
     save_file(load_file(path), path, metadata={"ccnn_torch": json.dumps(facts, sort_keys=True, ensure_ascii=False)})
     vouch(path)
     with pytest.raises(ModelFileError, match="edited after it was written"):
+        load_model(path)
+
+
+def test_a_file_of_an_earlier_version_says_what_to_do(copied: Path) -> None:
+    path = copied / "model.safetensors"
+    with safe_open(path, framework="pt") as file:
+        text = file.metadata()["ccnn_torch"]
+    older = text.replace("ccnn_torch compensator 2", "ccnn_torch compensator 1")
+    save_file(load_file(path), path, metadata={"ccnn_torch": older})
+    vouch(path)
+    with pytest.raises(ModelFileError, match=r"'ccnn_torch compensator 1' of another version.*write it again"):
         load_model(path)
 
 

@@ -153,7 +153,7 @@ def test_reaching_the_target_error_ends_the_training() -> None:
 
 def test_refinement_is_written_back_and_makes_the_model() -> None:
     data = toy_data([1, 2])
-    plain, refined = CCNN(SMALL), CCNN(replace(SMALL, refinement_iterations=20, refine_every=4))
+    plain, refined = CCNN(SMALL), CCNN(replace(SMALL, refinement_iterations=20, refine_every=4, waves=0))
     history, better = train(plain, data), train(refined, data)
     assert torch.equal(history[2]["error_train"], better[2]["error_train"])
     assert bool((better[-1]["error_train"] < 0.5 * history[-1]["error_train"]).all())

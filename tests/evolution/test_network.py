@@ -88,7 +88,7 @@ def test_a_network_without_any_path_gives_its_output_bias() -> None:
     masks = [torch.ones(4, 3, dtype=torch.bool), torch.zeros(2, 4, dtype=torch.bool)]
     weights = [torch.ones(4, 4, dtype=torch.float64), torch.full((2, 5), 0.7, dtype=torch.float64)]
     network = MaskedNetwork(masks, weights)
-    assert network.describe() == {"kind": "masked", "sizes": [3, 2], "spread": 0}
+    assert network.describe() == {"kind": "masked", "sizes": [3, 2], "spread": 0, "waves": 0}
     assert torch.equal(network(torch.randn(6, 3, dtype=torch.float64)), torch.full((6, 2), 0.7, dtype=torch.float64))
 
 

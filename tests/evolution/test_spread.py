@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from ccnn_torch.evolution.network import MaskedNetwork, average, hidden_signal
+from ccnn_torch.evolution import MaskedNetwork
+from ccnn_torch.evolution.network import average, hidden_signal
 from ccnn_torch.evolution.spread import readout_spread, spread_variance
 
 

@@ -17,8 +17,8 @@ __all__ = ["progress_plot"]
 
 Array = NDArray[np.float64]
 _AXES = (
-    ("seconds", "time inside the learner, one repeat's share [s]"),
-    ("evaluations", "evaluations (passes of the training rows through one model)"),
+    ("seconds", "time inside the learner [s]"),
+    ("evaluations", "evaluations [1]"),
 )
 
 
@@ -62,8 +62,9 @@ def progress_plot(
     return Plot(
         "progress",
         figure,
-        "Error on held-out rows against what it cost, in the fit on all training rows; a method that ends early keeps "
-        f"its last error, a dot. Medians over {count_text(repeats, 'repeat')}.",
+        "Error on held-out rows against what it cost, in the fit on all training rows: time (one repeat's share) and "
+        "passes of the training rows through one model. Dots are the last steps. "
+        f"Medians over {count_text(repeats, 'repeat')}.",
     )
 
 

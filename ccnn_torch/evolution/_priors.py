@@ -1,0 +1,42 @@
+"""Which weights of a network share a prior precision."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["prior_groups", "wave_groups"]
+
+
+def prior_groups(shapes: list[torch.Size], bias: bool, kind: str, slots: int = 0) -> Tensor:
+    """Group of every weight in the flat order, `k`, int64; the last group holds the output's biases and frequencies.
+
+    A periodic node has a group of its own for each output, of its two weights.
+    """
+    last = len(shapes) - 1
+    labels: list[tuple[int, int, int]] = []
+    for layer, (outputs, inputs) in enumerate(shapes):
+        waves = 2 * slots if layer == last else 0
+        for row in range(outputs):
+            by_output = row if kind == "unit" and layer == last else 0
+            for column in range(inputs):
+                if column >= inputs - waves:
+                    labels.append((_wave_layer(last), row, (column - inputs + waves) % slots))
+                    continue
+                by_input = column if kind == "unit" and layer == 0 else 0
+                labels.append((0 if kind == "network" else 2 * layer, by_output, by_input))
+            if bias:
+                labels.append((-1, 0, 0) if layer == last else (0 if kind == "network" else 2 * layer + 1, 0, 0))
+    labels += [(-1, 0, 0)] * slots
+    order = {label: index for index, label in enumerate(sorted(set(labels) - {(-1, 0, 0)}))}
+    return torch.tensor([order.get(label, len(order)) for label in labels])
+
+
+def wave_groups(last_group: int, outputs: int, slots: int) -> Tensor:
+    """Their labels sort last, before the group that is never held back."""
+    return torch.arange(last_group - outputs * slots, last_group) if slots else torch.zeros(0, dtype=torch.int64)
+
+
+def _wave_layer(last: int) -> int:
+    """Label of the waves' groups, behind those of all layers."""
+    return 2 * last + 2
