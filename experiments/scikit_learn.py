@@ -15,6 +15,6 @@ for regressor in (DummyRegressor(), CCNNRegressor(), BPLMRegressor(), GRNNRegres
     error = -cross_val_score(regressor, X, y, cv=folds, scoring="neg_root_mean_squared_error").mean()
     print(f"{type(regressor).__name__}: {1e6 * error:.1f} µm held out")
 
-search = GridSearchCV(BPLMRegressor(), {"hidden": [(3,), (10,)], "restarts": [1, 3]}, cv=folds).fit(X, y)
+search = GridSearchCV(BPLMRegressor(), {"hidden": [(3,), (10,)]}, cv=folds).fit(X, y)
 deviation, sd = search.best_estimator_.predict(X[:1], return_std=True)
 print(f"best {search.best_params_}; first pose {(1e6 * deviation[0]).round(1)} µm, sd {(1e6 * sd[0]).round(1)} µm")

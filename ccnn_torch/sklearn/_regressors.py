@@ -32,11 +32,14 @@ class CCNNRegressor(SteppedRegressor):
         members: independent coevolutions, whose networks are averaged.
         refine_every: generations between refinements; 0 = only after the last.
         refinement_iterations: Levenberg-Marquardt iterations of one refinement; 0 = none, as in the paper.
+        waves: slots for periodic nodes, found in what a refined network leaves; 0 = none, as in the paper.
+        wave_searches: how often to look for them.
         crossover, structural_mutation, weight_mutation: probabilities of the operators.
         density: share of connections that exist at the start.
         weight_range: weights start and mutate in -weight_range .. weight_range.
         bias: whether nodes have a bias.
-        periodic: inputs that are angles in rad, by index or by name, to be fed as sine and cosine.
+        periodic: inputs that are angles in rad, by index or by name, to be fed as sine and cosine; waves read the angle
+            itself, and their period need not be a part of a turn.
         early_stopping: hold rows out, find the step of the lowest error on them and how wide intervals must be to cover
             them, then train on all rows for so long.
         validation_fraction: share of the rows that are then held out.
@@ -66,6 +69,8 @@ class CCNNRegressor(SteppedRegressor):
         members: int = 2,
         refine_every: int = 0,
         refinement_iterations: int = 20,
+        waves: int = CCNNSettings.waves,
+        wave_searches: int = CCNNSettings.wave_searches,
         crossover: float = CCNNSettings.crossover,
         structural_mutation: float = CCNNSettings.structural_mutation,
         weight_mutation: float = CCNNSettings.weight_mutation,
@@ -84,6 +89,8 @@ class CCNNRegressor(SteppedRegressor):
         self.members = members
         self.refine_every = refine_every
         self.refinement_iterations = refinement_iterations
+        self.waves = waves
+        self.wave_searches = wave_searches
         self.crossover = crossover
         self.structural_mutation = structural_mutation
         self.weight_mutation = weight_mutation
@@ -160,8 +167,8 @@ class BPLMRegressor(SteppedRegressor):
 class ENNRegressor(SteppedRegressor):
     """One evolved population of whole networks, without cooperation and without refinement: the paper's comparison.
 
-    By default population and generations stay far below what a run has, so that the network is coarse. All settings:
-    `ccnn_torch.learners.enn.ENNSettings`.
+    By default hidden is one layer, and population and generations stay far below what a run has, so that the network
+    is coarse. All settings: `ccnn_torch.learners.enn.ENNSettings`.
 
     Args:
         hidden: nodes of each hidden layer; a number is one layer.
@@ -195,9 +202,9 @@ class ENNRegressor(SteppedRegressor):
     def __init__(
         self,
         *,
-        hidden: int | Sequence[int] = ENNSettings.hidden,
-        population: int = 60,
-        generations: int = 100,
+        hidden: int | Sequence[int] = (8,),
+        population: int = 50,
+        generations: int = 70,
         crossover: float = ENNSettings.crossover,
         structural_mutation: float = ENNSettings.structural_mutation,
         weight_mutation: float = ENNSettings.weight_mutation,
