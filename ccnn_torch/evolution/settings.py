@@ -14,9 +14,13 @@ class CCNNSettings:
 
     Attributes:
         hidden: nodes of each hidden layer. The paper has two layers and wants more individuals than one has genes (bits
-            and reals): 80 individuals allow two layers of 6. With refinement more nodes pay.
+            and reals): 80 individuals allow two layers of 6. With refinement more nodes pay, and one layer is best
+            where the deviation is smooth or hidden in noise.
+        rival_hidden: hidden layers of a second structure that is coevolved and refined beside the first, for deviations
+            with edges and little noise; each repeat takes the one of higher evidence. [] = none (paper: none). It needs
+            refinement.
         population: individuals of each subpopulation (paper: 80).
-        generations: generations (paper: 120). With refinement more than 30 brought nothing on a UR10.
+        generations: generations (paper: 120). With refinement more than 10 brought nothing.
         crossover: probability that a pair of parents is crossed (paper: 0.72).
         structural_mutation: probability that a bit of a structural offspring flips (paper: 0.0015).
         weight_mutation: probability that a weight of a weight offspring mutates (paper: 0.0025). With some 30 weights
@@ -35,9 +39,11 @@ class CCNNSettings:
         epsilon: added to the error in eq. 11, on standardised outputs.
         nonuniform_exponent: b of eq. 13 (paper: usually 2).
         target_error: end once the training error of eq. 11 (standardised) of every repeat is at most this; 0 = never.
-        members: independent coevolutions of each repeat; the model is the mean of their networks, itself one masked
-            network with their hidden layers side by side (paper: 1).
-        refine_every: generations between refinements of the best joined network; 0 = only after the last one.
+        members: independent coevolutions of each repeat (paper: 1).
+        kept: with refinement, the members of highest evidence that get periodic nodes and are averaged, into one masked
+            network with their hidden layers side by side.
+        refine_every: generations between refinements of the best joined network that are written back into the elite;
+            0 = only one, after the last generation.
         waves: slots for periodic nodes, each a sine and a cosine of one input found in what the refined network leaves,
             since gears and screws repeat their errors; 0 = none (paper: none). They need refinement.
         wave_searches: how often to look for them, each time followed by a refinement.
@@ -47,9 +53,10 @@ class CCNNSettings:
         ValueError: a value out of its range, in one sentence with the key.
     """
 
-    hidden: tuple[int, ...] = (12, 12)
+    hidden: tuple[int, ...] = (24,)
+    rival_hidden: tuple[int, ...] = (12, 12)
     population: int = 80
-    generations: int = 30
+    generations: int = 10
     crossover: float = 0.72
     structural_mutation: float = 0.0015
     weight_mutation: float = 0.0025
@@ -65,16 +72,21 @@ class CCNNSettings:
     nonuniform_exponent: float = 2.0
     target_error: float = 0.0
     members: int = 6
-    refine_every: int = 10
-    waves: int = 24
+    kept: int = 3
+    refine_every: int = 0
+    waves: int = 32
     wave_searches: int = 3
-    refinement_iterations: int = 20
+    refinement_iterations: int = 50
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
+        object.__setattr__(self, "rival_hidden", tuple(self.rival_hidden))
+        if not all(width >= 1 for width in self.rival_hidden):
+            raise ValueError(f"rival_hidden={list(self.rival_hidden)}: every hidden layer needs at least one node")
         for key, low in (
             ("representatives", 0),
             ("members", 1),
+            ("kept", 1),
             ("refine_every", 0),
             ("refinement_iterations", 0),
             ("waves", 0),

@@ -63,8 +63,9 @@ def wave_inputs(source: Tensor, inputs: Tensor) -> Tensor:
 def find_waves(waves: Waves, residual: Tensor, inputs: Tensor, rows: Tensor, readable: Tensor, passes: int) -> Waves:
     """Fill free slots with the periodic nodes that explain most of a residual.
 
-    Each pass takes, for every output, the input and frequency of the largest gain, where the gain is more than chance
-    and the Bayesian information criterion allow for the search: -s/2 log(1 - gain) > 2 log s + log(inputs x outputs).
+    Each pass takes, for every output, the input and frequency of the largest share of squares explained, where that
+    share is more than the best of so many candidates has by chance: of noise, -s/2 log(1 - share) is distributed
+    exponentially, so that its largest of n has passed log n + 2 one time in eight.
 
     Args:
         waves: slots so far, `b x k`.
@@ -82,7 +83,7 @@ def find_waves(waves: Waves, residual: Tensor, inputs: Tensor, rows: Tensor, rea
     moving = _values(inputs, there)
     left = residual
     count = rows.sum(-1, keepdim=True)
-    enough = 2 * count.log() + math.log(max(1, len(candidates) * residual.shape[-1]))
+    enough = math.log(max(1, len(candidates)) * residual.shape[-1] * len(frequencies)) + 2
     found = Waves(waves.source.clone(), waves.frequency.clone())
     for _ in range(passes):
         gain, source, frequency = _best(left, inputs, root, frequencies, candidates, moving)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution import forward
+from ccnn_torch.evolution import Coevolution, forward
 from ccnn_torch.evolution.evaluation import fitness, joined_errors
 from ccnn_torch.evolution.genome import active
 from ccnn_torch.learners import TrainingData
@@ -84,14 +84,19 @@ def train(learner: CCNN, data: TrainingData) -> list[dict[str, Tensor]]:
     return history
 
 
+def evolved(learner: CCNN) -> Coevolution:
+    """State of the first structure's coevolution."""
+    return learner._structures[0].state
+
+
 def test_generations_keep_every_invariant() -> None:
     data = toy_data([1, 2])
     learner = CCNN(SMALL)
     learner.start(data)
-    best = learner._state.best_fitness
+    best = evolved(learner).best_fitness
     while not learner.finished:
         metrics = learner.step()
-        state = learner._state
+        state = evolved(learner)
         assert bool((metrics["fitness_best"] >= best).all())
         best = metrics["fitness_best"]
         for population, part in zip(state.populations, state.best, strict=True):
@@ -113,9 +118,9 @@ def test_the_best_parts_survive_as_elites() -> None:
     learner = CCNN(SMALL)
     learner.start(toy_data([4]))
     for _ in range(3):
-        before = learner._state.best
+        before = evolved(learner).best
         learner.step()
-        first = learner._state.populations[0]
+        first = evolved(learner).populations[0]
         # The first layer is renewed first: its elite is the part of the network that was best before the step.
         assert torch.equal(first.weight[:, :1], before[0].weight)
         assert torch.equal(first.mask[:, :1], before[0].mask)
@@ -127,7 +132,7 @@ def test_repeats_run_beside_each_other_as_alone() -> None:
     for k, seed in enumerate([5, 6, 7]):
         alone = CCNN(SMALL)
         train(alone, toy_data([seed]))
-        for one, many in zip(alone._state.populations, together._state.populations, strict=True):
+        for one, many in zip(evolved(alone).populations, evolved(together).populations, strict=True):
             assert torch.equal(one.mask[0], many.mask[k])
             assert torch.allclose(one.weight[0], many.weight[k], rtol=0, atol=1e-12)
 
@@ -137,10 +142,10 @@ def test_mutation_off_and_no_crossover_keeps_the_gene_pool() -> None:
     settings = replace(SMALL, structural_mutation=0.0, density=0.3)
     learner = CCNN(settings)
     learner.start(toy_data([1]))
-    pool = [population.mask.any(1) for population in learner._state.populations]
+    pool = [population.mask.any(1) for population in evolved(learner).populations]
     while not learner.finished:
         learner.step()
-    for start, population in zip(pool, learner._state.populations, strict=True):
+    for start, population in zip(pool, evolved(learner).populations, strict=True):
         assert bool((population.mask.any(1) <= start).all())
 
 
@@ -153,14 +158,17 @@ def test_reaching_the_target_error_ends_the_training() -> None:
 
 def test_refinement_is_written_back_and_makes_the_model() -> None:
     data = toy_data([1, 2])
-    plain, refined = CCNN(SMALL), CCNN(replace(SMALL, refinement_iterations=20, refine_every=4, waves=0))
+    plain, refined = (
+        CCNN(SMALL),
+        CCNN(replace(SMALL, refinement_iterations=20, refine_every=4, rival_hidden=(), waves=0)),
+    )
     history, better = train(plain, data), train(refined, data)
     assert torch.equal(history[2]["error_train"], better[2]["error_train"])
     assert bool((better[-1]["error_train"] < 0.5 * history[-1]["error_train"]).all())
     # Fitter than evolution alone at the generation it was written back, so the elite has taken it.
     assert bool((better[3]["fitness_best"] > history[3]["fitness_best"]).all())
-    state = refined._state
-    scores = joined_errors(0, state.best[0], state.best, refined._task)[:, 0, 0]
+    state = evolved(refined)
+    scores = joined_errors(0, state.best[0], state.best, refined._structures[0].rows.task)[:, 0, 0]
     assert torch.allclose(fitness(scores, SMALL.epsilon), state.best_fitness, rtol=1e-12, atol=0)
 
 
@@ -187,8 +195,12 @@ def test_several_members_make_one_model() -> None:
     alone = CCNN(SMALL)
     train(alone, data)
     state, single = learner.state_dict(), alone.state_dict()
-    assert torch.allclose(state["population_weight_1"][:, :1], single["population_weight_1"], rtol=0, atol=1e-12)
-    assert not torch.equal(state["population_weight_1"][:, 1], state["population_weight_1"][:, 0])
+    assert torch.allclose(
+        state["structure_0_population_weight_1"][:, :1], single["structure_0_population_weight_1"], rtol=0, atol=1e-12
+    )
+    assert not torch.equal(
+        state["structure_0_population_weight_1"][:, 1], state["structure_0_population_weight_1"][:, 0]
+    )
 
 
 def test_the_network_is_pruned_and_equal() -> None:
@@ -197,7 +209,8 @@ def test_the_network_is_pruned_and_equal() -> None:
     train(learner, data)
     for k in range(2):
         masks, weights = learner.genome(k)
-        assert torch.equal(masks[0], learner.masks()[0][k]) and torch.equal(weights[0], learner.weights()[0][k])
+        plain = forward(masks, weights, data.inputs[k])
+        assert torch.allclose(plain, learner.predict(data.inputs)[k], rtol=0, atol=1e-13)
         assert torch.allclose(learner.network(k)(data.inputs[k]), learner.predict(data.inputs)[k], rtol=0, atol=1e-13)
 
 

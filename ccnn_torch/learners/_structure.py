@@ -1,0 +1,219 @@
+"""One structure of a CCNN: the coevolutions of its members, their refinement, and the search for periodic nodes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.evolution.bundle import Bundle, averaged, choose, mapped, resized, without_waves
+from ccnn_torch.evolution.coevolution import Coevolution, advance, keep_refined, start
+from ccnn_torch.evolution.evaluation import Task, fitness, joined_errors
+from ccnn_torch.evolution.genome import Genome
+from ccnn_torch.evolution.network import forward
+from ccnn_torch.evolution.refinement import RefinementSettings, refine
+from ccnn_torch.evolution.settings import CCNNSettings
+from ccnn_torch.evolution.waves import Waves, find_waves, no_waves
+
+__all__ = ["MemberRows", "Structure"]
+
+# Passes of one search: after each, what was found before is fitted anew.
+_PASSES = 2
+# Log evidence per measured value by which a member may fall short of the best and still be averaged: as much as 5 %
+# more noise costs.
+_SHORT = 0.05
+
+
+class MemberRows(NamedTuple):
+    """The training rows of `b` = repeats x members networks, the members of a repeat beside each other.
+
+    Attributes:
+        inputs: `b x s x i`; sigmoids read the leading ones, as many as `task` has.
+        targets: `b x s x o`.
+        weights: `b x s`.
+        metric: `b x s x c x o`, or None.
+        readable: which inputs periodic nodes may read, `i` bool.
+        task: the same rows laid out for evolution.
+        seeds: `b`.
+    """
+
+    inputs: Tensor
+    targets: Tensor
+    weights: Tensor
+    metric: Tensor | None
+    readable: Tensor
+    task: Task
+    seeds: Tensor
+
+    def of(self, index: Tensor) -> MemberRows:
+        """Those of some networks."""
+        metric = None if self.metric is None else self.metric[index]
+        task = Task(*(part[index] for part in self.task))
+        return MemberRows(
+            self.inputs[index], self.targets[index], self.weights[index], metric, self.readable, task, self.seeds[index]
+        )
+
+
+class Structure:
+    """Networks with the hidden layers `hidden`, `members` of them to each of `r` repeats.
+
+    Evolution comes first, all members side by side; then all are refined; then the `kept` members of highest evidence
+    get periodic nodes, in several searches, and are refined again after each. The model is the mean of these members.
+    """
+
+    def __init__(self, hidden: tuple[int, ...], settings: CCNNSettings, rows: MemberRows) -> None:
+        self.settings, self.rows = settings, rows
+        self.slots = settings.waves if settings.refinement_iterations else 0
+        self.kept = min(settings.kept, settings.members) if settings.refinement_iterations else settings.members
+        inputs, outputs = rows.task.inputs.shape[1], rows.targets.shape[-1]
+        self.state = start((inputs, *hidden, outputs), rows.task, settings, rows.seeds)
+        self.evidence = torch.full_like(self.state.best_fitness, -torch.inf)
+        self.passes = torch.zeros_like(self.evidence)
+        self.refined = self._evolved()
+
+    def evolve(self) -> None:
+        """One generation, and a refinement that is written back into the elite where one is due."""
+        settings = self.settings
+        self.state = advance(self.state, self.rows.task, settings, self.rows.seeds)
+        every = settings.refine_every
+        if settings.refinement_iterations and every and self.state.generation % every == 0:
+            self.refine()
+
+    def refine(self) -> None:
+        """Refine the best joined network of every member, keep it by evidence, and write it back where it is fitter."""
+        candidate, evidence = self._descend(self._evolved(), self.rows)
+        self.refined = choose(evidence > self.evidence, candidate, self.refined)
+        self.evidence = torch.maximum(self.evidence, evidence)
+        plain = without_waves(candidate)
+        genomes = tuple(
+            Genome(mask.unsqueeze(1), weight.unsqueeze(1))
+            for mask, weight in zip(plain.masks, plain.weights, strict=True)
+        )
+        errors = joined_errors(0, genomes[0], genomes, self.rows.task)[:, 0, 0]
+        self.state = keep_refined(self.state, genomes, fitness(errors, self.settings.epsilon))
+
+    def search_waves(self) -> None:
+        """Look for periodic nodes in what the kept members of a repeat leave, and refine those that got any."""
+        best = self._best()
+        index = best.flatten()
+        rows, model = self.rows.of(index), mapped(self.refined, lambda value: value[index])
+        each = best.shape[1]
+        first = slice(None, None, each)
+        left = rows.targets - forward(model.masks, model.weights, rows.inputs, model.waves)
+        left = left.unflatten(0, (-1, each)).mean(1)  # type: ignore[no-untyped-call]
+        # The members of a repeat share their slots; only the frequencies were refined apart.
+        before = Waves(*(part[first] for part in model.waves))
+        found = find_waves(before, left, rows.inputs[first], rows.weights[first], rows.readable, _PASSES)
+        fresh = ((found.frequency != 0) & (before.frequency == 0)).repeat_interleave(each, 0)
+        going = torch.nonzero(fresh.any(-1)).flatten()
+        if len(going) == 0:
+            return
+        source, frequency = (part.repeat_interleave(each, 0) for part in found)
+        connected = model.masks[-1].clone()
+        connected[..., connected.shape[-1] - 2 * self.slots :] |= fresh.repeat(1, 2).unsqueeze(-2)
+        wider = Bundle(
+            [*model.masks[:-1], connected],
+            model.weights,
+            Waves(torch.where(fresh, source, model.waves.source), torch.where(fresh, frequency, model.waves.frequency)),
+        )
+        candidate, evidence = self._descend(mapped(wider, lambda value: value[going]), rows.of(going))
+        # Taken by all members of a repeat or by none, so that they go on sharing their slots.
+        gain = (evidence - self.evidence[index[going]]).reshape(-1, each).sum(1).repeat_interleave(each)
+        taken = gain > 0
+        target = index[going][taken]
+        chosen = mapped(candidate, lambda value: value[taken])
+        old, new = self.refined.tensors, chosen.tensors
+        self.refined = Bundle.from_tensors({name: old[name].index_copy(0, target, new[name]) for name in old})
+        self.evidence = self.evidence.index_copy(0, target, evidence[taken])
+
+    def members(self) -> Bundle:
+        """The kept members of each repeat, refined where they are: `r x kept x ...`."""
+        best = self._best()
+        evidence = self.evidence[best]
+        rows = self.rows.weights[best].sum(-1) * self.rows.targets.shape[-1]
+        # A member that fell short stands back for a copy of the best one: every repeat has as many networks.
+        short = evidence < evidence[:, :1] - _SHORT * rows
+        model = choose(self.evidence > -torch.inf, self.refined, self._evolved())
+        voters = torch.where(short, best[:, :1], best)
+        return mapped(model, lambda value: value[voters])
+
+    def model(self) -> Bundle:
+        """Their mean: `r x ...`."""
+        return averaged(self.members())
+
+    def score(self) -> Tensor:
+        """Mean log evidence of the kept members, `r`; -inf before the first refinement."""
+        return self.evidence[self._best()].mean(1)
+
+    def by_repeat(self, tensor: Tensor) -> Tensor:
+        """`b x ...` to `r x members x ...`."""
+        members = self.settings.members
+        return tensor.reshape(len(tensor) // members, members, *tensor.shape[1:])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that changes, `r x members x ...`, but for the generation."""
+        state = self.state
+        named = {"best_fitness": state.best_fitness, "evidence": self.evidence, "passes": self.passes}
+        for name, parts in (("population", state.populations), ("best", state.best)):
+            for layer, part in enumerate(parts):
+                named[f"{name}_mask_{layer}"], named[f"{name}_weight_{layer}"] = part.mask, part.weight
+        named |= {f"fitness_{layer}": scores for layer, scores in enumerate(state.fitness)}
+        named |= {f"refined_{name}": tensor for name, tensor in self.refined.tensors.items()}
+        return {name: self.by_repeat(tensor) for name, tensor in named.items()}
+
+    def load(self, tensors: dict[str, Tensor], generation: int) -> None:
+        """Take back what `tensors` gave."""
+        flat = {name: tensor.flatten(0, 1) for name, tensor in tensors.items()}
+        layers = range(len(self.state.populations))
+
+        def parts(name: str) -> tuple[Genome, ...]:
+            return tuple(Genome(flat[f"{name}_mask_{n}"], flat[f"{name}_weight_{n}"]) for n in layers)
+
+        self.state = Coevolution(
+            populations=parts("population"),
+            fitness=tuple(flat[f"fitness_{n}"] for n in layers),
+            best=parts("best"),
+            best_fitness=flat["best_fitness"],
+            generation=generation,
+        )
+        prefix = "refined_"
+        self.refined = Bundle.from_tensors(
+            {name.removeprefix(prefix): tensor for name, tensor in flat.items() if name.startswith(prefix)}
+        )
+        self.evidence, self.passes = flat["evidence"], flat["passes"]
+
+    def _best(self) -> Tensor:
+        """Numbers of the kept members, those of highest evidence, `r x kept` in `b`."""
+        by_repeat = self.by_repeat(self.evidence)
+        # Stable, so that members of equal evidence keep their order.
+        order = by_repeat.sort(dim=1, descending=True, stable=True).indices[:, : self.kept]
+        return order + torch.arange(len(by_repeat), device=order.device).unsqueeze(-1) * self.settings.members
+
+    def _evolved(self) -> Bundle:
+        """Best joined network of every coevolution, its slots for periodic nodes free: `b x ...`."""
+        masks = [part.mask[:, 0].clone() for part in self.state.best]
+        weights = [part.weight[:, 0].clone() for part in self.state.best]
+        plain = Bundle(masks, weights, no_waves(tuple(masks[0].shape[:1]), 0, weights[0]))
+        return resized(plain, self.slots)
+
+    def _descend(self, model: Bundle, rows: MemberRows) -> tuple[Bundle, Tensor]:
+        """The refined networks and their log evidence."""
+        # Slots are filled from the first on: those that are free in every network need not be carried along.
+        used = int((model.waves.frequency != 0).sum(-1).max()) if self.slots else 0
+        small = resized(model, used)
+        refined = refine(
+            small.masks,
+            small.weights,
+            rows.inputs,
+            rows.targets,
+            rows.weights,
+            RefinementSettings(iterations=self.settings.refinement_iterations),
+            rows.metric,
+            small.waves,
+        )
+        # Networks that were done earlier made fewer iterations; this counts those of the last one, for all members.
+        self.passes = self.passes + refined.iterations * (rows.targets.shape[-1] + 1) * len(rows.seeds) / len(
+            self.passes
+        )
+        return resized(Bundle(small.masks, refined.weights, refined.waves), self.slots), refined.log_evidence
