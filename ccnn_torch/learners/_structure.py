@@ -20,9 +20,9 @@ __all__ = ["MemberRows", "Structure"]
 
 # Passes of one search: after each, what was found before is fitted anew.
 _PASSES = 2
-# Log evidence per measured value by which a member may fall short of the best and still be averaged: as much as 5 %
-# more noise costs.
-_SHORT = 0.05
+# Log evidence per measured value by which a member may fall short of the best and still be averaged. That is a lot: a
+# descent that failed. Evidence is too rough a guide to leave out more; averages did better than the best member.
+_SHORT = 0.5
 
 
 class MemberRows(NamedTuple):
