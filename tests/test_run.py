@@ -26,7 +26,17 @@ from ccnn_torch.runs.suite import load_suite
 
 ROOT = Path(__file__).parent.parent
 TRIPOD = ROOT / "experiments" / "tripod.yaml"
-SHORT = {"hidden": [4], "population": 12, "generations": 15}
+SHORT = {
+    "hidden": [4],
+    "rival_hidden": [],
+    "population": 12,
+    "generations": 10,
+    "members": 2,
+    "kept": 2,
+    "waves": 2,
+    "wave_searches": 1,
+    "refinement_iterations": 8,
+}
 FILES = (
     "config.yaml",
     "results.json",
@@ -182,7 +192,8 @@ def test_an_interrupted_run_says_so_in_one_sentence_and_keeps_its_checkpoint(tmp
     [(0.0, []), (0.5, ["training.early_stop=true", "split.validation=0.2", "ccnn.refinement_iterations=3"])],
 )
 def test_a_killed_run_resumes_to_identical_results(tmp_path: Path, delay: float, more: list[str]) -> None:
-    keys = ["ccnn.generations=60", "ccnn.population=40", "training.checkpoint_every=5", "seed=2", "save_models=false"]
+    keys = ["ccnn.generations=60", "ccnn.population=40", "training.checkpoint_every=5", "seed=2"]
+    keys += ["save_models=false", "save_report=false"]
     keys += more
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     subprocess.run(command(str(TRIPOD), *keys, f"out={whole}"), check=True, env=ENVIRONMENT, capture_output=True)

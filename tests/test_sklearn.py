@@ -37,7 +37,7 @@ SMALL: dict[type[Any], dict[str, Any]] = {
     CCNNRegressor: {"generations": 4, "population": 12, "hidden": 6},
     BPLMRegressor: {"iterations": 6, "restarts": 2, "hidden": 4},
     GRNNRegressor: {"iterations": 4},
-    ENNRegressor: {"generations": 30, "population": 20},
+    ENNRegressor: {"generations": 30, "population": 20, "density": 0.7},
 }
 GRIDS: dict[type[Any], dict[str, Any]] = {
     CCNNRegressor: {"hidden": [(4,), (6, 6)]},
@@ -166,7 +166,7 @@ def test_pickled_and_dumped_estimators_predict_the_same(kind: Any, tmp_path: Pat
         for one, two in zip(regressor.predict(X, return_std=True), copy.predict(X, return_std=True), strict=True):
             np.testing.assert_array_equal(one, two)
     # The model alone is kept, not the learner with its populations and training rows.
-    assert len(pickle.dumps(regressor)) < 30_000
+    assert len(pickle.dumps(regressor)) < 60_000
     assert not hasattr(clone(regressor), "network_")
 
 

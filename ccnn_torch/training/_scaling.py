@@ -7,6 +7,9 @@ from torch import Tensor, nn
 
 __all__ = ["Scaling"]
 
+# Share of the largest deviation of the outputs below which one is rounding.
+_ROUNDING = 1e-9
+
 
 class Scaling(nn.Module):
     """Input and output scaling of `r` repeats (or of none: every buffer then lacks the leading dimension).
@@ -63,14 +66,16 @@ class Scaling(nn.Module):
         mean = (targets * weights.unsqueeze(-1)).sum(-2) / total
         variance = ((targets - mean.unsqueeze(-2)).square() * weights.unsqueeze(-1)).sum(-2) / total
         deviation = variance.sqrt()
-        # A constant output keeps scale 1: its standardised value is then exactly 0 and is learned as such.
+        # A constant output keeps scale 1: its standardised value is then 0 and is learned as such. What varies by
+        # rounding alone beside the others is as good as constant: standardised, it would outweigh them.
+        varies = deviation > _ROUNDING * deviation.amax(-1, keepdim=True)
         return cls(
             linear,
             turning,
             (high + low) / 2,
             torch.where(half > 0, half, torch.ones_like(half)),
             mean,
-            torch.where(deviation > 0, deviation, torch.ones_like(deviation)),
+            torch.where(varies, deviation, torch.ones_like(deviation)),
         )
 
     @property
