@@ -12,7 +12,7 @@ from toy import Descent, linear_data
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners import Learner, TrainingData
-from ccnn_torch.training import Training, load_checkpoint, save_checkpoint, train, weighted_mse
+from ccnn_torch.training import Scaling, Training, load_checkpoint, save_checkpoint, train, weighted_mse
 
 
 class Stop(Exception):
@@ -161,3 +161,16 @@ def test_a_refit_that_ends_by_itself_keeps_its_last_state() -> None:
     assert training.best_step.tolist() == [2, 5, 5]
     assert torch.equal(learner.state_dict()["map"][1:], alone.state_dict()["map"][1:])
     assert not torch.equal(learner.state_dict()["map"][0], alone.state_dict()["map"][0])
+
+
+def test_an_output_of_rounding_size_is_taken_for_constant() -> None:
+    """Standardised, it would count as much as a real one."""
+    generator = torch.Generator().manual_seed(0)
+    inputs = torch.rand(1, 30, 2, generator=generator, dtype=torch.float64)
+    targets = torch.stack([1e-4 * inputs[..., 0], 1e-17 * inputs[..., 1], torch.zeros(1, 30, dtype=torch.float64)], -1)
+    weights = torch.ones(1, 30, dtype=torch.float64)
+    scaling = Scaling.fit(inputs, targets, weights, torch.zeros(2, dtype=torch.bool))
+    standardised = scaling.standardise(targets)
+    assert scaling.deviation[0, 1:].tolist() == [1.0, 1.0]
+    assert float(standardised[..., 0].std(correction=0)) == pytest.approx(1.0)
+    assert float(standardised[..., 1:].abs().max()) < 1e-15

@@ -82,7 +82,8 @@ class Structure:
 
     def refine(self) -> None:
         """Refine the best joined network of every member, keep it by evidence, and write it back where it is fitter."""
-        candidate, evidence = self._descend(self._evolved(), self.rows)
+        everyone = torch.arange(len(self.passes), device=self.passes.device)
+        candidate, evidence = self._descend(self._evolved(), everyone)
         self.refined = choose(evidence > self.evidence, candidate, self.refined)
         self.evidence = torch.maximum(self.evidence, evidence)
         plain = without_waves(candidate)
@@ -117,7 +118,7 @@ class Structure:
             model.weights,
             Waves(torch.where(fresh, source, model.waves.source), torch.where(fresh, frequency, model.waves.frequency)),
         )
-        candidate, evidence = self._descend(mapped(wider, lambda value: value[going]), rows.of(going))
+        candidate, evidence = self._descend(mapped(wider, lambda value: value[going]), index[going])
         # Taken by all members of a repeat or by none, so that they go on sharing their slots.
         gain = (evidence - self.evidence[index[going]]).reshape(-1, each).sum(1).repeat_interleave(each)
         taken = gain > 0
@@ -197,8 +198,10 @@ class Structure:
         plain = Bundle(masks, weights, no_waves(tuple(masks[0].shape[:1]), 0, weights[0]))
         return resized(plain, self.slots)
 
-    def _descend(self, model: Bundle, rows: MemberRows) -> tuple[Bundle, Tensor]:
-        """The refined networks and their log evidence."""
+    def _descend(self, model: Bundle, index: Tensor) -> tuple[Bundle, Tensor]:
+        """The refined networks and their log evidence. index: which of the `b` networks the model has."""
+        rows = self.rows.of(index)
+        outputs = rows.targets.shape[-1]
         # Slots are filled from the first on: those that are free in every network need not be carried along.
         used = int((model.waves.frequency != 0).sum(-1).max()) if self.slots else 0
         small = resized(model, used)
@@ -212,8 +215,8 @@ class Structure:
             rows.metric,
             small.waves,
         )
-        # Networks that were done earlier made fewer iterations; this counts those of the last one, for all members.
-        self.passes = self.passes + refined.iterations * (rows.targets.shape[-1] + 1) * len(rows.seeds) / len(
-            self.passes
+        # Networks that were done earlier made fewer iterations; this counts those of the last one.
+        self.passes = self.passes.index_add(
+            0, index, torch.full_like(refined.error, refined.iterations * (outputs + 1))
         )
         return resized(Bundle(small.masks, refined.weights, refined.waves), self.slots), refined.log_evidence
