@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ccnn_torch.errors import InputError
@@ -254,6 +254,7 @@ def test_make_config_is_checked_too() -> None:
         max_leaves=8,
     )
 )
+@example("a\x85b")
 def test_yaml_round_trip(value: object) -> None:
     back = parse_yaml(dump_yaml({"value": value}), "dump")["value"]
     assert back == value and repr(back) == repr(value)

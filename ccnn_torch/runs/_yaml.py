@@ -53,8 +53,15 @@ def parse_yaml(text: str, where: str) -> Any:
 
 def dump_yaml(tree: dict[str, Any]) -> str:
     """YAML text in block style, keys in the order given; `parse_yaml` gives the same tree back."""
+    text = _dumped(tree, unicode=True)
+    # The emitter takes NEL for a line break and the parser does not; escaped, both take it for what it is.
+    return _dumped(tree, unicode=False) if "\x85" in text else text
+
+
+def _dumped(tree: dict[str, Any], unicode: bool) -> str:
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = False
+    yaml.allow_unicode = unicode
     setattr(yaml, "sort_base_mapping_type_on_output", False)  # noqa: B010 - ruamel declares its type as None
     buffer = io.StringIO()
     yaml.dump(tree, buffer)
