@@ -60,20 +60,26 @@ def flat(weights: Layers) -> Tensor:
     return torch.cat([w.flatten(-2) for w in weights], dim=-1)
 
 
+@pytest.mark.parametrize("judged", ["outputs", "channels"])
 @pytest.mark.parametrize("bias", [True, False])
 @pytest.mark.parametrize("nodes", [(3, 2), (3, 5, 2), (4, 5, 6, 3)])
-def test_derivatives_match_autodiff(nodes: tuple[int, ...], bias: bool) -> None:
+def test_derivatives_match_autodiff(nodes: tuple[int, ...], bias: bool, judged: str) -> None:
     generator = torch.Generator().manual_seed(3)
     masks, weights = random_network((4,), nodes, generator, density=0.4, bias=bias)
     inputs = torch.rand(4, 7, nodes[0], generator=generator, dtype=torch.float64) * 2 - 1
     targets = torch.randn(4, 7, nodes[-1], generator=generator, dtype=torch.float64)
     factor = torch.randn(4, 7, 5, nodes[-1], generator=generator, dtype=torch.float64)
-    precision = torch.rand(4, 7, 5, generator=generator, dtype=torch.float64)
+    given = None if judged == "outputs" else factor
+    if given is None:
+        factor = torch.eye(nodes[-1], dtype=torch.float64).expand(4, 7, -1, -1)
+    precision = torch.rand(*factor.shape[:-1], generator=generator, dtype=torch.float64)
     network = network_of(masks, bias)
     w = flat(weights)
-    error = residual(network, w, inputs, targets, factor)
-    jacobian = dense_jacobian(network, w, inputs, targets, factor)
-    local = linearise(network, w, inputs, targets, factor, precision)
+    error = residual(network, w, inputs, targets, given)
+    jacobian = dense_jacobian(network, w, inputs, targets, given)
+    local = linearise(network, w, inputs, targets, given, precision)
+    kept = network.kept_flat
+    assert network.active.sum() == network.active.gather(1, kept).sum()
     for b in range(4):
         shapes = [m.shape[-2:] for m in weights]
 
@@ -88,9 +94,9 @@ def test_derivatives_match_autodiff(nodes: tuple[int, ...], bias: bool) -> None:
         torch.testing.assert_close(jacobian[b], expected, rtol=1e-10, atol=1e-12)
         wide = expected * precision[b].sqrt().unsqueeze(-1)
         matrix = torch.einsum("sck,scl->kl", wide, wide)
-        torch.testing.assert_close(local.matrix[b], matrix, rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(local.matrix[b], matrix[kept[b]][:, kept[b]], rtol=1e-10, atol=1e-12)
         gradient = torch.einsum("sck,sc,sc->k", expected, precision[b], error[b])
-        torch.testing.assert_close(local.gradient[b], gradient, rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(local.gradient[b], gradient[kept[b]], rtol=1e-10, atol=1e-12)
 
 
 def toy(runs: int, rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:

@@ -3,11 +3,13 @@
 The derivative of output k with respect to weight (a, b) of layer l is a product, D[k, a] h[b], of what flows back to
 node a and what flows in from node b. The sum over samples of its outer products is therefore one matrix product of
 `samples x a a'` with `samples x b b'` for each pair of layers: the derivative of every sample and output with respect
-to every weight is never laid out, which saves a factor of the number of outputs in work and in memory.
+to every weight is never laid out, which saves a factor of the number of outputs in work and in memory. Within one layer
+both factors are symmetric, so that each pair of nodes and each pair of signals is multiplied once.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import torch
@@ -29,6 +31,8 @@ class Network:
         bias: whether the last column of every weight matrix is a bias.
         source: which input each periodic node reads, `b x waves` int64; the output's mask has two columns for each
             behind those of the last hidden layer, and the flat weights end with the frequencies.
+        kept: of each layer, and of the frequencies, the active weights, `b x k_l` int64 in the order of that layer,
+            filled up with inactive ones to the same number in every network.
     """
 
     masks: list[Tensor]
@@ -36,6 +40,7 @@ class Network:
     active: Tensor
     bias: bool
     source: Tensor
+    kept: list[Tensor]
 
     @property
     def slots(self) -> int:
@@ -52,6 +57,13 @@ class Network:
         shapes = [(m.shape[-2], m.shape[-1] + int(self.bias)) for m in self.masks]
         parts = torch.split(flat[:, : flat.shape[-1] - self.slots], [rows * columns for rows, columns in shapes], -1)
         return [p.reshape(-1, *shape) for p, shape in zip(parts, shapes, strict=True)]
+
+    @property
+    def kept_flat(self) -> Tensor:
+        """`kept` in the flat order of all weights, `b x m`."""
+        shapes = [(mask.shape[-2], mask.shape[-1] + int(self.bias)) for mask in self.masks]
+        starts = itertools.accumulate((rows * columns for rows, columns in shapes), initial=0)
+        return torch.cat([part + start for part, start in zip(self.kept, starts, strict=False)], -1)
 
     def frequencies(self, flat: Tensor) -> Tensor:
         """flat: `b x k`; returns `b x waves`."""
@@ -82,17 +94,25 @@ def network_of(masks: list[Tensor], bias: bool, waves: Waves | None = None) -> N
         for mask, node in zip(effective, alive[1:], strict=True)
     ]
     read = periodic.sum(-2)
-    active = torch.cat([*(c.flatten(1) for c in columns), read[:, :slots] + read[:, slots:]], dim=-1) > 0
-    return Network(effective, [a.unsqueeze(1) for a in alive[1:-1]], active, bias, source)
+    lines = [read[:, :slots] + read[:, slots:]] if slots else []
+    parts = [part > 0 for part in (*(c.flatten(1) for c in columns), *lines)]
+    kept = [_first(part) for part in parts]
+    return Network(effective, [a.unsqueeze(1) for a in alive[1:-1]], torch.cat(parts, -1), bias, source, kept)
+
+
+def _first(active: Tensor) -> Tensor:
+    """Numbers of the active weights, then of as many others as make every network's list as long: `b x m`."""
+    longest = int(active.sum(-1).max()) if active.shape[-1] else 0
+    return (~active).to(torch.int8).sort(dim=-1, stable=True).indices[:, :longest]
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Half the weighted squared residual of `b` networks, to second order (Gauss-Newton) in their weights.
+    """Half the weighted squared residual of `b` networks, to second order (Gauss-Newton) in their kept weights.
 
     Attributes:
-        gradient: `b x k`.
-        matrix: `b x k x k`, sum over rows and channels of the outer product of the residual's derivative.
+        gradient: `b x m`, 0 for weights that are not active.
+        matrix: `b x m x m`, sum over rows and channels of the outer product of the residual's derivative, likewise.
     """
 
     gradient: Tensor
@@ -190,24 +210,69 @@ def linearise(
     back, inflows = _backward(network, flat, flows, _seed(targets, factor) * root.unsqueeze(-1), inputs)
     error = (error * root).unsqueeze(-2)
     gradient = torch.cat(
-        [((error @ b).squeeze(-2).mT @ f).flatten(1) for b, f in zip(back, inflows, strict=True)], dim=-1
+        [
+            ((error @ b).squeeze(-2).mT @ f).flatten(1).gather(1, kept)
+            for b, f, kept in zip(back, inflows, network.kept, strict=True)
+        ],
+        dim=-1,
     )
+    readout = len(network.masks) - 1
     rows: list[list[Tensor]] = []
     for i, (back_i, flow_i) in enumerate(zip(back, inflows, strict=True)):
-        blocks: list[Tensor] = []
-        for j, (back_j, flow_j) in enumerate(zip(back, inflows, strict=True)):
-            if j < i:
-                blocks.append(rows[j][i].mT)
-                continue
-            nodes = (back_i.mT @ back_j).flatten(2)
-            signals = (flow_i.unsqueeze(-1) * flow_j.unsqueeze(-2)).flatten(2)
-            counts = (back_i.shape[-1], back_j.shape[-1], flow_i.shape[-1], flow_j.shape[-1])
-            block = (nodes.mT @ signals).reshape(-1, *counts).transpose(2, 3)
-            blocks.append(block.reshape(-1, counts[0] * counts[2], counts[1] * counts[3]))
+        blocks = [rows[j][i].mT for j in range(i)]
+        blocks.append(_within(back_i, flow_i, network.kept[i], apart=factor is None and i == readout))
+        for j in range(i + 1, len(back)):
+            blocks.append(_between(back_i, flow_i, network.kept[i], back[j], inflows[j], network.kept[j]))
         rows.append(blocks)
     matrix = torch.cat([torch.cat(blocks, dim=-1) for blocks in rows], dim=-2)
-    active = network.active.to(flat.dtype)
+    active = network.active.gather(1, network.kept_flat).to(flat.dtype)
     return Linearised(gradient * active, matrix * active.unsqueeze(-1) * active.unsqueeze(-2))
+
+
+def _within(back: Tensor, flow: Tensor, kept: Tensor, apart: bool) -> Tensor:
+    """Sum over rows of the outer products of one layer's derivatives, `b x k x k`.
+
+    Args:
+        back: D, `b x s x c x out`.
+        flow: h, `b x s x in`.
+        kept: which weights, `b x k` in the flat order `out x in`.
+        apart: whether every node has a channel of its own (the output's nodes, judged as they are).
+    """
+    node, signal = kept // flow.shape[-1], kept % flow.shape[-1]
+    first, second, place = _pairs(flow.shape[-1], flow.device)
+    signals = flow[..., first] * flow[..., second]
+    column = place[signal.unsqueeze(-1), signal.unsqueeze(-2)]
+    if apart:
+        squares = back.diagonal(dim1=-2, dim2=-1).square()
+        row = node.unsqueeze(-1).expand_as(column)
+        same = node.unsqueeze(-1) == node.unsqueeze(-2)
+        return _picked(squares.mT @ signals, row, column) * same
+    above, beside, node_place = _pairs(back.shape[-1], back.device)
+    nodes = (back.mT @ back)[..., above, beside]
+    return _picked(nodes.mT @ signals, node_place[node.unsqueeze(-1), node.unsqueeze(-2)], column)
+
+
+def _between(back: Tensor, flow: Tensor, kept: Tensor, back_2: Tensor, flow_2: Tensor, kept_2: Tensor) -> Tensor:
+    """The same of two layers, `b x k x k_2`."""
+    nodes = (back.mT @ back_2).flatten(2)
+    signals = (flow.unsqueeze(-1) * flow_2.unsqueeze(-2)).flatten(2)
+    ins, ins_2 = flow.shape[-1], flow_2.shape[-1]
+    row = (kept // ins * back_2.shape[-1]).unsqueeze(-1) + (kept_2 // ins_2).unsqueeze(-2)
+    column = (kept % ins * ins_2).unsqueeze(-1) + (kept_2 % ins_2).unsqueeze(-2)
+    return _picked(nodes.mT @ signals, row, column)
+
+
+def _picked(table: Tensor, row: Tensor, column: Tensor) -> Tensor:
+    """table: `b x p x q`; row, column: `b x k x l`; returns `b x k x l`."""
+    return table.flatten(1).gather(1, (row * table.shape[-1] + column).flatten(1)).view(row.shape)
+
+
+def _pairs(count: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Row and column of every pair i <= j, and the number of the pair for every i and j, `count x count`."""
+    rows, columns = torch.triu_indices(count, count, device=device)
+    place = torch.zeros(count, count, dtype=torch.int64, device=device)
+    place[rows, columns] = place[columns, rows] = torch.arange(len(rows), device=device)
+    return rows, columns, place
 
 
 def dense_jacobian(

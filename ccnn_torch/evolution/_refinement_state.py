@@ -129,7 +129,10 @@ class RefinementState:
 
 
 class SecondOrder(NamedTuple):
-    """Gradient `b x k` and Gauss-Newton matrix `b x k x k` of the objective, 1 on the diagonal for inactive weights."""
+    """Gradient `b x m` and Gauss-Newton matrix `b x m x m` of the objective in the network's kept weights.
+
+    Inactive ones among them have the gradient 0 and 1 on the diagonal.
+    """
 
     gradient: Tensor
     matrix: Tensor
@@ -175,6 +178,7 @@ def part_of_problem(problem: RefinementProblem, index: Tensor) -> RefinementProb
             alive=[alive[index] for alive in network.alive],
             active=network.active[index],
             source=network.source[index],
+            kept=[kept[index] for kept in network.kept],
         ),
         inputs=problem.inputs[index],
         targets=problem.targets[index],

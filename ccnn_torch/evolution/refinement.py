@@ -182,14 +182,14 @@ def step_refinement(
     gradient, matrix = known or second_order(problem, state)
     before = _objective(problem, state, state.weights)
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-    weights, damping = state.weights, state.damping
+    weights, damping, kept = state.weights, state.damping, problem.network.kept_flat
     reached = before
     todo = torch.arange(len(before), device=before.device)
     for _ in range(problem.settings.trials):
         damped = matrix[todo] + torch.diag_embed(diagonal[todo] * damping[todo].unsqueeze(-1))
         root, failed = torch.linalg.cholesky_ex(damped)
         step = torch.cholesky_solve(gradient[todo].unsqueeze(-1), root).squeeze(-1)
-        candidate = state.weights[todo] - step
+        candidate = state.weights[todo].scatter_add(1, kept[todo], -step)
         after = _objective(part_of_problem(problem, todo), part_of_state(state, todo), candidate)
         good = (failed == 0) & (after < before[todo])
         taken = todo[good]
@@ -243,9 +243,10 @@ def second_order(problem: RefinementProblem, state: RefinementState) -> SecondOr
     """The objective to second order at a state; most of the work of an iteration."""
     precision = problem.rows.unsqueeze(-1) * state.noise.unsqueeze(1)
     local = linearise(problem.network, state.weights, problem.inputs, problem.targets, problem.metric, precision)
-    prior = state.prior[:, problem.groups]
-    active = problem.network.active
-    gradient = local.gradient + torch.where(active, prior * state.weights, 0)
+    kept = problem.network.kept_flat
+    active = problem.network.active.gather(1, kept)
+    prior = state.prior[:, problem.groups].gather(1, kept)
+    gradient = local.gradient + torch.where(active, prior * state.weights.gather(1, kept), 0)
     return SecondOrder(gradient, local.matrix + torch.diag_embed(torch.where(active, prior, 1)))
 
 
@@ -287,7 +288,8 @@ def _estimate_precisions(problem: RefinementProblem, state: RefinementState, mat
     root, failed = torch.linalg.cholesky_ex(matrix)
     identity = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device)
     inverse_root = torch.linalg.solve_triangular(root, identity.expand_as(root), upper=False)
-    variance = inverse_root.square().sum(-2)
+    kept = problem.network.kept_flat
+    variance = torch.zeros_like(state.weights).scatter(1, kept, inverse_root.square().sum(-2))
     group_count = state.prior.shape[-1]
     determined = 1 - state.prior[:, problem.groups] * variance
     effective = _group_sums(problem, determined, group_count).clamp_min(0)
