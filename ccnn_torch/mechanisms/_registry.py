@@ -13,6 +13,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms.dh_file import read_dh_file
 from ccnn_torch.mechanisms.machine_tool import MachineTool
+from ccnn_torch.mechanisms.mechanism_file import MechanismFile, read_mechanism_file
 from ccnn_torch.mechanisms.serial import SerialArm
 from ccnn_torch.mechanisms.tripod import Tripod
 from ccnn_torch.mechanisms.urdf import read_urdf
@@ -23,6 +24,7 @@ __all__ = ["REGISTRY", "load_mechanism", "mechanism_from_description"]
 REGISTRY: dict[str, Callable[..., Mechanism]] = {"tripod": Tripod, "machine_tool": MachineTool, "serial": SerialArm}
 
 _READERS: dict[str, Callable[..., Mechanism]] = {".yaml": read_dh_file, ".yml": read_dh_file, ".urdf": read_urdf}
+_YAML = (".yaml", ".yml")
 
 _FORMS = "a serial arm's geometry file (.yaml, .urdf), or your own class as path/to/file.py:Name"
 
@@ -31,12 +33,17 @@ def load_mechanism(spec: str, **keys: Any) -> Mechanism:
     """A mechanism by name, by geometry file, or from a user's Python file.
 
     Args:
-        spec: `tripod`, `machine_tool`, a DH file (.yaml), a URDF (.urdf), or `path/to/file.py:Name`.
+        spec: `tripod`, `machine_tool`, a DH file (.yaml), a URDF (.urdf), an identified machine's
+            mechanism file (.yaml, as `ccnn identify` writes it), or `path/to/file.py:Name`.
         keys: keys of its constructor (tripod: L, r; DH file: orientation; URDF: base, tip, orientation; …).
 
     Raises:
         InputError: unknown name (with the nearest), missing or faulty file, or a key that the mechanism does not take.
     """
+    if Path(spec).suffix.lower() in _YAML:
+        file = read_mechanism_file(spec)
+        if file is not None:
+            return _from_file(file, keys)
     mechanism = _call(spec, _maker(spec), keys)
     if not isinstance(mechanism, Mechanism):
         raise InputError(f"{spec}: is no mechanism; derive the class from ccnn_torch.mechanisms.Mechanism")
@@ -57,6 +64,12 @@ def mechanism_from_description(description: Mapping[str, Any]) -> Mechanism:
         raise InputError(f"the mechanism's description lacks {missing}; write it with describe()") from None
     mechanism = load_mechanism(spec, **keys)
     mechanism.set_parameters(parameters)
+    return mechanism
+
+
+def _from_file(file: MechanismFile, keys: Mapping[str, Any]) -> Mechanism:
+    mechanism = load_mechanism(file.spec, **{**file.keys, **keys})
+    mechanism.set_parameters(file.parameters_of(mechanism, "value"))
     return mechanism
 
 

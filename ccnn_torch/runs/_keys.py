@@ -7,7 +7,7 @@ import inspect
 import json
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -19,7 +19,7 @@ __all__ = ["explain", "list_keys"]
 def list_keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, str]]:
     """Every key of a config, dotted, with its default as YAML has it and its description."""
     for name, info in model.model_fields.items():
-        kind = info.annotation
+        kind = _section(info.annotation)
         if isinstance(kind, type) and issubclass(kind, BaseModel):
             yield from list_keys(kind, f"{prefix}{name}.")
         elif isinstance(kind, type) and dataclasses.is_dataclass(kind):
@@ -27,6 +27,12 @@ def list_keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, s
         else:
             default = info.get_default(call_default_factory=True)
             yield f"{prefix}{name}", _yaml(default), info.description or ""
+
+
+def _section(kind: Any) -> Any:
+    """The model of a section that may be left out (`Model | None`); any other annotation as it is."""
+    models = [k for k in get_args(kind) if isinstance(k, type) and issubclass(k, BaseModel)]
+    return models[0] if models and type(None) in get_args(kind) else kind
 
 
 def _list_dataclass(kind: type[Any], prefix: str) -> Iterator[tuple[str, str, str]]:

@@ -1,0 +1,269 @@
+"""The config of an identification: its keys, defaults and checks.
+
+Relative paths in a config file start from the file's folder, those on the command line from the current one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from ccnn_torch._table import nearest
+from ccnn_torch.errors import InputError
+from ccnn_torch.runs._keys import explain, list_keys
+from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
+from ccnn_torch.runs._yaml import dump_yaml, read_yaml
+
+__all__ = [
+    "IDENTIFY_METHODS",
+    "FrameConfig",
+    "HeldOutConfig",
+    "IdentifyConfig",
+    "ParameterConfig",
+    "SimulateConfig",
+    "base_method",
+    "describe_identify_keys",
+    "dump_identify_config",
+    "load_identify_config",
+    "make_identify_config",
+]
+
+IDENTIFY_METHODS = ("lm", "hga", "tikhonov", "ga", "sa", "pso")
+"""Solvers by name; `NAME_per_leg` identifies each leg from its own equations alone."""
+
+PER_LEG = "_per_leg"
+
+
+def _listed(value: Any) -> Any:
+    """A single name, or several with commas as a shell would have them, as a list."""
+    return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+
+
+Names = Annotated[list[str], BeforeValidator(_listed)]
+Size = float | str
+"""A number in SI, or a text of number and unit, such as `0.4 mm` or `0.03 deg`."""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ParameterConfig(_Part):
+    """Which parameters are identified, by name or pattern (`A*`, `leg1.*`)."""
+
+    free: Names | None = Field(default=None, description="parameters to identify, names or patterns; null = all")
+    fixed: Names = Field(default=[], description="parameters that keep their nominal value, names or patterns")
+    tied: list[list[str]] = Field(default=[], description="groups of parameters with one common value")
+    prior: dict[str, Size] = Field(
+        default={},
+        description="standard deviation of a Gaussian prior around the nominal value, by name or pattern, in SI or "
+        "as '0.5 mm'",
+    )
+
+
+class FrameConfig(_Part):
+    """Whether the measuring frame and the tool frame are unknown, too (parallel mechanisms)."""
+
+    base: bool = Field(default=False, description="identify where the mechanism stands in the measuring frame")
+    tool: bool = Field(default=False, description="identify where the measured target sits on the platform")
+
+
+class HeldOutConfig(_Part):
+    """Which measured rows are held out; see `ccnn_torch.splits`."""
+
+    kind: Literal["random", "group", "block"] = Field(default="random", description="random, group or block")
+    by: Names | None = Field(
+        default=None, description="what makes a group: columns or patterns, or position:5mm, the default"
+    )
+    test: float = Field(default=0.3, gt=0, lt=1, description="share of the rows (group: of the groups) held out")
+
+
+class SimulateConfig(_Part):
+    """Simulated machines, each with errors of its own, measured with noise."""
+
+    machines: int = Field(default=1, ge=1, description="machines, side by side; machine k has seed + k")
+    poses: int = Field(default=24, ge=1, description="poses measured of each machine")
+    design: Literal["random", "even", "planned", "planned_per_leg"] = Field(
+        default="even",
+        description="how poses are chosen: random (each machine its own), even (low discrepancy in the box), planned "
+        "(the most informative), or planned_per_leg (poses / legs of them for each leg, from which that leg alone "
+        "is identified by the methods *_per_leg; the others get planned ones)",
+    )
+    candidates: int = Field(default=4000, ge=10, description="poses that planned ones are chosen from")
+    noise: Size | dict[str, Size] = Field(
+        default=1e-5,
+        description="standard deviation of each measured coordinate, in SI or as '0.01 mm': of a position (an angle "
+        "has it over 0.3 m), or by coordinate; of each coordinate of each point where points are measured",
+    )
+    joint_noise: Size | dict[str, Size] = Field(
+        default=0.0, description="standard deviation of the recorded joints, one size or by joint"
+    )
+    errors: Size | dict[str, Size] = Field(
+        default={},
+        description="standard deviation of each parameter's error by name, pattern or unit (m, rad, 1); one number "
+        "multiplies the usual sizes; what is not named has its usual size (m: 1e-3, rad: 2e-3, 1: 2e-3), and 0 where "
+        "values are given",
+    )
+    values: dict[str, Size] = Field(
+        default={}, description="errors that every machine has beside the random ones, by parameter"
+    )
+    box: dict[str, tuple[Size, Size]] = Field(
+        default={}, description="range of a pose coordinate, [low, high]; null = the mechanism's own"
+    )
+    circle: bool = Field(default=False, description="poses inside the mechanism's maximal inscribed circle")
+    points: list[tuple[Size, Size, Size]] | None = Field(
+        default=None,
+        min_length=3,
+        max_length=3,
+        description="three points on the platform that are measured instead of the pose, x, y, z in its frame",
+    )
+    test_poses: int = Field(default=100, ge=1, description="held-out poses, measured with the same noise")
+    counts: list[int] = Field(
+        default=[], description="numbers of measured poses for which the study is repeated (measurements needed)"
+    )
+    map: int = Field(default=0, ge=0, description="points across a map of the pose error over the workspace; 0 = none")
+
+
+class IdentifyConfig(_Part):
+    """An identification: mechanism, data, parameters, methods."""
+
+    name: str = Field(
+        default="identification", min_length=1, description="name of the run; default: the config file's name"
+    )
+    seed: int = Field(default=0, ge=0, description="seed of the first machine; machine k has seed + k")
+    out: str | None = Field(default=None, description="folder to write; default runs/NAME-STAMP")
+    mechanism: str = Field(
+        default="",
+        description="a mechanism's name, a DH file (.yaml), a URDF, an identified.yaml, or file.py:Name",
+    )
+    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    frame: FrameConfig = Field(default_factory=FrameConfig)
+    records: str | None = Field(default=None, description="measured records, a CSV file with headers name[unit]")
+    simulate: SimulateConfig | None = Field(default=None, description="simulated machines instead of records")
+    noise: Size | dict[str, Size] | None = Field(
+        default=None, description="known noise of the records' pose, as simulate.noise; null = estimated from the fit"
+    )
+    joint_noise: Size | dict[str, Size] | None = Field(
+        default=None, description="known noise of the records' joints, one size or by joint; null = none"
+    )
+    split: HeldOutConfig = Field(default_factory=HeldOutConfig)
+    residual: Literal["auto", "inverse", "forward"] = Field(
+        default="auto",
+        description="compare joints (inverse kinematics of the measured pose) or poses (forward kinematics); auto = "
+        "poses for serial arms and where a frame is identified, else joints",
+    )
+    rotation_weight: float = Field(
+        default=0.3, gt=0, description="weight of orientation against position in m per rad, where noise is not known"
+    )
+    parameters: ParameterConfig = Field(default_factory=ParameterConfig)
+    methods: Names = Field(
+        default=["lm"],
+        min_length=1,
+        description=f"solvers: a list of {', '.join(IDENTIFY_METHODS)}, each also as NAME_per_leg; all = the six",
+    )
+    per_leg: bool = Field(
+        default=False, description="identify each leg from its own equations in every method, not only NAME_per_leg"
+    )
+    robust: Literal["huber", "cauchy"] | None = Field(
+        default=None, description="loss of lm that outliers cannot pull at: huber or cauchy; null = least squares"
+    )
+    starts: int = Field(default=1, ge=1, description="starts of lm, the first at the nominal values")
+    hga_machines: int = Field(default=5, ge=1, description="machines that hga, ga, sa and pso are run on, at most")
+    settings: dict[str, dict[str, Any]] = Field(
+        default={}, description="settings of a method, e.g. {hga: {generations: 500}}"
+    )
+    bootstrap: int = Field(default=0, ge=0, description="resampled fits beside the formula's intervals; 0 = none")
+    paper: Literal["001", "004"] | None = Field(
+        default=None, description="paper whose printed figures stand beside ours in the tables"
+    )
+    save_report: bool = Field(default=True, description="draw plots/ and write report.html")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill(cls, tree: Any) -> Any:
+        """An empty section is one of defaults; `all` is spelt out."""
+        if not isinstance(tree, dict):
+            return tree
+        sections = [key for key, field in cls.model_fields.items() if field.default_factory is not None]
+        return {key: value for key, value in tree.items() if value is not None or key not in sections}
+
+    @field_validator("methods")
+    @classmethod
+    def _known(cls, methods: list[str]) -> list[str]:
+        if methods == ["all"]:
+            return list(IDENTIFY_METHODS)
+        for method in methods:
+            if base_method(method) not in IDENTIFY_METHODS:
+                near = nearest(method, [*IDENTIFY_METHODS, *(m + PER_LEG for m in IDENTIFY_METHODS)])
+                known = ", ".join(IDENTIFY_METHODS)
+                hint = f"did you mean '{near}'?" if near else f"known are {known}, each also as NAME_per_leg, and all"
+                raise ValueError(f"there is no method '{method}'; {hint}")
+            if methods.count(method) > 1:
+                raise ValueError(f"'{method}' stands twice")
+        return methods
+
+    @model_validator(mode="after")
+    def _one_source(self) -> IdentifyConfig:
+        if not self.mechanism:
+            raise ValueError("mechanism: name one, e.g. mechanism=five_bar, a DH file, a URDF or file.py:Name")
+        if (self.records is None) == (self.simulate is None):
+            both = "both records and simulate are given; remove one" if self.records else "no data is named"
+            raise ValueError(f"{both}: records=FILE.csv, or a section simulate with machines, poses and noise")
+        if self.simulate is not None and (self.noise is not None or self.joint_noise is not None):
+            raise ValueError("noise: simulated data has simulate.noise and simulate.joint_noise; remove the key")
+        if self.simulate is not None and self.simulate.points and self.residual == "forward":
+            raise ValueError("residual: measured points are compared by joints; write residual=inverse or auto")
+        wrong = [name for name in self.settings if name not in IDENTIFY_METHODS]
+        if wrong:
+            raise ValueError(f"settings: '{wrong[0]}' is no method; known are {', '.join(IDENTIFY_METHODS)}")
+        return self
+
+
+def base_method(method: str) -> str:
+    """`lm` of `lm` and of `lm_per_leg`."""
+    return method.removesuffix(PER_LEG)
+
+
+def load_identify_config(path: str | Path, overrides: Iterable[str] = ()) -> IdentifyConfig:
+    """Read a config file and put overrides ``key.sub=value`` over it.
+
+    Raises:
+        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
+    """
+    path = Path(path)
+    tree = read_yaml(path)
+    tree.setdefault("name", path.stem)
+    resolve_paths(tree, path.absolute().parent)
+    given = apply_overrides(tree, overrides, Path.cwd())
+    return _validated(tree, str(path), given)
+
+
+def make_identify_config(**keys: Any) -> IdentifyConfig:
+    """A config from keys; relative paths start from the current folder.
+
+    Raises:
+        InputError: keys are wrong: one line that names them all.
+    """
+    tree = dict(keys)
+    resolve_paths(tree, Path.cwd())
+    return _validated(tree, "config", {})
+
+
+def _validated(tree: dict[str, Any], source: str, given: dict[str, str]) -> IdentifyConfig:
+    try:
+        return IdentifyConfig.model_validate(tree)
+    except ValidationError as error:
+        raise InputError(explain(error, IdentifyConfig, source, given)) from None
+
+
+def dump_identify_config(config: IdentifyConfig) -> str:
+    """The resolved config as YAML, every key written out; `load_identify_config` of it gives an equal config."""
+    return dump_yaml(config.model_dump(mode="json"))
+
+
+def describe_identify_keys() -> list[tuple[str, str, str]]:
+    """Every key, dotted, with its default and what it means."""
+    return list(list_keys(IdentifyConfig))
