@@ -21,8 +21,8 @@ ANGLE_ARM = 0.3
 Size = float | str
 
 
-def size(value: Size, unit: str, key: str) -> float:
-    """A number in SI.
+def size(value: Size, unit: str | None, key: str) -> float:
+    """A number in SI; unit None takes a text of any unit.
 
     Raises:
         InputError: a text that is no number with a unit, or a unit of another dimension; names the key.

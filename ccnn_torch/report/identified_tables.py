@@ -1,0 +1,246 @@
+"""The tables of an identification, from `identified.json` alone: for the screen, Markdown and the HTML report."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from ccnn_torch.report.display import count_text, display_unit, number_text
+from ccnn_torch.report.identified_paper import paper_tables
+from ccnn_torch.report.table_form import Table, print_table
+from ccnn_torch.report.tables import markdown_table
+
+__all__ = ["identified_markdown", "identified_tables", "identified_verdict", "print_identified", "write_identified_csv"]
+
+Block = Mapping[str, Any]
+
+
+def identified_verdict(results: Block) -> str:
+    """One sentence: what the identified geometry does to the pose error on held-out poses."""
+    named = [(name, results["test"][name]) for name in ("position", "rotation") if results["test"][name]]
+    if not named:
+        return "The pose error could not be judged."
+    parts = []
+    for name, block in named:
+        scale, unit = display_unit(block["unit"], block["after"])
+        parts.append(
+            f"{name} {number_text(block['before'] / scale, 3)} → {number_text(block['after'] / scale, 3)} {unit} RMS"
+        )
+    rows = count_text(results["rows"]["test"], "held-out pose")
+    machines = f" of {results['machines']} machines" if results["machines"] > 1 else ""
+    text = f"On {rows}{machines} {results['method']} brings the predicted pose nearer to the measured one: "
+    text += ", ".join(parts)
+    free = [p for p in results["parameters"].values() if p["free"]]
+    lost = sum(not p["identifiable"] for p in free)
+    text += f"; {len(free) - lost} of {len(free)} parameters are identified"
+    return text + (f", {lost} are not told by these rows." if lost else ".")
+
+
+def identified_tables(results: Block) -> list[Table]:
+    """All tables, in reading order."""
+    tables = [
+        _parameter_table(results),
+        _method_table(results),
+        _deviation_table(results),
+        _compensation_table(results),
+        _count_table(results),
+        *paper_tables(results),
+    ]
+    return [table for table in tables if table is not None]
+
+
+def identified_markdown(results: Block) -> str:
+    """Verdict and tables as Markdown (`identified.md`)."""
+    parts = [f"# {results['name']}", identified_verdict(results), *_unknown(results)]
+    return "\n\n".join([*parts, *map(markdown_table, identified_tables(results)), *results["notes"]]) + "\n"
+
+
+def print_identified(results: Block, console: Console) -> None:
+    """Show the tables and the verdict on a terminal."""
+    for table in identified_tables(results):
+        print_table(table, console)
+    for sentence in (*_unknown(results), *results["notes"]):
+        console.print(escape(sentence), style="yellow")
+    console.print(escape(identified_verdict(results)), style="bold")
+
+
+def _unknown(results: Block) -> list[str]:
+    found = results["combinations_not_identifiable"]
+    return [f"Not identifiable from these rows: {'; '.join(found)}."] if found else []
+
+
+def _text(block: Block | None, key: str, scale: float = 1.0, digits: int = 3) -> str:
+    """A figure with its interval, or –."""
+    if block is None or block.get(key) is None:
+        return "–"
+    text = number_text(block[key] / scale, digits)
+    spread = block.get("spread", {}).get(key)
+    if spread is not None:
+        low, high = (number_text(v / scale, digits) for v in spread)
+        text += f" [{low}, {high}]"
+    return text
+
+
+def _parameter_table(results: Block) -> Table:
+    simulated = results["simulated"]
+    rows = []
+    for name, block in results["parameters"].items():
+        if not block["free"]:
+            continue
+        size = block["sd"] or abs(block["value"] - block["nominal"])
+        scale, unit = display_unit(block["unit"], max(size, 1e-6))
+        sd = _text(block, "sd", scale) if block["identifiable"] else "not identifiable"
+        change = (block["value"] - block["nominal"]) / scale
+        cells = [f"{name} [{unit}]", number_text(block["nominal"] / scale, 6), number_text(change, 4), sd]
+        if simulated:
+            cells.append(_text(block, "deviation", scale))
+        elif "sd_bootstrap" in block:
+            cells.append(number_text(block["sd_bootstrap"] / scale, 3))
+        rows.append(tuple(cells))
+    columns = ["parameter", "nominal", "identified - nominal", "standard deviation"]
+    bootstrapped = any("sd_bootstrap" in p for p in results["parameters"].values())
+    columns += ["|identified - true|"] if simulated else ["by bootstrap"] * bootstrapped
+    several = results["machines"] > 1
+    note = f"By {results['method']}." + " Medians over the machines, [5 %, 95 %]." * several
+    note += " 95 % of intervals of ±1.96 standard deviations hold the true value, if the geometry is all that is wrong."
+    return Table("Parameters", tuple(columns), tuple(rows), note)
+
+
+def _method_table(results: Block) -> Table:
+    rows = []
+    for method, block in results["methods"].items():
+        cells = [method + (" (leg by leg)" if block["per_leg"] else "")]
+        for name in ("position", "rotation"):
+            test = block["test"][name]
+            if results["test"][name] is None:
+                continue
+            scale, unit = display_unit(test["unit"], test["after"])
+            cells += [
+                f"{_text(test, 'before', scale)} {unit}",
+                f"{_text(test, 'after', scale)} {unit}",
+                f"{_text(test, 'max_after', scale)} {unit}",
+            ]
+        cells += [str(block["machines"]), f"{100 * block['converged']:.0f} %", number_text(block["seconds"], 3)]
+        rows.append(tuple(cells))
+    columns = ["method"]
+    for name in ("position", "rotation"):
+        if results["test"][name] is not None:
+            columns += [f"{name} before", "after", "largest after"]
+    columns += ["machines", "converged", "seconds"]
+    noise = results["test"]["position"] or {}
+    note = "RMS distance of held-out measured poses from the predicted ones."
+    if noise.get("noise") is not None:
+        scale, unit = display_unit("m", noise["noise"])
+        note += f" The measurement noise alone is {number_text(noise['noise'] / scale, 3)} {unit} in position."
+    return Table("Held-out pose error", tuple(columns), tuple(rows), note)
+
+
+def _deviation_table(results: Block) -> Table | None:
+    if not results["simulated"]:
+        return None
+    units = [unit for unit in ("m", "rad", "1") if unit in next(iter(results["methods"].values()))["deviations"]]
+    rows = []
+    for method, block in results["methods"].items():
+        cells = [method]
+        for unit in units:
+            found = block["deviations"][unit]
+            scale, shown = display_unit(unit, found["largest"] or 1e-3)
+            cells += [f"{_text(found, key, scale)} {shown}".rstrip(" 1") for key in ("largest", "mean")]
+        bound = block["bound"]
+        cells.append(number_text(bound["median"], 3) if bound else "–")
+        cells.append(f"{number_text(bound['lowest'], 3)} to {number_text(bound['highest'], 3)}" if bound else "–")
+        cells.append("–" if block["coverage"] is None else f"{100 * block['coverage']:.1f} %")
+        rows.append(tuple(cells))
+    columns = ["method"]
+    for unit in units:
+        kind = {"m": "lengths", "rad": "angles"}.get(unit, "gains")
+        columns += [f"{kind}: largest", "mean"]
+    columns += ["σ / bound", "over parameters", "95 % intervals hold"]
+    note = (
+        "Deviation of identified from true parameters, median over machines. Bound: the Cramér-Rao bound of the same "
+        "rows and noise; the standard deviation over the machines divided by it, median over the parameters."
+    )
+    return Table("Deviation of the parameters", tuple(columns), tuple(rows), note)
+
+
+def _compensation_table(results: Block) -> Table | None:
+    rows = []
+    for method, block in results["methods"].items():
+        for kind in ("exact", "linear"):
+            found = (block["compensation"] or {}).get(kind)
+            if not found:
+                continue
+            cells = [f"{method}, {kind}"]
+            for name in ("position", "rotation"):
+                part = found[name]
+                if part is None:
+                    cells += ["–", "–"]
+                    continue
+                scale, unit = display_unit(part["unit"], part["after"])
+                cells += [f"{_text(part, 'after', scale)} {unit}", _text(part, "removed", 0.01, 4)]
+            rows.append(tuple(cells))
+    if not rows:
+        return None
+    columns = ("commands", "position left", "removed [%]", "rotation left", "removed [%]")
+    note = (
+        "RMS pose error of the simulated machines at held-out poses, commanded by the identified geometry: exact = real "
+        "inverse kinematics; linear = nominal joints corrected by the identification Jacobian (Sun et al. 2018, eq. 15)."
+    )
+    return Table("Compensation with the identified geometry", columns, tuple(rows), note)
+
+
+def _count_table(results: Block) -> Table | None:
+    if not results["counts"]:
+        return None
+    methods = list(results["counts"][0]["methods"])
+    rows = []
+    for entry in results["counts"]:
+        cells = [str(entry["poses"])]
+        for method in methods:
+            cells.append(_text(entry["methods"][method], "position", 1e-3))
+        rows.append(tuple(cells))
+    note = "RMS position error [mm] of the machines under exact commands, by the number of poses measured."
+    return Table("Measurements needed", ("poses", *methods), tuple(rows), note)
+
+
+_HEADER = ("subject", "name", "quantity", "unit", "value", "low", "high")
+Row = tuple[str, str, str, str, float | None, float | None, float | None]
+
+
+def _rows(results: Block) -> Iterator[Row]:
+    def of(subject: str, name: str, block: Block, unit: str, keys: tuple[str, ...], prefix: str = "") -> Iterator[Row]:
+        for key in keys:
+            if key in block:
+                low, high = block.get("spread", {}).get(key, (None, None))
+                yield subject, name, prefix + key, unit, block[key], low, high
+
+    for name, block in results["parameters"].items():
+        yield from of("parameter", name, block, block["unit"], ("nominal", "value", "sd", "true", "deviation"))
+    for method, block in results["methods"].items():
+        for part in ("position", "rotation"):
+            test = block["test"][part]
+            if test is not None:
+                keys = ("before", "after", "max_before", "max_after", "noise")
+                yield from of("method", method, test, test["unit"], keys, f"{part}_")
+        for unit, found in (block["deviations"] or {}).items():
+            yield from of("method", method, found, "1" if unit == "share" else unit, ("largest", "mean"), f"{unit}_")
+        for kind, found in (block["compensation"] or {}).items():
+            for part in ("position", "rotation"):
+                if found[part] is not None:
+                    yield from of("method", method, found[part], found[part]["unit"], ("after",), f"{kind}_{part}_")
+                    yield from of("method", method, found[part], "1", ("removed",), f"{kind}_{part}_")
+        yield "method", method, "seconds", "s", block["seconds"], None, None
+
+
+def write_identified_csv(path: str | Path, results: Block) -> None:
+    """Write `identified.csv`: every figure as one tidy row, in SI, 17 significant digits; an unknown one is empty."""
+    with Path(path).open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_HEADER)
+        for row in _rows(results):
+            writer.writerow(f"{v:.17g}" if isinstance(v, float | int) else v for v in row)

@@ -1,0 +1,41 @@
+"""How many measurements are needed: the study repeated with other numbers of poses (Table 3 of the 5R paper)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.runs.identification._figures import figures
+from ccnn_torch.runs.identification._judge import commanded
+from ccnn_torch.runs.identification._simulate import simulate
+from ccnn_torch.runs.identification._solve import Outcome, free_values, run_method, select
+from ccnn_torch.runs.identify_config import IdentifyConfig, base_method
+
+__all__ = ["count_study"]
+
+# The methods that are quick enough to be run once for every number of poses.
+_QUICK = ("lm", "tikhonov")
+
+
+def count_study(config: IdentifyConfig, mechanism: Mechanism) -> list[dict[str, Any]]:
+    """For each number of poses and each quick method: pose error under its exact commands, and parameter deviations.
+
+    Raises:
+        InputError: as `simulate` and `run_method`; too few poses among them.
+    """
+    if config.simulate is None:
+        return []
+    answer = []
+    for poses in config.simulate.counts:
+        measured = simulate(config, mechanism, poses)
+        block: dict[str, Any] = {"poses": poses, "methods": {}}
+        for method in (m for m in config.methods if base_method(m) in _QUICK):
+            outcome: Outcome = run_method(method, measured, config)
+            found = commanded(measured, outcome.values, outcome.machines)
+            assert found is not None and measured.truth is not None
+            gap = free_values(select(measured, config), outcome.values - measured.truth[outcome.machines])
+            block["methods"][method] = figures(
+                {"position": found.exact.position.square().mean(-1).sqrt(), "deviation": gap.abs().mean(-1)}
+            )
+        answer.append(block)
+    return answer

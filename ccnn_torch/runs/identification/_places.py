@@ -1,0 +1,122 @@
+"""Where simulated machines are measured: poses inside the workspace, or joints of a serial arm, evenly or at random."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from scipy.stats import qmc
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.runs.identification._sizes import Size, size
+
+__all__ = ["Places"]
+
+# Rounds of drawing before a box counts as out of reach.
+_ROUNDS = 50
+
+
+class Places:
+    """A box of places, and what machines with given parameters do there.
+
+    A place is a pose, `p` [SI]; of a serial arm, whose poses are hard to reach with all joints inside their limits, it
+    is a joint vector, `n` [SI].
+    """
+
+    def __init__(self, mechanism: Mechanism, truth: Tensor, box: Mapping[str, tuple[Size, Size]], circle: bool) -> None:
+        """Set the box.
+
+        Args:
+            mechanism: with its nominal parameters.
+            truth: parameters of the machines, `r x K` [SI]; a place is one that all of them reach.
+            box: ranges in place of the mechanism's own, by coordinate.
+            circle: only poses inside the maximal inscribed circle.
+
+        Raises:
+            InputError: a range names no coordinate or is empty, or the mechanism has no inscribed circle.
+        """
+        self.mechanism, self.truth = mechanism, truth
+        self.by_joints = isinstance(mechanism, SerialArm)
+        coordinates = mechanism.joints if isinstance(mechanism, SerialArm) else mechanism.pose
+        edges = mechanism.limits.T if isinstance(mechanism, SerialArm) else torch.stack(mechanism.bounds)
+        self.low, self.high = (edge.clone() for edge in edges)
+        names = [c.name for c in coordinates]
+        self.circle: tuple[Tensor, Tensor] | None = None
+        if circle:
+            self.circle = self._inscribed(mechanism)
+            centre, radius = self.circle
+            self.low, self.high = centre - radius, centre + radius
+        for name, pair in box.items():
+            if name not in names:
+                raise InputError(f"simulate.box.{name}: there is no such coordinate; there are {', '.join(names)}")
+            i = names.index(name)
+            low, high = (size(v, coordinates[i].unit, f"simulate.box.{name}") for v in pair)
+            if not low < high:
+                raise InputError(f"simulate.box.{name}: must be [low, high] with low below high, got {list(pair)}")
+            self.low[i], self.high[i] = low, high
+
+    @staticmethod
+    def _inscribed(mechanism: Mechanism) -> tuple[Tensor, Tensor]:
+        find: Any = getattr(mechanism, "maximal_inscribed_circle", None)
+        if find is None:
+            raise InputError(
+                f"simulate.circle: {mechanism.name} has no maximal inscribed circle; give the range as simulate.box"
+            )
+        centre, radius = find()
+        return torch.as_tensor(centre, dtype=torch.float64), torch.as_tensor(radius, dtype=torch.float64)
+
+    def taken(self, place: Tensor) -> tuple[Tensor, Tensor]:
+        """Joints `r x s x n` and pose `r x s x p` of every machine at places `s x .` or `r x s x .`."""
+        parameters = self.truth[:, None]
+        if self.by_joints:
+            joints = place.expand(len(self.truth), *place.shape[-2:])
+            return joints, self.mechanism.forward_kinematics(joints, parameters)
+        pose = place.expand(len(self.truth), *place.shape[-2:])
+        near = self.mechanism.solve_inverse(place)
+        return self.mechanism.solve_inverse(pose, parameters, near.expand(len(self.truth), *near.shape[-2:])), pose
+
+    def usable(self, place: Tensor) -> Tensor:
+        """Which places `s x .` every machine reaches, inside the circle where there is one; `s`, bool."""
+        inside = torch.ones(len(place), dtype=torch.bool)
+        if self.circle is not None:
+            centre, radius = self.circle
+            inside = torch.linalg.vector_norm(place - centre, dim=-1) <= radius
+        if not self.by_joints:
+            inside = inside & self.mechanism.reachable(place)
+        joints, pose = self.taken(place)
+        return inside & torch.isfinite(joints).all(-1).all(0) & torch.isfinite(pose).all(-1).all(0)
+
+    def even(self, count: int) -> Tensor:
+        """Places of low discrepancy, `count x .`: a Halton sequence in the box, without what is out of reach."""
+        sequence = qmc.Halton(len(self.low), scramble=False)
+        sequence.fast_forward(1)  # its first point is a corner
+        return self._filled(count, lambda number: torch.from_numpy(sequence.random(number)))
+
+    def random(self, count: int, generator: torch.Generator) -> Tensor:
+        """Uniform places, `count x .`."""
+        width = len(self.low)
+        return self._filled(count, lambda number: torch.rand(number, width, generator=generator, dtype=torch.float64))
+
+    def map(self, across: int) -> Tensor:
+        """A square grid over the first two coordinates, the others in the middle; `m x .`, in reach only."""
+        middle = (self.low + self.high) / 2
+        lines = [torch.linspace(float(self.low[i]), float(self.high[i]), across, dtype=torch.float64) for i in (0, 1)]
+        grid = torch.cartesian_prod(*lines)
+        place = middle.expand(len(grid), -1).clone()
+        place[:, :2] = grid
+        return place[self.usable(place)]
+
+    def _filled(self, count: int, draw: Any) -> Tensor:
+        found: list[Tensor] = []
+        for _ in range(_ROUNDS):
+            place = self.low + (self.high - self.low) * draw(2 * count)
+            found.append(place[self.usable(place)])
+            if sum(map(len, found)) >= count:
+                return torch.cat(found)[:count]
+        raise InputError(
+            f"simulate: hardly any pose of the box of {self.mechanism.name} can be reached by all machines; give a "
+            "smaller range in simulate.box, or smaller simulate.errors"
+        )

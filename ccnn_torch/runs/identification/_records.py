@@ -1,0 +1,87 @@
+"""Measured records as the rows of an identification: split, and the frames fitted that no maker can know."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames
+from ccnn_torch.records import Records, check_rows, load_records
+from ccnn_torch.runs.identification._measured import Measured, Rows
+from ccnn_torch.runs.identification._sizes import size, sizes_by_name, sizes_of_pose
+from ccnn_torch.runs.identify_config import IdentifyConfig
+from ccnn_torch.splits import split_rows
+
+__all__ = ["from_records"]
+
+
+def from_records(config: IdentifyConfig, mechanism: Mechanism) -> Measured:
+    """Load and split the records of a config.
+
+    Raises:
+        InputError: the records cannot be used, or the arm has frames per group of rows, which are no geometry.
+    """
+    assert config.records is not None
+    records = load_records(config.records, mechanism, [])
+    if isinstance(mechanism, SerialArm):
+        if mechanism.frame_per or mechanism.tool_per:
+            raise InputError(
+                f"{config.mechanism}: frame_per and tool_per give each group of rows a frame of its own; remove them "
+                "to identify one machine, or identify from the rows of one group"
+            )
+        if records.orientation == "none" and mechanism.orientation != "none":
+            mechanism = mechanism.with_orientation("none")
+    elif len(records.pose_coordinates) != len(mechanism.pose):
+        there = {c.name for c in records.pose_coordinates}
+        missing = [c.header for c in mechanism.pose if c.name not in there]
+        raise InputError(f"{records.path}: {mechanism.name} needs the columns {', '.join(missing)}, too")
+    if not config.frame.base and not config.frame.tool:
+        check_rows(records, mechanism)
+    split = split_rows(
+        records.positions,
+        config.split.kind,
+        config.split.by,
+        records.columns,
+        test=config.split.test,
+        validation=0.0,
+        seed=config.seed,
+    )
+    train, test = (Rows(records.joints[None, i], records.pose[None, i]) for i in (split.train, split.test))
+    start, unknown = _frames(mechanism, train)
+    return Measured(
+        mechanism=mechanism,
+        view=mechanism,
+        rows=train,
+        leg_rows={},
+        test=test,
+        start=start,
+        pose_noise=None if config.noise is None else sizes_of_pose(config.noise, mechanism.pose, "noise"),
+        joint_noise=_joint_noise(config, mechanism),
+        unknown_frame=unknown,
+        data_hash=records.data_hash,
+        notes=_notes(records),
+    )
+
+
+def _frames(mechanism: Mechanism, rows: Rows) -> tuple[Tensor, tuple[str, ...]]:
+    """Where the search starts, `1 x K`, and the parameters of frames that had to be fitted first."""
+    if not isinstance(mechanism, SerialArm) or not mechanism.unknown_frames:
+        return mechanism.nominal[None].clone(), ()
+    start = fit_frames(mechanism, rows.joints[0], rows.observed[0])
+    names = [p.name for p in mechanism.geometry]
+    prefixes = tuple(f"{frame}_" for frame in mechanism.unknown_frames)
+    return start[None], tuple(name for name in names if name.startswith(prefixes))
+
+
+def _joint_noise(config: IdentifyConfig, mechanism: Mechanism) -> Tensor | None:
+    given = config.joint_noise
+    if given is None:
+        return None
+    if isinstance(given, dict):
+        return sizes_by_name(given, mechanism.joints, "joint_noise", [0.0] * len(mechanism.joints))
+    return torch.tensor([size(given, j.unit, "joint_noise") for j in mechanism.joints], dtype=torch.float64)
+
+
+def _notes(records: Records) -> list[str]:
+    return [note for note in records.notes if note.startswith("joint")]

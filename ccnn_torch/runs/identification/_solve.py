@@ -1,0 +1,228 @@
+"""One method on the rows of an identification: joint or leg by leg, on all machines side by side."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.identification import (
+    Fit,
+    Knowledge,
+    ParameterChoice,
+    Problem,
+    Progress,
+    Solver,
+    forward_problem,
+    get_solver,
+    inverse_problem,
+    split_by_leg,
+    what_is_known,
+)
+from ccnn_torch.identification.parameters import Selection, select_parameters
+from ccnn_torch.mechanisms import SerialArm
+from ccnn_torch.runs.identification._measured import Measured, Rows
+from ccnn_torch.runs.identification._sizes import size
+from ccnn_torch.runs.identify_config import PER_LEG, IdentifyConfig, base_method
+
+__all__ = [
+    "Outcome",
+    "Piece",
+    "choice_of",
+    "free_values",
+    "is_apart",
+    "knowledge_of",
+    "machines_of",
+    "pieces_of",
+    "run_method",
+    "select",
+    "solver_of",
+]
+
+# Global searches take minutes where lm takes a blink.
+_SLOW = ("hga", "ga", "sa", "pso")
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A problem that is solved by itself: the whole, or one leg's; `leg` is None for the whole."""
+
+    problem: Problem
+    leg: int | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one method found.
+
+    Attributes:
+        machines: which machines it was run on, `r`, int64.
+        values: the whole geometry of each, `r x K` [SI].
+        converged: `r`, bool.
+        evaluations: residuals of all rows of one machine computed.
+        seconds: wall time.
+        message: a sentence where not all converged; else empty.
+    """
+
+    machines: Tensor
+    values: Tensor
+    converged: Tensor
+    evaluations: int
+    seconds: float
+    message: str
+
+
+def choice_of(config: IdentifyConfig) -> ParameterChoice:
+    """The parameters of a config; its priors in SI.
+
+    Raises:
+        InputError: a prior is no size.
+    """
+    about = config.parameters
+    prior = {name: size(value, None, f"parameters.prior.{name}") for name, value in about.prior.items()}
+    return ParameterChoice(free=about.free, fixed=about.fixed, tied=about.tied, prior=prior)
+
+
+def select(measured: Measured, config: IdentifyConfig) -> Selection:
+    """The free parameters of all machines."""
+    return select_parameters(measured.mechanism.geometry, choice_of(config), measured.start)
+
+
+def pieces_of(measured: Measured, config: IdentifyConfig, apart: bool, machines: Tensor) -> list[Piece]:
+    """The problems that a method solves.
+
+    Args:
+        apart: one for each leg, from that leg's rows where it has its own; else one for all.
+        machines: which machines.
+
+    Raises:
+        InputError: the rows do not fit the mechanism or are too few, or legs are not apart.
+    """
+    if not apart:
+        return [Piece(_problem(measured, config, measured.rows.of(machines), machines, False))]
+    whole = split_by_leg(_problem(measured, config, measured.rows.of(machines), machines, True))
+    legs = [next(p.leg for p in part.parameters if p.leg is not None) for part in whole]
+    if not measured.leg_rows:
+        return [Piece(part, leg) for part, leg in zip(whole, legs, strict=True)]
+    own = []
+    for i, leg in enumerate(legs):
+        rows = measured.leg_rows[leg].of(machines)
+        own.append(Piece(split_by_leg(_problem(measured, config, rows, machines, True))[i], leg))
+    return own
+
+
+def _problem(measured: Measured, config: IdentifyConfig, rows: Rows, machines: Tensor, per_leg: bool) -> Problem:
+    start = measured.start[machines]
+    forward = config.residual == "forward" or (
+        config.residual == "auto"
+        and (isinstance(measured.mechanism, SerialArm) or config.frame.base or config.frame.tool)
+    )
+    if not forward:
+        return inverse_problem(
+            measured.view,
+            rows.joints,
+            rows.observed,
+            choice=choice_of(config),
+            pose_noise=measured.pose_noise,
+            joint_noise=measured.joint_noise,
+            start=start,
+            per_leg=per_leg,
+        )
+    if per_leg:
+        raise InputError(
+            "methods: a pose depends on all legs, so legs are identified apart only by their joints; write "
+            "residual=inverse, or remove _per_leg"
+        )
+    return forward_problem(
+        measured.view,
+        rows.joints,
+        rows.observed,
+        choice=choice_of(config),
+        pose_noise=measured.pose_noise,
+        joint_noise=measured.joint_noise,
+        rotation_weight=config.rotation_weight,
+        start=start,
+    )
+
+
+def is_apart(method: str, config: IdentifyConfig) -> bool:
+    """Whether a method identifies leg by leg."""
+    return config.per_leg or method.endswith(PER_LEG)
+
+
+def machines_of(method: str, measured: Measured, config: IdentifyConfig) -> Tensor:
+    """Which machines a method is run on: slow ones on the first few only."""
+    count = measured.machines
+    return torch.arange(min(count, config.hga_machines) if base_method(method) in _SLOW else count)
+
+
+def solver_of(method: str, config: IdentifyConfig) -> Solver:
+    """The solver of a method with its settings.
+
+    Raises:
+        InputError: a setting that it does not have.
+    """
+    settings = dict(config.settings.get(base_method(method), {}))
+    if base_method(method) == "lm":
+        settings = {"starts": config.starts, "loss": config.robust or "squared"} | settings
+    return get_solver(base_method(method), **settings)
+
+
+def run_method(method: str, measured: Measured, config: IdentifyConfig, progress: Progress | None = None) -> Outcome:
+    """Run a method.
+
+    Raises:
+        InputError: see `pieces_of`, `solver_of`.
+    """
+    machines = machines_of(method, measured, config)
+    solver, selection = solver_of(method, config), select(measured, config)
+    pieces = pieces_of(measured, config, is_apart(method, config), machines)
+    begun = time.perf_counter()
+    fits: list[Fit] = []
+    for i, piece in enumerate(pieces):
+        part = None if progress is None else _part(progress, i, len(pieces))
+        fits.append(solver(piece.problem, config.seed, part))
+    seconds = time.perf_counter() - begun
+    values = whole_values(selection, pieces, [fit.values for fit in fits], machines)
+    said = [fit.message for fit in fits if fit.message]
+    return Outcome(
+        machines,
+        values,
+        torch.stack([fit.converged for fit in fits]).all(0),
+        sum(fit.evaluations for fit in fits),
+        seconds,
+        said[0] if said else "",
+    )
+
+
+def whole_values(selection: Selection, pieces: list[Piece], values: list[Tensor], machines: Tensor) -> Tensor:
+    """The whole geometry `r x K` from the values `r x k` of each piece's free parameters."""
+    names = [p.name for p in selection.parameters]
+    free = selection.start.expand(int(machines.max()) + 1, -1)[machines].clone()
+    for piece, found in zip(pieces, values, strict=True):
+        free[:, [names.index(p.name) for p in piece.problem.parameters]] = found
+    fixed = selection.fixed.expand(int(machines.max()) + 1, -1)[machines]
+    return free @ selection.spread + fixed
+
+
+def free_values(selection: Selection, whole: Tensor) -> Tensor:
+    """Values of the free parameters, `r x k`, out of the whole geometry `r x K`."""
+    first = selection.spread.argmax(-1)
+    return whole[:, first]
+
+
+def knowledge_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> list[Knowledge]:
+    """What is known of each piece's parameters at a geometry `r x K`."""
+    names = [p.name for p in selection.parameters]
+    free = free_values(selection, whole)
+    return [
+        what_is_known(piece.problem, free[:, [names.index(p.name) for p in piece.problem.parameters]])
+        for piece in pieces
+    ]
+
+
+def _part(progress: Progress, index: int, count: int) -> Progress:
+    return lambda done: progress((index + done) / count)
