@@ -50,7 +50,7 @@ def gather_rows(
     w = (
         torch.ones(1, q.shape[1], dtype=torch.float64, device=q.device)
         if weights is None
-        else torch.atleast_2d(weights)
+        else weights.reshape(-1, weights.shape[-1])
     )
     counts = {len(q), len(x), len(w), 1 if start is None or start.dim() == 1 else len(start)}
     rows = {q.shape[1], x.shape[1], w.shape[1]}
@@ -117,7 +117,8 @@ def inverse_root(matrix: Tensor, used: Tensor, what: str) -> Tensor:
             f"row {row}: the noise given leaves a direction of the {what} without any; give joint_noise too, or a "
             "pose_noise above 0 for every coordinate"
         )
-    return torch.linalg.solve_triangular(factor, unit.expand_as(factor), upper=False)
+    root: Tensor = torch.linalg.solve_triangular(factor, unit.expand_as(factor), upper=False)
+    return root
 
 
 def check_finite(residual: Tensor, used: Tensor, pose: Tensor, mechanism: Mechanism, channels: Sequence[str]) -> None:

@@ -6,15 +6,16 @@ Zhuang, Yan and Masory (1998); papers: Zhang and Gao 2012 eq. 1 (pseudoerror), t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification._rows import check_finite, covariance, gather_rows, inverse_root
+from ccnn_torch.identification._rows import MeasuredRows, check_finite, covariance, gather_rows, inverse_root
 from ccnn_torch.identification.checks import check_equations
-from ccnn_torch.identification.parameters import ParameterChoice, select_parameters
+from ccnn_torch.identification.parameters import ParameterChoice, Selection, select_parameters
 from ccnn_torch.identification.problem import Channel, Problem
 from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import Mechanism
@@ -79,35 +80,28 @@ def inverse_problem(
     first = gap(begin[:, None], rows.pose, rows.joints, *extra)
     check_finite(first, used, rows.pose, mechanism, [f"joint {n}" for n in names])
 
+    n = len(names)
     whole = selection.full(selection.start)[:, None]
     matrix = _joint_covariance(mechanism, rows.joints, rows.pose, whole, pose_noise, joint_noise)
-    moved = _depends(gap, begin[:1, None], rows.pose[:1], rows.joints[:1], tuple(e[:1] for e in extra), selection.scale)
-    n = len(names)
+    moved = _depends(lambda v: gap(v, *(d[:1] for d in (rows.pose, rows.joints, *extra))), begin[:1], rows, selection)
     kept = [i for i in range(n) if bool(moved[i].any())] if per_leg else list(range(n))
     if not kept:
         free = ", ".join(p.name for p in selection.parameters)
         raise InputError(f"parameters.free: no joint of mechanism '{mechanism.name}' depends on {free}; free others")
-    diagonal = per_leg or matrix is None or bool((matrix == torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1))).all())
-    if matrix is None:
-        whiten: tuple[Tensor, ...] = ()
-    elif diagonal:
-        variance = torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1))
-        used_here = used.expand(torch.broadcast_shapes(used.shape, variance.shape[:2]))
-        root = inverse_root(variance.expand(*used_here.shape, n, n), used_here, "joints")
-        whiten = (_shared(root.diagonal(dim1=-2, dim2=-1))[..., kept],)
-    else:
-        used_here = used.expand(torch.broadcast_shapes(used.shape, matrix.shape[:2]))
-        whiten = (_shared(inverse_root(matrix.expand(*used_here.shape, n, n), used_here, "joints")).flatten(-2),)
+    diagonal = matrix is None or per_leg or bool((matrix == _only_diagonal(matrix)).all())
+    whiten: tuple[Tensor, ...] = ()
+    if matrix is not None:
+        root = _shared(inverse_root(_only_diagonal(matrix) if diagonal else matrix, used, "joints"))
+        whiten = (root.diagonal(dim1=-2, dim2=-1)[..., kept] if diagonal else root.flatten(-2),)
 
     def residual(values: Tensor, x: Tensor, q: Tensor, *rest: Tensor) -> Tensor:
         difference = gap(values, x, q, *rest[len(whiten) :])
-        if not whiten:
-            return difference[..., kept] if len(kept) < n else difference
-        if diagonal:
-            return (difference[..., kept] if len(kept) < n else difference) * rest[0]
-        return (rest[0].unflatten(-1, (n, n)) * difference[..., None, :]).sum(-1)
+        if not diagonal:
+            return (rest[0].reshape(*rest[0].shape[:-1], n, n) * difference[..., None, :]).sum(-1)
+        if len(kept) < n:
+            difference = difference[..., kept]
+        return difference * rest[0] if whiten else difference
 
-    channels = tuple(Channel(names[i], _leg(selection.parameters, moved[i]) if diagonal else None) for i in kept)
     problem = Problem(
         parameters=selection.parameters,
         start=begin,
@@ -116,7 +110,7 @@ def inverse_problem(
         residual=residual,
         data=(rows.pose, rows.joints, *whiten, *extra),
         weights=rows.weights,
-        channels=channels,
+        channels=tuple(Channel(names[i], _leg(selection.parameters, moved[i]) if diagonal else None) for i in kept),
         noise_known=matrix is not None,
     )
     check_equations(problem)
@@ -140,24 +134,23 @@ def _joint_covariance(
         slope = jacobian_of(lambda x: mechanism.solve_inverse(x, parameters, joints), pose.expand(machines, -1, -1))[1]
         total = slope @ of_pose @ slope.mT
     if of_joints is not None:
-        n = len(mechanism.joints)
-        shape = (1, pose.shape[1], n, n)
-        total = of_joints.expand(torch.broadcast_shapes(of_joints.shape, shape)) if total is None else total + of_joints
+        total = of_joints.expand(1, pose.shape[1], -1, -1) if total is None else total + of_joints
     return total
 
 
-def _depends(
-    gap: object, start: Tensor, pose: Tensor, joints: Tensor, extra: tuple[Tensor, ...], scale: Tensor
-) -> Tensor:
+def _only_diagonal(matrix: Tensor) -> Tensor:
+    return torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1))
+
+
+def _depends(gap: Callable[[Tensor], Tensor], start: Tensor, rows: MeasuredRows, selection: Selection) -> Tensor:
     """Which joints depend on which free parameters, in the first machine's rows: `n x k`, bool."""
-    point = start.expand(1, pose.shape[1], -1)
-    slope = jacobian_of(lambda v: gap(v, pose, joints, *extra), point)[1]  # type: ignore[operator]
-    size = (torch.nan_to_num(slope).abs() * scale).flatten(0, 1).amax(0)
+    slope = jacobian_of(gap, start[:, None].expand(-1, rows.pose.shape[1], -1))[1]
+    size = (torch.nan_to_num(slope).abs() * selection.scale).flatten(0, 1).amax(0)
     return size > _DEPENDS * size.max()
 
 
-def _leg(parameters: Sequence[object], moved: Tensor) -> int | None:
-    legs = {getattr(p, "leg", None) for p, m in zip(parameters, moved.tolist(), strict=True) if m}
+def _leg(parameters: Sequence[Parameter], moved: Tensor) -> int | None:
+    legs = {p.leg for p, m in zip(parameters, moved.tolist(), strict=True) if m}
     return legs.pop() if len(legs) == 1 else None
 
 

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt over machines and starts at once (Levenberg 1944, Marquardt 1963), with robust loss and priors."""
+"""Levenberg-Marquardt over machines and starts at once (Levenberg 1944, Marquardt 1963); robust loss, priors."""
 
 from __future__ import annotations
 
@@ -61,7 +61,8 @@ def solve_lm(
     rows = WeightedRows(problem)
     machines, k = problem.start.shape
     size = max(1, starts * rows.weights.shape[1] * rows.channels * k)
-    blocks = torch.arange(machines, device=problem.start.device).split(max(1, _BLOCK // size))
+    everyone = torch.arange(machines, device=problem.start.device)
+    blocks = torch.split(everyone, max(1, _BLOCK // size))  # type: ignore[no-untyped-call]
     begin = _starts(rows, starts, seed)
     values, cost, converged, count = torch.empty_like(problem.start), [], [], 0
     for block in blocks:

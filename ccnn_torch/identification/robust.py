@@ -47,7 +47,8 @@ def loss_weights(residual: Tensor, weights: Tensor, loss: str, parameters: int) 
     scale = middle / float(chi2.ppf(0.5, channels)) ** 0.5 * spared
     bend = float(chi2.ppf(chi2.cdf(_BEND[loss] ** 2, 1), channels)) ** 0.5
     ratio = length / (scale * bend).clamp_min(torch.finfo(length.dtype).tiny)
-    return 1 / ratio.clamp_min(1) if loss == "huber" else 1 / (1 + ratio.square())
+    factor: Tensor = 1 / ratio.clamp_min(1) if loss == "huber" else 1 / (1 + ratio.square())
+    return factor
 
 
 def reweighted(problem: Problem, values: Tensor, loss: str) -> Problem:
