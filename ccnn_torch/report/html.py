@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from ccnn_torch.report.table_form import Table
 from ccnn_torch.report.tables import failures, result_tables, verdict
 
-__all__ = ["InlineFigure", "html_text"]
+__all__ = ["InlineFigure", "html_text", "page_text"]
 
 
 class InlineFigure(NamedTuple):
@@ -32,6 +33,37 @@ def html_text(
         config: the resolved configuration, as text.
         files: names of files in the run folder to link to.
     """
+    optional: dict[str, Any] = {"case": None, "best_method": None, "notes": [], "versions": {}}
+    return page_text(
+        "report",
+        optional | dict(results),
+        verdict(results),
+        result_tables(results),
+        failures(results),
+        figures,
+        config,
+        files,
+        results.get("best_method"),
+    )
+
+
+def page_text(
+    template: str,
+    results: Mapping[str, Any],
+    verdict: str,
+    tables: Sequence[Table],
+    failures: Sequence[str],
+    figures: Sequence[InlineFigure],
+    config: str,
+    files: Sequence[str],
+    best: str | None = None,
+) -> str:
+    """A page: verdict, sentences about what failed, tables, figures, notes, files, configuration, versions.
+
+    Args:
+        template: `report` or `identified`.
+        best: first cell of the rows that are set in bold.
+    """
     environment = Environment(
         loader=PackageLoader("ccnn_torch.report", "."),
         autoescape=True,
@@ -39,14 +71,14 @@ def html_text(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    optional: dict[str, Any] = {"case": None, "best_method": None, "notes": [], "versions": {}}
-    return environment.get_template("report.html.jinja").render(
-        results=optional | dict(results),
-        verdict=verdict(results),
-        tables=result_tables(results),
-        failures=failures(results),
+    return environment.get_template(f"{template}.html.jinja").render(
+        results=results,
+        verdict=verdict,
+        tables=tables,
+        failures=failures,
         # Markup: the SVG is our own; everything else on the page is escaped.
         figures=[figure._replace(svg=Markup(figure.svg)) for figure in figures],
         config=config,
         files=files,
+        best=best,
     )

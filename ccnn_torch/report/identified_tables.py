@@ -15,7 +15,7 @@ from ccnn_torch.report.identified_paper import paper_tables
 from ccnn_torch.report.table_form import Table, print_table
 from ccnn_torch.report.tables import markdown_table
 
-__all__ = ["identified_markdown", "identified_tables", "identified_verdict", "print_identified", "write_identified_csv"]
+__all__ = ["identified_markdown", "identified_tables", "identified_verdict", "print_identified", "unknown_sentences", "write_identified_csv"]
 
 Block = Mapping[str, Any]
 
@@ -56,7 +56,7 @@ def identified_tables(results: Block) -> list[Table]:
 
 def identified_markdown(results: Block) -> str:
     """Verdict and tables as Markdown (`identified.md`)."""
-    parts = [f"# {results['name']}", identified_verdict(results), *_unknown(results)]
+    parts = [f"# {results['name']}", identified_verdict(results), *unknown_sentences(results)]
     return "\n\n".join([*parts, *map(markdown_table, identified_tables(results)), *results["notes"]]) + "\n"
 
 
@@ -64,12 +64,13 @@ def print_identified(results: Block, console: Console) -> None:
     """Show the tables and the verdict on a terminal."""
     for table in identified_tables(results):
         print_table(table, console)
-    for sentence in (*_unknown(results), *results["notes"]):
+    for sentence in (*unknown_sentences(results), *results["notes"]):
         console.print(escape(sentence), style="yellow")
     console.print(escape(identified_verdict(results)), style="bold")
 
 
-def _unknown(results: Block) -> list[str]:
+def unknown_sentences(results: Block) -> list[str]:
+    """Which combinations of parameters the rows do not tell, as sentences."""
     found = results["combinations_not_identifiable"]
     return [f"Not identifiable from these rows: {'; '.join(found)}."] if found else []
 

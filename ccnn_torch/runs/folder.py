@@ -19,8 +19,8 @@ class RunFolder:
     path: Path
 
     @classmethod
-    def create(cls, out: str | None, name: str) -> RunFolder:
-        """Make the folder `out`, or `runs/NAME-STAMP`.
+    def create(cls, out: str | None, name: str, resume: str = "ccnn run --resume") -> RunFolder:
+        """Make the folder `out`, or `runs/NAME-STAMP`; `resume` is the command that goes on in a folder.
 
         Raises:
             InputError: the folder holds files already, or cannot be made.
@@ -30,7 +30,7 @@ class RunFolder:
             if path.exists() and (not path.is_dir() or any(path.iterdir())):
                 raise InputError(
                     f"{path} holds files already; give another folder with out=…, "
-                    f"or go on with that run: ccnn run --resume {path}"
+                    f"or go on with that run: {resume} {path}"
                 )
             path.mkdir(parents=True, exist_ok=True)
         except OSError as problem:

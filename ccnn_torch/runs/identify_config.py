@@ -120,6 +120,11 @@ class SimulateConfig(_Part):
         max_length=3,
         description="three points on the platform that are measured instead of the pose, x, y, z in its frame",
     )
+    as_built: bool = Field(
+        default=False,
+        description="machines that leave the nominal motion by their errors, where the mechanism knows how "
+        "(overconstrained_2dof); needs points",
+    )
     test_poses: int = Field(default=100, ge=1, description="held-out poses, measured with the same noise")
     counts: list[int] = Field(
         default=[], description="numbers of measured poses for which the study is repeated (measurements needed)"
@@ -216,6 +221,8 @@ class IdentifyConfig(_Part):
             raise ValueError("noise: simulated data has simulate.noise and simulate.joint_noise; remove the key")
         if self.simulate is not None and self.simulate.points and self.residual == "forward":
             raise ValueError("residual: measured points are compared by joints; write residual=inverse or auto")
+        if self.simulate is not None and self.simulate.as_built and not self.simulate.points:
+            raise ValueError("simulate.as_built: a machine off its nominal motion is measured by points; give simulate.points")
         wrong = [name for name in self.settings if name not in IDENTIFY_METHODS]
         if wrong:
             raise ValueError(f"settings: '{wrong[0]}' is no method; known are {', '.join(IDENTIFY_METHODS)}")

@@ -119,7 +119,7 @@ def assemble(
         arrays["map"] = measured.map
         error = map_error(measured, measured.start, torch.arange(measured.machines))
         if error is not None:
-            arrays["map_before"] = error.square().mean(0).sqrt()
+            arrays["map_before"] = error
     arrays["correlation"] = known[first].correlation
     arrays["observed"] = measured.rows.observed[:1]
     arrays |= {f"observed_leg{leg}": rows.observed[:1] for leg, rows in measured.leg_rows.items()}
@@ -204,7 +204,7 @@ def _method_block(
         }
     error = map_error(measured, outcome.values, machines)
     if error is not None:
-        arrays[f"map_{method}"] = error.square().mean(0).sqrt()
+        arrays[f"map_{method}"] = error
     return block
 
 

@@ -19,10 +19,17 @@ __all__ = ["Instrument", "PointsView", "make_instrument"]
 
 @dataclass(frozen=True)
 class Instrument:
-    """`view`: the mechanism with what is measured as its pose; `observe`: that of a true pose, `... x p` -> `... x o`."""
+    """What is seen of a machine.
+
+    Attributes:
+        view: the mechanism with what is measured as its pose, `o` coordinates.
+        observe: (pose `... x p`, position `... x 3`, rotation `... x 3 x 3` or None) of the platform -> `... x o`.
+        pose_of: `... x o` -> the pose that was measured, `... x p`.
+    """
 
     view: Mechanism
-    observe: Callable[[Tensor], Tensor]
+    observe: Callable[[Tensor, Tensor, Tensor | None], Tensor]
+    pose_of: Callable[[Tensor], Tensor]
 
 
 def make_instrument(mechanism: Mechanism, points: Sequence[tuple[Size, Size, Size]] | None) -> Instrument:
@@ -32,16 +39,16 @@ def make_instrument(mechanism: Mechanism, points: Sequence[tuple[Size, Size, Siz
         InputError: points lie on one line, or the mechanism's inverse kinematics takes no measured frame.
     """
     if points is None:
-        return Instrument(mechanism, lambda pose: pose)
+        return Instrument(mechanism, lambda pose, position, rotation: pose, lambda observed: observed)
     place = torch.tensor([[size(v, "m", "simulate.points") for v in p] for p in points], dtype=torch.float64)
     if float(torch.linalg.cross(place[0] - place[1], place[2] - place[1]).norm()) < 1e-9:
         raise InputError("simulate.points: the three points lie on one line, which shows no rotation about it")
-    if not hasattr(mechanism, "joints_of_frame"):
+    if not (hasattr(mechanism, "joints_of_frame") and hasattr(mechanism, "pose_near")):
         raise InputError(
             f"simulate.points: {mechanism.name} takes no measured rotation matrix; measure its pose (remove points)"
         )
     view = PointsView(mechanism, place)
-    return Instrument(view, view.observe)
+    return Instrument(view, lambda pose, *frame: view.seen(*frame), view.pose_of)
 
 
 class PointsView(Mechanism):
@@ -51,15 +58,13 @@ class PointsView(Mechanism):
     the platform's position from their middle. Parameters and joints are the mechanism's own.
     """
 
-    points: Tensor
-
     def __init__(self, mechanism: Mechanism, points: Tensor) -> None:
         """points: in the platform's frame, `3 x 3` [m]."""
         # Not a submodule's task: the view only lends the mechanism other pose coordinates.
         self._inner: Any = (mechanism,)
         self._turn = _triad(points)
         self._points = points
-        home = self.observe(mechanism.home_pose)
+        home = self.seen(*mechanism.frame(mechanism.home_pose))
         super().__init__(
             name=f"{mechanism.name} by three points",
             joints=mechanism.joints,
@@ -72,10 +77,15 @@ class PointsView(Mechanism):
         )
         self.nominal.copy_(mechanism.nominal)
 
-    def observe(self, pose: Tensor) -> Tensor:
-        """The points of a true pose; `... x p` -> `... x 9` [m]."""
-        position, rotation = self._inner[0].frame(pose)
+    def seen(self, position: Tensor, rotation: Tensor | None) -> Tensor:
+        """The points of a platform; position `... x 3` [m], rotation `... x 3 x 3`; returns `... x 9` [m]."""
+        assert rotation is not None
         return (position[..., None, :] + self._points @ rotation.mT).flatten(-2)
+
+    def pose_of(self, observed: Tensor) -> Tensor:
+        """The mechanism's pose that is nearest to the measured frame; `... x 9` [m] -> `... x p` [SI]."""
+        pose: Tensor = self._inner[0].pose_near(*self.frame(observed))
+        return pose
 
     def frame(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Position `... x 3` [m] and rotation `... x 3 x 3` from the points, `... x 9` [m]."""

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from ccnn_torch.least_squares import jacobian_of
-from ccnn_torch.mechanisms import Mechanism, PoseError
-from ccnn_torch.rotations import geodesic_angle
+from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.runs.identification._measured import Measured
 
 __all__ = ["Commanded", "commanded", "map_error", "noise_of_test", "predicted"]
@@ -31,76 +29,53 @@ def predicted(measured: Measured, values: Tensor, machines: Tensor) -> PoseError
         machines: which machines the rows are of, `r`.
     """
     rows = measured.test.of(machines)
-    guess = rows.observed if measured.view is measured.mechanism else None
-    if guess is None and measured.wanted is not None:
-        guess = measured.wanted[machines]
-    pose = measured.mechanism.forward_kinematics(rows.joints, values[:, None], guess)
-    return _distance(measured.mechanism.frame(pose), measured.view.frame(rows.observed))
+    pose = measured.kinematics.reached(rows.joints, values[:, None], rows.observed)
+    return measured.mechanism.pose_error(pose, rows.observed)
 
 
 def noise_of_test(measured: Measured) -> PoseError | None:
     """Distance of the held-out measured poses from the true ones, `r x t`; None for records."""
-    if measured.wanted is None:
+    if measured.reached is None:
         return None
-    return _distance(measured.view.frame(measured.test.observed), measured.mechanism.frame(measured.wanted))
+    return measured.mechanism.pose_error(measured.test.observed, measured.reached)
 
 
 def commanded(measured: Measured, values: Tensor, machines: Tensor) -> Commanded | None:
     """Pose errors of the simulated machines at the wanted held-out poses, `r x t` each; None for records.
 
     Exact: the joints of the pose by the identified geometry. Linear: Sun et al. 2018, eq. 15, the nominal joints and
-    the parameters' errors by the nominal identification Jacobian, dg/dθ (-J_p⁻¹ E_ac there).
+    the parameters' errors by the nominal identification Jacobian dg/dθ (-J_p⁻¹ E_ac there).
     """
     if measured.wanted is None or measured.truth is None or measured.wanted_joints is None:
         return None
-    return _commanded(
-        measured.mechanism,
-        measured.wanted[machines],
-        measured.wanted_joints[machines],
-        measured.start[machines],
-        values,
-        measured.truth[machines],
-    )
-
-
-def map_error(measured: Measured, values: Tensor, machines: Tensor) -> Tensor | None:
-    """Position error at the points of the map, commanded by a geometry `r x K`; `r x m` [m]; None without a map."""
-    if measured.map is None or measured.truth is None:
-        return None
-    mechanism, place = measured.mechanism, measured.map.expand(len(machines), -1, -1)
-    joints = mechanism.solve_inverse(place, values[:, None], _near(mechanism, measured.map, len(machines)))
-    reached = mechanism.forward_kinematics(joints, measured.truth[machines][:, None], place)
-    return mechanism.pose_error(reached, place).position
-
-
-def _commanded(
-    mechanism: Mechanism, wanted: Tensor, guess: Tensor, nominal: Tensor, values: Tensor, truth: Tensor
-) -> Commanded:
+    wanted, guess, truth = (t[machines] for t in (measured.wanted, measured.wanted_joints, measured.truth))
+    nominal, mechanism = measured.start[machines], measured.mechanism
     near = mechanism.solve_inverse(wanted, nominal[:, None], guess)
-    exact = mechanism.solve_inverse(wanted, values[:, None], near)
+    exact = measured.kinematics.command(wanted, values[:, None], near)
 
     def joints_of(parameters: Tensor) -> Tensor:
         return mechanism.solve_inverse(wanted, parameters, near)
 
-    point = nominal[:, None].expand(*wanted.shape[:-1], -1)
-    slope = jacobian_of(joints_of, point)[1]
+    slope = jacobian_of(joints_of, nominal[:, None].expand(*wanted.shape[:-1], -1))[1]
     linear = near + (slope @ (values - nominal)[:, None, :, None])[..., 0]
 
     def error(joints: Tensor) -> PoseError:
-        return mechanism.pose_error(mechanism.forward_kinematics(joints, truth[:, None], wanted), wanted)
+        return mechanism.pose_error(measured.kinematics.reached(joints, truth[:, None], wanted), wanted)
 
     return Commanded(error(near), error(exact), error(linear))
 
 
-def _near(mechanism: Mechanism, place: Tensor, machines: int) -> Tensor:
-    joints = mechanism.solve_inverse(place)
-    return joints.expand(machines, *joints.shape)
+def map_error(measured: Measured, values: Tensor, machines: Tensor) -> Tensor | None:
+    """RMS over the machines of the position error at the points of the map, commanded by a geometry; `m` [m].
 
-
-def _distance(first: tuple[Tensor, Tensor | None], second: tuple[Tensor, Tensor | None]) -> PoseError:
-    position = torch.linalg.vector_norm(first[0] - second[0], dim=-1)
-    if first[1] is None or second[1] is None:
-        return PoseError(position, None)
-    return PoseError(position, geodesic_angle(first[1], second[1]))
-
+    Args:
+        values: `r x K` [SI].
+    """
+    if measured.map is None or measured.truth is None:
+        return None
+    mechanism, place = measured.mechanism, measured.map.expand(len(machines), -1, -1)
+    guess = mechanism.solve_inverse(measured.map).expand(len(machines), -1, -1)
+    joints = measured.kinematics.command(place, values[:, None], guess)
+    reached = measured.kinematics.reached(joints, measured.truth[machines][:, None], place)
+    return mechanism.pose_error(reached, place).position.square().mean(0).sqrt()
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.runs.identification._kinematics import Kinematics
 
 __all__ = ["Measured", "Rows"]
 
@@ -35,15 +36,17 @@ class Measured:
 
     Attributes:
         mechanism: what is identified.
+        kinematics: how its machines move.
         view: the mechanism as the instrument sees it; its pose coordinates are the columns of `Rows.observed`. The
             mechanism itself, or a view with the same parameters where points on the platform are measured.
         rows: from which all is identified.
         leg_rows: rows for one leg alone, by leg, where each leg has poses of its own; else empty.
-        test: held-out rows.
+        test: held-out rows; their `observed` are poses of the mechanism.
         start: where the search begins, `r x K` [SI]: nominal, or with the frames fitted.
         truth: the simulated machines' parameters, `r x K` [SI]; None for records.
-        wanted, wanted_joints: held-out poses without noise, `r x t x p` [SI], and the joints that take the true machines
-            there, `r x t x n`, which tell the branch; None for records.
+        wanted, wanted_joints: held-out poses that machines are sent to, `r x t x p` [SI], and joints near by, `r x t x n`,
+            which tell the branch; None for records.
+        reached: true poses of the held-out rows, `r x t x p` [SI]; None for records.
         map: poses of the map, `m x p` [SI]; None where none is drawn.
         pose_noise: standard deviation of each observed coordinate, `o` [SI]; None where it is to be estimated.
         joint_noise: of the recorded joints, `n` [SI]; None where there is none.
@@ -54,6 +57,7 @@ class Measured:
     """
 
     mechanism: Mechanism
+    kinematics: Kinematics
     view: Mechanism
     rows: Rows
     leg_rows: dict[int, Rows]
@@ -62,6 +66,7 @@ class Measured:
     truth: Tensor | None = None
     wanted: Tensor | None = None
     wanted_joints: Tensor | None = None
+    reached: Tensor | None = None
     map: Tensor | None = None
     pose_noise: Tensor | None = None
     joint_noise: Tensor | None = None

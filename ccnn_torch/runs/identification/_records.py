@@ -8,6 +8,7 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames
 from ccnn_torch.records import Records, check_rows, load_records
+from ccnn_torch.runs.identification._kinematics import Kinematics
 from ccnn_torch.runs.identification._measured import Measured, Rows
 from ccnn_torch.runs.identification._sizes import size, sizes_by_name, sizes_of_pose
 from ccnn_torch.runs.identify_config import IdentifyConfig
@@ -51,6 +52,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism) -> Measured:
     start, unknown = _frames(mechanism, train)
     return Measured(
         mechanism=mechanism,
+        kinematics=Kinematics(mechanism),
         view=mechanism,
         rows=train,
         leg_rows={},

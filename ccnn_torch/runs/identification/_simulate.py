@@ -13,6 +13,7 @@ from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.runs.identification._designs import choose_places
 from ccnn_torch.runs.identification._instrument import Instrument, make_instrument
+from ccnn_torch.runs.identification._kinematics import make_kinematics
 from ccnn_torch.runs.identification._measured import Measured, Rows
 from ccnn_torch.runs.identification._places import Places
 from ccnn_torch.runs.identification._random import generator_of, normal_draws
@@ -48,9 +49,11 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
         config, places, instrument, about.poses if poses is None else poses, noise, joint_noise, (_PLACES, seeds)
     )
 
-    def measure(place: Tensor, stream: int) -> Rows:
-        joints, pose = places.taken(place)
-        observed = instrument.observe(pose)
+    kinematics = make_kinematics(mechanism, about.as_built)
+
+    def measure(joints: Tensor, pose: Tensor, stream: int) -> Rows:
+        frame = kinematics.frame(joints, truth[:, None], pose) if about.points else (pose, None)
+        observed = instrument.observe(pose, *frame)
         return Rows(
             joints + joint_noise * normal_draws(joints.shape[1:], seeds, stream, 1),
             observed + noise * normal_draws(observed.shape[1:], seeds, stream, 0),
@@ -58,16 +61,19 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
 
     test = places.random(about.test_poses, generator_of(config.seed, _TEST, 2))
     wanted_joints, wanted = places.taken(test)
+    held_out = measure(wanted_joints, wanted, _TEST)
     return Measured(
         mechanism=mechanism,
+        kinematics=kinematics,
         view=instrument.view,
-        rows=measure(common, _ROWS),
-        leg_rows={leg: measure(place, _LEGS + leg) for leg, place in of_legs.items()},
-        test=measure(test, _TEST),
+        rows=measure(*places.taken(common), _ROWS),
+        leg_rows={leg: measure(*places.taken(place), _LEGS + leg) for leg, place in of_legs.items()},
+        test=Rows(held_out.joints, instrument.pose_of(held_out.observed)),
         start=mechanism.nominal.expand(len(seeds), -1).clone(),
         truth=truth,
         wanted=wanted,
         wanted_joints=wanted_joints,
+        reached=kinematics.reached(wanted_joints, truth[:, None], wanted) if about.as_built else wanted,
         map=places.map(about.map) if about.map else None,
         pose_noise=noise,
         joint_noise=joint_noise if bool((joint_noise > 0).any()) else None,

@@ -1,0 +1,59 @@
+"""`ccnn identify`: geometric parameters from measured poses, or from simulated machines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ccnn_torch.errors import InputError
+
+__all__ = ["identify"]
+
+
+def identify(
+    config: Annotated[Path | None, typer.Argument(help="A YAML config, e.g. experiments/five_bar.yaml.")] = None,
+    overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
+    resume: Annotated[Path | None, typer.Option(help="Go on with the identification in this folder.")] = None,
+    out: Annotated[str | None, typer.Option(help="Folder to write; the same as out=….")] = None,
+    seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
+    keys: Annotated[bool, typer.Option("--keys", help="List every key with its default, and do nothing.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no tables.")] = False,
+) -> None:
+    """Identify a machine's geometry: parameters with intervals, what the poses cannot tell, held-out pose error.
+
+    The folder gets identified.json, .csv, .md, plots and report.html, and the machine itself: identified.yaml, which
+    every command takes as a mechanism and ccnn compensate as a model; of a serial arm also identified.urdf and
+    identified_dh.yaml for other tools.
+
+    Examples:
+
+    ccnn identify experiments/five_bar.yaml
+
+    ccnn identify experiments/overconstrained_2dof.yaml methods=[lm,tikhonov] simulate.machines=20
+
+    ccnn identify arm.yaml mechanism=ur10.yaml records=measured.csv out=runs/arm
+
+    ccnn identify --resume runs/arm
+
+    ccnn compensate runs/arm/identified.yaml poses.csv commands.csv --pose
+    """
+    from ccnn_torch.runs.identification import resume_identification, start_identification
+    from ccnn_torch.runs.identify_config import describe_identify_keys, load_identify_config
+
+    if keys:
+        for key, default, description in describe_identify_keys():
+            typer.echo(f"{key}={default}\n    {description}")
+        return
+    if resume is not None:
+        if config is not None or overrides or out is not None or seed is not None:
+            raise InputError("--resume goes on as it was; it takes the folder and nothing beside it")
+        resume_identification(resume, quiet=quiet)
+        return
+    if config is None:
+        raise InputError("name a config, for example: ccnn identify experiments/five_bar.yaml (or --resume DIR)")
+    changes = list(overrides or [])
+    changes += [f"out={out}"] if out is not None else []
+    changes += [f"seed={seed}"] if seed is not None else []
+    start_identification(load_identify_config(config, changes), quiet=quiet)

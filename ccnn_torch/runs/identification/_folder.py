@@ -1,0 +1,93 @@
+"""`ccnn identify`: a config to a finished folder, and an unfinished folder to a finished one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.identification import Progress
+from ccnn_torch.report.identified_tables import print_identified
+from ccnn_torch.runs.folder import RunFolder
+from ccnn_torch.runs.identification._identify import Identification, identify
+from ccnn_torch.runs.identification._outputs import RESULTS, write_outputs
+from ccnn_torch.runs.identify_config import IdentifyConfig, dump_identify_config, load_identify_config
+from ccnn_torch.runs.screen import note, stderr, stdout
+
+__all__ = ["resume_identification", "start_identification"]
+
+
+def start_identification(config: IdentifyConfig, quiet: bool = False) -> Path:
+    """Identify into a fresh folder.
+
+    Raises:
+        InputError: the config or its data cannot be used, or the folder is taken.
+    """
+    folder = RunFolder.create(config.out, config.name, "ccnn identify --resume")
+    try:
+        folder.write_text("config.yaml", dump_identify_config(config))
+        _run(config, folder.path, quiet)
+    except InputError:
+        # Nothing was computed: the next try may take the same name.
+        if not any(folder.path.glob("methods/*")):
+            folder.config.unlink(missing_ok=True)
+            folder.path.rmdir()
+        raise
+    return folder.path
+
+
+def resume_identification(path: Path, quiet: bool = False) -> Path:
+    """Finish the identification in a folder; methods that are finished are kept.
+
+    Raises:
+        InputError: there is none in the folder, or its records were changed.
+    """
+    if not (path / "config.yaml").is_file():
+        raise InputError(f"{path} has no config.yaml, so there is nothing to resume; name a folder of ccnn identify")
+    if (path / RESULTS).is_file():
+        note(f"{path} is finished; nothing to do", quiet)
+        return path
+    _run(load_identify_config(path / "config.yaml"), path, quiet)
+    return path
+
+
+def _run(config: IdentifyConfig, path: Path, quiet: bool) -> Identification:
+    bars = _Bars(quiet)
+    try:
+        found = identify(config, path / "methods", bars.watch)
+    finally:
+        bars.stop()
+    note("writing tables, plots and files …", quiet)
+    write_outputs(found, path)
+    if not quiet:
+        print_identified(found.results, stdout)
+        stdout.print(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
+    return found
+
+
+@dataclass
+class _Bars:
+    """A line on stderr for each method; silent off a terminal."""
+
+    quiet: bool
+
+    def __post_init__(self) -> None:
+        self._bar = Bar(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeRemainingColumn(),
+            console=stderr,
+            disable=self.quiet or not stderr.is_terminal,
+        )
+
+    def watch(self, label: str) -> Progress:
+        self._bar.start()
+        task = self._bar.add_task(label, total=1.0)
+        return lambda done: self._bar.update(task, completed=done)
+
+    def stop(self) -> None:
+        self._bar.stop()
