@@ -62,7 +62,7 @@ def solve_lm(
     machines, k = problem.start.shape
     size = max(1, starts * rows.weights.shape[1] * rows.channels * k)
     everyone = torch.arange(machines, device=problem.start.device)
-    blocks = torch.split(everyone, max(1, _BLOCK // size))  # type: ignore[no-untyped-call]
+    blocks = torch.split(everyone, max(1, _BLOCK // size))
     begin = _starts(rows, starts, seed)
     values, cost, converged, count = torch.empty_like(problem.start), [], [], 0
     for block in blocks:
