@@ -55,13 +55,13 @@ class Stewart(Mechanism):
             high=(0.1, 0.1, height + 0.1, tilt, tilt, tilt),
         )
         if type(self) is Stewart:
-            self.recipe = {"spec": "stewart", "keys": {}}
+            self.recipe = {"spec": "stewart", "keys": {"height": height}}
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Distances between the joints of each leg, less the offset, by the gain; closed form, for every pose."""
         values = self.resolve(parameters)
         legs = values.reshape(*values.shape[:-1], 6, 8)
-        length = torch.linalg.vector_norm(self._arms_and_legs(pose, values)[1], dim=-1)
+        length: Tensor = torch.linalg.vector_norm(self._arms_and_legs(pose, values)[1], dim=-1)
         return (length - legs[..., 6]) / legs[..., 7]
 
     def forward_kinematics(
@@ -85,7 +85,7 @@ class Stewart(Mechanism):
         gain = values.reshape(*values.shape[:-1], 6, 8)[..., 7, None]
         known = torch.isfinite(pose).all(-1)[..., None, None]
         eye = torch.eye(6, dtype=rows.dtype)
-        inverse: Tensor = torch.linalg.solve(torch.where(known, rows / gain, eye), eye)
+        inverse: Tensor = torch.linalg.inv(torch.where(known, rows / gain, eye))
         return torch.where(known, inverse, torch.nan)
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
@@ -99,7 +99,7 @@ class Stewart(Mechanism):
         return same
 
     def _arms_and_legs(self, pose: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """From the platform's origin to its joints, and from base to platform joint, in base axes; `... x 6 x 3` [m]."""
+        """From the platform's origin to its joints, and from base to platform joint, `... x 6 x 3` [m] in base axes."""
         legs = values.reshape(*values.shape[:-1], 6, 8)
         position, rotation = self.frame(pose)
         arm = (rotation[..., None, :, :] @ legs[..., 3:6, None])[..., 0]
