@@ -7,11 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import expand_leading
 from ccnn_torch.coordinates import Coordinate, Parameter
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms._mechanism import Mechanism
-from ccnn_torch.rotations import rotation_vector_to_matrix
+from ccnn_torch.mechanisms._numeric import solve
+from ccnn_torch.rotations import rotation_vector_rate, rotation_vector_to_matrix
 
 __all__ = ["Stewart"]
 
@@ -68,35 +67,46 @@ class Stewart(Mechanism):
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
     ) -> Tensor:
         """Newton from the middle of the workspace (or `guess`); NaN where it leaves the assembly mode."""
-        pose = super().forward_kinematics(joints, parameters, guess)
-        return torch.where(self.reachable(pose.detach(), parameters)[..., None], pose, torch.nan)
+        values = self.resolve(parameters)
+
+        def closure(pose: Tensor, joints: Tensor, values: Tensor) -> Tensor:
+            return self.solve_inverse(pose, values) - joints
+
+        def slope(pose: Tensor, joints: Tensor, values: Tensor) -> Tensor:
+            rows = self._joint_rates(pose, values)
+            return torch.cat([rows[..., :3], rows[..., 3:] @ rotation_vector_rate(pose[..., 3:])], dim=-1)
+
+        pose = solve(closure, self.home_pose if guess is None else guess, (joints, values), slope)
+        return torch.where(self.reachable(pose.detach(), values.detach())[..., None], pose, torch.nan)
 
     def frame(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Position and rotation of the platform."""
         return pose[..., :3], rotation_vector_to_matrix(pose[..., 3:])
 
     def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
-        """Inverse of the matrix with a row (u, R p x u) / gain per leg, u its direction; see `Mechanism.jacobian`."""
+        """Closed form at the pose of the joints; see `Mechanism.jacobian`."""
         values = self.resolve(parameters)
         pose = self.forward_kinematics(joints, values, guess)
-        arm, leg = self._arms_and_legs(pose, values)
-        direction = leg / torch.linalg.vector_norm(leg, dim=-1, keepdim=True)
-        rows = torch.cat([direction, torch.linalg.cross(arm, direction, dim=-1)], dim=-1)
-        gain = values.reshape(*values.shape[:-1], 6, 8)[..., 7, None]
         known = torch.isfinite(pose).all(-1)[..., None, None]
-        eye = torch.eye(6, dtype=rows.dtype)
-        inverse: Tensor = torch.linalg.inv(torch.where(known, rows / gain, eye))
-        return torch.where(known, inverse, torch.nan)
+        rows = torch.where(known, self._joint_rates(pose, values), torch.eye(6, dtype=pose.dtype))
+        return torch.where(known, torch.linalg.inv(rows), torch.nan)
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """The assembly mode: det(∂q/∂X) has the sign that it has in the middle of the workspace; `...`, bool."""
-        parameters = self.resolve(parameters)
-        sides = [
-            torch.linalg.det(jacobian_of(lambda x: self.solve_inverse(x, parameters), expand_leading(x, parameters))[1])
-            for x in (pose, self.home_pose)
-        ]
-        same: Tensor = sides[0] * sides[1] > 0
+        values = self.resolve(parameters)
+        here, home = (torch.linalg.det(self._joint_rates(x, values)) for x in (pose, self.home_pose))
+        same: Tensor = here * home > 0
         return same
+
+    def _joint_rates(self, pose: Tensor, values: Tensor) -> Tensor:
+        """Joints' rates per velocity and rate of rotation of the platform, `... x 6 x 6`.
+
+        One row (u, R p x u) / gain per leg, u its direction and R p its joint on the platform.
+        """
+        arm, leg = self._arms_and_legs(pose, values)
+        direction = leg / torch.linalg.vector_norm(leg, dim=-1, keepdim=True)
+        gain = values.reshape(*values.shape[:-1], 6, 8)[..., 7, None]
+        return torch.cat([direction, torch.linalg.cross(arm, direction, dim=-1)], dim=-1) / gain
 
     def _arms_and_legs(self, pose: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """From the platform's origin to its joints, and from base to platform joint, `... x 6 x 3` [m] in base axes."""
