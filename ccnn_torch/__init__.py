@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ccnn_torch.pseudoerror import joint_deviations as joint_deviations
     from ccnn_torch.records import load_records as load_records
     from ccnn_torch.runs.api import calibrate as calibrate
+    from ccnn_torch.runs.api import identify as identify
 
 __version__ = "0.1.0"
 
@@ -24,6 +25,7 @@ _HOMES = {
     "Compensator": "ccnn_torch.compensation",
     "Mechanism": "ccnn_torch.mechanisms",
     "calibrate": "ccnn_torch.runs.api",
+    "identify": "ccnn_torch.runs.api",
     "joint_deviations": "ccnn_torch.pseudoerror",
     "load_mechanism": "ccnn_torch.mechanisms",
     "load_model": "ccnn_torch.compensation",

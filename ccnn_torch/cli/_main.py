@@ -10,6 +10,7 @@ import typer
 
 from ccnn_torch import __version__
 from ccnn_torch.cli.compensate import compensate
+from ccnn_torch.cli.identify import identify
 from ccnn_torch.cli.keys import keys
 from ccnn_torch.cli.picture import picture
 from ccnn_torch.cli.run import run
@@ -42,7 +43,7 @@ def _common(
         typer.echo(context.get_help())
 
 
-for _command in (run, suite, compensate, picture, keys):
+for _command in (run, suite, identify, compensate, picture, keys):
     app.command(epilog=(_command.__doc__ or "").partition("\n\n")[2])(_command)
 
 

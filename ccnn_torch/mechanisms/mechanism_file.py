@@ -1,10 +1,10 @@
 """Our own mechanism file: which mechanism, which keys, and every parameter's nominal and identified value.
 
-    mechanism: five_bar
-    keys: {}
-    parameters:
-      A1x: {value: -0.5057, nominal: -0.5, unit: m}
-      …
+mechanism: five_bar
+keys: {}
+parameters:
+  A1x: {value: -0.5057, nominal: -0.5, unit: m}
+  …
 """
 
 from __future__ import annotations

@@ -15,7 +15,14 @@ from ccnn_torch.report.identified_paper import paper_tables
 from ccnn_torch.report.table_form import Table, print_table
 from ccnn_torch.report.tables import markdown_table
 
-__all__ = ["identified_markdown", "identified_tables", "identified_verdict", "print_identified", "unknown_sentences", "write_identified_csv"]
+__all__ = [
+    "identified_markdown",
+    "identified_tables",
+    "identified_verdict",
+    "print_identified",
+    "unknown_sentences",
+    "write_identified_csv",
+]
 
 Block = Mapping[str, Any]
 

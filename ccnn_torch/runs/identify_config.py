@@ -222,7 +222,7 @@ class IdentifyConfig(_Part):
         if self.simulate is not None and self.simulate.points and self.residual == "forward":
             raise ValueError("residual: measured points are compared by joints; write residual=inverse or auto")
         if self.simulate is not None and self.simulate.as_built and not self.simulate.points:
-            raise ValueError("simulate.as_built: a machine off its nominal motion is measured by points; give simulate.points")
+            raise ValueError("simulate.as_built: such a machine is measured by points; give simulate.points")
         wrong = [name for name in self.settings if name not in IDENTIFY_METHODS]
         if wrong:
             raise ValueError(f"settings: '{wrong[0]}' is no method; known are {', '.join(IDENTIFY_METHODS)}")

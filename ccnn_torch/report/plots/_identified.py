@@ -100,7 +100,13 @@ def deviation_plots(results: Results, arrays: Arrays) -> list[Plot]:
         bound = np.median(arrays[f"bound_{methods[0]}"][:, at], axis=0) / scale
         known = np.isfinite(bound)
         axes.plot(
-            np.arange(len(at))[known], bound[known], "_", color=FLOOR, markersize=14, markeredgewidth=2, label="bound (1σ)"
+            np.arange(len(at))[known],
+            bound[known],
+            "_",
+            color=FLOOR,
+            markersize=14,
+            markeredgewidth=2,
+            label="bound (1σ)",
         )
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")

@@ -8,13 +8,10 @@ from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.runs.identification._figures import figures
 from ccnn_torch.runs.identification._judge import commanded
 from ccnn_torch.runs.identification._simulate import simulate
-from ccnn_torch.runs.identification._solve import Outcome, free_values, run_method, select
+from ccnn_torch.runs.identification._solve import QUICK, Outcome, free_values, run_method, select
 from ccnn_torch.runs.identify_config import IdentifyConfig, base_method
 
 __all__ = ["count_study"]
-
-# The methods that are quick enough to be run once for every number of poses.
-_QUICK = ("lm", "tikhonov")
 
 
 def count_study(config: IdentifyConfig, mechanism: Mechanism) -> list[dict[str, Any]]:
@@ -29,7 +26,7 @@ def count_study(config: IdentifyConfig, mechanism: Mechanism) -> list[dict[str, 
     for poses in config.simulate.counts:
         measured = simulate(config, mechanism, poses)
         block: dict[str, Any] = {"poses": poses, "methods": {}}
-        for method in (m for m in config.methods if base_method(m) in _QUICK):
+        for method in (m for m in config.methods if base_method(m) in QUICK):
             outcome: Outcome = run_method(method, measured, config)
             found = commanded(measured, outcome.values, outcome.machines)
             assert found is not None and measured.truth is not None

@@ -8,18 +8,30 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from ccnn_torch.identification import ParameterChoice, Progress, bootstrap
-from ccnn_torch.mechanisms import Framed, Mechanism, load_mechanism
+from ccnn_torch.errors import InputError
+from ccnn_torch.identification import Fit, Progress, bootstrap
+from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.runs.identification._assemble import assemble
 from ccnn_torch.runs.identification._counts import count_study
 from ccnn_torch.runs.identification._measured import Measured
 from ccnn_torch.runs.identification._records import from_records
 from ccnn_torch.runs.identification._simulate import simulate
-from ccnn_torch.runs.identification._solve import Outcome, frames_first, is_apart, pieces_of, run_method, solver_of
+from ccnn_torch.runs.identification._solve import (
+    QUICK,
+    Outcome,
+    frames_first,
+    free_values,
+    is_apart,
+    pieces_of,
+    run_method,
+    select,
+    solver_of,
+)
 from ccnn_torch.runs.identification._store import load_outcome, save_outcome
-from ccnn_torch.runs.identify_config import IdentifyConfig
+from ccnn_torch.runs.identify_config import IdentifyConfig, base_method
 
 __all__ = ["Identification", "Watch", "identify"]
 
@@ -63,6 +75,8 @@ def prepare(config: IdentifyConfig) -> tuple[Mechanism, Measured]:
     """
     mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
     if config.frame.base or config.frame.tool:
+        from ccnn_torch.mechanisms.framed import Framed
+
         mechanism = Framed(mechanism, base=config.frame.base, tool=config.frame.tool)
     measured = from_records(config, mechanism) if config.records is not None else simulate(config, mechanism)
     return mechanism, frames_first(measured, config)
@@ -81,7 +95,7 @@ def identify(config: IdentifyConfig, store: Path | None = None, watch: Watch | N
     mechanism, measured = prepare(config)
     for method in config.methods:  # what cannot be solved is said before anything takes minutes
         solver_of(method, config)
-        pieces_of(measured, config, is_apart(method, config), _first(measured))
+        pieces_of(measured, config, is_apart(method, config), torch.arange(1))
     mark = _fingerprint(measured)
     outcomes: dict[str, Outcome] = {}
     for method in config.methods:
@@ -93,5 +107,37 @@ def identify(config: IdentifyConfig, store: Path | None = None, watch: Watch | N
                 save_outcome(path, outcome, mark)
         outcomes[method] = outcome
     counts = count_study(config, mechanism)
-    done = assemble(config, measured, outcomes, counts, _bootstrap(config, measured))
+    done = assemble(config, measured, outcomes, counts, _bootstrap(config, measured, outcomes))
     return Identification(config, measured, outcomes, done.results, done.arrays)
+
+
+def _bootstrap(config: IdentifyConfig, measured: Measured, outcomes: dict[str, Outcome]) -> Tensor | None:
+    """Standard deviations of the first machine's parameters over resampled fits, `k` [SI]; None where not asked for.
+
+    Raises:
+        InputError: of a slow method: hundreds of its fits would take hours.
+    """
+    if config.bootstrap == 0:
+        return None
+    method = config.methods[0]
+    if base_method(method) not in QUICK:
+        raise InputError(f"bootstrap: {method} takes too long to be run again and again; put lm first in methods")
+    selection, outcome = select(measured, config), outcomes[method]
+    one, solver = torch.arange(1), solver_of(method, config)
+    names = [p.name for p in selection.parameters]
+    sd = torch.full((len(names),), torch.nan, dtype=torch.float64)
+    found = free_values(selection, outcome.values[:1])
+    for number, piece in enumerate(pieces_of(measured, config, is_apart(method, config), one)):
+        at = torch.tensor([names.index(p.name) for p in piece.problem.parameters])
+        fit = Fit(found[:, at], torch.zeros(1), outcome.converged[:1], 0, "")
+        sd[at] = bootstrap(piece.problem, fit, solver, config.bootstrap, config.seed + number).sd()[0]
+    return sd
+
+
+def _fingerprint(measured: Measured) -> str:
+    """SHA-256 of the rows and of where the search begins."""
+    digest = hashlib.sha256()
+    rows = [measured.rows, measured.test, *measured.leg_rows.values()]
+    for table in (measured.start, *(t for r in rows for t in (r.joints, r.observed))):
+        digest.update(table.contiguous().numpy().tobytes())
+    return digest.hexdigest()

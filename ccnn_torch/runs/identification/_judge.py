@@ -78,4 +78,3 @@ def map_error(measured: Measured, values: Tensor, machines: Tensor) -> Tensor | 
     joints = measured.kinematics.command(place, values[:, None], guess)
     reached = measured.kinematics.reached(joints, measured.truth[machines][:, None], place)
     return mechanism.pose_error(reached, place).position.square().mean(0).sqrt()
-

@@ -67,4 +67,3 @@ def make_kinematics(mechanism: Mechanism, built: bool) -> Kinematics:
             "simulate; remove the key"
         )
     return Kinematics(mechanism, built)
-

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import torch
 from torch import Tensor
 
 from ccnn_torch.mechanisms import Mechanism
@@ -44,8 +43,8 @@ class Measured:
         test: held-out rows; their `observed` are poses of the mechanism.
         start: where the search begins, `r x K` [SI]: nominal, or with the frames fitted.
         truth: the simulated machines' parameters, `r x K` [SI]; None for records.
-        wanted, wanted_joints: held-out poses that machines are sent to, `r x t x p` [SI], and joints near by, `r x t x n`,
-            which tell the branch; None for records.
+        wanted, wanted_joints: held-out poses that machines are sent to, `r x t x p` [SI], and joints near by,
+            `r x t x n` [SI], which tell the branch; None for records.
         reached: true poses of the held-out rows, `r x t x p` [SI]; None for records.
         map: poses of the map, `m x p` [SI]; None where none is drawn.
         pose_noise: standard deviation of each observed coordinate, `o` [SI]; None where it is to be estimated.

@@ -45,9 +45,9 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
     noise = _noise(about, instrument)
     joint_noise = _joint_noise(about, mechanism)
     places = Places(mechanism, truth, about.box, about.circle)
-    common, of_legs = choose_places(
-        config, places, instrument, about.poses if poses is None else poses, noise, joint_noise, (_PLACES, seeds)
-    )
+    count = about.poses if poses is None else poses
+    common = choose_places(config, places, count, seeds, _PLACES)
+    of_legs: dict[int, Tensor] = {}
 
     kinematics = make_kinematics(mechanism, about.as_built)
 

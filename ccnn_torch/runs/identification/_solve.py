@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -17,21 +17,23 @@ from ccnn_torch.identification import (
     Progress,
     Solver,
     forward_problem,
-    get_solver,
     inverse_problem,
     split_by_leg,
     what_is_known,
 )
 from ccnn_torch.identification.parameters import Selection, select_parameters
+from ccnn_torch.identification.solvers import get_solver
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.runs.identification._measured import Measured, Rows
 from ccnn_torch.runs.identification._sizes import size
 from ccnn_torch.runs.identify_config import PER_LEG, IdentifyConfig, base_method
 
 __all__ = [
+    "QUICK",
     "Outcome",
     "Piece",
     "choice_of",
+    "frames_first",
     "free_values",
     "is_apart",
     "knowledge_of",
@@ -42,8 +44,8 @@ __all__ = [
     "solver_of",
 ]
 
-# Global searches take minutes where lm takes a blink.
-_SLOW = ("hga", "ga", "sa", "pso")
+QUICK = ("lm", "tikhonov")
+"""The others are global searches, which take minutes where these take a blink."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,28 @@ def _problem(measured: Measured, config: IdentifyConfig, rows: Rows, machines: T
     )
 
 
+def frames_first(measured: Measured, config: IdentifyConfig) -> Measured:
+    """The rows with those frames fitted that no maker can know: the search and "before" begin from there."""
+    if not (config.frame.base or config.frame.tool):
+        return measured
+    prefixes = tuple(f"{part}_" for part, free in (("base", config.frame.base), ("tool", config.frame.tool)) if free)
+    names = tuple(p.name for p in measured.mechanism.geometry if p.name.startswith(prefixes))
+    choice = ParameterChoice(free=names)
+    problem = forward_problem(
+        measured.view,
+        measured.rows.joints,
+        measured.rows.observed,
+        choice=choice,
+        pose_noise=measured.pose_noise,
+        joint_noise=measured.joint_noise,
+        rotation_weight=config.rotation_weight,
+        start=measured.start,
+    )
+    found = get_solver("lm")(problem, config.seed)
+    start = select_parameters(measured.mechanism.geometry, choice, measured.start).full(found.values)
+    return replace(measured, start=start, unknown_frame=names)
+
+
 def is_apart(method: str, config: IdentifyConfig) -> bool:
     """Whether a method identifies leg by leg."""
     return config.per_leg or method.endswith(PER_LEG)
@@ -156,7 +180,7 @@ def is_apart(method: str, config: IdentifyConfig) -> bool:
 def machines_of(method: str, measured: Measured, config: IdentifyConfig) -> Tensor:
     """Which machines a method is run on: slow ones on the first few only."""
     count = measured.machines
-    return torch.arange(min(count, config.hga_machines) if base_method(method) in _SLOW else count)
+    return torch.arange(min(count, config.hga_machines) if base_method(method) not in QUICK else count)
 
 
 def solver_of(method: str, config: IdentifyConfig) -> Solver:
@@ -184,7 +208,7 @@ def run_method(method: str, measured: Measured, config: IdentifyConfig, progress
     fits: list[Fit] = []
     for i, piece in enumerate(pieces):
         part = None if progress is None else _part(progress, i, len(pieces))
-        fits.append(solver(piece.problem, config.seed, part))
+        fits.append(solver(piece.problem, config.seed + i, part))
     seconds = time.perf_counter() - begun
     values = whole_values(selection, pieces, [fit.values for fit in fits], machines)
     said = [fit.message for fit in fits if fit.message]
@@ -201,11 +225,10 @@ def run_method(method: str, measured: Measured, config: IdentifyConfig, progress
 def whole_values(selection: Selection, pieces: list[Piece], values: list[Tensor], machines: Tensor) -> Tensor:
     """The whole geometry `r x K` from the values `r x k` of each piece's free parameters."""
     names = [p.name for p in selection.parameters]
-    free = selection.start.expand(int(machines.max()) + 1, -1)[machines].clone()
+    free = selection.start[machines].clone()
     for piece, found in zip(pieces, values, strict=True):
         free[:, [names.index(p.name) for p in piece.problem.parameters]] = found
-    fixed = selection.fixed.expand(int(machines.max()) + 1, -1)[machines]
-    return free @ selection.spread + fixed
+    return free @ selection.spread + selection.fixed[machines]
 
 
 def free_values(selection: Selection, whole: Tensor) -> Tensor:
