@@ -121,8 +121,21 @@ def inverse_root(matrix: Tensor, used: Tensor, what: str) -> Tensor:
     return root
 
 
-def check_finite(residual: Tensor, used: Tensor, pose: Tensor, mechanism: Mechanism, channels: Sequence[str]) -> None:
-    """Name the first row (and leg) whose residual `r x s x c` is not finite although it is used.
+def check_finite(
+    residual: Tensor,
+    used: Tensor,
+    given: Tensor,
+    coordinates: Sequence[Coordinate],
+    mechanism: str,
+    channels: Sequence[str],
+) -> None:
+    """Name the first row, and its channel, whose residual `r x s x c` is not finite although it is used (`r x s`).
+
+    Args:
+        residual, used: see above.
+        given: what the kinematics were solved for, `r x s x …`, with its coordinates.
+        mechanism: its name.
+        channels: names of the `c` columns.
 
     Raises:
         InputError: there is one: the pose is out of reach.
@@ -131,11 +144,11 @@ def check_finite(residual: Tensor, used: Tensor, pose: Tensor, mechanism: Mechan
     if not len(lost):
         return
     machine, row, channel = (int(i) for i in lost[0])
-    many = len(torch.unique(lost[:, :2], dim=0))
-    values = pose.expand(len(residual), -1, -1)[machine, row].tolist()
-    where = ", ".join(f"{c.name} = {v:.6g} {c.unit}" for c, v in zip(mechanism.pose, values, strict=True))
+    many = len(torch.unique(lost[:, 1]))
+    values = given[machine if len(given) > 1 else 0, row].tolist()
+    where = ", ".join(f"{c.name} = {v:.6g} {c.unit}" for c, v in zip(coordinates, values, strict=True))
     raise InputError(
-        f"row {row + 1}: mechanism '{mechanism.name}' with its starting geometry does not reach this pose "
-        f"({where}): there is no {channels[channel]} ({many} rows so in all); check units, frame and starting values, "
-        "or leave the row out"
+        f"row {row + 1}: {mechanism} with its starting geometry is out of reach at {where}: {channels[channel]} has no "
+        f"solution ({many} {'row' if many == 1 else 'rows'} so in all); check units, frame and starting values, or "
+        "leave the row out"
     )

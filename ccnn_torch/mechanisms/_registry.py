@@ -11,11 +11,13 @@ from typing import Any
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.mechanisms.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.dh_file import read_dh_file
 from ccnn_torch.mechanisms.five_bar import FiveBar
 from ccnn_torch.mechanisms.machine_tool import MachineTool
 from ccnn_torch.mechanisms.overconstrained import Overconstrained2Dof
 from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.mechanisms.stewart import Stewart
 from ccnn_torch.mechanisms.tripod import Tripod
 from ccnn_torch.mechanisms.urdf import read_urdf
 from ccnn_torch.plugins import is_plugin, load_plugin
@@ -27,6 +29,9 @@ REGISTRY: dict[str, Callable[..., Mechanism]] = {
     "machine_tool": MachineTool,
     "five_bar": FiveBar,
     "overconstrained_2dof": Overconstrained2Dof,
+    "stewart": Stewart,
+    "delta": Delta,
+    "delta_linear": DeltaLinear,
     "serial": SerialArm,
 }
 
