@@ -34,7 +34,7 @@ def combinations_in_words(parameters: Sequence[Parameter], hidden: Tensor, scale
     sizes = scale.cpu().numpy()
     sentences = []
     for number in range(count):
-        members = np.flatnonzero((group == number) & part)
+        members = np.flatnonzero((group == number) & part).tolist()
         if len(members):
             visible = _visible(projector[np.ix_(members, members)]) / sizes[members]
             sentences.append(_sentence([parameters[i].name for i in members], visible))

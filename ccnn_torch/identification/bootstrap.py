@@ -98,7 +98,8 @@ def _redrawn(problem: Problem, values: Tensor, uniform: Tensor) -> Tensor:
     root = problem.weights.sqrt()[..., None]
     equations = (problem.weights > 0).sum(-1) * len(problem.channels)
     raised = (equations / (equations - values.shape[-1]).clamp_min(1)).sqrt()[:, None, None]
-    pool = left * root * raised
+    pool = left * root
+    pool = (pool - pool.sum(-2, keepdim=True) / (root > 0).sum(-2, keepdim=True)) * raised
     # The n-th used row of a machine, n drawn uniformly.
     order = torch.argsort((problem.weights == 0).to(torch.int8), dim=-1, stable=True)
     number = (uniform * (problem.weights > 0).sum(-1)[:, None]).long()

@@ -15,6 +15,7 @@ from ccnn_torch.identification.robust import LOSSES, loss_weights
 __all__ = ["solve_lm"]
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-14, 1e6
+_ROUNDING = 1e-9  # Step in plausible errors that is nothing: 1e-12 m.
 _BLOCK = 8_000_000  # Numbers in the Jacobian of the machines that are worked on at once.
 _REACH = 3.0  # Starts lie within so many plausible errors.
 _ROUNDS = 30  # Of reweighting.
@@ -146,6 +147,7 @@ def _descend(
         left = promised * (promised / before.clamp_min(1e-300)).clamp_max(1)
         variance = 2 * cost / free
         near = (left <= tolerance**2 / 2 * variance) | (promised <= least) | (promised <= 1e-13 * cost)
+        near |= (step.abs().amax(-1) <= _ROUNDING) & (damping <= 1e-2)
         near &= ~done
         # So small a step keeps its promise: no need to look.
         x = torch.where(near[..., None], x + scale * step, x)

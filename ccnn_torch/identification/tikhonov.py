@@ -109,8 +109,8 @@ def _curvature(weight: Tensor, passed: Tensor, part: Tensor, size2: Tensor, misf
     eta, rho = size2.clamp_min(1e-300), misfit2.clamp_min(1e-300)
     # d(size²)/dα, and d(misfit²)/dα = -α² d(size²)/dα (Hansen 1998, section 4.6).
     slope = -4 / weight * ((1 - passed) * part.square()).sum(-1)
-    bend = 2 * eta * rho / slope.clamp_max(-1e-300)
+    bend = -2 * eta * rho / slope.clamp_max(-1e-300)
     top = weight.square() * slope * rho + 2 * weight * eta * rho + weight**4 * eta * slope
-    value = bend * top / (weight.square() * eta.square() + rho.square()).pow(1.5)
+    value = bend * top / (weight**4 * eta.square() + rho.square()).pow(1.5)
     known = (slope < -1e-290) & (misfit2 > 0) & torch.isfinite(value)
     return torch.where(known, value, -torch.inf)
