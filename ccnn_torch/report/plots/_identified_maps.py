@@ -26,7 +26,9 @@ def map_plot(results: Results, arrays: Arrays) -> Plot | None:
         return None
     maps = {"before": arrays["map_before"]}
     maps |= {m: arrays[f"map_{m}"] for m in results["methods"] if f"map_{m}" in arrays}
-    place = arrays["map"][:, :2]
+    known = np.isfinite(np.stack(list(maps.values()))).all(0)
+    place = arrays["map"][known, :2]
+    maps = {name: values[known] for name, values in maps.items()}
     after = np.concatenate([v for name, v in maps.items() if name != "before"])
     scale, unit = display_unit("m", float(np.median(after)))
     norm = LogNorm(float(np.quantile(after, 0.01)) / scale, float(np.quantile(after, 0.99)) / scale, clip=True)
@@ -34,7 +36,8 @@ def map_plot(results: Results, arrays: Arrays) -> Plot | None:
     figure = Figure(figsize=(3.3 * len(maps) + 1.2, 3.5), layout="constrained")
     told = []
     drawn: Any = None
-    for axes, (name, values) in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps.items(), strict=True):
+    panels = figure.subplots(1, len(maps), squeeze=False)[0]
+    for axes, (name, values) in zip(panels, maps.items(), strict=True):
         own = name == "before"
         shown = values / (first_scale if own else scale)
         # Before, the error is hundreds of times larger: it has a scale of its own.
@@ -50,7 +53,7 @@ def map_plot(results: Results, arrays: Arrays) -> Plot | None:
         else:
             drawn = picture
     if drawn is not None:
-        figure.colorbar(drawn, ax=figure.axes, shrink=0.8, label=unit)
+        figure.colorbar(drawn, ax=list(panels[1:]), shrink=0.8, label=unit)
     return Plot(
         "map",
         figure,

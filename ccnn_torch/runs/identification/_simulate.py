@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.runs.identification._designs import choose_places
+from ccnn_torch.runs.identification._designs import choose_places, plan_places
 from ccnn_torch.runs.identification._instrument import Instrument, make_instrument
 from ccnn_torch.runs.identification._kinematics import make_kinematics
 from ccnn_torch.runs.identification._measured import Measured, Rows
@@ -43,11 +43,15 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
     truth = mechanism.nominal + _errors(mechanism, about, seeds)
     instrument = make_instrument(mechanism, about.points)
     noise = _noise(about, instrument)
-    joint_noise = _joint_noise(about, mechanism)
+    joint_sd = _joint_noise(about, mechanism)
+    joint_noise = joint_sd if bool((joint_sd > 0).any()) else None
     places = Places(mechanism, truth, about.box, about.circle)
     count = about.poses if poses is None else poses
-    common = choose_places(config, places, count, seeds, _PLACES)
     of_legs: dict[int, Tensor] = {}
+    if about.design.startswith("planned"):
+        common, of_legs = plan_places(config, places, instrument, count, noise, joint_noise)
+    else:
+        common = choose_places(config, places, count, seeds, _PLACES)
 
     kinematics = make_kinematics(mechanism, about.as_built)
 
@@ -55,7 +59,7 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
         frame = kinematics.frame(joints, truth[:, None], pose) if about.points else (pose, None)
         observed = instrument.observe(pose, *frame)
         return Rows(
-            joints + joint_noise * normal_draws(joints.shape[1:], seeds, stream, 1),
+            joints + joint_sd * normal_draws(joints.shape[1:], seeds, stream, 1),
             observed + noise * normal_draws(observed.shape[1:], seeds, stream, 0),
         )
 
@@ -76,7 +80,7 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
         reached=kinematics.reached(wanted_joints, truth[:, None], wanted) if about.as_built else wanted,
         map=places.map(about.map) if about.map else None,
         pose_noise=noise,
-        joint_noise=joint_noise if bool((joint_noise > 0).any()) else None,
+        joint_noise=joint_noise,
     )
 
 
