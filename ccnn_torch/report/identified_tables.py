@@ -34,10 +34,7 @@ def identified_verdict(results: Block) -> str:
         return "The pose error could not be judged."
     parts = []
     for name, block in named:
-        scale, unit = display_unit(block["unit"], block["after"])
-        parts.append(
-            f"{name} {number_text(block['before'] / scale, 3)} → {number_text(block['after'] / scale, 3)} {unit} RMS"
-        )
+        parts.append(f"{name} {_with_unit(block, 'before')} → {_with_unit(block, 'after')} RMS")
     rows = count_text(results["rows"]["test"], "held-out pose")
     machines = f" of {results['machines']} machines" if results["machines"] > 1 else ""
     text = f"On {rows}{machines} {results['method']} brings the predicted pose nearer to the measured one: "
@@ -94,6 +91,11 @@ def _text(block: Block | None, key: str, scale: float = 1.0, digits: int = 3) ->
     return text
 
 
+def _with_unit(block: Block, key: str) -> str:
+    scale, unit = display_unit(block["unit"], block[key])
+    return f"{number_text(block[key] / scale, 3)} {unit}"
+
+
 def _parameter_table(results: Block) -> Table:
     simulated = results["simulated"]
     rows = []
@@ -103,16 +105,21 @@ def _parameter_table(results: Block) -> Table:
         size = block["sd"] or abs(block["value"] - block["nominal"])
         scale, unit = display_unit(block["unit"], max(size, 1e-6))
         sd = _text(block, "sd", scale) if block["identifiable"] else "not identifiable"
-        change = (block["value"] - block["nominal"]) / scale
-        cells = [f"{name} [{unit}]", number_text(block["nominal"] / scale, 6), number_text(change, 4), sd]
+        nominal = f"{number_text(block['nominal'], 6)} {block['unit']}".removesuffix(" 1")
+        cells = [f"{name} [{unit}]", nominal]
         if simulated:
-            cells.append(_text(block, "deviation", scale))
-        elif "sd_bootstrap" in block:
+            cells += [_text(block, "error_before", scale), _text(block, "deviation", scale)]
+        else:
+            cells.append(number_text((block["value"] - block["nominal"]) / scale, 4))
+        cells.append(sd)
+        if "sd_bootstrap" in block:
             cells.append(number_text(block["sd_bootstrap"] / scale, 3))
         rows.append(tuple(cells))
-    columns = ["parameter", "nominal", "identified - nominal", "standard deviation"]
+    columns = ["parameter", "nominal"]
+    columns += ["|true - nominal|", "|true - identified|"] if simulated else ["identified - nominal"]
+    columns.append("standard deviation")
     bootstrapped = any("sd_bootstrap" in p for p in results["parameters"].values())
-    columns += ["|identified - true|"] if simulated else ["by bootstrap"] * bootstrapped
+    columns += ["by bootstrap"] * bootstrapped
     several = results["machines"] > 1
     note = f"By {results['method']}." + " Medians over the machines, [5 %, 95 %]." * several
     note += " 95 % of intervals of ±1.96 standard deviations hold the true value, if the geometry is all that is wrong."
@@ -127,12 +134,9 @@ def _method_table(results: Block) -> Table:
             test = block["test"][name]
             if results["test"][name] is None:
                 continue
-            scale, unit = display_unit(test["unit"], test["after"])
-            cells += [
-                f"{_text(test, 'before', scale)} {unit}",
-                f"{_text(test, 'after', scale)} {unit}",
-                f"{_text(test, 'max_after', scale)} {unit}",
-            ]
+            for key in ("before", "after", "max_after"):
+                scale, unit = display_unit(test["unit"], test[key] or 1.0)
+                cells.append(f"{_text(test, key, scale)} {unit}")
         cells += [str(block["machines"]), f"{100 * block['converged']:.0f} %", number_text(block["seconds"], 3)]
         rows.append(tuple(cells))
     columns = ["method"]
@@ -228,7 +232,9 @@ def _rows(results: Block) -> Iterator[Row]:
                 yield subject, name, prefix + key, unit, block[key], low, high
 
     for name, block in results["parameters"].items():
-        yield from of("parameter", name, block, block["unit"], ("nominal", "value", "sd", "true", "deviation"))
+        yield from of(
+            "parameter", name, block, block["unit"], ("nominal", "value", "sd", "true", "error_before", "deviation")
+        )
     for method, block in results["methods"].items():
         for part in ("position", "rotation"):
             test = block["test"][part]

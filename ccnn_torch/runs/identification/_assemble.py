@@ -106,9 +106,9 @@ def assemble(
     arrays: dict[str, Tensor] = {"start": measured.start}
     known: dict[str, Known] = {}
     for method, outcome in outcomes.items():
-        pieces = pieces_of(measured, config, is_apart(method, config), outcome.machines)
+        pieces = pieces_of(measured, config, is_apart(method, config), outcome.machines, outcome.values)
         known[method] = known_of(pieces, selection, outcome.values)
-        blocks[method] = _method_block(config, measured, method, outcome, known[method], pieces, selection, arrays)
+        blocks[method] = _method_block(config, measured, method, outcome, known[method], selection, arrays)
     before = predicted(measured, measured.start[main.machines], main.machines)
     after = predicted(measured, main.values, main.machines)
     arrays |= _pose_arrays(before, after, noise)
@@ -161,7 +161,6 @@ def _method_block(
     method: str,
     outcome: Outcome,
     known: Known,
-    pieces: list[Piece],
     selection: Selection,
     arrays: dict[str, Tensor],
 ) -> dict[str, Any]:
@@ -187,6 +186,7 @@ def _method_block(
         return block
     truth = measured.truth[machines]
     gap = free_values(selection, outcome.values - truth)
+    pieces = pieces_of(measured, config, is_apart(method, config), machines, truth)
     bound = known_of(pieces, selection, truth).sd
     arrays[f"deviation_{method}"], arrays[f"bound_{method}"] = gap, bound
     block["deviations"] = _deviations(selection, gap, free_values(selection, truth - measured.start[machines]))
@@ -244,7 +244,12 @@ def _parameters(
         values["sd"] = known.sd[:, i] if i is not None and identifiable else None
         if measured.truth is not None:
             truth = measured.truth[outcome.machines, column]
-            values |= {"true": truth, "deviation": (outcome.values[:, column] - truth).abs()}
+            start = measured.start[outcome.machines, column]
+            values |= {
+                "true": truth,
+                "error_before": (start - truth).abs(),
+                "deviation": (outcome.values[:, column] - truth).abs(),
+            }
         entry = {"nominal": float(measured.mechanism.nominal[column])} | figures(values)
         entry |= {
             "free": i is not None,

@@ -19,6 +19,8 @@ from ccnn_torch.runs.identify_config import IdentifyConfig
 
 __all__ = ["choose_places", "plan_places"]
 
+MAX_CONDITION = 50.0
+"""Of the Jacobian at a planned pose."""
 # Stream of the candidates, beside the seed of the first machine.
 _CANDIDATES = 7
 
@@ -49,10 +51,10 @@ def plan_places(
     about, mechanism = config.simulate, places.mechanism
     assert about is not None
     candidates = places.random(about.candidates, generator_of(config.seed, _CANDIDATES))
-    if places.by_joints:
-        joints, pose = candidates, mechanism.forward_kinematics(candidates)
-    else:
-        joints, pose = mechanism.solve_inverse(candidates), candidates
+    joints, pose = places.nominal(candidates)
+    # The most informative poses of all are next to singular ones, where noise is no longer small.
+    regular = mechanism.condition_number(joints, guess=pose) <= MAX_CONDITION
+    candidates, joints, pose = candidates[regular], joints[regular], pose[regular]
     position, rotation = mechanism.frame(pose)
     rows = Rows(joints[None], instrument.observe(pose, position, rotation)[None])
     nominal = Measured(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Fit, Progress, bootstrap
-from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.mechanisms import Framed, Mechanism, load_mechanism
 from ccnn_torch.runs.identification._assemble import assemble
 from ccnn_torch.runs.identification._counts import count_study
 from ccnn_torch.runs.identification._measured import Measured
@@ -75,8 +75,6 @@ def prepare(config: IdentifyConfig) -> tuple[Mechanism, Measured]:
     """
     mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
     if config.frame.base or config.frame.tool:
-        from ccnn_torch.mechanisms.framed import Framed
-
         mechanism = Framed(mechanism, base=config.frame.base, tool=config.frame.tool)
     measured = from_records(config, mechanism) if config.records is not None else simulate(config, mechanism)
     return mechanism, frames_first(measured, config)

@@ -10,7 +10,7 @@ from scipy.stats import qmc
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
 from ccnn_torch.runs.identification._sizes import Size, size
 
 __all__ = ["Places"]
@@ -23,7 +23,7 @@ class Places:
     """A box of places, and what machines with given parameters do there.
 
     A place is a pose, `p` [SI]; of a serial arm, whose poses are hard to reach with all joints inside their limits, it
-    is a joint vector, `n` [SI].
+    is a joint vector, `n` [SI]; of a mechanism seen from a measuring frame it is a pose of the mechanism itself.
     """
 
     def __init__(self, mechanism: Mechanism, truth: Tensor, box: Mapping[str, tuple[Size, Size]], circle: bool) -> None:
@@ -39,14 +39,15 @@ class Places:
             InputError: a range names no coordinate or is empty, or the mechanism has no inscribed circle.
         """
         self.mechanism, self.truth = mechanism, truth
-        self.by_joints = isinstance(mechanism, SerialArm)
-        coordinates = mechanism.joints if isinstance(mechanism, SerialArm) else mechanism.pose
-        edges = mechanism.limits.T if isinstance(mechanism, SerialArm) else torch.stack(mechanism.bounds)
+        own = mechanism.mechanism if isinstance(mechanism, Framed) else mechanism
+        self._own = own
+        coordinates = own.joints if isinstance(own, SerialArm) else own.pose
+        edges = own.limits.T if isinstance(own, SerialArm) else torch.stack(own.bounds)
         self.low, self.high = (edge.clone() for edge in edges)
         names = [c.name for c in coordinates]
         self.circle: tuple[Tensor, Tensor] | None = None
         if circle:
-            self.circle = self._inscribed(mechanism)
+            self.circle = self._inscribed(own)
             centre, radius = self.circle
             self.low, self.high = centre - radius, centre + radius
         for name, pair in box.items():
@@ -71,12 +72,20 @@ class Places:
     def taken(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """Joints `r x s x n` and pose `r x s x p` of every machine at places `s x .` or `r x s x .`."""
         parameters = self.truth[:, None]
-        if self.by_joints:
-            joints = place.expand(len(self.truth), *place.shape[-2:])
-            return joints, self.mechanism.forward_kinematics(joints, parameters)
+        if self._own is not self.mechanism or isinstance(self._own, SerialArm):
+            joints, near = self.nominal(place)
+            joints = joints.expand(len(self.truth), *joints.shape[-2:])
+            return joints, self.mechanism.forward_kinematics(joints, parameters, near)
         pose = place.expand(len(self.truth), *place.shape[-2:])
         near = self.mechanism.solve_inverse(place)
         return self.mechanism.solve_inverse(pose, parameters, near.expand(len(self.truth), *near.shape[-2:])), pose
+
+    def nominal(self, place: Tensor) -> tuple[Tensor, Tensor]:
+        """Joints and pose of the nominal machine at places `... x .`."""
+        if isinstance(self._own, SerialArm):
+            return place, self.mechanism.forward_kinematics(place)
+        joints = self._own.solve_inverse(place)
+        return joints, place if self._own is self.mechanism else self.mechanism.forward_kinematics(joints)
 
     def usable(self, place: Tensor) -> Tensor:
         """Which places `s x .` every machine reaches, inside the circle where there is one; `s`, bool."""
@@ -84,8 +93,8 @@ class Places:
         if self.circle is not None:
             centre, radius = self.circle
             inside = torch.linalg.vector_norm(place - centre, dim=-1) <= radius
-        if not self.by_joints:
-            inside = inside & self.mechanism.reachable(place)
+        if not isinstance(self._own, SerialArm):
+            inside = inside & self._own.reachable(place)
         joints, pose = self.taken(place)
         return inside & torch.isfinite(joints).all(-1).all(0) & torch.isfinite(pose).all(-1).all(0)
 

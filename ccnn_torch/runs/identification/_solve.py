@@ -46,6 +46,8 @@ __all__ = [
 
 QUICK = ("lm", "tikhonov")
 """The others are global searches, which take minutes where these take a blink."""
+# The noise of a row is carried over at the start, then at what was found; a third time changes nothing that counts.
+_ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -93,31 +95,42 @@ def select(measured: Measured, config: IdentifyConfig) -> Selection:
     return select_parameters(measured.mechanism.geometry, choice_of(config), measured.start)
 
 
-def pieces_of(measured: Measured, config: IdentifyConfig, apart: bool, machines: Tensor) -> list[Piece]:
+def pieces_of(
+    measured: Measured, config: IdentifyConfig, apart: bool, machines: Tensor, near: Tensor | None = None
+) -> list[Piece]:
     """The problems that a method solves.
 
     Args:
         apart: one for each leg, from that leg's rows where it has its own; else one for all.
         machines: which machines.
+        near: geometry at which the noise of the pose is carried over to the residual, `r x K` [SI]; where the search
+            begins when None. Near singular poses the difference matters.
 
     Raises:
         InputError: the rows do not fit the mechanism or are too few, or legs are not apart.
     """
     if not apart:
-        return [Piece(_problem(measured, config, measured.rows.of(machines), machines, False))]
-    whole = split_by_leg(_problem(measured, config, measured.rows.of(machines), machines, True))
+        return [Piece(_problem(measured, config, measured.rows.of(machines), machines, False, near))]
+    whole = split_by_leg(_problem(measured, config, measured.rows.of(machines), machines, True, near))
     legs = [next(p.leg for p in part.parameters if p.leg is not None) for part in whole]
     if not measured.leg_rows:
         return [Piece(part, leg) for part, leg in zip(whole, legs, strict=True)]
     own = []
     for i, leg in enumerate(legs):
         rows = measured.leg_rows[leg].of(machines)
-        own.append(Piece(split_by_leg(_problem(measured, config, rows, machines, True))[i], leg))
+        own.append(Piece(split_by_leg(_problem(measured, config, rows, machines, True, near))[i], leg))
     return own
 
 
-def _problem(measured: Measured, config: IdentifyConfig, rows: Rows, machines: Tensor, per_leg: bool) -> Problem:
+def _problem(
+    measured: Measured, config: IdentifyConfig, rows: Rows, machines: Tensor, per_leg: bool, near: Tensor | None
+) -> Problem:
     start = measured.start[machines]
+    problem = _problem_at(measured, config, rows, start if near is None else near, per_leg)
+    return replace(problem, start=select(measured, config).start[machines])
+
+
+def _problem_at(measured: Measured, config: IdentifyConfig, rows: Rows, start: Tensor, per_leg: bool) -> Problem:
     forward = config.residual == "forward" or (
         config.residual == "auto"
         and (isinstance(measured.mechanism, SerialArm) or config.frame.base or config.frame.tool)
@@ -203,14 +216,19 @@ def run_method(method: str, measured: Measured, config: IdentifyConfig, progress
     """
     machines = machines_of(method, measured, config)
     solver, selection = solver_of(method, config), select(measured, config)
-    pieces = pieces_of(measured, config, is_apart(method, config), machines)
     begun = time.perf_counter()
     fits: list[Fit] = []
-    for i, piece in enumerate(pieces):
-        part = None if progress is None else _part(progress, i, len(pieces))
-        fits.append(solver(piece.problem, config.seed + i, part))
+    values: Tensor | None = None
+    rounds = _ROUNDS if base_method(method) in QUICK and measured.pose_noise is not None else 1
+    for _ in range(rounds):
+        pieces = pieces_of(measured, config, is_apart(method, config), machines, values)
+        fits = []
+        for i, piece in enumerate(pieces):
+            part = None if progress is None else _part(progress, i, len(pieces))
+            fits.append(solver(piece.problem, config.seed + i, part))
+        values = whole_values(selection, pieces, [fit.values for fit in fits], machines)
+    assert values is not None
     seconds = time.perf_counter() - begun
-    values = whole_values(selection, pieces, [fit.values for fit in fits], machines)
     said = [fit.message for fit in fits if fit.message]
     return Outcome(
         machines,
