@@ -13,6 +13,7 @@ from ccnn_torch.cli.compensate import compensate
 from ccnn_torch.cli.identify import identify
 from ccnn_torch.cli.keys import keys
 from ccnn_torch.cli.picture import picture
+from ccnn_torch.cli.plan import plan
 from ccnn_torch.cli.run import run
 from ccnn_torch.cli.suite import suite
 from ccnn_torch.errors import InputError, MethodFailedError
@@ -43,7 +44,7 @@ def _common(
         typer.echo(context.get_help())
 
 
-for _command in (run, suite, identify, compensate, picture, keys):
+for _command in (run, suite, identify, compensate, plan, picture, keys):
     app.command(epilog=(_command.__doc__ or "").partition("\n\n")[2])(_command)
 
 

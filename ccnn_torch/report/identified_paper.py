@@ -78,8 +78,8 @@ def _table_two(results: Mapping[str, Any]) -> Table:
             )
         )
     note = (
-        "Left: Table 2 of Sun et al. 2018, one machine. Right: median over our machines of |identified - true|, and the "
-        "standard deviation that the formula gives. The paper states neither the tilt range nor the three points; ours "
+        "Left: Table 2 of Sun et al. 2018, one machine. Right: median over our machines of |identified - true|, and "
+        "the standard deviation that the formula gives. The paper states neither the tilt range nor the three points; ours "
         "stand in the configuration."
     )
     columns = ("error", "predefined", "identified (paper)", "off by (paper)", "off by (ours)", "σ (ours)")
@@ -105,8 +105,8 @@ def _figures_seven_eight(results: Mapping[str, Any]) -> Table:
         )
     note = (
         "Largest and mean |identified - true| over a machine's parameters, median over the machines with [5 %, 95 %]; "
-        "the share is the mean over the parameters that are not 0. Figures 7 and 8 print no numbers; what the text says "
-        f"of them stands here; {_LM_NOTE}."
+        "the share is the mean over the parameters that are not 0. Figures 7 and 8 print no numbers; what the text "
+        f"says of them stands here; {_LM_NOTE}."
     )
     columns = ("method", "largest position [mm]", "mean position [mm]", "largest orientation [deg]", "mean share [%]")
     return Table("Largest deviations, Table 2 and Figures 7 and 8", columns, tuple(rows), note)
@@ -139,8 +139,8 @@ def _table_three(results: Mapping[str, Any]) -> Table:
     ]
     note = (
         "Numbers measured: two coordinates and the joints of each pose. The paper's text measures 36 common poses, its "
-        "Table 3 counts 18. The matrix inverted is CᵀC, which has the size of the parameters (12, or 6 for each leg) and "
-        "not of the poses, so that the costs in the paper's table do not hold; its Figures 5 and 6 print no numbers."
+        "Table 3 counts 18. The matrix inverted is CᵀC, which has the size of the parameters (12, or 6 for each leg) "
+        "and not of the poses, so that the costs in the paper's table do not hold; its Figures 5 and 6 print no numbers."
     )
     columns = ("method", "poses measured", "numbers measured", "cost of the inversion")
     return Table("Table 3 of the paper beside ours", columns, tuple(rows), note)

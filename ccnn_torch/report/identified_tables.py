@@ -200,8 +200,9 @@ def _compensation_table(results: Block) -> Table | None:
         return None
     columns = ("commands", "position left", "removed [%]", "rotation left", "removed [%]")
     note = (
-        "RMS pose error of the simulated machines at held-out poses, commanded by the identified geometry: exact = real "
-        "inverse kinematics; linear = nominal joints corrected by the identification Jacobian (Sun et al. 2018, eq. 15)."
+        "RMS pose error of the simulated machines at held-out poses, commanded by the identified geometry: exact = "
+        "real inverse kinematics; linear = nominal joints corrected by the identification Jacobian (Sun et al. 2018, "
+        "eq. 15)."
     )
     return Table("Compensation with the identified geometry", columns, tuple(rows), note)
 

@@ -50,21 +50,33 @@ def gains_of(rows: Tensor, first: int, scale: Tensor, prior_sd: Tensor) -> Gains
         prior_sd: standard deviations of the prior, `k` [SI], inf where there is none.
     """
     count = torch.arange(first, len(rows) + 1)
-    k = rows.shape[-1]
     there = torch.arange(len(rows)) < count[:, None]
     matrices = torch.where(there[:, :, None, None], rows, 0.0).flatten(1, 2)
+    return gains_of_sets(matrices, count, scale, prior_sd)
+
+
+def gains_of_sets(matrices: Tensor, count: Tensor, scale: Tensor, prior_sd: Tensor) -> Gains:
+    """The figures of several sets of poses, one after the other.
+
+    Args:
+        matrices: identification matrices, `t x m x k` [1], in plausible errors.
+        count: poses in each, `t` or one for all.
+        scale, prior_sd: as `gains_of`.
+    """
+    k = matrices.shape[-1]
     seen = observability(matrices, count)
-    held = torch.diag(torch.where(torch.isfinite(prior_sd), scale / prior_sd, 0.0)).expand(len(count), k, k)
+    held = torch.diag(torch.where(torch.isfinite(prior_sd), scale / prior_sd, 0.0)).expand(len(matrices), k, k)
     whole = torch.cat([matrices, held], dim=1)
     # The triangular factor of the rows, and not their square, so that no digits are lost.
     factor = torch.linalg.qr(whole).R
     information = factor.diagonal(dim1=-2, dim2=-1).abs().log().mean(-1).exp()
-    unit = torch.eye(k, dtype=rows.dtype).expand_as(factor)
-    relative = torch.linalg.vector_norm(torch.linalg.solve_triangular(factor, unit, upper=True), dim=-1)
+    unit = torch.eye(k, dtype=matrices.dtype).expand_as(factor)
+    inverse = torch.linalg.solve_triangular(factor, unit, upper=True)
+    relative = torch.linalg.vector_norm(inverse, dim=-1)
     largest = relative.amax(-1)
-    nan = torch.full((1,), math.nan, dtype=rows.dtype)
+    nan = torch.full((1,), math.nan, dtype=matrices.dtype)
     return Gains(
-        count,
+        count.expand(len(matrices)),
         seen,
         information,
         relative * scale,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +10,8 @@ from torch import Tensor
 from ccnn_torch._table import nearest
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.inverse import inverse_problem
+from ccnn_torch.identification.forward import forward_problem
+from ccnn_torch.identification.inverse import Noise, inverse_problem
 from ccnn_torch.identification.legs import split_by_leg
 from ccnn_torch.identification.parameters import ParameterChoice
 from ccnn_torch.identification.planning._candidates import (
@@ -28,7 +28,7 @@ from ccnn_torch.identification.planning._design import (
     order_by_worth,
     tightest_bound,
 )
-from ccnn_torch.identification.planning._gains import Gains, gains_of, recommended_count
+from ccnn_torch.identification.planning._gains import Gains, gains_of, gains_of_sets, recommended_count
 from ccnn_torch.identification.planning._observability import INDICES
 from ccnn_torch.identification.planning._other_indices import exchange_by_index
 from ccnn_torch.identification.problem import Problem, Progress
@@ -36,6 +36,10 @@ from ccnn_torch.mechanisms import Mechanism
 
 __all__ = ["Choice", "Plan", "choose_poses", "plan_poses"]
 
+# Draws of random poses that a plan is held against; odd, for the median.
+_RANDOM = 101
+# Candidates shown in pictures.
+_AROUND = 2000
 # Measuring noise where none is given: a laser tracker's [m], and the same over a lever of 0.3 m [rad].
 _NOISE = {"m": 1e-5, "rad": 1e-5 / 0.3}
 
@@ -51,10 +55,14 @@ class Choice:
         bound: share of the best possible det^(1/k) of the information that is reached at least; None for an index other
             than O1 and where there is a prior.
         settled: whether no exchange of a pose betters the index.
+        random_o1: O1 of as many candidates drawn at random, the median of 101 draws.
+        random_sd: standard deviation of each parameter with them, likewise, `k` [SI].
     """
 
     chosen: Tensor
     gains: Gains
+    random_o1: float
+    random_sd: Tensor
     recommended: int | None
     bound: float | None
     settled: bool
@@ -67,22 +75,36 @@ class Plan:
     Attributes:
         leg: whose parameters they are for; None for all.
         parameters: what is to be identified, `k`.
+        scale: their plausible errors, `k` [SI].
         joints: commands for the machine, `N x n` [SI].
         pose: where they bring the nominal machine, `N x p` [SI].
         index: what was made largest.
         choice: the choice and its figures.
         candidates: how many configurations there were to choose from.
         drawn: how many were drawn to find them.
+        around: the poses of some of them, for pictures, `m x p` [SI].
     """
 
     leg: int | None
     parameters: tuple[Parameter, ...]
+    scale: Tensor
     joints: Tensor
     pose: Tensor
     index: str
     choice: Choice
     candidates: int
     drawn: int
+    around: Tensor
+
+    @property
+    def sd(self) -> Tensor:
+        """Standard deviation of each parameter with the planned poses, `k` [SI]."""
+        return self.choice.gains.sd[self.choice.gains.count.tolist().index(len(self.pose))]
+
+    @property
+    def o1(self) -> float:
+        """O1 of the planned poses, divided by √poses; parameters in plausible errors, measurements in noise."""
+        return float(self.choice.gains.observability.o1[self.choice.gains.count.tolist().index(len(self.pose))])
 
 
 def choose_poses(
@@ -118,22 +140,20 @@ def choose_poses(
     turn = common_coordinates(rows, held, [p.name for p in problem.parameters])
     even = rows @ turn
     prior = turn.mT @ torch.diag(held.square()) @ turn
-    known = bool((held > 0).any())
 
     design = make_design(even, prior if bool((held > 0).all()) else None, repeat)
+    tell = progress or (lambda _: None)
     design_share = 0.4 if index != "O1" else 0.8
     for step in range(count):
         add_best(design)
-        if progress is not None:
-            progress(0.2 * (step + 1) / count)
+        tell(0.2 * (step + 1) / count)
     design.prior = prior
-    tell = None if progress is None else lambda done: progress(0.2 + design_share * done)
-    settled = exchange(design, tell)
-    bound = None if known or index != "O1" else tightest_bound(design)
+    settled = exchange(design, _share(tell, 0.2, design_share))
+    bound = None if bool((held > 0).any()) or index != "O1" else tightest_bound(design)
     chosen = design.chosen
     if index != "O1":
-        last = None if progress is None else lambda done: progress(0.6 + 0.4 * done)
-        chosen, settled = exchange_by_index(rows, chosen, torch.diag(held.square()), index, repeat, last)
+        known_already = torch.diag(held.square())
+        chosen, settled = exchange_by_index(rows, chosen, known_already, index, repeat, _share(tell, 0.6, 0.4))
     order, first = order_by_worth(even[chosen], prior)
     chosen = [chosen[place] for place in order]
 
@@ -145,9 +165,17 @@ def choose_poses(
     for _ in range(min(max(6, count // 2), len(rows) - count if not repeat else count)):
         add_best(design)
     gains = gains_of(rows[design.chosen], first, problem.scale, problem.prior_sd)
-    if progress is not None:
-        progress(1.0)
-    return Choice(torch.tensor(chosen), gains, recommended_count(gains, least_gain), bound, settled)
+    tell(1.0)
+    recommended = recommended_count(gains, least_gain)
+    random_o1, random_sd = _random(rows, count, problem)
+    return Choice(torch.tensor(chosen), gains, random_o1, random_sd, recommended, bound, settled)
+
+
+def _random(rows: Tensor, count: int, problem: Problem) -> tuple[float, Tensor]:
+    """O1 and standard deviations of poses taken at random, medians."""
+    draws = torch.rand(_RANDOM, len(rows), generator=torch.Generator().manual_seed(0)).topk(count, sorted=False).indices
+    found = gains_of_sets(rows[draws].flatten(1, 2), torch.tensor(count), problem.scale, problem.prior_sd)
+    return float(found.observability.o1.median()), found.sd.median(0).values
 
 
 def plan_poses(
@@ -155,13 +183,14 @@ def plan_poses(
     poses: int,
     *,
     choice: ParameterChoice | None = None,
-    pose_noise: float | Sequence[float] | Tensor | None = None,
-    joint_noise: float | Sequence[float] | Tensor | None = None,
+    pose_noise: Noise | None = None,
+    joint_noise: Noise | None = None,
     index: str = "O1",
     candidates: int = 100_000,
     limits: Limits | None = None,
     max_condition: float = 50.0,
     rotation_weight: float = 0.04,
+    residual: str = "auto",
     per_leg: bool = False,
     repeat: bool = False,
     least_gain: float = 0.02,
@@ -179,6 +208,7 @@ def plan_poses(
         index: `O1` (determinant, the paper's) … `O5`.
         candidates: configurations to choose from.
         limits, max_condition, rotation_weight: as `draw_candidates`.
+        residual: `inverse` compares joints, `forward` poses; `auto` = poses for serial arms and framed mechanisms.
         per_leg: a plan for each leg (divide and conquer, paper 004) in place of a common one.
         repeat, least_gain: as `choose_poses`.
         seed: of the draws.
@@ -198,11 +228,11 @@ def plan_poses(
         limits=limits,
         max_condition=max_condition,
         rotation_weight=rotation_weight,
-        progress=lambda done: tell(0.4 * done),
+        progress=_share(tell, 0.0, 0.4),
     )
     if pose_noise is None and joint_noise is None:
         pose_noise = [_NOISE.get(c.unit, 1e-5) for c in mechanism.pose]
-    problem = _problem(mechanism, found, choice, pose_noise, joint_noise, per_leg)
+    problem = _problem(mechanism, found, choice, (pose_noise, joint_noise), residual, per_leg)
     parts = split_by_leg(problem) if per_leg else [problem]
     plans = []
     for number, part in enumerate(parts):
@@ -212,31 +242,55 @@ def plan_poses(
             index=index,
             repeat=repeat,
             least_gain=least_gain,
-            progress=lambda done, number=number: tell(0.4 + 0.6 * (number + done) / len(parts)),
+            progress=_share(tell, 0.4 + 0.6 * number / len(parts), 0.6 / len(parts)),
         )
         joints, pose = found.joints[chosen.chosen], found.pose[chosen.chosen]
         leg = part.channels[0].leg if per_leg else None
-        plans.append(Plan(leg, part.parameters, joints, pose, index, chosen, candidates, found.drawn))
+        around = found.pose[:_AROUND]
+        plans.append(
+            Plan(leg, part.parameters, part.scale, joints, pose, index, chosen, candidates, found.drawn, around)
+        )
     return plans
+
+
+def _share(tell: Progress, begin: float, width: float) -> Progress:
+    return lambda done: tell(begin + width * done)
 
 
 def _problem(
     mechanism: Mechanism,
     found: Candidates,
     choice: ParameterChoice | None,
-    pose_noise: float | Sequence[float] | Tensor | None,
-    joint_noise: float | Sequence[float] | Tensor | None,
+    noise: tuple[Noise | None, Noise | None],
+    residual: str,
     per_leg: bool,
 ) -> Problem:
+    if residual not in ("auto", "inverse", "forward"):
+        raise InputError(f"residual: must be auto, inverse or forward, not '{residual}'")
+    of_pose, of_joints = noise
+    if residual == "forward" or (residual == "auto" and _needs_forward(mechanism)):
+        if per_leg:
+            raise InputError(
+                "per_leg: a pose depends on the parameters of all legs; plan from joints (residual=inverse) or for all "
+                "legs together (per_leg=false)"
+            )
+        return forward_problem(
+            mechanism, found.joints, found.pose, choice=choice, pose_noise=of_pose, joint_noise=of_joints
+        )
     return inverse_problem(
         mechanism,
         found.joints,
         found.pose,
         choice=choice,
-        pose_noise=pose_noise,
-        joint_noise=joint_noise,
+        pose_noise=of_pose,
+        joint_noise=of_joints,
         per_leg=per_leg,
     )
+
+
+def _needs_forward(mechanism: Mechanism) -> bool:
+    """Serial arms, whose inverse is a search; and poses in a frame of their own (base_x …), which a leg alone lacks."""
+    return bool(mechanism.orientations) or any(p.name.startswith(("base_", "tool_")) for p in mechanism.geometry)
 
 
 def _check_count(problem: Problem, count: int, there: int, repeat: bool) -> None:
