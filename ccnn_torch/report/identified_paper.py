@@ -79,7 +79,7 @@ def _table_two(results: Mapping[str, Any]) -> Table:
         )
     note = (
         "Left: Table 2 of Sun et al. 2018, one machine. Right: median over our machines of |identified - true|, and "
-        "the standard deviation that the formula gives. The paper states neither the tilt range nor the three points; ours "
+        "the standard deviation that the formula gives. The paper states neither the tilt range nor the points; ours "
         "stand in the configuration."
     )
     columns = ("error", "predefined", "identified (paper)", "off by (paper)", "off by (ours)", "σ (ours)")
@@ -140,7 +140,7 @@ def _table_three(results: Mapping[str, Any]) -> Table:
     note = (
         "Numbers measured: two coordinates and the joints of each pose. The paper's text measures 36 common poses, its "
         "Table 3 counts 18. The matrix inverted is CᵀC, which has the size of the parameters (12, or 6 for each leg) "
-        "and not of the poses, so that the costs in the paper's table do not hold; its Figures 5 and 6 print no numbers."
+        "and not of the poses, so that the costs in the paper's table do not hold. Figures 5 and 6 print no numbers."
     )
     columns = ("method", "poses measured", "numbers measured", "cost of the inversion")
     return Table("Table 3 of the paper beside ours", columns, tuple(rows), note)

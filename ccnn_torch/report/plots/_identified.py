@@ -179,6 +179,6 @@ def residual_plot(arrays: Arrays) -> Plot | None:
     return Plot(
         "residuals",
         figure,
-        f"Residuals of the equations that were identified from (training rows, first machine): RMS {rms[0]} → {rms[1]}; 1 "
-        "is the noise where it is known, else the unit is the residual's own.",
+        f"Residuals of the equations that were identified from (training rows, first machine): RMS {rms[0]} → "
+        f"{rms[1]}; 1 is the noise where it is known, else the unit is the residual's own.",
     )
