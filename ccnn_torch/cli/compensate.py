@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,10 +14,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-    from ccnn_torch.compensation import LoadedModel
+    from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
     from ccnn_torch.mechanisms import Mechanism
     from ccnn_torch.records import Table
 
+    Model = LoadedModel | IdentifiedGeometry
     Array = NDArray[np.float64]
 
 __all__ = ["compensate"]
@@ -29,7 +30,7 @@ _STARTS = 64
 
 
 def compensate(
-    model: Annotated[Path, typer.Argument(help="A .safetensors, .onnx or .pt2 file with its card beside it.")],
+    model: Annotated[Path, typer.Argument(help="A .safetensors, .onnx or .pt2 file, or identified.yaml.")],
     input: Annotated[Path, typer.Argument(metavar="IN.csv", help="Ideal joints; columns are name[unit].")],
     output: Annotated[Path, typer.Argument(metavar="OUT.csv", help="IN's columns and the commands.")],
     pose: Annotated[bool, typer.Option("--pose", help="IN has wanted poses instead of joints.")] = False,
@@ -44,7 +45,8 @@ def compensate(
     and inside_domain[1]; the commands are the columns command_q1… where IN.csv has them, else q1…. With --pose a
     serial arm takes the branch of guess_q1[unit]… where given, else that of the row before. With --sd it also adds
     deviation_sd_q1[unit]…: what the machine does beyond the command, measured anew, is within 1.96 of it in about 95 of
-    100 places inside the domain.
+    100 places inside the domain. With identified.yaml, which ccnn identify writes, the commands are those of the real
+    kinematics.
 
     Examples:
 
@@ -55,15 +57,17 @@ def compensate(
     ccnn compensate checkpoints/tripod/model.onnx commands.csv ideal.csv --back
 
     ccnn compensate checkpoints/tripod/model.onnx joints.csv commands.csv --sd
+
+    ccnn compensate runs/five_bar/identified.yaml poses.csv commands.csv --pose
     """
     if pose and back:
         raise InputError("--pose and --back exclude each other: --pose takes wanted poses, --back takes commands")
     if sd and back:
         raise InputError("--sd and --back exclude each other: --sd tells how sure a command is, --back takes commands")
-    from ccnn_torch.compensation import load_model
+    from ccnn_torch.compensation import load_compensation
     from ccnn_torch.records import read_table, stack_columns, write_table
 
-    loaded = load_model(model)
+    loaded = load_compensation(model)
     table = read_table(input)
     if pose:
         joints, units = _joints_of_poses(loaded, table), {c.name: c.unit for c in loaded.joints}
@@ -80,15 +84,17 @@ def compensate(
         inside = found["inside_domain"]
     added["inside_domain[1]"] = inside.astype(float)
     if sd:
+        if "deviation_sd" not in found:
+            raise InputError(f"--sd: {model} is identified geometry, which has no standard deviation of a command")
         added |= _named("deviation_sd", loaded, found["deviation_sd"], units)
     names = {header.partition("[")[0] for header in added}
     kept = {f"{name}[{unit}]": table.raw(name) for name, unit in table.units.items() if name not in names}
     write_table(output, kept | added)
     if not quiet:
-        _tell(output, inside)
+        _tell(output, inside, trained=bool(loaded.covariates) or "deviation_sd" in found)
 
 
-def _joints(loaded: LoadedModel, table: Table, back: bool) -> tuple[Array, dict[str, str]]:
+def _joints(loaded: Model, table: Table, back: bool) -> tuple[Array, dict[str, str]]:
     """Joints `rows x n` [SI], and the unit of each as written."""
     from ccnn_torch.coordinates import Coordinate
     from ccnn_torch.records import JOINT_LIMIT, stack_columns
@@ -101,7 +107,7 @@ def _joints(loaded: LoadedModel, table: Table, back: bool) -> tuple[Array, dict[
     return stack_columns(table, columns, JOINT_LIMIT), {c.name: table.units[names[c.name]] for c in loaded.joints}
 
 
-def _refuse_other_machine(loaded: LoadedModel, table: Table) -> None:
+def _refuse_other_machine(loaded: Model, table: Table) -> None:
     """A file with more joints than the model's is that of another machine; fewer are missed by name anyway."""
     known = {c.name for c in loaded.joints}
     other = [name for name in table.names if name[:1] == "q" and name[1:].isdigit() and name not in known]
@@ -113,7 +119,7 @@ def _refuse_other_machine(loaded: LoadedModel, table: Table) -> None:
         )
 
 
-def _joints_of_poses(loaded: LoadedModel, table: Table) -> Array:
+def _joints_of_poses(loaded: Model, table: Table) -> Array:
     """Ideal joints of wanted poses on the mechanism that the model was made for, `rows x n` [SI].
 
     Raises:
@@ -132,8 +138,7 @@ def _joints_of_poses(loaded: LoadedModel, table: Table) -> Array:
         missing = [c.header for c in mechanism.pose if c.name not in {k.name for k in coordinates}]
         raise InputError(f"{table.path}: the poses of {mechanism.name} need the columns {', '.join(missing)}, too")
     poses = torch.from_numpy(values)
-    edges = [loaded.facts["domain"]["inputs"][c.name] for c in mechanism.joints]
-    guess = torch.tensor([(edge["low"] + edge["high"]) / 2 for edge in edges], dtype=torch.float64)
+    guess = torch.from_numpy(loaded.middle)
     guesses = tuple(Coordinate(f"guess_{c.name}", c.unit) for c in mechanism.joints)
     guided = any(c.name in table for c in guesses)
     if guided:
@@ -181,7 +186,7 @@ def _reached(mechanism: Mechanism, joints: Tensor, poses: Tensor) -> Tensor:
     return reached if error.rotation is None else reached & (error.rotation < _CLOSE)
 
 
-def _named(what: str, loaded: LoadedModel, values: Array, units: dict[str, str]) -> dict[str, Array]:
+def _named(what: str, loaded: Model, values: Array, units: dict[str, str]) -> dict[str, Array]:
     """Columns `what_joint[unit]` in the units that the joints were written in."""
     from ccnn_torch.units import from_si
 
@@ -191,11 +196,16 @@ def _named(what: str, loaded: LoadedModel, values: Array, units: dict[str, str])
     }
 
 
-def _tell(output: Path, inside: NDArray[np.bool_]) -> None:
+def _tell(output: Path, inside: NDArray[Any], trained: bool) -> None:
     outside = len(inside) - int(inside.sum())
     typer.echo(f"{output}: {len(inside)} rows written.")
     if outside:
-        typer.echo(
-            f"{outside} of them {'is' if outside == 1 else 'are'} outside the domain that the model was trained on "
-            "(inside_domain = 0): their correction fades into the safe one, the mean training deviation."
+        what = (
+            "outside the domain that the model was trained on" if trained else "out of the identified machine's reach"
         )
+        then = (
+            "their correction fades into the safe one, the mean training deviation"
+            if trained
+            else "their joints are as they were"
+        )
+        typer.echo(f"{outside} of them {'is' if outside == 1 else 'are'} {what} (inside_domain = 0): {then}.")

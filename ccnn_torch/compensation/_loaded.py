@@ -98,6 +98,12 @@ class LoadedModel:
         found = self._run(given.reshape(-1, given.shape[-1]), flat)
         return {name: value.reshape((*lead, *value.shape[1:])) for name, value in found.items()}
 
+    @property
+    def middle(self) -> Array:
+        """Middle of the domain's joints, `n` [SI]; where a search for joints begins."""
+        edges = [self.facts["domain"]["inputs"][c.name] for c in self.joints]
+        return np.array([(edge["low"] + edge["high"]) / 2 for edge in edges])
+
     def back(self, command: ArrayLike, covariates: ArrayLike | None = None) -> Array:
         """Ideal joints of commands (or of joints fed back), `... x n` [SI]; arguments and errors as a call."""
         return self(command, covariates)["ideal"]

@@ -77,11 +77,21 @@ def _table_two(results: Mapping[str, Any]) -> Table:
                 sd,
             )
         )
+    shares = [
+        abs(block["deviation"]) / abs(OVERCONSTRAINED[name][0] * (MM if block["unit"] == "m" else DEG))
+        for name, block in results["parameters"].items()
+        if name in OVERCONSTRAINED and OVERCONSTRAINED[name][0] and block.get("deviation") is not None
+    ]
     note = (
         "Left: Table 2 of Sun et al. 2018, one machine. Right: median over our machines of |identified - true|, and "
         "the standard deviation that the formula gives. The paper states neither the tilt range nor the points; ours "
         "stand in the configuration."
     )
+    if shares:
+        note += (
+            f" As a share of Table 2's values, over those that are not 0: {100 * sum(shares) / len(shares):.3g} % (the "
+            "paper: 9.52 % over 22, 9.97 % over these 21)."
+        )
     columns = ("error", "predefined", "identified (paper)", "off by (paper)", "off by (ours)", "σ (ours)")
     return Table("Table 2 of the paper beside ours", columns, tuple(rows), note)
 

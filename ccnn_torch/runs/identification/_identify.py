@@ -31,7 +31,8 @@ from ccnn_torch.runs.identification._solve import (
     solver_of,
 )
 from ccnn_torch.runs.identification._store import load_outcome, save_outcome
-from ccnn_torch.runs.identify_config import IdentifyConfig, base_method
+from ccnn_torch.runs.identify_config import IdentifyConfig, base_method, dump_identify_config
+from ccnn_torch.training import write_whole
 
 __all__ = ["Identification", "Watch", "identify"]
 
@@ -60,6 +61,19 @@ class Identification:
         """The mechanism with the identified parameters of one machine; by default the first method's."""
         outcome = self.outcomes[method or next(iter(self.outcomes))]
         return self.measured.mechanism.with_nominal(outcome.values[machine])
+
+    def save(self, folder: str | Path) -> None:
+        """Write what `ccnn identify` writes into a folder, which is made.
+
+        Raises:
+            InputError: a class of a mechanism stands in no file, so that nobody could build it again.
+        """
+        from ccnn_torch.runs.identification._outputs import write_outputs
+
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / "config.yaml", dump_identify_config(self.config).encode())
+        write_outputs(self, folder)
 
     def nominal(self) -> dict[str, float]:
         """What the parameters were before, by name [SI]: nominal, or with the frames fitted."""
