@@ -179,7 +179,8 @@ class Overconstrained2Dof(Mechanism):
         )
         real = torch.isfinite(joints).all(-1)
         determinant: Tensor = torch.linalg.det(torch.where(real[..., None, None], slope, 0.0))
-        return real & (determinant > 0) & (torch.linalg.vector_norm(tilt, dim=-1) <= torch.pi)
+        half_turn: Tensor = torch.linalg.vector_norm(tilt, dim=-1) <= torch.pi
+        return real & (determinant > 0) & half_turn
 
 
 def _tilt(pose: Tensor) -> Tensor:
