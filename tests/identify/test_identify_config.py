@@ -1,0 +1,92 @@
+"""Keys of an identification: what is right, and one sentence for what is not."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.runs.identification._sizes import size, sizes_by_name, sizes_of_pose
+from ccnn_torch.runs.identify_config import (
+    describe_identify_keys,
+    dump_identify_config,
+    load_identify_config,
+    make_identify_config,
+)
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+
+
+@pytest.mark.parametrize("name", ["five_bar", "overconstrained_2dof"])
+def test_an_experiment_is_the_same_when_written_and_read_back(name: str, tmp_path: Path) -> None:
+    config = load_identify_config(EXPERIMENTS / f"{name}.yaml")
+    path = tmp_path / "config.yaml"
+    path.write_text(dump_identify_config(config))
+    assert load_identify_config(path) == config
+
+
+def test_the_overconstrained_experiment_runs_all_six_methods() -> None:
+    config = load_identify_config(EXPERIMENTS / "overconstrained_2dof.yaml")
+    assert set(config.methods) == {"lm", "hga", "tikhonov", "ga", "sa", "pso"}
+    assert config.simulate is not None
+    assert (config.simulate.machines, config.hga_machines) == (100, 5)
+
+
+def test_every_key_is_described() -> None:
+    keys = {key: text for key, _, text in describe_identify_keys()}
+    assert all(keys.values())
+    assert {"mechanism", "simulate.machines", "parameters.free", "split.test", "hga_machines"} <= set(keys)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({}, "no data is named"),
+        ({"simulate": {}, "records": "a.csv"}, "both records and simulate are given"),
+        ({"simulate": {}, "methods": ["lm_per_legs"]}, "no method 'lm_per_legs'; did you mean 'lm_per_leg'"),
+        ({"simulate": {}, "methods": ["lm", "lm"]}, "'lm' stands twice"),
+        ({"simulate": {"machine": 3}}, "no key 'simulate.machine'; did you mean 'simulate.machines'"),
+        ({"simulate": {}, "noise": 1e-5}, "simulated data has simulate.noise"),
+        ({"simulate": {"as_built": True}}, "give simulate.points"),
+        ({"simulate": {}, "settings": {"lmm": {}}}, "'lmm' is no method"),
+    ],
+)
+def test_wrong_keys_are_one_sentence(keys: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        make_identify_config(mechanism="five_bar", **keys)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_mechanism_must_be_named() -> None:
+    with pytest.raises(InputError, match="mechanism: name one"):
+        make_identify_config(simulate={})
+
+
+def test_sizes_have_units() -> None:
+    assert size("0.4 mm", "m", "key") == pytest.approx(4e-4)
+    assert size("0.5", "m", "key") == 0.5
+    assert size("180 deg", "rad", "key") == pytest.approx(torch.pi)
+    with pytest.raises(InputError, match="key: 'much' is no number"):
+        size("much", "m", "key")
+    with pytest.raises(InputError, match=r"key.*deg"):
+        size("1 deg", "m", "key")
+
+
+def test_sizes_go_by_name_pattern_or_unit() -> None:
+    geometry = load_mechanism("five_bar").geometry
+    given = {"m": "1 mm", "A*x": "2 mm", "gamma2": "0.1 deg"}
+    found = dict(zip([p.name for p in geometry], sizes_by_name(given, geometry, "k", [0.0] * 12).tolist(), strict=True))
+    assert found["l1"] == 1e-3
+    assert found["A1x"] == found["A2x"] == 2e-3
+    assert found["gamma1"] == found["k1"] == 0
+    assert found["gamma2"] == pytest.approx(0.1 * torch.pi / 180)
+    with pytest.raises(InputError, match=r"k\.gama1: there is no such name; did you mean 'gamma1'"):
+        sizes_by_name({"gama1": 1.0}, geometry, "k", [0.0] * 12)
+
+
+def test_an_angle_has_the_noise_over_its_arm() -> None:
+    pose = load_mechanism("tripod").pose
+    assert sizes_of_pose(3e-5, pose, "noise").tolist() == pytest.approx([3e-5, 3e-5, 1e-4])
+    with pytest.raises(InputError, match="noise: gives no size of phi"):
+        sizes_of_pose({"y": 1e-5, "z": 1e-5}, pose, "noise")

@@ -1,0 +1,91 @@
+"""The identified machine out again: our own file, DH file, URDF."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from mechanisms.catalogue import make
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
+from ccnn_torch.mechanisms.arm_files import dh_text, urdf_text
+from ccnn_torch.mechanisms.mechanism_file import mechanism_text, read_mechanism_file
+
+ARMS = ("ur10", "ur10_positions", "panda", "scara", "urdf")
+
+
+def changed(mechanism: Mechanism, seed: int = 0) -> Mechanism:
+    """The mechanism with other parameters, all of them."""
+    noise = torch.randn(len(mechanism.nominal), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return mechanism.with_nominal(mechanism.nominal + 1e-3 * noise)
+
+
+@pytest.mark.parametrize("name", ["tripod", "five_bar", "machine_tool", "ur10", "urdf"])
+def test_own_file_gives_the_same_parameters_bit_by_bit(name: str, tmp_path: Path) -> None:
+    mechanism = changed(make(name, tmp_path))
+    names = [p.name for p in mechanism.geometry]
+    nominal = dict.fromkeys(names, 0.25)
+    path = tmp_path / "identified.yaml"
+    path.write_text(mechanism_text(mechanism, nominal))
+    again = load_mechanism(str(path))
+    assert torch.equal(again.nominal, mechanism.nominal)
+    assert again.describe()["parameters"] == mechanism.describe()["parameters"]
+    file = read_mechanism_file(str(path))
+    assert file is not None
+    assert file.parameters_of(again, "nominal") == nominal
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_urdf_reaches_the_same_frames(name: str, tmp_path: Path) -> None:
+    arm = changed(make(name, tmp_path))
+    assert isinstance(arm, SerialArm)
+    path = tmp_path / "out.urdf"
+    path.write_text(urdf_text(arm))
+    again = load_mechanism(str(path))
+    assert isinstance(again, SerialArm)
+    joints = arm.sample_joints(20, torch.Generator().manual_seed(1))
+    for ours, theirs in zip(arm.forward_frame(joints), again.forward_frame(joints), strict=True):
+        torch.testing.assert_close(theirs, ours, rtol=0, atol=1e-12)
+    torch.testing.assert_close(again.limits, arm.limits)
+    assert torch.equal(again.revolute, arm.revolute)
+
+
+@pytest.mark.parametrize("name", ["ur10", "ur10_positions", "panda", "scara"])
+def test_dh_file_gives_the_same_parameters_bit_by_bit(name: str, tmp_path: Path) -> None:
+    arm = changed(make(name, tmp_path))
+    assert isinstance(arm, SerialArm)
+    path = tmp_path / "out.yaml"
+    path.write_text(dh_text(arm))
+    again = load_mechanism(str(path), orientation=arm.orientation)
+    assert isinstance(again, SerialArm)
+    assert torch.equal(again.nominal, arm.nominal)
+    assert again.unknown_frames == ()
+    assert again.parallel_axes == arm.parallel_axes
+    joints = arm.sample_joints(5, torch.Generator().manual_seed(1))
+    assert torch.equal(again.forward_kinematics(joints), arm.forward_kinematics(joints))
+
+
+def test_a_urdf_arm_has_no_dh_table(tmp_path: Path) -> None:
+    arm = make("urdf", tmp_path)
+    assert isinstance(arm, SerialArm)
+    with pytest.raises(InputError, match="has no Denavit-Hartenberg table"):
+        dh_text(arm)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("L: {", "K: {", "check K, L"),
+        ("unit: m}", "unit: mm}", "parameters.L.unit: must be m, not 'mm'"),
+        ("value: 1.0,", "value: .nan,", "parameters.L.value: must be a finite number, not nan"),
+        ("keys: {}", "keys: 3", "a mechanism file has mechanism, keys and parameters"),
+    ],
+)
+def test_a_damaged_file_is_named(old: str, new: str, message: str, tmp_path: Path) -> None:
+    mechanism = load_mechanism("tripod")
+    path = tmp_path / "tripod.yaml"
+    text = mechanism_text(mechanism, dict(zip("Lr", mechanism.nominal.tolist(), strict=True)))
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=message):
+        load_mechanism(str(path))
