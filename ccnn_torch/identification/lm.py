@@ -14,8 +14,7 @@ from ccnn_torch.identification.robust import LOSSES, loss_weights
 
 __all__ = ["solve_lm"]
 
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-14, 1e6
-_EASE, _TIGHTEN = 1000, 30
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-8, 1e-14, 1e6
 _ROUNDING = 1e-9  # Step in plausible errors that is nothing: 1e-12 m.
 _BLOCK = 8_000_000  # Numbers in the Jacobian of the machines that are worked on at once.
 _REACH = 3.0  # Starts lie within so many plausible errors.
@@ -33,7 +32,7 @@ def solve_lm(
     starts: int = 1,
     loss: str = "squared",
     max_iterations: int = 60,
-    tolerance: float = 1e-5,
+    tolerance: float = 1e-4,
 ) -> Fit:
     """Minimise the problem of every machine from several starts, all in one batch; the best start counts.
 
@@ -164,17 +163,25 @@ def _descend(
         count += new_cost.numel()
         here = slice(None) if len(index) == len(x) else index
         better = ~done[here] & (new_cost <= cost[here])
+        kept = (cost[here] - new_cost) / promised[here]
+        eased = (damping[here] * _change(kept, better)).clamp_min(_LEAST_DAMPING)
         if bool(better.all()) and len(index) == len(x):
             x, cost, gradient, matrix = trial, new_cost, new_gradient, new_matrix
-            before, damping = promised, (damping / _EASE).clamp_min(_LEAST_DAMPING)
+            before, damping = promised, eased
             continue
         x = _put(x, here, better, trial[here])
         cost = _put(cost, here, better, new_cost)
         gradient = _put(gradient, here, better, new_gradient)
         matrix = _put(matrix, here, better, new_matrix)
         before = _put(torch.zeros_like(before), here, better, promised[here])
-        damping = _put(damping * _TIGHTEN, here, better, (damping[here] / _EASE).clamp_min(_LEAST_DAMPING))
+        damping = _put(damping, here, ~done[here], eased)
     return x, cost, converged, count
+
+
+def _change(kept: Tensor, better: Tensor) -> Tensor:
+    """Factor of the damping, from the share of the promised fall that a step kept."""
+    factor = torch.where(kept > 0.9, 1e-3, torch.where(kept > 0.5, 0.1, torch.where(kept > 0.1, 1.0, 4.0)))
+    return torch.where(better, factor, 10.0)
 
 
 def _put(table: Tensor, index: Tensor | slice, chosen: Tensor, values: Tensor) -> Tensor:

@@ -30,9 +30,7 @@ def measured(
     mechanism = load_mechanism(name)
     generator = torch.Generator().manual_seed(seed)
     scale = torch.tensor([plausible_error(p) for p in mechanism.geometry], dtype=torch.float64)
-    truth = mechanism.nominal + error * scale * torch.randn(
-        count, len(scale), generator=generator, dtype=torch.float64
-    )
+    truth = mechanism.nominal + error * scale * torch.randn(count, len(scale), generator=generator, dtype=torch.float64)
     middle = (mechanism.low + mechanism.high) / 2
     ideal = middle + 0.6 * (mechanism.sample_workspace(count * rows, generator) - middle)
     joints = mechanism.solve_inverse(ideal).reshape(count, rows, -1)
