@@ -77,7 +77,7 @@ def whitened_problem(
     whiten: tuple[Tensor, ...] = ()
     if covariance is not None:
         covariance = covariance.expand(1, rows.pose.shape[1], c, c) if covariance.dim() < 4 else covariance
-        root = _shared(inverse_root(_only_diagonal(covariance) if diagonal else covariance, rows.weights > 0, what))
+        root = _shared(inverse_root(_only_diagonal(covariance) if diagonal else covariance, rows.weights > 0))
         whiten = (root.diagonal(dim1=-2, dim2=-1)[..., kept] if diagonal else root.flatten(-2),)
 
     factor = "none" if covariance is None else "diagonal" if diagonal else "full"
