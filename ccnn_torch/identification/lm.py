@@ -14,7 +14,7 @@ from ccnn_torch.identification.robust import LOSSES, loss_weights
 
 __all__ = ["solve_lm"]
 
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-14, 1e6
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-8, 1e-14, 1e6
 _ROUNDING = 1e-9  # Step in plausible errors that is nothing: 1e-12 m.
 _BLOCK = 8_000_000  # Numbers in the Jacobian of the machines that are worked on at once.
 _REACH = 3.0  # Starts lie within so many plausible errors.
@@ -32,7 +32,7 @@ def solve_lm(
     starts: int = 1,
     loss: str = "squared",
     max_iterations: int = 60,
-    tolerance: float = 1e-5,
+    tolerance: float = 1e-4,
 ) -> Fit:
     """Minimise the problem of every machine from several starts, all in one batch; the best start counts.
 
@@ -132,63 +132,78 @@ def _descend(
     normal: Normal, start: Tensor, scale: Tensor, free: Tensor, max_iterations: int, tolerance: float
 ) -> tuple[Tensor, Tensor, Tensor, int]:
     """Search from `r x m x k`; returns values, cost and converged (`r x m`), and the number of evaluations."""
-    x = start.clone()
+    x = start
     everyone = torch.arange(len(x), device=x.device)
     cost, gradient, matrix = normal(x, everyone)
     count = cost.numel()
-    converged = torch.zeros_like(cost, dtype=torch.bool)
     done = torch.isinf(cost)
+    converged = torch.zeros_like(done)
+    # Of the cost: what the tolerance and rounding make of it; and of the first cost, for data without noise.
+    enough = tolerance**2 / free + 1e-13
     least = 1e-24 * cost
     damping = torch.full_like(cost, _FIRST_DAMPING)
     before = torch.zeros_like(cost)
     for _ in range(max_iterations):
         step, promised = _step(matrix, gradient, damping)
         # Steps that fall from one to the next by a ratio leave about the last times that ratio.
-        left = promised * (promised / before.clamp_min(1e-300)).clamp_max(1)
-        variance = 2 * cost / free
-        near = (left <= tolerance**2 / 2 * variance) | (promised <= least) | (promised <= 1e-13 * cost)
-        near |= (step.abs().amax(-1) <= _ROUNDING) & (damping <= 1e-2)
+        left = promised * (promised / before).clamp_max(1)
+        near = (left <= enough * cost + least) | (step.abs().amax(-1) <= _ROUNDING) & (damping <= 1e-2)
         near &= ~done
-        # So small a step keeps its promise: no need to look.
-        x = torch.where(near[..., None], x + scale * step, x)
-        cost = torch.where(near, cost - promised, cost)
-        stuck = ~near & (damping >= _MOST_DAMPING)
-        converged |= near
-        done = done | near | stuck
-        index = torch.nonzero(~done.all(-1)).squeeze(-1)
-        if not len(index):
+        trial = x + scale * step
+        if bool(near.any()):
+            # So small a step keeps its promise: no need to look.
+            x = torch.where(near[..., None], trial, x)
+            cost = torch.where(near, cost - promised, cost)
+            converged, done = converged | near, done | near
+        done = done | (damping >= _MOST_DAMPING)
+        index = everyone if len(x) == 1 else torch.nonzero(~done.all(-1)).squeeze(-1)
+        if bool(done.all()):
             break
-        everything = len(index) == len(x)
-        trial = x + scale * torch.where(done[..., None], 0.0, step)
-        new = normal(trial if everything else trial[index], index)
-        count += new[0].numel()
-        if everything:
-            new_cost, new_gradient, new_matrix = new
-        else:
-            new_cost, new_gradient, new_matrix = cost.clone(), gradient.clone(), matrix.clone()
-            new_cost[index], new_gradient[index], new_matrix[index] = new
-        better = ~done & (new_cost <= cost)
-        worse = ~done & ~better
-        x = torch.where(better[..., None], trial, x)
-        cost = torch.where(better, new_cost, cost)
-        gradient = torch.where(better[..., None], new_gradient, gradient)
-        matrix = torch.where(better[..., None, None], new_matrix, matrix)
-        before = torch.where(better, promised, torch.where(worse, 0.0, before))
-        damping = torch.where(
-            better, (damping / 1000).clamp_min(_LEAST_DAMPING), torch.where(worse, damping * 30, damping)
-        )
+        new_cost, new_gradient, new_matrix = normal(trial[index], index)
+        count += new_cost.numel()
+        here = slice(None) if len(index) == len(x) else index
+        better = ~done[here] & (new_cost <= cost[here])
+        kept = (cost[here] - new_cost) / promised[here]
+        eased = (damping[here] * _change(kept, better)).clamp_min(_LEAST_DAMPING)
+        if bool(better.all()) and len(index) == len(x):
+            x, cost, gradient, matrix = trial, new_cost, new_gradient, new_matrix
+            before, damping = promised, eased
+            continue
+        x = _put(x, here, better, trial[here])
+        cost = _put(cost, here, better, new_cost)
+        gradient = _put(gradient, here, better, new_gradient)
+        matrix = _put(matrix, here, better, new_matrix)
+        before = _put(torch.zeros_like(before), here, better, promised[here])
+        damping = _put(damping, here, ~done[here], eased)
     return x, cost, converged, count
+
+
+def _change(kept: Tensor, better: Tensor) -> Tensor:
+    """Factor of the damping, from the share of the promised fall that a step kept."""
+    factor = torch.where(kept > 0.9, 1e-3, torch.where(kept > 0.5, 0.1, torch.where(kept > 0.1, 1.0, 4.0)))
+    return torch.where(better, factor, 10.0)
+
+
+def _put(table: Tensor, index: Tensor | slice, chosen: Tensor, values: Tensor) -> Tensor:
+    """The table with the chosen entries of some machines replaced."""
+    mask = chosen.reshape(*chosen.shape, *[1] * (values.dim() - chosen.dim()))
+    table = table.clone()
+    table[index] = torch.where(mask, values, table[index])
+    return table
 
 
 def _step(matrix: Tensor, gradient: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
     """Step `… x k` and the fall of the cost that it promises, `…`."""
-    ridge = damping * matrix.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-100)
-    damped = matrix.clone()
-    damped.diagonal(dim1=-2, dim2=-1).add_(ridge[..., None])
-    step = -torch.cholesky_solve(gradient[..., None], torch.linalg.cholesky_ex(damped).L)[..., 0]
-    promised = (ridge * step.square().sum(-1) - (step * gradient).sum(-1)) / 2
-    lost = ~torch.isfinite(promised) | (promised < 0)
-    return torch.where(lost[..., None], 0.0, step), torch.where(lost, torch.inf, promised)
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    ridge = (damping * diagonal.amax(-1)).clamp_min(1e-100)
+    damped = matrix + torch.diag_embed(ridge[..., None].expand_as(diagonal))
+    step = torch.cholesky_solve(-gradient[..., None], torch.linalg.cholesky_ex(damped).L)[..., 0]
+    promised = (step * (ridge[..., None] * step - gradient)).sum(-1) / 2
+    # Without a factor there is no step: the damping has to grow.
+    sound = promised >= 0
+    if bool(sound.all()):
+        return step, promised
+    return torch.where(sound[..., None], step, 0.0), torch.where(sound, promised, torch.inf)
 
 
 def _message(converged: Tensor, cost: Tensor, max_iterations: int) -> str:
