@@ -1,4 +1,4 @@
-"""Batched differentiable kinematics: base class, the paper's two machines, serial arms, and how to load them."""
+"""Batched differentiable kinematics: base class, parallel mechanisms, serial arms, and how to load them."""
 
 from ccnn_torch.mechanisms._mechanism import InverseKinematics as InverseKinematics
 from ccnn_torch.mechanisms._mechanism import Mechanism as Mechanism
@@ -9,6 +9,7 @@ from ccnn_torch.mechanisms.delta import Delta as Delta
 from ccnn_torch.mechanisms.delta import DeltaLinear as DeltaLinear
 from ccnn_torch.mechanisms.dh_file import read_dh_file as read_dh_file
 from ccnn_torch.mechanisms.five_bar import FiveBar as FiveBar
+from ccnn_torch.mechanisms.framed import Framed as Framed
 from ccnn_torch.mechanisms.frames import fit_frames as fit_frames
 from ccnn_torch.mechanisms.machine_tool import MachineTool as MachineTool
 from ccnn_torch.mechanisms.overconstrained import Overconstrained2Dof as Overconstrained2Dof

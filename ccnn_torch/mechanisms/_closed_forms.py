@@ -8,16 +8,20 @@ from torch import Tensor
 __all__ = ["crank_angle", "meeting_point", "real_acos", "real_sqrt", "upward_angle"]
 
 
-def real_sqrt(square: Tensor) -> Tensor:
-    """Square root, any shape; NaN where it is not real, and no gradient there that could spoil other rows."""
+def real_sqrt(square: Tensor) -> tuple[Tensor, Tensor]:
+    """Square root, any shape, and where it is real (bool); elsewhere 0.
+
+    What follows from a root that is not real is set to NaN last, by the mask: a NaN on the way, times a zero gradient,
+    would become the gradient of whatever the rows share.
+    """
     real = square >= 0
-    return torch.where(real, torch.sqrt(torch.where(real, square, 1.0)), torch.nan)
+    return torch.where(real, torch.sqrt(torch.where(real, square, 1.0)), 0.0), real
 
 
-def real_acos(cosine: Tensor) -> Tensor:
-    """Arc cosine, any shape [rad]; NaN where it is not real, and no gradient there that could spoil other rows."""
+def real_acos(cosine: Tensor) -> tuple[Tensor, Tensor]:
+    """Arc cosine, any shape [rad], and where it is real (bool); elsewhere 0. See `real_sqrt`."""
     real = cosine.abs() <= 1
-    return torch.where(real, torch.acos(torch.where(real, cosine, 0.0)), torch.nan)
+    return torch.where(real, torch.acos(torch.where(real, cosine, 0.0)), 0.0), real
 
 
 def upward_angle(x: Tensor, y: Tensor) -> Tensor:
@@ -41,7 +45,8 @@ def crank_angle(cosine: Tensor, sine: Tensor, constant: Tensor, side: float | Te
     Returns:
         `...` [rad]; NaN where there is no real root.
     """
-    return upward_angle(cosine, sine) + side * real_acos(-constant / torch.hypot(cosine, sine))
+    away, real = real_acos(-constant / torch.hypot(cosine, sine))
+    return torch.where(real, upward_angle(cosine, sine) + side * away, torch.nan)
 
 
 def meeting_point(centres: Tensor, radii: Tensor, below: bool) -> Tensor:
@@ -65,6 +70,6 @@ def meeting_point(centres: Tensor, radii: Tensor, below: bool) -> Tensor:
     a, b = (vv * along_u - uv * along_v) / area, (uu * along_v - uv * along_u) / area
     normal = torch.linalg.cross(u, v, dim=-1)
     foot = a[..., None] * u + b[..., None] * v
-    height = real_sqrt((r1**2 - (foot * foot).sum(-1)) / area)
-    point: Tensor = first + foot + (-height if below else height)[..., None] * normal
-    return point
+    height, real = real_sqrt((r1**2 - (foot * foot).sum(-1)) / area)
+    point = first + foot + (-height if below else height)[..., None] * normal
+    return torch.where(real[..., None], point, torch.nan)

@@ -45,6 +45,9 @@ def inscribed_circle(crank: Tensor, coupler: Tensor, foot: Tensor) -> tuple[Tens
                 f"cranks {crank.tolist()}, couplers {coupler.tolist()}, feet {foot.tolist()}"
             )
         centre, half = points[best], half / 4
+        # The margin rises by no more than the way gone: farther edge points cannot be the nearest any more.
+        near = torch.linalg.vector_norm(edge - centre, dim=-1) < margin[best] + 3 * half
+        edge = edge[near]
     return centre, margin[best]
 
 

@@ -162,7 +162,8 @@ class DeltaLinear(_Parallelograms):
         radial, aside, up = _in_leg(pose, angle)
         joint = stack_last(radial + platform - base, aside, up)
         along = (joint * _rail(lean, skew)).sum(-1)
-        return along + real_sqrt(along**2 - (joint**2).sum(-1) + rod**2) - offset
+        above, real = real_sqrt(along**2 - (joint**2).sum(-1) + rod**2)
+        return torch.where(real, along + above - offset, torch.nan)
 
 
 # Of the two solutions for a crank, the one that puts its end outward.

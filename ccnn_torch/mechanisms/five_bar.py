@@ -86,11 +86,11 @@ class FiveBar(Mechanism):
         crank, coupler, foot, gain, offset = _geometry(self.resolve(parameters))
         to_tool = pose[..., None, :] - foot
         distance = torch.linalg.vector_norm(to_tool, dim=-1)
-        at_foot = real_acos((crank**2 + distance**2 - coupler**2) / (2 * crank * distance))
+        at_foot, real = real_acos((crank**2 + distance**2 - coupler**2) / (2 * crank * distance))
         angle = upward_angle(*to_tool.unbind(-1)) + torch.tensor(_OUTWARD, dtype=pose.dtype) * at_foot
         theta = stack_last(angle[..., 0], torch.pi - angle[..., 1])
         psi = (theta - offset) / gain
-        return stack_last(psi[..., 0], torch.pi - psi[..., 1])
+        return torch.where(real, stack_last(psi[..., 0], torch.pi - psi[..., 1]), torch.nan)
 
     def forward_kinematics(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
@@ -102,9 +102,10 @@ class FiveBar(Mechanism):
         across = elbow[..., 1, :] - elbow[..., 0, :]
         square = (across**2).sum(-1)
         share = (coupler[..., 0] ** 2 - coupler[..., 1] ** 2 + square) / (2 * square)
-        height = real_sqrt(coupler[..., 0] ** 2 / square - share**2)
+        height, real = real_sqrt(coupler[..., 0] ** 2 / square - share**2)
         upward = stack_last(-across[..., 1], across[..., 0])
-        return elbow[..., 0, :] + share[..., None] * across + height[..., None] * upward
+        tool = elbow[..., 0, :] + share[..., None] * across + height[..., None] * upward
+        return torch.where(real[..., None], tool, torch.nan)
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Within reach of both legs, and above the line from elbow 1 to elbow 2; `...`, bool."""

@@ -79,10 +79,6 @@ class Stewart(Mechanism):
         pose = solve(closure, self.home_pose if guess is None else guess, (joints, values), slope)
         return torch.where(self.reachable(pose.detach(), values.detach())[..., None], pose, torch.nan)
 
-    def frame(self, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Position and rotation of the platform."""
-        return pose[..., :3], rotation_vector_to_matrix(pose[..., 3:])
-
     def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Closed form at the pose of the joints; see `Mechanism.jacobian`."""
         values = self.resolve(parameters)
@@ -111,6 +107,6 @@ class Stewart(Mechanism):
     def _arms_and_legs(self, pose: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """From the platform's origin to its joints, and from base to platform joint, `... x 6 x 3` [m] in base axes."""
         legs = values.reshape(*values.shape[:-1], 6, 8)
-        position, rotation = self.frame(pose)
+        rotation = rotation_vector_to_matrix(pose[..., 3:])
         arm = (rotation[..., None, :, :] @ legs[..., 3:6, None])[..., 0]
-        return arm, position[..., None, :] + arm - legs[..., :3]
+        return arm, pose[..., None, :3] + arm - legs[..., :3]
