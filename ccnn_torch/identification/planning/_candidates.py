@@ -22,6 +22,8 @@ Limits = Mapping[str, tuple[float, float]]
 _AT_ONCE = 20_000
 # Machines with plausible errors that must reach a pose, too.
 _MACHINES = 8
+# Configurations whose forward kinematics are tried on these machines in one call.
+_TRIED = 500
 # Draws after which a mechanism with hardly any candidate is given up.
 _DRAWS = 200
 # Singular values below this share of the largest are no information but rounding.
@@ -57,10 +59,9 @@ def draw_candidates(
         limits: lowest and highest value of joints and pose coordinates by name [SI].
         max_condition: bound on the condition number of the Jacobian: beyond it is too near to a singularity.
         rotation_weight: of the Jacobian's rotation rows [m/rad].
-        uncertainty: by how much each of the mechanism's parameters may be off, `K` [SI]; poses that would be out of
+        uncertainty: by how much each of the mechanism's parameters may be off, `K` [SI]; configurations that are out of
             reach of one of eight machines, every parameter of which is off by so much to one side or the other, are
-            left out: the most informative poses are at the edge of the workspace. A serial arm commands joints, which
-            are always there.
+            left out: the most informative ones are at the edge of the workspace. Serial arms reach all of theirs.
         progress: told the share that is found.
 
     Raises:
@@ -77,12 +78,14 @@ def draw_candidates(
         values = torch.cat([joints, pose], dim=-1)
         good = (torch.isfinite(values) & (values >= bounds[:, 0]) & (values <= bounds[:, 1])).all(-1)
         joints, pose = joints[good], pose[good]
+        condition = mechanism.condition_number(joints, rotation_weight, guess=pose)
+        order = condition.argsort(descending=True)
+        order = order[condition[order] <= max_condition]
         if others is not None:
-            good = mechanism.reachable(pose, others).all(0)
-            joints, pose = joints[good], pose[good]
-        good = mechanism.condition_number(joints, rotation_weight, guess=pose) <= max_condition
-        found.append((joints[good], pose[good]))
-        there += int(good.sum())
+            order = _in_reach(mechanism, joints, pose, order, others)
+        kept = order.sort().values
+        found.append((joints[kept], pose[kept]))
+        there += len(kept)
         if progress is not None:
             progress(min(1.0, there / count))
         if there >= count:
@@ -110,6 +113,23 @@ def _others(mechanism: Mechanism, uncertainty: Tensor | None) -> Tensor | None:
         return None
     draw = torch.rand(_MACHINES, 1, len(uncertainty), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return mechanism.nominal + torch.where(draw < 0.5, -uncertainty, uncertainty)
+
+
+def _in_reach(mechanism: Mechanism, joints: Tensor, pose: Tensor, order: Tensor, others: Tensor) -> Tensor:
+    """Which of the configurations in `order` (worst conditioned first) all the other machines reach, too.
+
+    That a machine has joints for the pose is asked everywhere. That the commanded joints close its loops, too, is asked
+    where it may fail, near singularities of the second kind: from the worst conditioned on, until none fails any more.
+    """
+    order = order[mechanism.reachable(pose[order], others).all(0)]
+    kept = []
+    for part in torch.split(order, _TRIED):
+        there = mechanism.forward_kinematics(joints[part], others, pose[part])
+        good = torch.isfinite(there).all(-1).all(0)
+        kept.append(part[good])
+        if bool(good.all()):
+            break
+    return torch.cat([*kept, order[len(kept) * _TRIED :]])
 
 
 def _bounds(mechanism: Mechanism, limits: Limits) -> Tensor:
