@@ -105,7 +105,9 @@ def test_linear_delta_with_leaning_rails_is_level_at_the_same_height():
     star = load_mechanism("delta_linear", lean=math.pi / 2, base=0.0)
     pose = torch.tensor([0.0, 0.0, -0.4], dtype=torch.float64)
     expected = 0.05 + math.sqrt(0.6**2 - 0.4**2)
-    torch.testing.assert_close(star.solve_inverse(pose), torch.full((3,), expected, dtype=torch.float64), rtol=0, atol=1e-14)
+    torch.testing.assert_close(
+        star.solve_inverse(pose), torch.full((3,), expected, dtype=torch.float64), rtol=0, atol=1e-14
+    )
 
 
 def test_stewart_keeps_its_assembly_mode():
