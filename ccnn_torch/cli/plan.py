@@ -24,7 +24,8 @@ def plan(
     OUT.csv has a row for each pose: the joints to command, q1[unit]…, and the pose at which they bring the nominal
     machine, in the order of their worth. The page beside it tells what each further pose would give. Keys:
     mechanism_keys, parameters.free, .fixed, .tied, .prior, residual, noise, joint_noise, index, candidates, limits,
-    max_condition, rotation_weight, per_leg, repeat, least_gain, seed.
+    max_condition, rotation_weight, per_leg, repeat,
+    least_gain, margin, seed.
 
     Examples:
 

@@ -75,6 +75,11 @@ class PlanConfig(_Part):
     least_gain: float = Field(
         default=0.02, gt=0, lt=1, description="what a further pose must give to be worth measuring, a share"
     )
+    margin: float = Field(
+        default=2.0,
+        ge=0,
+        description="poses stay in reach of machines whose parameters are off by so many plausible errors",
+    )
     seed: int = Field(default=0, ge=0, description="seed of the candidates")
 
 

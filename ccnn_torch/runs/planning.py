@@ -59,6 +59,7 @@ def make_plan(
         per_leg=config.per_leg,
         repeat=config.repeat,
         least_gain=config.least_gain,
+        margin=config.margin,
         seed=config.seed,
         progress=progress,
     )

@@ -20,6 +20,10 @@ Limits = Mapping[str, tuple[float, float]]
 
 # Candidates drawn and looked at in one call.
 _AT_ONCE = 20_000
+# Machines with plausible errors that must reach a pose, too.
+_MACHINES = 8
+# Configurations whose forward kinematics are tried on these machines in one call.
+_TRIED = 500
 # Draws after which a mechanism with hardly any candidate is given up.
 _DRAWS = 200
 # Singular values below this share of the largest are no information but rounding.
@@ -43,6 +47,7 @@ def draw_candidates(
     limits: Limits | None = None,
     max_condition: float = 50.0,
     rotation_weight: float = 0.04,
+    uncertainty: Tensor | None = None,
     progress: Progress | None = None,
 ) -> Candidates:
     """Configurations from the mechanism's own sampling of its workspace.
@@ -54,6 +59,9 @@ def draw_candidates(
         limits: lowest and highest value of joints and pose coordinates by name [SI].
         max_condition: bound on the condition number of the Jacobian: beyond it is too near to a singularity.
         rotation_weight: of the Jacobian's rotation rows [m/rad].
+        uncertainty: by how much each of the mechanism's parameters may be off, `K` [SI]; configurations that are out of
+            reach of one of eight machines, every parameter of which is off by so much to one side or the other, are
+            left out: the most informative ones are at the edge of the workspace. Serial arms reach all of theirs.
         progress: told the share that is found.
 
     Raises:
@@ -61,6 +69,7 @@ def draw_candidates(
     """
     bounds = _bounds(mechanism, limits or {})
     generator = torch.Generator().manual_seed(seed)
+    others = _others(mechanism, uncertainty)
     found: list[tuple[Tensor, Tensor]] = []
     there = drawn = 0
     for _ in range(_DRAWS):
@@ -69,9 +78,14 @@ def draw_candidates(
         values = torch.cat([joints, pose], dim=-1)
         good = (torch.isfinite(values) & (values >= bounds[:, 0]) & (values <= bounds[:, 1])).all(-1)
         joints, pose = joints[good], pose[good]
-        good = mechanism.condition_number(joints, rotation_weight, guess=pose) <= max_condition
-        found.append((joints[good], pose[good]))
-        there += int(good.sum())
+        condition = mechanism.condition_number(joints, rotation_weight, guess=pose)
+        order = condition.argsort(descending=True)
+        order = order[condition[order] <= max_condition]
+        if others is not None:
+            order = _in_reach(mechanism, joints, pose, order, others)
+        kept = order.sort().values
+        found.append((joints[kept], pose[kept]))
+        there += len(kept)
         if progress is not None:
             progress(min(1.0, there / count))
         if there >= count:
@@ -80,8 +94,8 @@ def draw_candidates(
         if there < drawn / 100 and drawn >= _DRAWS // 2 * min(count, _AT_ONCE):
             break
     raise InputError(
-        f"mechanism '{mechanism.name}': only {there} of {drawn} configurations are inside the limits and have a "
-        f"condition number up to {max_condition:g}; widen limits or max_condition"
+        f"mechanism '{mechanism.name}': only {there} of {drawn} configurations are inside the limits, have a condition "
+        f"number up to {max_condition:g}, and are in reach with plausible errors; widen limits or max_condition"
     )
 
 
@@ -91,6 +105,31 @@ def _draw(mechanism: Mechanism, count: int, generator: torch.Generator) -> tuple
         return mechanism.solve_inverse(pose), pose
     joints = mechanism.sample_joints(count, generator)
     return joints, mechanism.forward_kinematics(joints)
+
+
+def _others(mechanism: Mechanism, uncertainty: Tensor | None) -> Tensor | None:
+    """Parameters of machines that are off, `m x 1 x K`."""
+    if uncertainty is None or mechanism.orientations:
+        return None
+    draw = torch.rand(_MACHINES, 1, len(uncertainty), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return mechanism.nominal + torch.where(draw < 0.5, -uncertainty, uncertainty)
+
+
+def _in_reach(mechanism: Mechanism, joints: Tensor, pose: Tensor, order: Tensor, others: Tensor) -> Tensor:
+    """Which of the configurations in `order` (worst conditioned first) all the other machines reach, too.
+
+    That a machine has joints for the pose is asked everywhere. That the commanded joints close its loops, too, is asked
+    where it may fail, near singularities of the second kind: from the worst conditioned on, until none fails any more.
+    """
+    order = order[mechanism.reachable(pose[order], others).all(0)]
+    kept = []
+    for part in torch.split(order, _TRIED):
+        there = mechanism.forward_kinematics(joints[part], others, pose[part])
+        good = torch.isfinite(there).all(-1).all(0)
+        kept.append(part[good])
+        if bool(good.all()):
+            break
+    return torch.cat([*kept, order[len(kept) * _TRIED :]])
 
 
 def _bounds(mechanism: Mechanism, limits: Limits) -> Tensor:

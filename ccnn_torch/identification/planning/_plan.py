@@ -13,7 +13,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.forward import forward_problem
 from ccnn_torch.identification.inverse import Noise, inverse_problem
 from ccnn_torch.identification.legs import split_by_leg
-from ccnn_torch.identification.parameters import ParameterChoice
+from ccnn_torch.identification.parameters import ParameterChoice, select_parameters
 from ccnn_torch.identification.planning._candidates import (
     Candidates,
     Limits,
@@ -194,6 +194,7 @@ def plan_poses(
     per_leg: bool = False,
     repeat: bool = False,
     least_gain: float = 0.02,
+    margin: float = 2.0,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[Plan]:
@@ -211,6 +212,7 @@ def plan_poses(
         residual: `inverse` compares joints, `forward` poses; `auto` = poses for serial arms and framed mechanisms.
         per_leg: a plan for each leg (divide and conquer, paper 004) in place of a common one.
         repeat, least_gain: as `choose_poses`.
+        margin: poses stay in reach of machines whose free parameters are off by so many plausible errors.
         seed: of the draws.
         progress: told the share that is done.
 
@@ -221,6 +223,7 @@ def plan_poses(
         InputError: as `draw_candidates`, `choose_poses` and `inverse_problem`.
     """
     tell = progress or (lambda _: None)
+    selection = select_parameters(mechanism.geometry, choice, mechanism.nominal)
     found = draw_candidates(
         mechanism,
         candidates,
@@ -228,6 +231,7 @@ def plan_poses(
         limits=limits,
         max_condition=max_condition,
         rotation_weight=rotation_weight,
+        uncertainty=margin * selection.scale @ selection.spread,
         progress=_share(tell, 0.0, 0.4),
     )
     if pose_noise is None and joint_noise is None:

@@ -13,9 +13,6 @@ from ccnn_torch.report.plots._style import FLOOR, GREY, SERIES, Plot, styled
 
 __all__ = ["plan_plot"]
 
-# Poses up to so many have their number in the order of worth beside them.
-_NUMBERED = 40
-
 
 @styled
 def plan_plot(pose: Sequence[Coordinate], plans: Sequence[Plan], least_gain: float) -> Plot:
@@ -32,10 +29,9 @@ def plan_plot(pose: Sequence[Coordinate], plans: Sequence[Plan], least_gain: flo
     for axes, plane in zip(maps, planes, strict=True):
         _draw_map(axes, pose, plans, plane)
     _draw_gains(curves, plans, least_gain)
-    numbered = ", numbered in the order of their worth" if len(plans[0].pose) <= _NUMBERED else ""
     caption = (
-        f"The planned poses among the candidates{numbered} (left), and the share by which each further pose makes the "
-        f"information det^(1/2k) larger (right; {100 * least_gain:g} % is the least that is worth a measurement)."
+        "The planned poses among the candidates (left), and the share by which each further pose makes the information "
+        f"det^(1/2k) larger (right; {100 * least_gain:g} % is the least that is worth a measurement)."
     )
     return Plot("plan", figure, caption)
 
@@ -49,12 +45,6 @@ def _draw_map(axes: Axes, pose: Sequence[Coordinate], plans: Sequence[Plan], pla
         x, y = plan.pose[:, across], plan.pose[:, up]
         label = "planned" if plan.leg is None else f"leg {plan.leg}"
         axes.scatter(x, y, s=22, color=color, edgecolors="white", linewidths=0.6, zorder=3, label=label)
-        if len(x) <= _NUMBERED:
-            for number, (a, b) in enumerate(zip(x.tolist(), y.tolist(), strict=True), start=1):
-                place = (3, 3 if i % 2 == 0 else -9)
-                axes.annotate(
-                    str(number), (a, b), xytext=place, textcoords="offset points", fontsize=6.5, color=color, zorder=4
-                )
     if pose[across].unit == pose[up].unit:
         axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(f"{pose[across].name} [{pose[across].unit}]")
