@@ -158,7 +158,7 @@ def identification_rows(problem: Problem, progress: Progress | None = None) -> T
         part = slice(begin, begin + _AT_ONCE)
         data = tuple(d[0, part] for d in problem.data)
         values = problem.start[0].expand(len(data[0]), -1)
-        rows.append(row_jacobian(problem.residual, values, data)[1] * problem.scale)
+        rows.append(row_jacobian(problem.residual, values, data, len(problem.channels))[1] * problem.scale)
         if progress is not None:
             progress(min(1.0, (begin + _AT_ONCE) / count))
     return torch.cat(rows)

@@ -1,0 +1,157 @@
+"""`ccnn identify` and `ccnn compensate` with what it wrote: files, resuming, exit codes."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import pytest
+import torch
+
+from ccnn_torch.compensation import load_compensation
+from ccnn_torch.errors import InputError, ModelFileError
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.records import read_table, write_table
+from ccnn_torch.report.identified_report import write_identified_report
+from ccnn_torch.report.json_files import load_schema
+from ccnn_torch.runs.identification import resume_identification, start_identification
+from ccnn_torch.runs.identify_config import load_identify_config
+
+CONFIG = """\
+mechanism: five_bar
+simulate: {machines: 3, poses: 20, noise: 1e-6, circle: true, test_poses: 12, counts: [16, 24], map: 9,
+           design: planned_per_leg, candidates: 300}
+methods: [lm, lm_per_leg, tikhonov]
+paper: "004"
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished folder of `ccnn identify`."""
+    path = tmp_path_factory.mktemp("identify")
+    (path / "bar.yaml").write_text(CONFIG)
+    return start_identification(load_identify_config(path / "bar.yaml", [f"out={path / 'out'}"]), quiet=True)
+
+
+def test_the_folder_has_everything(folder: Path) -> None:
+    names = {p.name for p in folder.iterdir()}
+    assert names >= {"config.yaml", "identified.json", "identified.csv", "identified.md", "identified.yaml"}
+    assert names >= {"report.html", "plots", "arrays.safetensors", "methods"}
+    results = json.loads((folder / "identified.json").read_text())
+    jsonschema.validate(results, load_schema("identified"))
+    assert list(results["methods"]) == ["lm", "lm_per_leg", "tikhonov"]
+    assert set(results["parameters"]["l1"]["spread"]) >= {"value", "sd"}
+    assert [c["poses"] for c in results["counts"]] == [16, 24]
+    plots = {p.stem for p in (folder / "plots").glob("*.png")}
+    assert plots >= {"pose_error", "parameters", "deviations_lengths", "map", "poses", "measurements", "correlation"}
+    page = (folder / "report.html").read_text()
+    assert page.count("<figure") == len(plots)
+    assert "Table 3 of the paper beside ours" in page and "http" not in page.replace("http://www.w3.org", "")
+    csv = (folder / "identified.csv").read_text().splitlines()
+    assert csv[0] == "subject,name,quantity,unit,value,low,high"
+    assert any(line.startswith("parameter,l1,sd,m,") for line in csv)
+
+
+def test_the_report_can_be_written_again(folder: Path, tmp_path: Path) -> None:
+    again = tmp_path / "copy"
+    shutil.copytree(folder, again)
+    before = (again / "report.html").read_bytes()
+    write_identified_report(again)
+    assert (again / "report.html").read_bytes() == before
+
+
+def test_an_interrupted_one_goes_on_behind_the_last_method(folder: Path, tmp_path: Path) -> None:
+    stopped = tmp_path / "stopped"
+    shutil.copytree(folder, stopped)
+    (stopped / "identified.json").unlink()
+    (stopped / "methods" / "tikhonov.safetensors").unlink()
+    kept = (stopped / "methods" / "lm.safetensors").read_bytes()
+    resume_identification(stopped, quiet=True)
+    assert (stopped / "methods" / "lm.safetensors").read_bytes() == kept
+    first, second = (json.loads((f / "identified.json").read_text()) for f in (folder, stopped))
+    for results in (first, second):
+        results["methods"]["tikhonov"].pop("seconds")
+    assert first == second
+    finished = (stopped / "identified.json").read_bytes()
+    resume_identification(stopped, quiet=True)
+    assert (stopped / "identified.json").read_bytes() == finished
+
+
+def test_changed_data_and_damaged_files_are_refused(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    (other / "identified.json").unlink()
+    config = (other / "config.yaml").read_text()
+    (other / "config.yaml").write_text(config.replace("seed: 0", "seed: 1"))
+    with pytest.raises(InputError, match="is of other data"):
+        resume_identification(other, quiet=True)
+    (other / "config.yaml").write_text(config)
+    (other / "methods" / "lm.safetensors").write_bytes(b"12345678")
+    with pytest.raises(InputError, match=r"lm\.safetensors: is damaged"):
+        resume_identification(other, quiet=True)
+    with pytest.raises(InputError, match="nothing to resume"):
+        resume_identification(tmp_path / "empty", quiet=True)
+
+
+def test_a_folder_whose_data_cannot_be_used_is_free_again(tmp_path: Path) -> None:
+    (tmp_path / "bar.yaml").write_text("mechanism: five_bar\nsimulate: {poses: 2}\n")
+    config = load_identify_config(tmp_path / "bar.yaml", [f"out={tmp_path / 'out'}"])
+    with pytest.raises(InputError, match="cannot determine"):
+        start_identification(config, quiet=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_commands_by_identified_geometry_are_exact_and_lead_back(folder: Path) -> None:
+    model = load_compensation(folder / "identified.json")
+    nominal, real = load_mechanism("five_bar"), load_mechanism(str(folder / "identified.yaml"))
+    assert not torch.equal(nominal.nominal, real.nominal)
+    wanted = nominal.sample_workspace(30, torch.Generator().manual_seed(0))
+    wanted = wanted[(wanted - nominal.home_pose).norm(dim=-1) < 0.5]
+    ideal = nominal.solve_inverse(wanted)
+    found = model(ideal)
+    assert found["inside_domain"].all()
+    reached = real.forward_kinematics(torch.from_numpy(found["command"]))
+    torch.testing.assert_close(reached, wanted, rtol=0, atol=1e-12)
+    torch.testing.assert_close(torch.from_numpy(model(found["command"])["ideal"]), ideal, rtol=0, atol=1e-12)
+    torch.testing.assert_close(torch.from_numpy(found["command"] + found["deviation"]), ideal, rtol=0, atol=1e-15)
+
+
+def test_what_cannot_be_reached_comes_back_as_it_was(folder: Path) -> None:
+    model = load_compensation(folder / "identified.yaml")
+    far = [[0.0, torch.pi], [float("nan"), 1.0]]
+    found = model(far)
+    assert not found["inside_domain"].any()
+    assert found["command"][0].tolist() == far[0]
+    with pytest.raises(InputError, match=r"takes the joints q1\[rad\], q2\[rad\]"):
+        model([1.0, 2.0, 3.0])
+
+
+def test_the_command_line(folder: Path, tmp_path: Path) -> None:
+    def ccnn(*words: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "ccnn_torch", *map(str, words)]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+
+    poses = load_mechanism("five_bar").sample_workspace(9, torch.Generator().manual_seed(2)) * 0.3
+    poses[:, 1] += 0.8
+    write_table(tmp_path / "in.csv", {"x[mm]": 1e3 * poses[:, 0].numpy(), "y[mm]": 1e3 * poses[:, 1].numpy()})
+    done = ccnn("compensate", folder / "identified.yaml", "in.csv", "out.csv", "--pose")
+    assert done.returncode == 0 and done.stderr == ""
+    table = read_table(tmp_path / "out.csv")
+    command = torch.stack([torch.from_numpy(table.column(f"command_q{i}", "rad")) for i in (1, 2)], dim=-1)
+    reached = load_mechanism(str(folder / "identified.yaml")).forward_kinematics(command)
+    torch.testing.assert_close(reached, poses, rtol=0, atol=1e-12)
+    refused = ccnn("compensate", folder / "identified.yaml", "in.csv", "out.csv", "--pose", "--sd")
+    assert refused.returncode == 2 and "has no standard deviation" in refused.stderr
+    wrong = ccnn("identify", folder / "config.yaml", "methods=lm_pr_leg", "--out", "x")
+    assert wrong.returncode == 2 and len(wrong.stderr.splitlines()) == 1
+    assert "did you mean 'lm_per_leg'" in wrong.stderr
+
+
+def test_a_file_that_is_no_identified_machine_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "dh.yaml").write_text("dof: 6\n")
+    for name in ("dh.yaml", "missing.yaml", "missing.json"):
+        with pytest.raises(ModelFileError, match="there is no identified machine"):
+            load_compensation(tmp_path / name)
