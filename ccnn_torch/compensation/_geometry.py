@@ -22,6 +22,8 @@ Array = NDArray[Any]
 
 # How near to a pose the joints must bring a machine [m, rad].
 _CLOSE = 1e-8
+# How far joints may be from those that the inverse kinematics give for their pose [SI].
+_SAME = 1e-6
 _FORMS = (".yaml", ".yml", ".json")
 
 
@@ -119,4 +121,6 @@ def _carried(first: Mechanism, second: Mechanism, joints: Tensor) -> tuple[Tenso
     reached = error.position < _CLOSE
     if error.rotation is not None:
         reached = reached & (error.rotation < _CLOSE)
+    # Joints in another working mode take a pose that our inverse kinematics would take with far-off joints.
+    reached &= first.wrap(first.solve_inverse(pose, guess=joints) - joints).abs().amax(-1) < _SAME
     return torch.where(reached[..., None], found, joints), reached

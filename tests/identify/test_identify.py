@@ -52,7 +52,7 @@ def test_held_out_error_is_the_measurement_noise_and_almost_all_is_removed() -> 
     assert results["test"]["rotation"] is None
     assert results["compensation"]["exact"]["position"]["removed"] >= 0.99
     # Linear commands leave what is of second order in the errors.
-    assert 0.9 < results["compensation"]["linear"]["position"]["removed"] < 0.99
+    assert 0.9 < results["compensation"]["linear"]["position"]["removed"] < 0.995
 
 
 def test_every_machine_has_its_own_errors_and_more_machines_do_not_change_them() -> None:
@@ -198,7 +198,7 @@ def arm_rows(folder: Path) -> tuple[Path, Path, SerialArm]:
     truth[:6] += torch.tensor([1.0, -2.0, 0.5, 0.1, 0.2, 1.5])
     truth[-6:] += torch.tensor([0.02, 0.01, 0.1, 0.0, 0.3, 0.2])
     real = arm.with_nominal(truth)
-    joints = real.sample_joints(70, generator)
+    joints = real.sample_joints(40, generator)
     pose = real.forward_kinematics(joints)
     pose = pose + torch.tensor([1e-5] * 3 + [3e-5] * 3) * torch.randn(pose.shape, generator=generator, dtype=pose.dtype)
     columns = {c.header: joints[:, i].numpy() for i, c in enumerate(arm.joints)}
@@ -209,7 +209,7 @@ def arm_rows(folder: Path) -> tuple[Path, Path, SerialArm]:
 
 def test_an_arm_from_records_out_again_as_dh_file_and_urdf(tmp_path: Path) -> None:
     rows, file, real = arm_rows(tmp_path)
-    found = ccnn_torch.identify(mechanism=str(file), records=str(rows), noise=1e-5)
+    found = ccnn_torch.identify(mechanism=str(file), records=str(rows), noise=1e-5, save_report=False)
     results = found.results
     assert results["data_sha256"]
     assert results["compensation"] is None and not results["simulated"]

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import jsonschema
 import pytest
 import torch
 
+from ccnn_torch.cli import main
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.mechanisms import load_mechanism
@@ -55,12 +55,10 @@ def test_the_folder_has_everything(folder: Path) -> None:
     assert any(line.startswith("parameter,l1,sd,m,") for line in csv)
 
 
-def test_the_report_can_be_written_again(folder: Path, tmp_path: Path) -> None:
-    again = tmp_path / "copy"
-    shutil.copytree(folder, again)
-    before = (again / "report.html").read_bytes()
-    write_identified_report(again)
-    assert (again / "report.html").read_bytes() == before
+def test_a_report_needs_its_arrays(folder: Path, tmp_path: Path) -> None:
+    shutil.copy(folder / "identified.json", tmp_path)
+    with pytest.raises(InputError, match=r"arrays\.safetensors: is not there or damaged"):
+        write_identified_report(tmp_path)
 
 
 def test_an_interrupted_one_goes_on_behind_the_last_method(folder: Path, tmp_path: Path) -> None:
@@ -68,6 +66,8 @@ def test_an_interrupted_one_goes_on_behind_the_last_method(folder: Path, tmp_pat
     shutil.copytree(folder, stopped)
     (stopped / "identified.json").unlink()
     (stopped / "methods" / "tikhonov.safetensors").unlink()
+    config = (stopped / "config.yaml").read_text()
+    (stopped / "config.yaml").write_text(config.replace("save_report: true", "save_report: false"))
     kept = (stopped / "methods" / "lm.safetensors").read_bytes()
     resume_identification(stopped, quiet=True)
     assert (stopped / "methods" / "lm.safetensors").read_bytes() == kept
@@ -121,7 +121,7 @@ def test_commands_by_identified_geometry_are_exact_and_lead_back(folder: Path) -
 
 def test_what_cannot_be_reached_comes_back_as_it_was(folder: Path) -> None:
     model = load_compensation(folder / "identified.yaml")
-    far = [[0.0, torch.pi], [float("nan"), 1.0]]
+    far = [[0.0, 0.0], [float("nan"), 1.0]]  # the left crank inward: another working mode
     found = model(far)
     assert not found["inside_domain"].any()
     assert found["command"][0].tolist() == far[0]
@@ -129,25 +129,34 @@ def test_what_cannot_be_reached_comes_back_as_it_was(folder: Path) -> None:
         model([1.0, 2.0, 3.0])
 
 
-def test_the_command_line(folder: Path, tmp_path: Path) -> None:
-    def ccnn(*words: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "ccnn_torch", *map(str, words)]
-        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+def test_the_command_line(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ccnn(*words: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["ccnn", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return int(ended.value.code or 0), capsys.readouterr().err
 
+    monkeypatch.chdir(tmp_path)
     poses = load_mechanism("five_bar").sample_workspace(9, torch.Generator().manual_seed(2)) * 0.3
     poses[:, 1] += 0.8
     write_table(tmp_path / "in.csv", {"x[mm]": 1e3 * poses[:, 0].numpy(), "y[mm]": 1e3 * poses[:, 1].numpy()})
-    done = ccnn("compensate", folder / "identified.yaml", "in.csv", "out.csv", "--pose")
-    assert done.returncode == 0 and done.stderr == ""
+    assert ccnn("compensate", folder / "identified.yaml", "in.csv", "out.csv", "--pose") == (0, "")
     table = read_table(tmp_path / "out.csv")
     command = torch.stack([torch.from_numpy(table.column(f"command_q{i}", "rad")) for i in (1, 2)], dim=-1)
     reached = load_mechanism(str(folder / "identified.yaml")).forward_kinematics(command)
     torch.testing.assert_close(reached, poses, rtol=0, atol=1e-12)
-    refused = ccnn("compensate", folder / "identified.yaml", "in.csv", "out.csv", "--pose", "--sd")
-    assert refused.returncode == 2 and "has no standard deviation" in refused.stderr
-    wrong = ccnn("identify", folder / "config.yaml", "methods=lm_pr_leg", "--out", "x")
-    assert wrong.returncode == 2 and len(wrong.stderr.splitlines()) == 1
-    assert "did you mean 'lm_per_leg'" in wrong.stderr
+    code, said = ccnn("compensate", folder / "identified.yaml", "in.csv", "out.csv", "--pose", "--sd")
+    assert code == 2 and "has no standard deviation" in said
+    code, said = ccnn("identify", folder / "config.yaml", "methods=lm_pr_leg", "--out", "x")
+    assert code == 2 and len(said.splitlines()) == 1 and "did you mean 'lm_per_leg'" in said
+    code, said = ccnn("identify", "--resume", folder, "seed=3")
+    assert code == 2 and len(said.splitlines()) == 1
+    assert ccnn(
+        "identify", folder / "config.yaml", "save_report=false", "--quiet", "--out", "again", "--seed", "7"
+    ) == (0, "")
+    assert json.loads((tmp_path / "again" / "identified.json").read_text())["seed"] == 7
 
 
 def test_a_file_that_is_no_identified_machine_is_refused(tmp_path: Path) -> None:

@@ -96,8 +96,8 @@ class Places:
         if not isinstance(self._own, SerialArm):
             inside = inside & self._own.reachable(place)
         joints, pose = self.taken(place)
-        found: Tensor = torch.isfinite(joints).all(-1).all(0) & torch.isfinite(pose).all(-1).all(0)
-        return inside & found
+        usable: Tensor = inside & torch.isfinite(joints).all(-1).all(0) & torch.isfinite(pose).all(-1).all(0)
+        return usable
 
     def even(self, count: int) -> Tensor:
         """Places of low discrepancy, `count x .`: a Halton sequence in the box, without what is out of reach."""
