@@ -56,7 +56,7 @@ def _visible(projector: NDArray[np.float64]) -> NDArray[np.float64]:
 def _sentence(names: list[str], visible: NDArray[np.float64]) -> str:
     everyone = _listed(names)
     if not len(visible):
-        return f"{everyone} not at all: no measured row depends on {'it' if len(names) == 1 else 'them'}"
+        return f"{everyone} not at all"
     return f"{everyone} only as {_listed([_combination(names, row) for row in visible])}"
 
 

@@ -10,7 +10,11 @@ from torch import Tensor
 
 from ccnn_torch.identification.problem import Problem
 
-__all__ = ["SparseResidual", "WeightedRows", "row_jacobian"]
+__all__ = ["OPEN", "SparseResidual", "WeightedRows", "row_jacobian"]
+
+# A direction in which the rows leave more than so many plausible errors open (0.1 m, 0.2 rad) counts as unseen: what a
+# linearised problem says so far away means nothing.
+OPEN = 100.0
 
 # Numbers in the residual's copies below which one backward pass through all of them beats a pass for each channel.
 _SMALL = 20_000

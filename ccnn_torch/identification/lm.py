@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification._linear import WeightedRows
+from ccnn_torch.identification._linear import OPEN, WeightedRows
 from ccnn_torch.identification.problem import Fit, Problem, Progress
 from ccnn_torch.identification.robust import LOSSES, loss_weights
 
 __all__ = ["solve_lm"]
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-8, 1e-14, 1e6
+_FAR = 30.0  # Plausible errors in one step that make one ask whether its direction is seen at all.
 _ROUNDING = 1e-9  # Step in plausible errors that is nothing: 1e-12 m.
 _BLOCK = 8_000_000  # Numbers in the Jacobian of the machines that are worked on at once.
 _REACH = 3.0  # Starts lie within so many plausible errors.
@@ -36,8 +37,9 @@ def solve_lm(
 ) -> Fit:
     """Minimise the problem of every machine from several starts, all in one batch; the best start counts.
 
-    The step solves (JᵀJ + prior + λ max diag(JᵀJ) I) du = -gradient, u being the values in plausible errors: a
-    direction that the rows do not see stays where it was. A trial that is worse, or not finite (out of reach), is
+    The step solves (JᵀJ + prior + λ max diag(JᵀJ) I) du = -gradient, u being the values in plausible errors. A
+    direction that the rows do not see stays where it was, and so does one that they see so faintly that the noise
+    would move it by 100 plausible errors. A trial that is worse, or not finite (out of reach), is
     refused and λ grows.
 
     Args:
@@ -145,6 +147,10 @@ def _descend(
     before = torch.zeros_like(cost)
     for _ in range(max_iterations):
         step, promised = _step(matrix, gradient, damping)
+        far = ~done & (step.abs().amax(-1) > _FAR)
+        if bool(far.any()):
+            unseen = (2 * cost / free / OPEN**2)[far]
+            step[far], promised[far] = _seen_step(matrix[far], gradient[far], damping[far], unseen)
         # Steps that fall from one to the next by a ratio leave about the last times that ratio.
         left = promised * (promised / before).clamp_max(1)
         near = (left <= enough * cost + least) | (step.abs().amax(-1) <= _ROUNDING) & (damping <= 1e-2)
@@ -176,6 +182,17 @@ def _descend(
         before = _put(torch.zeros_like(before), here, better, promised[here])
         damping = _put(damping, here, ~done[here], eased)
     return x, cost, converged, count
+
+
+def _seen_step(matrix: Tensor, gradient: Tensor, damping: Tensor, unseen: Tensor) -> tuple[Tensor, Tensor]:
+    """As `_step`, within the eigenvectors of the matrix whose eigenvalue is above `unseen`, `…`."""
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(matrix))
+    largest = values[..., -1:]
+    along = (vectors.mT @ gradient[..., None])[..., 0]
+    curvature = values + (damping[..., None] * largest).clamp_min(1e-100)
+    part = torch.where(values > torch.maximum(unseen[..., None], 1e-14 * largest), -along / curvature, 0.0)
+    step = (vectors @ part[..., None])[..., 0]
+    return step, (part * ((curvature - values) * part - along)).sum(-1) / 2
 
 
 def _change(kept: Tensor, better: Tensor) -> Tensor:
