@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification._combinations import combinations_in_words
+from ccnn_torch.identification._combinations import TAKES_PART, combinations_in_words
 from ccnn_torch.identification._linear import OPEN, WeightedRows
 from ccnn_torch.identification.problem import Problem
 
@@ -18,8 +18,6 @@ __all__ = ["Knowledge", "require_identifiable", "what_is_known"]
 
 # Singular values below this share of the largest are rounding.
 _RANK = 1e-9
-# A parameter takes part in a direction that cannot be known from this component on (squared).
-_TAKES_PART = 1e-10
 
 
 @dataclass(frozen=True)
@@ -72,6 +70,8 @@ def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
     At the true values with the true noise the standard errors are the Cramér-Rao bound. No pseudoinverse: along a
     direction that the rows do not see the uncertainty is infinite, and so is that of every parameter that takes part
     in it. A direction whose standard error would be above 100 plausible errors counts as not seen.
+    A parameter takes part in a direction if one plausible error along it moves the parameter by more than a hundredth
+    of its own; one that is moved by less keeps a finite error, with that movement in it.
 
     Args:
         problem: for a robust fit, that of `robust.reweighted`; its errors are then approximate, `bootstrap` tells.
@@ -98,9 +98,10 @@ def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
     _, singular, directions = torch.linalg.svd(_tall(slope), full_matrices=False)
     seen = singular > torch.maximum(_RANK * singular[:, :1], least)
     hidden = torch.where(seen[..., None], 0.0, directions)
-    identifiable = hidden.square().sum(-2) <= _TAKES_PART
+    identifiable = hidden.square().sum(-2) <= TAKES_PART**2
     open_ = strength <= torch.maximum(_RANK * strength[:, :1], least)
-    left_open = torch.where(open_[..., None], basis, 0.0).square().sum(-2) > _TAKES_PART
+    dragged = torch.where(open_[..., None], basis, 0.0).square().sum(-2)
+    left_open = dragged > TAKES_PART**2
     spread = torch.where(open_, 0.0, 1 / strength.clamp_min(1e-300))[..., None] * basis
     covariance = spread.mT @ spread
     root = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -109,7 +110,7 @@ def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
     worst = int(seen.sum(-1).argmin())
     return Knowledge(
         parameters=problem.parameters,
-        sd=torch.where(left_open, torch.inf, unit[:, None] * root * problem.scale),
+        sd=torch.where(left_open, torch.inf, ((unit[:, None] * root).square() + dragged).sqrt() * problem.scale),
         correlation=torch.where(either, torch.nan, correlation.clamp(-1, 1)),
         identifiable=identifiable,
         singular_values=singular,

@@ -50,14 +50,14 @@ def poses(count: int, seed: int) -> tuple[SerialArm, Tensor, Tensor, Tensor]:
 
 
 def test_at_the_truth_the_residual_of_an_arm_is_white() -> None:
-    six, truth, joints, pose = poses(3000, 1)
+    six, truth, joints, pose = poses(1500, 1)
     generator = torch.Generator().manual_seed(3)
     read = joints + 1e-4 * torch.randn(joints.shape, generator=generator, dtype=torch.float64)
     for q, joint_noise in ((joints, None), (read, 1e-4)):
         problem = forward_problem(six, q, pose, pose_noise=NOISE, joint_noise=joint_noise)
         residual = problem.residual(truth.expand(1, len(pose), -1), *problem.data)[0]
         spread = torch.cov(residual.mT)
-        torch.testing.assert_close(spread, torch.eye(6, dtype=torch.float64), rtol=0, atol=5 * (2 / 3000) ** 0.5)
+        torch.testing.assert_close(spread, torch.eye(6, dtype=torch.float64), rtol=0, atol=5 * (2 / 1500) ** 0.5)
 
 
 def test_what_an_arm_cannot_tell_is_named() -> None:

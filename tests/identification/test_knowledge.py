@@ -26,7 +26,7 @@ from ccnn_torch.identification import (
 
 @pytest.mark.parametrize("kind", ["known noise", "unknown noise", "per leg"])
 def test_intervals_hold_the_truth_as_often_as_they_say(kind: str) -> None:
-    """1,000 machines in one batch; each parameter's share has a standard error of 0.7 %, all together of about 0.3 %."""
+    """1,000 machines in one batch: a parameter's share has a standard error of 0.7 %, all together of about 0.3 %."""
     rows = measured(1000, 36, 1)
     per_leg = kind != "known noise"
     noise = None if kind == "unknown noise" else NOISE
@@ -39,10 +39,9 @@ def test_intervals_hold_the_truth_as_often_as_they_say(kind: str) -> None:
     assert float(held.min()) > 0.91
     if noise is not None:
         assert abs(float(known.noise.mean()) - 1) < 0.02
-    # Errors are as large as the Cramér-Rao bound says.
-    bound = what_is_known(problem, rows.truth).sd if noise is not None else known.sd
-    ratio = ((fit.values - rows.truth) / bound).square().mean(0).sqrt()
-    assert float((ratio - 1).abs().max()) < 0.1
+        # Errors are as large as the Cramér-Rao bound says.
+        ratio = ((fit.values - rows.truth) / what_is_known(problem, rows.truth).sd).square().mean(0).sqrt()
+        assert float((ratio - 1).abs().max()) < 0.1
 
 
 def linear(matrix: np.ndarray, noise: float = 1.0, known: bool = True) -> Problem:
