@@ -82,7 +82,7 @@ class WeightedRows:
         self.quick = problem.residual.jacobian if isinstance(problem.residual, SparseResidual) else None
         self.data = problem.data if whole else tuple(d[:, kept] for d in problem.data)
         self.weights = problem.weights if whole else problem.weights[:, kept]
-        self.alike = bool((self.weights == 1).all())
+        self.alike = whole and bool((self.weights == 1).all())
         self.channels = len(problem.channels)
         self.equations = used.sum(-1) * self.channels
         self.scale = problem.scale

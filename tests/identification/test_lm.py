@@ -126,12 +126,13 @@ def test_outliers_do_little_under_a_robust_loss(loss: str) -> None:
 
 
 def test_without_outliers_a_robust_loss_costs_little() -> None:
-    rows = measured(100, 36, 5)
+    rows = measured(200, 36, 5)
     problem = inverse_problem(rows.mechanism, rows.joints, rows.pose, pose_noise=NOISE)
     plain, robust = solve_lm(problem), solve_lm(problem, loss="huber")
     spread = [(fit.values - rows.truth).square().mean(0) for fit in (plain, robust)]
-    # 95 % efficiency is a ratio of 1.05; of 100 machines its own standard error is about 0.03.
-    assert 1.0 < float((spread[1] / spread[0]).mean()) < 1.15
+    # 95 % efficiency is a ratio of 1.05; of 200 machines its own standard error is about 0.03.
+    assert 0.97 < float((spread[1] / spread[0]).mean()) < 1.15
+    assert not torch.equal(plain.values, robust.values)
 
 
 def test_the_first_machine_that_fails_is_named() -> None:
