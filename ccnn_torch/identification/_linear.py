@@ -10,7 +10,11 @@ from torch import Tensor
 
 from ccnn_torch.identification.problem import Problem
 
-__all__ = ["SparseResidual", "WeightedRows", "row_jacobian"]
+__all__ = ["OPEN", "SparseResidual", "WeightedRows", "row_jacobian"]
+
+# A direction in which the rows leave more than so many plausible errors open (0.1 m, 0.2 rad) counts as unseen: what a
+# linearised problem says so far away means nothing.
+OPEN = 100.0
 
 # Numbers in the residual's copies below which one backward pass through all of them beats a pass for each channel.
 _SMALL = 20_000
@@ -78,7 +82,7 @@ class WeightedRows:
         self.quick = problem.residual.jacobian if isinstance(problem.residual, SparseResidual) else None
         self.data = problem.data if whole else tuple(d[:, kept] for d in problem.data)
         self.weights = problem.weights if whole else problem.weights[:, kept]
-        self.alike = bool((self.weights == 1).all())
+        self.alike = whole and bool((self.weights == 1).all())
         self.channels = len(problem.channels)
         self.equations = used.sum(-1) * self.channels
         self.scale = problem.scale

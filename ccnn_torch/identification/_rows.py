@@ -150,8 +150,9 @@ def check_finite(
     many = len(torch.unique(lost[:, 1]))
     values = given[machine if len(given) > 1 else 0, row].tolist()
     where = ", ".join(f"{c.name} = {v:.6g} {c.unit}" for c, v in zip(coordinates, values, strict=True))
+    place = f"row {row + 1}" + (f" of machine {machine + 1}" if len(given) > 1 else "")
     raise InputError(
-        f"row {row + 1}{f' of machine {machine + 1}' if len(given) > 1 else ''}: {mechanism} with its starting geometry is out of reach at {where}: {channels[channel]} has no "
+        f"{place}: {mechanism} with its starting geometry is out of reach at {where}: {channels[channel]} has no "
         f"solution ({many} {'row' if many == 1 else 'rows'} so in all); check units, frame and starting values, or "
         "leave the row out"
     )

@@ -68,8 +68,9 @@ class WhitenedResidual:
         self.factor = factor
         self.groups = [g for g in ([i for i in g if i in kept] for g in entries_together(moved)) if g]
         # In a group, the entry that a parameter moves (any, where it moves none: its derivative is zero).
-        self.owner = [moved[g].to(torch.int8).argmax(0) for g in self.groups]
+        self.owner = [torch.tensor(g, device=moved.device)[moved[g].to(torch.int8).argmax(0)] for g in self.groups]
         self.sparse = len(self.groups) < len(kept)
+        self.whole = self.groups == [list(range(entries))]
 
     def __call__(self, values: Tensor, *data: Tensor) -> Tensor:
         difference = self.gap(values, *(data if self.factor == "none" else data[:-1]))
@@ -90,13 +91,12 @@ class WhitenedResidual:
         point = values.detach().clone().requires_grad_()
         with torch.enable_grad():
             difference = self.gap(point, *(data if self.factor == "none" else data[:-1]))
-            whole = len(self.groups) == 1 and len(self.groups[0]) == self.entries
-            sums = [difference.sum()] if whole else [difference[..., g].sum() for g in self.groups]
+            sums = [difference.sum()] if self.whole else [difference[..., g].sum() for g in self.groups]
         slope: Tensor | None = None
-        for i, (group, owner) in enumerate(zip(self.groups, self.owner, strict=True)):
+        for i, owner in enumerate(self.owner):
             more = i + 1 < len(sums)
             part = torch.autograd.grad(sums[i], point, retain_graph=more, materialize_grads=True)[0][..., None, :]
-            part = part * self._share(torch.tensor(group, device=owner.device)[owner], data)
+            part = part * self._share(owner, data)
             slope = part if slope is None else slope + part
         difference = difference.detach()
         value = self._weighted(difference, data)

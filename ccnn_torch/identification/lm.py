@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.identification._descent import descend
 from ccnn_torch.identification._linear import WeightedRows
 from ccnn_torch.identification.problem import Fit, Problem, Progress
 from ccnn_torch.identification.robust import LOSSES, loss_weights
 
 __all__ = ["solve_lm"]
 
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-8, 1e-14, 1e6
-_ROUNDING = 1e-9  # Step in plausible errors that is nothing: 1e-12 m.
-_BLOCK = 8_000_000  # Numbers in the Jacobian of the machines that are worked on at once.
+_BLOCK = 400_000  # Numbers in the Jacobian of the machines that are worked on at once: about what caches hold.
 _REACH = 3.0  # Starts lie within so many plausible errors.
 _ROUNDS = 30  # Of reweighting.
 _SETTLED = 1e-4  # Change of the weights below which reweighting ends.
-
-Normal = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
 def solve_lm(
@@ -36,8 +31,9 @@ def solve_lm(
 ) -> Fit:
     """Minimise the problem of every machine from several starts, all in one batch; the best start counts.
 
-    The step solves (JᵀJ + prior + λ max diag(JᵀJ) I) du = -gradient, u being the values in plausible errors: a
-    direction that the rows do not see stays where it was. A trial that is worse, or not finite (out of reach), is
+    The step solves (JᵀJ + prior + λ max diag(JᵀJ) I) du = -gradient, u being the values in plausible errors. A
+    direction that the rows do not see stays where it was, and so does one that they see so faintly that the noise
+    would move it by 100 plausible errors. A trial that is worse, or not finite (out of reach), is
     refused and λ grows.
 
     Args:
@@ -81,12 +77,12 @@ def solve_lm(
 
 def _starts(rows: WeightedRows, starts: int, seed: int) -> Tensor:
     """`r x m x k`: the problem's start and draws around it, drawn in halfway until every row is within reach."""
+    if starts == 1:
+        return rows.start[:, None]
     generator = torch.Generator().manual_seed(seed)
     r, k = rows.start.shape
     draw = torch.rand(r, starts - 1, k, generator=generator, dtype=torch.float64).to(rows.start.device)
     away = torch.cat([torch.zeros_like(rows.start)[:, None], (2 * draw - 1) * (_REACH * rows.scale)], dim=1)
-    if starts == 1:
-        return rows.start[:, None]
     everyone = torch.arange(r, device=rows.start.device)
     for _ in range(10):
         lost = torch.isinf(rows.cost(rows.start[:, None] + away, everyone))
@@ -106,7 +102,7 @@ def _solve_block(
         def normal(values: Tensor, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             return rows.normal(values, block[index], None if extra is None else extra[index])
 
-        return _descend(normal, point, rows.scale, free.clamp_min(1)[:, None], max_iterations, tolerance)
+        return descend(normal, point, rows.scale, free.clamp_min(1)[:, None], max_iterations, tolerance)
 
     x, cost, converged, count = search(begin, None)
     best = cost.argmin(-1)
@@ -126,84 +122,6 @@ def _solve_block(
             if change < _SETTLED:
                 break
     return x, rows.cost(x[:, None], block)[:, 0], converged, count
-
-
-def _descend(
-    normal: Normal, start: Tensor, scale: Tensor, free: Tensor, max_iterations: int, tolerance: float
-) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Search from `r x m x k`; returns values, cost and converged (`r x m`), and the number of evaluations."""
-    x = start
-    everyone = torch.arange(len(x), device=x.device)
-    cost, gradient, matrix = normal(x, everyone)
-    count = cost.numel()
-    done = torch.isinf(cost)
-    converged = torch.zeros_like(done)
-    # Of the cost: what the tolerance and rounding make of it; and of the first cost, for data without noise.
-    enough = tolerance**2 / free + 1e-13
-    least = 1e-24 * cost
-    damping = torch.full_like(cost, _FIRST_DAMPING)
-    before = torch.zeros_like(cost)
-    for _ in range(max_iterations):
-        step, promised = _step(matrix, gradient, damping)
-        # Steps that fall from one to the next by a ratio leave about the last times that ratio.
-        left = promised * (promised / before).clamp_max(1)
-        near = (left <= enough * cost + least) | (step.abs().amax(-1) <= _ROUNDING) & (damping <= 1e-2)
-        near &= ~done
-        trial = x + scale * step
-        if bool(near.any()):
-            # So small a step keeps its promise: no need to look.
-            x = torch.where(near[..., None], trial, x)
-            cost = torch.where(near, cost - promised, cost)
-            converged, done = converged | near, done | near
-        done = done | (damping >= _MOST_DAMPING)
-        index = everyone if len(x) == 1 else torch.nonzero(~done.all(-1)).squeeze(-1)
-        if bool(done.all()):
-            break
-        new_cost, new_gradient, new_matrix = normal(trial[index], index)
-        count += new_cost.numel()
-        here = slice(None) if len(index) == len(x) else index
-        better = ~done[here] & (new_cost <= cost[here])
-        kept = (cost[here] - new_cost) / promised[here]
-        eased = (damping[here] * _change(kept, better)).clamp_min(_LEAST_DAMPING)
-        if bool(better.all()) and len(index) == len(x):
-            x, cost, gradient, matrix = trial, new_cost, new_gradient, new_matrix
-            before, damping = promised, eased
-            continue
-        x = _put(x, here, better, trial[here])
-        cost = _put(cost, here, better, new_cost)
-        gradient = _put(gradient, here, better, new_gradient)
-        matrix = _put(matrix, here, better, new_matrix)
-        before = _put(torch.zeros_like(before), here, better, promised[here])
-        damping = _put(damping, here, ~done[here], eased)
-    return x, cost, converged, count
-
-
-def _change(kept: Tensor, better: Tensor) -> Tensor:
-    """Factor of the damping, from the share of the promised fall that a step kept."""
-    factor = torch.where(kept > 0.9, 1e-3, torch.where(kept > 0.5, 0.1, torch.where(kept > 0.1, 1.0, 4.0)))
-    return torch.where(better, factor, 10.0)
-
-
-def _put(table: Tensor, index: Tensor | slice, chosen: Tensor, values: Tensor) -> Tensor:
-    """The table with the chosen entries of some machines replaced."""
-    mask = chosen.reshape(*chosen.shape, *[1] * (values.dim() - chosen.dim()))
-    table = table.clone()
-    table[index] = torch.where(mask, values, table[index])
-    return table
-
-
-def _step(matrix: Tensor, gradient: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
-    """Step `… x k` and the fall of the cost that it promises, `…`."""
-    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
-    ridge = (damping * diagonal.amax(-1)).clamp_min(1e-100)
-    damped = matrix + torch.diag_embed(ridge[..., None].expand_as(diagonal))
-    step = torch.cholesky_solve(-gradient[..., None], torch.linalg.cholesky_ex(damped).L)[..., 0]
-    promised = (step * (ridge[..., None] * step - gradient)).sum(-1) / 2
-    # Without a factor there is no step: the damping has to grow.
-    sound = promised >= 0
-    if bool(sound.all()):
-        return step, promised
-    return torch.where(sound[..., None], step, 0.0), torch.where(sound, promised, torch.inf)
 
 
 def _message(converged: Tensor, cost: Tensor, max_iterations: int) -> str:

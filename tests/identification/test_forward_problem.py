@@ -50,14 +50,14 @@ def poses(count: int, seed: int) -> tuple[SerialArm, Tensor, Tensor, Tensor]:
 
 
 def test_at_the_truth_the_residual_of_an_arm_is_white() -> None:
-    six, truth, joints, pose = poses(3000, 1)
+    six, truth, joints, pose = poses(1500, 1)
     generator = torch.Generator().manual_seed(3)
     read = joints + 1e-4 * torch.randn(joints.shape, generator=generator, dtype=torch.float64)
     for q, joint_noise in ((joints, None), (read, 1e-4)):
         problem = forward_problem(six, q, pose, pose_noise=NOISE, joint_noise=joint_noise)
         residual = problem.residual(truth.expand(1, len(pose), -1), *problem.data)[0]
         spread = torch.cov(residual.mT)
-        torch.testing.assert_close(spread, torch.eye(6, dtype=torch.float64), rtol=0, atol=5 * (2 / 3000) ** 0.5)
+        torch.testing.assert_close(spread, torch.eye(6, dtype=torch.float64), rtol=0, atol=5 * (2 / 1500) ** 0.5)
 
 
 def test_what_an_arm_cannot_tell_is_named() -> None:
@@ -111,13 +111,13 @@ def test_without_noise_given_angles_are_weighed_in_metres() -> None:
 
 
 def test_forward_and_inverse_calibration_agree() -> None:
-    """Both are the maximum of one likelihood, to first order in the noise."""
+    """Both are the maximum of one likelihood, to first order in noise and errors (the noise is carried nominally)."""
     rows = measured(3, 36, 5, noise=1e-6)
     forward = forward_problem(rows.mechanism, rows.joints, rows.pose, pose_noise=1e-6)
     inverse = inverse_problem(rows.mechanism, rows.joints, rows.pose, pose_noise=1e-6)
     first, second = solve_lm(forward), solve_lm(inverse)
     sd = what_is_known(inverse, second.values).sd
-    torch.testing.assert_close(sd, what_is_known(forward, first.values).sd, rtol=1e-2, atol=0)
+    torch.testing.assert_close(sd, what_is_known(forward, first.values).sd, rtol=5e-2, atol=0)
     assert float(((first.values - second.values) / sd).abs().max()) < 0.2
 
 

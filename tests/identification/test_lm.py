@@ -131,7 +131,8 @@ def test_without_outliers_a_robust_loss_costs_little() -> None:
     plain, robust = solve_lm(problem), solve_lm(problem, loss="huber")
     spread = [(fit.values - rows.truth).square().mean(0) for fit in (plain, robust)]
     # 95 % efficiency is a ratio of 1.05; of 200 machines its own standard error is about 0.03.
-    assert 1.0 < float((spread[1] / spread[0]).mean()) < 1.15
+    assert 0.97 < float((spread[1] / spread[0]).mean()) < 1.15
+    assert not torch.equal(plain.values, robust.values)
 
 
 def test_the_first_machine_that_fails_is_named() -> None:
