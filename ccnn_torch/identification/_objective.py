@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.identification._linear import row_jacobian
 from ccnn_torch.identification.problem import Problem
 
 __all__ = ["FORBIDDEN", "Objective", "make_objective"]
@@ -20,6 +21,9 @@ _ROWS_AT_ONCE = 1 << 15
 
 # Half the width of the box that global searches stay in, in units of `Problem.scale`.
 _WIDTH = 3.0
+
+
+_HELD = 1e-9
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,24 @@ class Objective:
             (gradient,) = torch.autograd.grad(cost.sum(), here)
         good = (cost < FORBIDDEN) & torch.isfinite(gradient).all(-1)
         return torch.where(good, cost, FORBIDDEN).detach(), torch.where(good[:, None], gradient, 0.0)
+
+    def even_coordinates(self, points: Tensor) -> Tensor:
+        """T with T Tᵀ the inverse of the Gauss-Newton Hessian at `r x k`; `r x k x k`.
+
+        Directions that the rows hardly see are held by a share of 1e-9 of the largest curvature.
+        """
+        problem = self.problem
+        count = problem.weights.shape[-1]
+        values = self.values(points)[:, None].expand(-1, count, -1)
+        slope = row_jacobian(problem.residual, values, self.data)[1] * problem.scale
+        slope = torch.nan_to_num(slope, posinf=0.0, neginf=0.0) * problem.weights.sqrt()[..., None, None]
+        flat = slope.flatten(1, 2)
+        hessian = flat.mT @ flat + torch.diag(self.stiffness.square())
+        held = _HELD * hessian.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-100)
+        unit = torch.eye(len(problem.scale), dtype=hessian.dtype)
+        factor = torch.linalg.cholesky(hessian + held[:, None, None] * unit)
+        turn: Tensor = torch.linalg.solve_triangular(factor.mT, unit.expand_as(factor), upper=True)
+        return turn
 
     def _cost(self, points: Tensor, machines: Tensor) -> Tensor:
         values = self.problem.start[machines, None] + points * self.problem.scale

@@ -32,7 +32,7 @@ _BEYOND = 0.25
 _OCTAVES = 20.0
 # Share of the work that the genetic algorithm is, for the progress.
 _GENETIC_SHARE = 0.9
-# Rounds of quadratic programming; each starts with a fresh Hessian. One that gains less than this share ends them.
+# Rounds of quadratic programming, and the share of the cost below which the gain of one ends them.
 _ROUNDS, _GAIN = 20, 1e-9
 
 
@@ -116,6 +116,10 @@ class HybridGenetic:
 def polish(objective: Objective, points: Tensor, tell: Progress) -> tuple[Tensor, Tensor, Tensor, int]:
     """Sequential quadratic programming from each machine's point, without bounds.
 
+    SciPy's SLSQP begins with the identity for the Hessian and learns the rest by updates, of which parameters that are
+    hardly told apart need thousands. So each round is in coordinates in which the Gauss-Newton Hessian at its start is
+    the identity, and rounds follow until one gains nothing that counts.
+
     Args:
         objective: what is minimised.
         points: `r x k` [1].
@@ -125,32 +129,43 @@ def polish(objective: Objective, points: Tensor, tell: Progress) -> tuple[Tensor
         points `r x k`, costs `r`, converged `r` (the last round gained nothing that counts), and the evaluations of the
         slowest machine (one gradient = one).
     """
-    start = points.numpy()
-    first, _ = objective.cost_and_gradient(points)
-    unit = first.clamp_min(1e-300).numpy()
+    here, calls = points, 0
+    cost = objective.cost_and_gradient(here)[0]
+    ended = torch.zeros(len(here), dtype=torch.bool)
+    for number in range(_ROUNDS):
+        found, count = _one_round(objective, here, cost)
+        reached = objective.cost_and_gradient(found)[0]
+        ended = ~(reached < cost * (1 - _GAIN))
+        here = torch.where((reached < cost)[:, None], found, here)
+        cost, calls = torch.minimum(cost, reached), calls + count
+        tell((number + 1) / _ROUNDS)
+        if bool(ended.all()):
+            break
+    return here, cost, ended, calls
+
+
+def _one_round(objective: Objective, points: Tensor, cost: Tensor) -> tuple[Tensor, int]:
+    """SLSQP of every machine from its point; returns where it ended, `r x k`, and the number of evaluations."""
+    unit = cost.clamp_min(1e-300)
+    # u = points + turn z, so that cost / unit is about 1 + gradient z + |z|² / 2.
+    turn = objective.even_coordinates(points) * unit.sqrt()[:, None, None]
     calls = 0
-    ended = np.zeros(len(start), dtype=bool)
 
     def evaluate(where: Array) -> list[tuple[float, Array]]:
         nonlocal calls
         calls += 1
-        cost, gradient = objective.cost_and_gradient(torch.from_numpy(where))
-        return [(c / u, g / u) for c, g, u in zip(cost.tolist(), gradient.numpy(), unit, strict=True)]
+        at = points + (turn @ torch.from_numpy(where)[..., None])[..., 0]
+        there, gradient = objective.cost_and_gradient(at)
+        slope = (turn.mT @ gradient[..., None])[..., 0] / unit[:, None]
+        return list(zip((there / unit).tolist(), slope.numpy(), strict=True))
 
     def search(machine: int, ask: Callable[[Array], tuple[float, Array]]) -> Array:
-        here: Array = start[machine]
-        cost = 1.0
-        for _ in range(_ROUNDS):
-            found = minimize(ask, here, jac=True, method="SLSQP", options={"maxiter": 500, "ftol": 1e-15})
-            if not found.fun < cost * (1 - _GAIN):
-                ended[machine] = True
-                break
-            here, cost = found.x, found.fun
-        tell(float(ended.mean()))
-        return here
+        begin = np.zeros(points.shape[-1])
+        found = minimize(ask, begin, jac=True, method="SLSQP", options={"maxiter": 500, "ftol": 1e-15})
+        return np.asarray(found.x)
 
-    found = torch.from_numpy(run_side_by_side(search, evaluate, start))
-    return found, objective.cost_and_gradient(found)[0], torch.from_numpy(ended), calls
+    found = torch.from_numpy(run_side_by_side(search, evaluate, np.zeros(points.shape)))
+    return points + (turn @ found[..., None])[..., 0], calls
 
 
 def _message(settled: Tensor, sqp: bool) -> str:
