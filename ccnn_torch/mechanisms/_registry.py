@@ -11,16 +11,41 @@ from typing import Any
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.mechanisms._protocol import checked_plugin
+from ccnn_torch.mechanisms.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.dh_file import read_dh_file
+from ccnn_torch.mechanisms.five_bar import FiveBar
+from ccnn_torch.mechanisms.framed import Framed
 from ccnn_torch.mechanisms.machine_tool import MachineTool
+from ccnn_torch.mechanisms.overconstrained import Overconstrained2Dof
 from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.mechanisms.stewart import Stewart
 from ccnn_torch.mechanisms.tripod import Tripod
 from ccnn_torch.mechanisms.urdf import read_urdf
 from ccnn_torch.plugins import is_plugin, load_plugin
 
 __all__ = ["REGISTRY", "load_mechanism", "mechanism_from_description"]
 
-REGISTRY: dict[str, Callable[..., Mechanism]] = {"tripod": Tripod, "machine_tool": MachineTool, "serial": SerialArm}
+
+def _framed(
+    mechanism: str | Mapping[str, Any], base: bool = True, tool: bool = False, rotation_weight: float = 0.04
+) -> Framed:
+    """A mechanism by name, file or description, seen from a measuring frame."""
+    inner = load_mechanism(mechanism) if isinstance(mechanism, str) else mechanism_from_description(mechanism)
+    return Framed(inner, base, tool, rotation_weight)
+
+
+REGISTRY: dict[str, Callable[..., Mechanism]] = {
+    "tripod": Tripod,
+    "machine_tool": MachineTool,
+    "five_bar": FiveBar,
+    "overconstrained_2dof": Overconstrained2Dof,
+    "stewart": Stewart,
+    "delta": Delta,
+    "delta_linear": DeltaLinear,
+    "serial": SerialArm,
+    "framed": _framed,
+}
 
 _READERS: dict[str, Callable[..., Mechanism]] = {".yaml": read_dh_file, ".yml": read_dh_file, ".urdf": read_urdf}
 
@@ -31,16 +56,21 @@ def load_mechanism(spec: str, **keys: Any) -> Mechanism:
     """A mechanism by name, by geometry file, or from a user's Python file.
 
     Args:
-        spec: `tripod`, `machine_tool`, a DH file (.yaml), a URDF (.urdf), or `path/to/file.py:Name`.
-        keys: keys of its constructor (tripod: L, r; DH file: orientation; URDF: base, tip, orientation; …).
+        spec: a name in the registry (`tripod`, `five_bar`, `stewart`, …), a DH file (.yaml), a URDF (.urdf), or
+            `path/to/file.py:Name`.
+        keys: keys of its constructor (tripod: L, r, per_leg; DH file: orientation; URDF: base, tip, orientation;
+            framed: mechanism, base, tool; …).
 
     Raises:
-        InputError: unknown name (with the nearest), missing or faulty file, or a key that the mechanism does not take.
+        InputError: unknown name (with the nearest), missing or faulty file, a key that the mechanism does not take, or
+            a user's class that breaks the protocol of mechanisms.
     """
-    mechanism = _call(spec, _maker(spec), keys)
-    if not isinstance(mechanism, Mechanism):
-        raise InputError(f"{spec}: is no mechanism; derive the class from ccnn_torch.mechanisms.Mechanism")
-    if spec in REGISTRY or is_plugin(spec):
+    maker = _maker(spec)
+    if is_plugin(spec):
+        mechanism = checked_plugin(spec, functools.partial(_call, spec, maker, keys))
+    else:
+        mechanism = _call(spec, maker, keys)
+    if (spec in REGISTRY or is_plugin(spec)) and not isinstance(mechanism, Framed):
         mechanism.recipe = {"spec": spec, "keys": keys}
     return mechanism
 
@@ -74,7 +104,7 @@ def _maker(spec: str) -> Callable[..., Any]:
 
 
 def _call(spec: str, maker: Callable[..., Any], keys: Mapping[str, Any]) -> Any:
-    """Call with the keys; a key too many or missing becomes a sentence, an error inside stays what it is."""
+    """Call with the keys; a key too many or missing becomes a sentence."""
     signature = inspect.signature(maker)
     try:
         signature.bind(**keys)

@@ -24,16 +24,24 @@ class MachineTool(Mechanism):
     """
 
     def __init__(
-        self, l_e: float = 0.2, l_b: float = 0.7, z_0: float = 0.1, l: float = 0.6, gamma: float = math.radians(45.0)
+        self,
+        l_e: float = 0.2,
+        l_b: float = 0.7,
+        z_0: float = 0.1,
+        l: float = 0.6,
+        gamma: float = math.radians(45.0),
+        per_leg: bool = False,
     ) -> None:
-        """Radii of platform and base, height of the spherical joints, leg length [m]; slope of the guideways [rad]."""
-        geometry = [
-            Parameter("l_e", "m", l_e),
-            Parameter("l_b", "m", l_b),
-            Parameter("z_0", "m", z_0),
-            Parameter("l", "m", l),
-            Parameter("gamma", "rad", gamma),
-        ]
+        """Radii of platform and base, height of the spherical joints, leg length [m]; slope of the guideways [rad].
+
+        per_leg: leg i has all parameters of its own, for identification: l_ei, l_bi, z_0i, li, gammai, alphai, betai
+        and the offset u_0i of its drive [m] (its carriage stands at the joint plus this); else only alphai and betai.
+        """
+        common = [("l_e", "m", l_e), ("l_b", "m", l_b), ("z_0", "m", z_0), ("l", "m", l), ("gamma", "rad", gamma)]
+        geometry = [] if per_leg else [Parameter(*part) for part in common]
+        if per_leg:
+            parts = [*common, ("u_0", "m", 0.0)]
+            geometry = [Parameter(f"{n}{i}", u, v, i) for n, u, v in parts for i in (1, 2, 3)]
         for letter in ("alpha", "beta"):
             geometry += [Parameter(f"{letter}{i + 1}", "rad", a, leg=i + 1) for i, a in enumerate(_ATTACHMENTS)]
         tilt = math.radians(15.0)
@@ -46,13 +54,11 @@ class MachineTool(Mechanism):
             high=(tilt, tilt, 0.7),
         )
         if type(self) is MachineTool:
-            self.recipe = {"spec": "machine_tool", "keys": {}}
+            self.recipe = {"spec": "machine_tool", "keys": {"per_leg": True} if per_leg else {}}
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Eq. 18: |c_i - u_i d_i| = l with d_i the guideway's direction; the smaller root, NaN where it is not real."""
-        values = self.resolve(parameters)
-        l_e, l_b, z_0, l, gamma = (v[..., None] for v in values[..., :5].unbind(-1))
-        alpha, beta = values[..., 5:8], values[..., 8:11]
+        l_e, l_b, z_0, l, gamma, u_0, alpha, beta = self._legs(self.resolve(parameters))
         position, rotation = self.frame(pose)
         joint = stack_last(l_e * torch.cos(beta), l_e * torch.sin(beta), z_0)
         foot = stack_last(l_b * torch.cos(alpha), l_b * torch.sin(alpha), torch.zeros_like(l_b))
@@ -60,7 +66,14 @@ class MachineTool(Mechanism):
         along = stack_last(-slide * torch.cos(alpha), -slide * torch.sin(alpha), torch.sin(gamma))
         c = position[..., None, :] + (rotation[..., None, :, :] @ joint[..., None])[..., 0] - foot
         middle = (c * along).sum(-1)
-        return middle - torch.sqrt(middle**2 - (c**2).sum(-1) + l**2)
+        return middle - torch.sqrt(middle**2 - (c**2).sum(-1) + l**2) - u_0
+
+    def _legs(self, values: Tensor) -> tuple[Tensor, ...]:
+        """l_e, l_b, z_0, l, gamma, u_0, alpha, beta of the legs, `... x 3` each (the common ones `... x 1`)."""
+        if len(self.geometry) == 11:
+            common = values[..., :5, None].unbind(-2)
+            return (*common, torch.zeros_like(common[0]), values[..., 5:8], values[..., 8:11])
+        return values.reshape(*values.shape[:-1], 8, 3).unbind(-2)
 
     def frame(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Point (0, 0, z) on the axis and the rotation Rx(theta_x) Ry(theta_y) that eq. 18 spells out."""

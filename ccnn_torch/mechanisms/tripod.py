@@ -21,29 +21,47 @@ class Tripod(Mechanism):
     y ±0.2 m, z 0.4..0.7 m, phi ±0.3 rad.
     """
 
-    def __init__(self, L: float = 1.0, r: float = 0.3) -> None:
-        """L: length of the legs [m]; r: radius of the platform [m]."""
+    def __init__(self, L: float = 1.0, r: float = 0.3, per_leg: bool = False) -> None:
+        """L: length of the legs [m]; r: radius of the platform [m].
+
+        per_leg: leg i has parameters of its own, for identification: its length Li, the radius ri of its joint on the
+        platform and the offset di of its drive [m] (its carriage stands at the joint plus this); else L and r are
+        common.
+        """
+        geometry = [Parameter("L", "m", L), Parameter("r", "m", r)]
+        if per_leg:
+            parts = (("L", L), ("r", r), ("d", 0.0))
+            geometry = [Parameter(f"{n}{i}", "m", v, i) for i in (1, 2, 3) for n, v in parts]
         super().__init__(
             name="tripod",
             joints=[Coordinate(q, "m") for q in ("q1", "q2", "q3")],
             pose=[Coordinate("y", "m"), Coordinate("z", "m"), Coordinate("phi", "rad")],
-            geometry=[Parameter("L", "m", L), Parameter("r", "m", r)],
+            geometry=geometry,
             low=(-0.2, 0.4, -0.3),
             high=(0.2, 0.7, 0.3),
             home_pose=(0.0, 0.55, 0.0),
         )
         if type(self) is Tripod:
-            self.recipe = {"spec": "tripod", "keys": {}}
+            self.recipe = {"spec": "tripod", "keys": {"per_leg": True} if per_leg else {}}
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Eq. 15, closed form; NaN where a root is not real."""
-        length, radius = self.values(parameters)
+        length, radius, offset = self._legs(self.resolve(parameters))
         y, z, phi = pose.unbind(-1)
-        up, out = radius * torch.sin(phi), radius * torch.cos(phi)
-        rho1 = torch.sqrt(length**2 - y**2 - (z + up) ** 2) + out
-        rho2 = torch.sqrt(length**2 - y**2 - (z - up) ** 2) + out
-        rho3 = torch.sqrt(length**2 - z**2) + y + radius
-        return stack_last(rho1, rho2, rho3)
+        (l1, l2, l3), (r1, r2, r3) = length.unbind(-1), radius.unbind(-1)
+        s, c = torch.sin(phi), torch.cos(phi)
+        rho1 = torch.sqrt(l1**2 - y**2 - (z + r1 * s) ** 2) + r1 * c
+        rho2 = torch.sqrt(l2**2 - y**2 - (z - r2 * s) ** 2) + r2 * c
+        rho3 = torch.sqrt(l3**2 - z**2) + y + r3
+        return stack_last(rho1, rho2, rho3) - offset
+
+    def _legs(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Length, radius and offset of each leg, `... x 3` [m]."""
+        if len(self.geometry) == 2:
+            length, radius = (values[..., i, None].expand(*values.shape[:-1], 3) for i in (0, 1))
+            return length, radius, torch.zeros_like(length)
+        legs = values.reshape(*values.shape[:-1], 3, 3)
+        return legs[..., 0], legs[..., 1], legs[..., 2]
 
     def forward_kinematics(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
