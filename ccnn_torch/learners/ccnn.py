@@ -64,8 +64,8 @@ class CCNN:
             member_seeds(data.seeds, members).flatten(),
         )
         self._data, self._phase = data, 0
-        rivals = [settings.rival_hidden] if settings.refinement_iterations and settings.rival_hidden else []
-        self._structures = [Structure(hidden, settings, rows) for hidden in (settings.hidden, *rivals)]
+        self._layers = settings.structures(targets.shape[-1])
+        self._structures = [Structure(hidden, settings, rows) for hidden in self._layers]
 
     def step(self) -> dict[str, Tensor]:
         """One generation, or one refinement or search after the last of them."""
@@ -177,8 +177,7 @@ class CCNN:
 
     @property
     def _phases(self) -> int:
-        rivals = 2 if self.settings.rival_hidden else 1
-        return self._phases_each * rivals
+        return self._phases_each * len(self._layers)
 
     def _scores(self) -> Tensor:
         """Evidence of each structure, `structures x r`."""

@@ -21,12 +21,13 @@ __all__ = ["BPLMRegressor", "CCNNRegressor", "ENNRegressor", "GRNNRegressor"]
 class CCNNRegressor(SteppedRegressor):
     """Cooperative coevolution of a masked network's layers, refined by Levenberg-Marquardt (paper 000, section III).
 
-    By default hidden, population, generations, members, refine_every and refinement_iterations stay below what a run
+    By default hidden, rival_hidden, population, generations, members and refinement_iterations stay below what a run
     has, which takes about ten times as long and predicts somewhat better. All settings:
     `ccnn_torch.learners.ccnn.CCNNSettings`.
 
     Args:
         hidden: nodes of each hidden layer; a number is one layer.
+        rival_hidden: hidden layers of a second structure; the one of higher evidence is taken. () = none.
         population: individuals of each subpopulation, one a layer.
         generations: steps.
         members: independent coevolutions, whose networks are averaged.
@@ -64,6 +65,7 @@ class CCNNRegressor(SteppedRegressor):
         self,
         *,
         hidden: int | Sequence[int] = (12, 12),
+        rival_hidden: Sequence[int] = (),
         population: int = 40,
         generations: int = 10,
         members: int = 2,
@@ -84,6 +86,7 @@ class CCNNRegressor(SteppedRegressor):
         random_state: Any = 0,
     ) -> None:
         self.hidden = hidden
+        self.rival_hidden = rival_hidden
         self.population = population
         self.generations = generations
         self.members = members
