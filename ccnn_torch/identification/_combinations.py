@@ -12,9 +12,11 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 
-__all__ = ["combinations_in_words"]
+__all__ = ["TAKES_PART", "combinations_in_words"]
 
-_TAKES_PART = 1e-5  # Component of a unit vector below which a parameter does not take part.
+# Component of a hidden direction below which a parameter does not take part. Real geometry is never exactly parallel:
+# smaller components come from the errors themselves and would tie everything to everything.
+TAKES_PART = 1e-2
 
 
 def combinations_in_words(parameters: Sequence[Parameter], hidden: Tensor, scale: Tensor) -> tuple[str, ...]:
@@ -29,8 +31,8 @@ def combinations_in_words(parameters: Sequence[Parameter], hidden: Tensor, scale
     """
     rows = hidden.detach().cpu().numpy()
     projector = rows.T @ rows
-    part = np.diag(projector) > _TAKES_PART**2
-    count, group = connected_components((np.abs(projector) > _TAKES_PART**2) & part & part[:, None], directed=False)
+    part = np.diag(projector) > TAKES_PART**2
+    count, group = connected_components((np.abs(projector) > TAKES_PART) & part & part[:, None], directed=False)
     sizes = scale.cpu().numpy()
     sentences = []
     for number in range(count):
@@ -50,13 +52,13 @@ def _visible(projector: NDArray[np.float64]) -> NDArray[np.float64]:
         return basis
     own = np.sort(qr(basis, mode="economic", pivoting=True)[2][: len(basis)])
     reduced: NDArray[np.float64] = np.linalg.solve(basis[:, own], basis)
-    return np.where(np.abs(reduced) < _TAKES_PART, 0.0, reduced)
+    return np.where(np.abs(reduced) < TAKES_PART, 0.0, reduced)
 
 
 def _sentence(names: list[str], visible: NDArray[np.float64]) -> str:
     everyone = _listed(names)
     if not len(visible):
-        return f"{everyone} not at all: no measured row depends on {'it' if len(names) == 1 else 'them'}"
+        return f"{everyone} not at all"
     return f"{everyone} only as {_listed([_combination(names, row) for row in visible])}"
 
 

@@ -62,6 +62,9 @@ def gather_rows(
     if not bool((w >= 0).all()):
         raise InputError("weights must be 0 or positive; a row with weight 0 is left out")
     machines = max(counts)
+    empty = torch.nonzero(~(w > 0).any(-1))
+    if len(empty):
+        raise InputError(f"machine {int(empty[0]) + 1} of {machines}: no row has a weight above 0; keep some rows")
     for table, coordinates in ((q, mechanism.joints), (x, mechanism.pose)):
         wrong = torch.nonzero(~torch.isfinite(table) & (w > 0)[..., None])
         if len(wrong):
@@ -99,7 +102,7 @@ def covariance(
     return torch.diag(sd.expand(d) ** 2)
 
 
-def inverse_root(matrix: Tensor, used: Tensor, what: str) -> Tensor:
+def inverse_root(matrix: Tensor, used: Tensor) -> Tensor:
     """L⁻¹ of covariances L Lᵀ, `r x s x d x d`; the identity in rows that are not `used` (`r x s`, bool).
 
     Raises:
@@ -114,7 +117,7 @@ def inverse_root(matrix: Tensor, used: Tensor, what: str) -> Tensor:
     if bool(spoilt.any()):
         row = int(torch.nonzero(spoilt)[0, -1]) + 1
         raise InputError(
-            f"row {row}: the noise given leaves a direction of the {what} without any; give joint_noise too, or a "
+            f"row {row}: the noise given leaves a direction of the residual without any; give joint_noise too, or a "
             "pose_noise above 0 for every coordinate"
         )
     root: Tensor = torch.linalg.solve_triangular(factor, unit.expand_as(factor), upper=False)
@@ -147,8 +150,9 @@ def check_finite(
     many = len(torch.unique(lost[:, 1]))
     values = given[machine if len(given) > 1 else 0, row].tolist()
     where = ", ".join(f"{c.name} = {v:.6g} {c.unit}" for c, v in zip(coordinates, values, strict=True))
+    place = f"row {row + 1}" + (f" of machine {machine + 1}" if len(given) > 1 else "")
     raise InputError(
-        f"row {row + 1}: {mechanism} with its starting geometry is out of reach at {where}: {channels[channel]} has no "
+        f"{place}: {mechanism} with its starting geometry is out of reach at {where}: {channels[channel]} has no "
         f"solution ({many} {'row' if many == 1 else 'rows'} so in all); check units, frame and starting values, or "
         "leave the row out"
     )

@@ -10,14 +10,12 @@ from torch import Tensor
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification._rows import MeasuredRows, inverse_root
+from ccnn_torch.identification._sparse import WhitenedResidual, dependence
 from ccnn_torch.identification.checks import check_equations
 from ccnn_torch.identification.parameters import Selection
 from ccnn_torch.identification.problem import Channel, Problem
-from ccnn_torch.least_squares import jacobian_of
 
 __all__ = ["Geometry", "whitened_problem"]
-
-_DEPENDS = 1e-9  # Relative size of a derivative below which it is rounding.
 
 
 class Geometry:
@@ -69,8 +67,8 @@ def whitened_problem(
     if not noise_known and bool(torch.isfinite(selection.prior_sd).any()):
         raise InputError("parameters.prior: a prior can be weighed against the rows only if their noise is given")
     begin = selection.start.expand(rows.machines, -1)
-    moved = _depends(lambda v: gap(v, *(d[:1] for d in data)), begin[:1], rows, selection)
     c = len(names)
+    moved = dependence(gap, begin[0], selection.scale, tuple(d[0] for d in data), rows.weights[0] > 0, c)
     kept = [i for i in range(c) if bool(moved[i].any())] if per_leg else list(range(c))
     if not bool(moved.any()):
         free = ", ".join(p.name for p in selection.parameters)
@@ -79,24 +77,16 @@ def whitened_problem(
     whiten: tuple[Tensor, ...] = ()
     if covariance is not None:
         covariance = covariance.expand(1, rows.pose.shape[1], c, c) if covariance.dim() < 4 else covariance
-        root = _shared(inverse_root(_only_diagonal(covariance) if diagonal else covariance, rows.weights > 0, what))
+        root = _shared(inverse_root(_only_diagonal(covariance) if diagonal else covariance, rows.weights > 0))
         whiten = (root.diagonal(dim1=-2, dim2=-1)[..., kept] if diagonal else root.flatten(-2),)
 
-    def residual(values: Tensor, *everything: Tensor) -> Tensor:
-        difference = gap(values, *everything[: len(data)])
-        if not diagonal:
-            root = everything[-1].reshape(*everything[-1].shape[:-1], c, c)
-            return (root * difference[..., None, :]).sum(-1)
-        if len(kept) < c:
-            difference = difference[..., kept]
-        return difference * everything[-1] if whiten else difference
-
+    factor = "none" if covariance is None else "diagonal" if diagonal else "full"
     problem = Problem(
         parameters=selection.parameters,
         start=begin,
         scale=selection.scale,
         prior_sd=selection.prior_sd,
-        residual=residual,
+        residual=WhitenedResidual(gap, c, kept, factor, moved),
         data=(*data, *whiten),
         weights=rows.weights,
         channels=tuple(Channel(names[i], _leg(selection.parameters, moved[i]) if diagonal else None) for i in kept),
@@ -108,14 +98,6 @@ def whitened_problem(
 
 def _only_diagonal(matrix: Tensor) -> Tensor:
     return torch.diag_embed(matrix.diagonal(dim1=-2, dim2=-1))
-
-
-def _depends(gap: Callable[[Tensor], Tensor], start: Tensor, rows: MeasuredRows, selection: Selection) -> Tensor:
-    """Which entries depend on which free parameters, in the first machine's rows: `c x k`, bool."""
-    slope = jacobian_of(gap, start[:, None].expand(-1, rows.pose.shape[1], -1))[1]
-    used = (rows.weights[:1] > 0)[..., None, None]
-    size = (torch.where(used, slope, 0.0).abs() * selection.scale).flatten(0, 1).amax(0)
-    return size > _DEPENDS * size.max()
 
 
 def _leg(parameters: Sequence[Parameter], moved: Tensor) -> int | None:

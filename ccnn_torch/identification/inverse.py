@@ -44,6 +44,9 @@ def inverse_problem(
     stay apart (`split_by_leg`), and joints that no free parameter moves are left out. Without any noise given, the
     residual is in joint units and its variance is estimated from the fit.
 
+    Where the geometry found is far from the start, build the problem again with `start` there: the noise is then
+    carried over by the right geometry.
+
     Args:
         mechanism: any with an inverse; where that is iterative, it starts from the measured joints.
         joints: `s x n` or `r x s x n`, as commanded or read [SI].

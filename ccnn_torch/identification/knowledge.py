@@ -10,17 +10,14 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification._combinations import combinations_in_words
-from ccnn_torch.identification._linear import WeightedRows
+from ccnn_torch.identification._combinations import TAKES_PART, combinations_in_words
+from ccnn_torch.identification._linear import OPEN, WeightedRows
 from ccnn_torch.identification.problem import Problem
 
 __all__ = ["Knowledge", "require_identifiable", "what_is_known"]
 
-# Singular values below this share of the largest are rounding. With columns in plausible errors, a direction that is
-# even weaker would be uncertain by 1e5 plausible errors and more at any noise that a calibration begins with.
+# Singular values below this share of the largest are rounding.
 _RANK = 1e-9
-# A parameter takes part in a direction that cannot be known from this component on (squared).
-_TAKES_PART = 1e-10
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,9 @@ def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
 
     At the true values with the true noise the standard errors are the Cramér-Rao bound. No pseudoinverse: along a
     direction that the rows do not see the uncertainty is infinite, and so is that of every parameter that takes part
-    in it.
+    in it. A direction whose standard error would be above 100 plausible errors counts as not seen.
+    A parameter takes part in a direction if one plausible error along it moves the parameter by more than a hundredth
+    of its own; one that is moved by less keeps a finite error, with that movement in it.
 
     Args:
         problem: for a robust fit, that of `robust.reweighted`; its errors are then approximate, `bootstrap` tells.
@@ -89,41 +88,52 @@ def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
     if len(lost):
         raise InputError(f"machine {int(lost[0]) + 1}: the residual is not finite at the values given")
     k = values.shape[-1]
-    _, singular, directions = torch.linalg.svd(_tall(slope), full_matrices=False)
-    seen = singular > _RANK * singular[:, :1]
-    hidden = torch.where(seen[..., None], 0.0, directions)
-    identifiable = hidden.square().sum(-2) <= _TAKES_PART
-
     pull = torch.diag(rows.pull.sqrt()).expand(len(values), k, k)
     _, strength, basis = torch.linalg.svd(_tall(torch.cat([slope, pull], dim=-2)), full_matrices=False)
-    open_ = strength <= _RANK * strength[:, :1]
+    freedom, noise = _noise(residual, slope, rows.equations, strength, basis)
+    unit = torch.ones_like(noise) if problem.noise_known else noise
+    # Without an equation to spare nobody knows the noise: then only rounding says what is not seen.
+    least = torch.where(torch.isfinite(unit), unit / OPEN, 0.0)[:, None]
+
+    _, singular, directions = torch.linalg.svd(_tall(slope), full_matrices=False)
+    seen = singular > torch.maximum(_RANK * singular[:, :1], least)
+    hidden = torch.where(seen[..., None], 0.0, directions)
+    identifiable = hidden.square().sum(-2) <= TAKES_PART**2
+    open_ = strength <= torch.maximum(_RANK * strength[:, :1], least)
+    dragged = torch.where(open_[..., None], basis, 0.0).square().sum(-2)
+    left_open = dragged > TAKES_PART**2
     spread = torch.where(open_, 0.0, 1 / strength.clamp_min(1e-300))[..., None] * basis
     covariance = spread.mT @ spread
-    left_open = torch.where(open_[..., None], basis, 0.0).square().sum(-2) > _TAKES_PART
-
-    determined = (slope @ spread.mT).square().sum((-2, -1))
-    freedom = rows.equations - determined
-    # Whole numbers without priors; a remainder of rounding is no equation to spare.
-    freedom = torch.where(freedom > 1e-6, freedom, 0.0)
-    noise = torch.where(freedom > 0, (residual.square().sum(-1) / freedom.clamp_min(1e-6)).sqrt(), torch.inf)
-    unit = torch.ones_like(noise) if problem.noise_known else noise
     root = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     correlation = covariance / (root[..., None] * root[..., None, :]).clamp_min(1e-300)
     either = left_open[..., None] | left_open[..., None, :]
-    least = int(seen.sum(-1).argmin())
+    worst = int(seen.sum(-1).argmin())
     return Knowledge(
         parameters=problem.parameters,
-        sd=torch.where(left_open, torch.inf, unit[:, None] * root * problem.scale),
+        sd=torch.where(left_open, torch.inf, ((unit[:, None] * root).square() + dragged).sqrt() * problem.scale),
         correlation=torch.where(either, torch.nan, correlation.clamp(-1, 1)),
         identifiable=identifiable,
         singular_values=singular,
         directions=directions,
         rank=seen.sum(-1),
-        combinations=combinations_in_words(problem.parameters, hidden[least], problem.scale),
+        combinations=combinations_in_words(problem.parameters, hidden[worst], problem.scale),
         noise=noise,
         freedom=freedom,
         noise_known=problem.noise_known,
     )
+
+
+def _noise(
+    residual: Tensor, slope: Tensor, equations: Tensor, strength: Tensor, basis: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Equations to spare and the standard deviation of the residual, `r` each; strength and basis with the priors."""
+    inverse = torch.where(strength > _RANK * strength[:, :1], 1 / strength.clamp_min(1e-300), 0.0)
+    determined = (slope @ (inverse[..., None] * basis).mT).square().sum((-2, -1))
+    # Whole numbers without priors; a remainder of rounding is no equation to spare.
+    freedom = equations - determined
+    freedom = torch.where(freedom > 1e-6, freedom, 0.0)
+    noise = torch.where(freedom > 0, (residual.square().sum(-1) / freedom.clamp_min(1e-6)).sqrt(), torch.inf)
+    return freedom, noise
 
 
 def require_identifiable(knowledge: Knowledge) -> None:

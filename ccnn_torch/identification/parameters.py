@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import fnmatch
 import math
@@ -12,14 +13,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ccnn_torch.coordinates import Parameter
+from ccnn_torch.coordinates import Parameter, plausible_error
 from ccnn_torch.errors import InputError
 
 __all__ = ["ParameterChoice", "Selection", "select_parameters"]
-
-# Plausible errors where a parameter names none of its own, by SI unit.
-_PLAUSIBLE = {"m": 1e-3, "rad": 2e-3}
-_PLAUSIBLE_ELSE = 2e-3
 
 
 @dataclass(frozen=True)
@@ -101,7 +98,7 @@ def select_parameters(
         parameters,
         groups,
         whole[:, firsts],
-        torch.tensor([_plausible(p) for p in parameters], dtype=torch.float64, device=whole.device),
+        torch.tensor([plausible_error(p) for p in parameters], dtype=torch.float64, device=whole.device),
         _prior(geometry, choice.prior, groups).to(whole.device),
         whole * (1 - spread.sum(0)),
         spread,
@@ -160,7 +157,7 @@ def _groups(
 def _merged(members: Sequence[Parameter]) -> Parameter:
     """One parameter for a tied group."""
     legs = {m.leg for m in members}
-    return members[0] if len(legs) == 1 else Parameter(members[0].name, members[0].unit, members[0].nominal)
+    return members[0] if len(legs) == 1 else dataclasses.replace(members[0], leg=None)
 
 
 def _prior(geometry: Sequence[Parameter], prior: Mapping[str, float], groups: tuple[tuple[str, ...], ...]) -> Tensor:
@@ -171,7 +168,3 @@ def _prior(geometry: Sequence[Parameter], prior: Mapping[str, float], groups: tu
             raise InputError(f"parameters.prior: '{pattern}' has the standard deviation {value}; give a positive one")
         sd.update(dict.fromkeys(_match(geometry, [pattern], "prior"), float(value)))
     return torch.tensor([min(sd[n] for n in group) for group in groups], dtype=torch.float64)
-
-
-def _plausible(parameter: Parameter) -> float:
-    return _PLAUSIBLE.get(parameter.unit, _PLAUSIBLE_ELSE)

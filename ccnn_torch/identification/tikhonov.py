@@ -100,7 +100,8 @@ def solve_tikhonov(problem: Problem, seed: int = 0, progress: Progress | None = 
     message = ""
     if not bool(within.all()):
         first = int(torch.nonzero(~within)[0]) + 1
-        message = f"{int((~within).sum())} of {len(within)} machines: the step leads out of reach; the first is {first}"
+        lost = int((~within).sum())
+        message = f"{lost} of {len(within)} machines: the step leads out of reach; the first is number {first}"
     return Fit(values, cost, within, 2 * len(values), message)
 
 
