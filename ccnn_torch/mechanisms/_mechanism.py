@@ -233,7 +233,9 @@ class Mechanism(nn.Module):
         guess: Tensor | None = None,
     ) -> Tensor:
         """Condition number of the Jacobian with its rotation rows times `rotation_weight` [m/rad]; `...` [1]."""
-        return 1 / self.singularity(joints, rotation_weight, parameters, guess)
+        values = self.singular_values(joints, rotation_weight, parameters, guess)
+        ratio = values[..., 0] / values[..., -1]
+        return torch.where(torch.isfinite(ratio), ratio, torch.inf)
 
     def singularity(
         self,
@@ -251,9 +253,7 @@ class Mechanism(nn.Module):
         `rotation_weight` [m/rad]. Unlike determinants of the two matrices it does not depend on how F is written.
         Which kind is near, `singular_values` tells.
         """
-        values = self.singular_values(joints, rotation_weight, parameters, guess)
-        ratio = values[..., -1] / values[..., 0]
-        return torch.where(torch.isfinite(ratio), ratio, 0.0)
+        return 1 / self.condition_number(joints, rotation_weight, parameters, guess)
 
     def singular_values(
         self,

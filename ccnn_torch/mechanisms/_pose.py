@@ -61,7 +61,7 @@ def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor) -> Tensor
         point: `... x n`.
 
     Returns:
-        `... x 6 x n`, or `... x 3 x n` without rotation.
+        `... x 6 x n`, or `... x 3 x n` without rotation; NaN where the frame is.
     """
 
     def flat(x: Tensor) -> Tensor:
@@ -69,6 +69,7 @@ def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor) -> Tensor
         return position if rotation is None else torch.cat([position, rotation.flatten(-2)], dim=-1)
 
     value, slope = jacobian_of(flat, point)
+    slope = torch.where(torch.isfinite(value).all(-1)[..., None, None], slope, torch.nan)
     if value.shape[-1] == 3:
         return slope
     rotation = value[..., 3:].reshape(*value.shape[:-1], 3, 3)

@@ -11,6 +11,7 @@ from typing import Any
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.mechanisms._protocol import checked_plugin
 from ccnn_torch.mechanisms.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.dh_file import read_dh_file
 from ccnn_torch.mechanisms.five_bar import FiveBar
@@ -61,11 +62,14 @@ def load_mechanism(spec: str, **keys: Any) -> Mechanism:
             framed: mechanism, base, tool; …).
 
     Raises:
-        InputError: unknown name (with the nearest), missing or faulty file, or a key that the mechanism does not take.
+        InputError: unknown name (with the nearest), missing or faulty file, a key that the mechanism does not take, or
+            a user's class that breaks the protocol of mechanisms.
     """
-    mechanism = _call(spec, _maker(spec), keys)
-    if not isinstance(mechanism, Mechanism):
-        raise InputError(f"{spec}: is no mechanism; derive the class from ccnn_torch.mechanisms.Mechanism")
+    maker = _maker(spec)
+    if is_plugin(spec):
+        mechanism = checked_plugin(spec, functools.partial(_call, spec, maker, keys))
+    else:
+        mechanism = _call(spec, maker, keys)
     if (spec in REGISTRY or is_plugin(spec)) and not isinstance(mechanism, Framed):
         mechanism.recipe = {"spec": spec, "keys": keys}
     return mechanism
@@ -100,7 +104,7 @@ def _maker(spec: str) -> Callable[..., Any]:
 
 
 def _call(spec: str, maker: Callable[..., Any], keys: Mapping[str, Any]) -> Any:
-    """Call with the keys; a key too many or missing becomes a sentence, an error inside stays what it is."""
+    """Call with the keys; a key too many or missing becomes a sentence."""
     signature = inspect.signature(maker)
     try:
         signature.bind(**keys)

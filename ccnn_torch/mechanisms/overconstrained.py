@@ -173,13 +173,14 @@ class Overconstrained2Dof(Mechanism):
         return torch.where(self._same_mode(tilt.detach(), values.detach())[..., None], tilt, torch.nan)
 
     def _same_mode(self, tilt: Tensor, values: Tensor) -> Tensor:
-        """det(∂q/∂tilt) > 0, as at no tilt: beyond a singularity it changes its sign."""
+        """det(∂q/∂tilt) > 0 as at no tilt, which changes at a singularity, and a tilt of half a turn at most."""
         joints, slope = jacobian_of(
             lambda t: self.joints_of_frame(*self._placed(t, values), values), expand_leading(tilt, values)
         )
         real = torch.isfinite(joints).all(-1)
         determinant: Tensor = torch.linalg.det(torch.where(real[..., None, None], slope, 0.0))
-        return real & (determinant > 0)
+        half_turn: Tensor = torch.linalg.vector_norm(tilt, dim=-1) <= torch.pi
+        return real & (determinant > 0) & half_turn
 
 
 def _tilt(pose: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import torch
+
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 
 UR10 = """\
@@ -71,18 +73,25 @@ URDF = """\
 """
 
 FIVE_BAR = Path(__file__).parent / "five_bar.py"
+OWN_MECHANISM = Path(__file__).parents[2] / "experiments" / "my_mechanism.py"
 
 NAMES = (
     "tripod",
     "machine_tool",
     "five_bar",
     "overconstrained_2dof",
+    "stewart",
+    "delta",
+    "delta_linear",
     "ur10",
     "ur10_positions",
     "panda",
     "scara",
     "urdf",
     "users_five_bar",
+    "users_3rrr",
+    "framed_five_bar",
+    "framed_stewart",
 )
 
 
@@ -91,6 +100,13 @@ def make(name: str, folder: Path) -> Mechanism:
     files = {"ur10": UR10, "ur10_positions": UR10, "panda": PANDA, "scara": SCARA, "urdf": URDF}
     if name == "users_five_bar":
         return load_mechanism(f"{FIVE_BAR}:FiveBar")
+    if name == "users_3rrr":
+        return load_mechanism(f"{OWN_MECHANISM}:Planar3RRR")
+    if name.startswith("framed_"):
+        framed = load_mechanism("framed", mechanism=name.removeprefix("framed_"), tool=name == "framed_stewart")
+        shift = torch.linspace(-0.3, 0.4, len(framed.nominal), dtype=torch.float64)
+        frames = torch.tensor([g.name.startswith(("base_", "tool_")) for g in framed.geometry])
+        return framed.with_nominal(framed.nominal + shift * frames)
     if name not in files:
         return load_mechanism(name)
     path = folder / (f"{name}.urdf" if name == "urdf" else f"{name}.yaml")

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import root
+from scipy.spatial.transform import Rotation
 
 from ccnn_torch.least_squares import jacobian_of
-from ccnn_torch.mechanisms import MachineTool, Tripod
+from ccnn_torch.mechanisms import MachineTool, Tripod, mechanism_from_description
 
 
 def _poses(mechanism, count=40, seed=0):
@@ -106,3 +107,59 @@ def test_platform_frames_carry_the_legs():
         torch.testing.assert_close((tip - foot).norm(dim=-1), torch.ones_like(joint), rtol=0, atol=1e-12)
     error = machine.pose_error(torch.tensor([0.1, 0.0, 0.6]).double(), torch.tensor([0.1, 1e-9, 0.6]).double())
     assert float(error.rotation) == pytest.approx(1e-9, rel=1e-6) and float(error.position) == 0.0
+
+
+@pytest.mark.parametrize("kind", [Tripod, MachineTool])
+def test_legs_of_their_own_are_the_common_ones_when_alike(kind):
+    """Nominally the same joints bit by bit; one leg's parameters move one joint; the description keeps them."""
+    common, own = kind(), kind(per_leg=True)
+    poses = _poses(common)
+    assert torch.equal(own.solve_inverse(poses), common.solve_inverse(poses))
+    joints = own.solve_inverse(poses)
+    torch.testing.assert_close(own.forward_kinematics(joints), poses, rtol=0, atol=1e-9)
+    slope = jacobian_of(lambda v: own.solve_inverse(poses, v), own.nominal.expand(len(poses), -1))[1].abs().amax(0)
+    moved = {(i + 1, g.leg) for k, g in enumerate(own.geometry) for i in range(3) if slope[i, k] > 0}
+    assert moved == {(1, 1), (2, 2), (3, 3)}
+    values = own.nominal + 1e-3 * torch.arange(len(own.nominal), dtype=torch.float64)
+    twin = mechanism_from_description(own.with_nominal(values).describe())
+    assert torch.equal(twin.nominal, values) and torch.equal(
+        twin.solve_inverse(poses), own.solve_inverse(poses, values)
+    )
+
+
+def test_tripod_with_legs_of_their_own_is_equation_15_of_each():
+    tripod = Tripod(per_leg=True)
+    values = tripod.nominal + 1e-3 * torch.arange(9, dtype=torch.float64)
+    (l1, r1, d1), (l2, r2, d2), (l3, r3, d3) = values.reshape(3, 3).tolist()
+    for pose in _poses(tripod, 10):
+        y, z, phi = pose.tolist()
+        expected = (
+            math.sqrt(l1**2 - y**2 - (z + r1 * math.sin(phi)) ** 2) + r1 * math.cos(phi) - d1,
+            math.sqrt(l2**2 - y**2 - (z - r2 * math.sin(phi)) ** 2) + r2 * math.cos(phi) - d2,
+            math.sqrt(l3**2 - z**2) + y + r3 - d3,
+        )
+        assert tripod.solve_inverse(pose, values).tolist() == pytest.approx(expected, abs=1e-15)
+
+
+def test_machine_tool_with_legs_of_their_own_is_equation_18_of_each():
+    machine = MachineTool(per_leg=True)
+    values = machine.nominal + 1e-3 * torch.arange(24, dtype=torch.float64)
+    names = ("l_e", "l_b", "z_0", "l", "gamma")
+    named = dict(zip([g.name for g in machine.geometry], values.tolist(), strict=True))
+    for pose in _poses(machine, 10):
+        u = machine.solve_inverse(pose, values).tolist()
+        for i in range(3):
+            angles = named[f"alpha{i + 1}"], named[f"beta{i + 1}"]
+            left = _equation_18_of_a_leg(
+                pose.tolist(), u[i] + named[f"u_0{i + 1}"], angles, *(named[f"{n}{i + 1}"] for n in names)
+            )
+            assert left == pytest.approx(0, abs=1e-14)
+
+
+def _equation_18_of_a_leg(pose, u, angles, l_e, l_b, z_0, l, gamma):
+    rotation = Rotation.from_euler("XY", pose[:2]).as_matrix()
+    a, b = angles
+    joint = rotation @ [l_e * math.cos(b), l_e * math.sin(b), z_0] + [0, 0, pose[2]]
+    reach = l_b - u * math.cos(gamma)
+    carriage = np.array([reach * math.cos(a), reach * math.sin(a), u * math.sin(gamma)])
+    return np.linalg.norm(joint - carriage) - l

@@ -94,3 +94,73 @@ def test_a_fitted_base_moves_the_box(tmp_path):
     twin = arm.with_nominal(moved)
     torch.testing.assert_close(twin.bounds[0][:3], arm.bounds[0][:3] + 10.0)
     torch.testing.assert_close(twin.home_pose[:3], arm.home_pose[:3] + 10.0)
+
+
+def _users_class(tmp_path, **changed):
+    """A sliding point on a line, with one part changed; solve_inverse alone, the rest numerical."""
+    parts = {
+        "joints": '[Coordinate("q1", "m")]',
+        "pose": '[Coordinate("x", "m")]',
+        "geometry": '[Parameter("d", "m", 0.1, 1)]',
+        "box": "(0.0,), (1.0,)",
+        "call": "super().__init__",
+        "inverse": "pose - self.resolve(parameters)",
+        "extra": "",
+    }
+    parts.update(changed)
+    path = tmp_path / "own.py"
+    path.write_text(
+        "import torch\n"
+        "from ccnn_torch.coordinates import Coordinate, Parameter\n"
+        "from ccnn_torch.mechanisms import Mechanism\n\n\n"
+        "class Slide(Mechanism):\n"
+        "    def __init__(self):\n"
+        f"        {parts['call']}('slide', {parts['joints']}, {parts['pose']}, {parts['geometry']}, {parts['box']})\n\n"
+        "    def solve_inverse(self, pose, parameters=None, guess=None):\n"
+        f"        return {parts['inverse']}\n"
+        f"{parts['extra']}"
+    )
+    return f"{path}:Slide"
+
+
+_CLOSURE = "\n    def closure(self, pose, joints, parameters=None):\n        return {}\n"
+_FORWARD = "\n    def forward_kinematics(self, joints, parameters=None, guess=None):\n        return {}\n"
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"joints": '[Coordinate("a", "m")]'}, r"its joints must be named q1, not \['a'\]"),
+        ({"pose": '[Coordinate("x", "mm")]'}, r"in m or rad, not x\[mm\]"),
+        (
+            {
+                "geometry": '[Parameter("d", "m", 0.1), Parameter("d", "m", 0.1)]',
+                "inverse": "pose - self.resolve(parameters)[..., :1]",
+            },
+            "its geometry has the name 'd' twice",
+        ),
+        ({"geometry": '[Parameter("d", "m", 0.1, 3)]'}, "'d' belongs to leg 3; legs are numbered from 1 to 1"),
+        ({"box": "(1.0,), (0.0,)"}, "low and high need 1 numbers each, low below high"),
+        ({"call": "len"}, "own.py:Slide line 8: TypeError"),
+        ({"inverse": "pose - self.nominal"}, r"gives shape \(3, 1\) for 3 poses and 2 sets of parameters"),
+        (
+            {"inverse": "pose - self.resolve(parameters).length"},
+            "own.py:Slide line 11: AttributeError: .* no attribute",
+        ),
+        ({"inverse": "torch.sqrt(self.resolve(parameters) - 1 - pose)"}, "its home pose has no joints"),
+        ({"inverse": "(pose - self.resolve(parameters)).float()"}, "gives torch.float32, expected torch.float64"),
+        ({"extra": _CLOSURE.format("pose + joints")}, "closure is .* expected 0"),
+        ({"extra": _CLOSURE.format("(pose - joints).sum()")}, r"closure gives shape \(\) for 2 x 3"),
+        ({"extra": _FORWARD.format("joints")}, "misses it by 0.1"),
+        ({"extra": _FORWARD.format("self.home_pose")}, r"forward_kinematics gives shape \(1,\)"),
+    ],
+)
+def test_a_users_mechanism_that_breaks_the_protocol(tmp_path, changed, sentence):
+    with pytest.raises(InputError, match=sentence) as caught:
+        load_mechanism(_users_class(tmp_path, **changed))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_users_mechanism_that_keeps_the_protocol(tmp_path):
+    slide = load_mechanism(_users_class(tmp_path))
+    assert slide.solve_inverse(slide.home_pose).tolist() == [0.4]
