@@ -120,3 +120,9 @@ def test_a_mechanism_that_is_at_hand_needs_no_name() -> None:
     assert mechanism.name == "tripod" and len(plans) == 1 and told == sorted(told)
     with pytest.raises(InputError, match="unknown mechanism 'tripot'"):
         make_plan("tripot", 6, config)
+
+
+def test_the_page_on_planning_lists_every_key_as_it_is() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "planning.md").read_text()
+    for key, default, description in describe_plan_keys():
+        assert f"| `{key}` | `{default}` | {description} |" in page

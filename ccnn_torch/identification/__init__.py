@@ -21,6 +21,8 @@ from ccnn_torch.identification.problem import Progress as Progress
 from ccnn_torch.identification.problem import Solver as Solver
 from ccnn_torch.identification.robust import LOSSES as LOSSES
 from ccnn_torch.identification.robust import reweighted as reweighted
+from ccnn_torch.identification.solvers import SOLVERS as SOLVERS
+from ccnn_torch.identification.solvers import get_solver as get_solver
 from ccnn_torch.identification.tikhonov import LCurve as LCurve
 from ccnn_torch.identification.tikhonov import l_curve as l_curve
 from ccnn_torch.identification.tikhonov import solve_tikhonov as solve_tikhonov

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification._linear import row_jacobian
 from ccnn_torch.identification.problem import Problem
+from ccnn_torch.least_squares import jacobian_of
 
 __all__ = ["FORBIDDEN", "Objective", "make_objective"]
 
@@ -94,7 +94,7 @@ class Objective:
         problem = self.problem
         count = problem.weights.shape[-1]
         values = self.values(points)[:, None].expand(-1, count, -1)
-        slope = row_jacobian(problem.residual, values, self.data)[1] * problem.scale
+        slope = jacobian_of(lambda v: problem.residual(v, *self.data), values)[1] * problem.scale
         slope = torch.nan_to_num(slope, posinf=0.0, neginf=0.0) * problem.weights.sqrt()[..., None, None]
         flat = slope.flatten(1, 2)
         hessian = flat.mT @ flat + torch.diag(self.stiffness.square())

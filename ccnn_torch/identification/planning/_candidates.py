@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification._linear import row_jacobian
 from ccnn_torch.identification.problem import Problem, Progress
+from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import Mechanism
 
 __all__ = ["Candidates", "common_coordinates", "draw_candidates", "identification_rows"]
@@ -156,12 +156,16 @@ def identification_rows(problem: Problem, progress: Progress | None = None) -> T
     count = problem.weights.shape[-1]
     for begin in range(0, count, _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
-        data = tuple(d[0, part] for d in problem.data)
-        values = problem.start[0].expand(len(data[0]), -1)
-        rows.append(row_jacobian(problem.residual, values, data, len(problem.channels))[1] * problem.scale)
+        residual = _at(problem, tuple(d[0, part] for d in problem.data))
+        values = problem.start[0].expand(min(_AT_ONCE, count - begin), -1)
+        rows.append(jacobian_of(residual, values)[1] * problem.scale)
         if progress is not None:
             progress(min(1.0, (begin + _AT_ONCE) / count))
     return torch.cat(rows)
+
+
+def _at(problem: Problem, data: tuple[Tensor, ...]) -> Callable[[Tensor], Tensor]:
+    return lambda values: problem.residual(values, *data)
 
 
 def common_coordinates(rows: Tensor, prior: Tensor, names: list[str]) -> Tensor:

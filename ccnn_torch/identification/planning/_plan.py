@@ -138,10 +138,9 @@ def choose_poses(
     _check_count(problem, count, len(rows), repeat)
     held = torch.where(torch.isfinite(problem.prior_sd), problem.scale / problem.prior_sd, 0.0)
     turn = common_coordinates(rows, held, [p.name for p in problem.parameters])
-    even = rows @ turn
     prior = turn.mT @ torch.diag(held.square()) @ turn
 
-    design = make_design(even, prior if bool((held > 0).all()) else None, repeat)
+    design = make_design(rows @ turn, prior if bool((held > 0).all()) else None, repeat)
     tell = progress or (lambda _: None)
     design_share = 0.4 if index != "O1" else 0.8
     for step in range(count):
@@ -154,7 +153,7 @@ def choose_poses(
     if index != "O1":
         known_already = torch.diag(held.square())
         chosen, settled = exchange_by_index(rows, chosen, known_already, index, repeat, _share(tell, 0.6, 0.4))
-    order, first = order_by_worth(even[chosen], prior)
+    order, first = order_by_worth(rows[chosen] @ turn, prior)
     chosen = [chosen[place] for place in order]
 
     # What more poses would give: the best ones to add, one by one.
