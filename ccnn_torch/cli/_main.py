@@ -12,6 +12,7 @@ from ccnn_torch import __version__
 from ccnn_torch.cli.compensate import compensate
 from ccnn_torch.cli.keys import keys
 from ccnn_torch.cli.picture import picture
+from ccnn_torch.cli.plan import plan
 from ccnn_torch.cli.run import run
 from ccnn_torch.cli.suite import suite
 from ccnn_torch.errors import InputError, MethodFailedError
@@ -42,7 +43,7 @@ def _common(
         typer.echo(context.get_help())
 
 
-for _command in (run, suite, compensate, picture, keys):
+for _command in (run, suite, compensate, plan, picture, keys):
     app.command(epilog=(_command.__doc__ or "").partition("\n\n")[2])(_command)
 
 

@@ -6,6 +6,7 @@ from ccnn_torch.report.plots._learning import convergence_plot as convergence_pl
 from ccnn_torch.report.plots._learning import population_plot as population_plot
 from ccnn_torch.report.plots._network import alive_nodes as alive_nodes
 from ccnn_torch.report.plots._network import network_plot as network_plot
+from ccnn_torch.report.plots._plan import plan_plot as plan_plot
 from ccnn_torch.report.plots._progress import progress_plot as progress_plot
 from ccnn_torch.report.plots._style import Plot as Plot
 from ccnn_torch.report.plots._style import inline_svg as inline_svg

@@ -1,0 +1,60 @@
+"""`ccnn plan`: which poses to measure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["plan"]
+
+
+def plan(
+    mechanism: Annotated[str, typer.Option(help="A mechanism's name, a geometry file, or path/to/file.py:Name.")],
+    poses: Annotated[int, typer.Option(help="How many poses to plan (per_leg: for each leg).")],
+    out: Annotated[Path, typer.Option(help="CSV to write; a page .md and a picture .png, .svg are put beside it.")],
+    overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
+    config: Annotated[Path | None, typer.Option(help="A YAML file with keys as below.")] = None,
+    seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no tables.")] = False,
+) -> None:
+    """Choose the poses that show a machine's geometric parameters best, and tell how many are worth measuring.
+
+    OUT.csv has a row for each pose: the joints to command, q1[unit]…, and the pose at which they bring the nominal
+    machine, in the order of their worth. The page beside it tells what each further pose would give. Keys:
+    mechanism_keys, parameters.free, .fixed, .tied, .prior, residual, noise, joint_noise, index, candidates, limits,
+    max_condition, rotation_weight, per_leg, repeat,
+    least_gain, margin, seed.
+
+    Examples:
+
+    ccnn plan --mechanism five_bar --poses 36 --out poses.csv
+
+    ccnn plan --mechanism five_bar --poses 18 --out poses.csv per_leg=true noise=1e-4
+
+    ccnn plan --mechanism my_arm.yaml --poses 40 --out poses.csv 'limits={z: [0.2, 0.8]}' parameters.fixed=[base_*]
+
+    ccnn plan --mechanism my_machine.py:MyMachine --poses 24 --out poses.csv --config plan.yaml
+    """
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from ccnn_torch.report.plan import gain_table, parameter_table, plan_sentence
+    from ccnn_torch.report.table_form import print_table
+    from ccnn_torch.runs.plan_config import load_plan_config
+    from ccnn_torch.runs.planning import make_plan, write_plan
+    from ccnn_torch.runs.screen import stderr, stdout
+
+    wanted = load_plan_config(config, [*(overrides or []), *([f"seed={seed}"] if seed is not None else [])])
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=stderr, disable=quiet or not stderr.is_terminal, transient=True) as bar:
+        task = bar.add_task("poses", total=1.0)
+        machine, plans = make_plan(mechanism, poses, wanted, lambda done: bar.update(task, completed=done))
+    files = write_plan(out, machine, plans, wanted.least_gain)
+    if quiet:
+        return
+    for part in plans:
+        print_table(parameter_table(part), stdout)
+        print_table(gain_table(part, short=True), stdout)
+        typer.echo(plan_sentence(part, wanted.least_gain))
+    typer.echo(f"Written: {', '.join(str(file) for file in files)}")

@@ -1,0 +1,201 @@
+"""Poses to choose from: reachable, inside the limits, away from singularities; and what they show of the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ccnn_torch._table import nearest
+from ccnn_torch.errors import InputError
+from ccnn_torch.identification.problem import Problem, Progress
+from ccnn_torch.least_squares import jacobian_of
+from ccnn_torch.mechanisms import Mechanism
+
+__all__ = ["Candidates", "common_coordinates", "draw_candidates", "identification_rows"]
+
+Limits = Mapping[str, tuple[float, float]]
+
+# Candidates drawn and looked at in one call.
+_AT_ONCE = 20_000
+# Machines with plausible errors that must reach a pose, too.
+_MACHINES = 8
+# Configurations whose forward kinematics are tried on these machines in one call.
+_TRIED = 500
+# Draws after which a mechanism with hardly any candidate is given up.
+_DRAWS = 200
+# Singular values below this share of the largest are no information but rounding.
+_UNSEEN = 1e-9
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Configurations to choose from: joints `M x n` and poses `M x p` [SI]; `drawn`: how many were looked at."""
+
+    joints: Tensor
+    pose: Tensor
+    drawn: int
+
+
+def draw_candidates(
+    mechanism: Mechanism,
+    count: int,
+    seed: int = 0,
+    *,
+    limits: Limits | None = None,
+    max_condition: float = 50.0,
+    rotation_weight: float = 0.04,
+    uncertainty: Tensor | None = None,
+    progress: Progress | None = None,
+) -> Candidates:
+    """Configurations from the mechanism's own sampling of its workspace.
+
+    Args:
+        mechanism: any; a serial arm is sampled in its joints, all others in their poses.
+        count: how many to find.
+        seed: of the draws.
+        limits: lowest and highest value of joints and pose coordinates by name [SI].
+        max_condition: bound on the condition number of the Jacobian: beyond it is too near to a singularity.
+        rotation_weight: of the Jacobian's rotation rows [m/rad].
+        uncertainty: by how much each of the mechanism's parameters may be off, `K` [SI]; configurations that are out of
+            reach of one of eight machines, every parameter of which is off by so much to one side or the other, are
+            left out: the most informative ones are at the edge of the workspace. Serial arms reach all of theirs.
+        progress: told the share that is found.
+
+    Raises:
+        InputError: a limit on something that the mechanism does not have, or fewer than one draw in a hundred is left.
+    """
+    bounds = _bounds(mechanism, limits or {})
+    generator = torch.Generator().manual_seed(seed)
+    others = _others(mechanism, uncertainty)
+    found: list[tuple[Tensor, Tensor]] = []
+    there = drawn = 0
+    for _ in range(_DRAWS):
+        joints, pose = _draw(mechanism, min(count, _AT_ONCE), generator)
+        drawn += len(joints)
+        values = torch.cat([joints, pose], dim=-1)
+        good = (torch.isfinite(values) & (values >= bounds[:, 0]) & (values <= bounds[:, 1])).all(-1)
+        joints, pose = joints[good], pose[good]
+        condition = mechanism.condition_number(joints, rotation_weight, guess=pose)
+        order = condition.argsort(descending=True)
+        order = order[condition[order] <= max_condition]
+        if others is not None:
+            order = _in_reach(mechanism, joints, pose, order, others)
+        kept = order.sort().values
+        found.append((joints[kept], pose[kept]))
+        there += len(kept)
+        if progress is not None:
+            progress(min(1.0, there / count))
+        if there >= count:
+            joints, pose = (torch.cat(part)[:count] for part in zip(*found, strict=True))
+            return Candidates(joints, pose, drawn)
+        if there < drawn / 100 and drawn >= _DRAWS // 2 * min(count, _AT_ONCE):
+            break
+    raise InputError(
+        f"mechanism '{mechanism.name}': only {there} of {drawn} configurations are inside the limits, have a condition "
+        f"number up to {max_condition:g}, and are in reach with plausible errors; widen limits or max_condition"
+    )
+
+
+def _draw(mechanism: Mechanism, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    if type(mechanism).sample_joints is Mechanism.sample_joints:
+        pose = mechanism.sample_workspace(count, generator)
+        return mechanism.solve_inverse(pose), pose
+    joints = mechanism.sample_joints(count, generator)
+    return joints, mechanism.forward_kinematics(joints)
+
+
+def _others(mechanism: Mechanism, uncertainty: Tensor | None) -> Tensor | None:
+    """Parameters of machines that are off, `m x 1 x K`."""
+    if uncertainty is None or mechanism.orientations:
+        return None
+    draw = torch.rand(_MACHINES, 1, len(uncertainty), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return mechanism.nominal + torch.where(draw < 0.5, -uncertainty, uncertainty)
+
+
+def _in_reach(mechanism: Mechanism, joints: Tensor, pose: Tensor, order: Tensor, others: Tensor) -> Tensor:
+    """Which of the configurations in `order` (worst conditioned first) all the other machines reach, too.
+
+    That a machine has joints for the pose is asked everywhere. That the commanded joints close its loops, too, is asked
+    where it may fail, near singularities of the second kind: from the worst conditioned on, until none fails any more.
+    """
+    order = order[mechanism.reachable(pose[order], others).all(0)]
+    kept = []
+    for part in torch.split(order, _TRIED):
+        there = mechanism.forward_kinematics(joints[part], others, pose[part])
+        good = torch.isfinite(there).all(-1).all(0)
+        kept.append(part[good])
+        if bool(good.all()):
+            break
+    return torch.cat([*kept, order[len(kept) * _TRIED :]])
+
+
+def _bounds(mechanism: Mechanism, limits: Limits) -> Tensor:
+    """Lowest and highest value of joints and pose coordinates, `(n + p) x 2`."""
+    names = [c.name for c in (*mechanism.joints, *mechanism.pose)]
+    bounds = torch.tensor([-torch.inf, torch.inf], dtype=torch.float64).repeat(len(names), 1)
+    for name, (low, high) in limits.items():
+        if name not in names:
+            near = nearest(name, names)
+            hint = f"did you mean '{near}'?" if near else f"it has {', '.join(names)}"
+            raise InputError(f"limits: mechanism '{mechanism.name}' has no joint or pose coordinate '{name}'; {hint}")
+        if not low < high:
+            raise InputError(f"limits.{name}: the first number must be smaller than the second, not {low:g}, {high:g}")
+        bounds[names.index(name)] = torch.tensor([low, high], dtype=torch.float64)
+    return bounds
+
+
+def identification_rows(problem: Problem, progress: Progress | None = None) -> Tensor:
+    """What each row of a problem shows: derivatives of its residual at the start, `s x c x k` [1] (first machine).
+
+    The residual is in units of its noise and each parameter in its plausible error, so that the rows are numbers.
+    """
+    rows = []
+    count = problem.weights.shape[-1]
+    for begin in range(0, count, _AT_ONCE):
+        part = slice(begin, begin + _AT_ONCE)
+        residual = _at(problem, tuple(d[0, part] for d in problem.data))
+        values = problem.start[0].expand(min(_AT_ONCE, count - begin), -1)
+        rows.append(jacobian_of(residual, values)[1] * problem.scale)
+        if progress is not None:
+            progress(min(1.0, (begin + _AT_ONCE) / count))
+    return torch.cat(rows)
+
+
+def _at(problem: Problem, data: tuple[Tensor, ...]) -> Callable[[Tensor], Tensor]:
+    return lambda values: problem.residual(values, *data)
+
+
+def common_coordinates(rows: Tensor, prior: Tensor, names: list[str]) -> Tensor:
+    """Coordinates in which all candidates together give one unit of information a pose in every direction.
+
+    Determinants compare designs alike in all coordinates; in these nothing is lost to rounding.
+
+    Args:
+        rows: `M x c x k` [1].
+        prior: square roots of the prior's information, `k` [1], 0 where there is none.
+        names: of the parameters.
+
+    Returns:
+        T, `k x k`: rows @ T are the rows there.
+
+    Raises:
+        InputError: some combination of the parameters shows in no candidate.
+    """
+    flat = rows.flatten(0, 1) / len(rows) ** 0.5
+    # By parts, so that no second copy of all rows is needed.
+    parts = [torch.linalg.qr(part).R for part in torch.split(flat, _AT_ONCE)]
+    factor = torch.linalg.qr(torch.cat([*parts, torch.diag(prior)])).R
+    _, values, directions = torch.linalg.svd(factor)
+    if not float(values[-1]) > _UNSEEN * float(values[0]):
+        unseen = directions[-1]
+        inside = [name for name, share in zip(names, unseen.abs().tolist(), strict=True) if share > 0.1]
+        several = len(inside) > 1
+        raise InputError(
+            f"no pose shows {'a combination of ' if several else ''}{', '.join(inside)}: "
+            f"{'fix one of them' if several else 'fix it'} (parameters: {{fixed: [{inside[0]}]}}) or give it a prior"
+        )
+    turn: Tensor = torch.linalg.solve_triangular(factor, torch.eye(len(factor), dtype=rows.dtype), upper=True)
+    return turn

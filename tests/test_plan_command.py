@@ -1,0 +1,128 @@
+"""`ccnn plan`: the files it writes, and one sentence for everything that is wrong."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ccnn_torch.cli import main
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.records import load_records, read_table
+from ccnn_torch.runs.plan_config import PlanConfig, describe_plan_keys, load_plan_config
+from ccnn_torch.runs.planning import make_plan
+
+Cli = Callable[..., tuple[int, str, str]]
+FAST = ("candidates=400", "noise=1e-4")
+
+
+@pytest.fixture
+def cli(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
+    """Run `ccnn WORDS…` in this process; returns exit code, stdout and stderr."""
+
+    def call(*words: str | Path) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["ccnn", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        captured = capsys.readouterr()
+        return int(ended.value.code or 0), captured.out, captured.err
+
+    return call
+
+
+def test_a_plan_is_a_file_for_the_machine_and_a_page_for_the_person(cli: Cli, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "poses.csv"
+    code, told, err = cli("plan", "--mechanism", "five_bar", "--poses", 10, "--out", out, *FAST)
+    assert code == 0 and err == ""
+    assert "10 poses for 12 parameters: O1 is" in told
+    mechanism = load_mechanism("five_bar")
+    table = read_table(out)
+    assert list(table.names) == ["q1", "q2", "x", "y"] and set(table.units.values()) == {"rad", "m"}
+    records = load_records(out, mechanism)
+    assert torch.equal(mechanism.solve_inverse(records.pose), records.joints)  # 17 digits: the floats themselves
+    page = out.with_suffix(".md").read_text()
+    assert "poses.png" in page and "## What each further pose gives" in page and "| gamma2 | " in page
+    assert {f.suffix for f in out.parent.iterdir()} == {".csv", ".md", ".png", ".svg"}
+
+
+def test_each_leg_has_its_rows_and_the_same_seed_gives_the_same_bytes(cli: Cli, tmp_path: Path) -> None:
+    words = ("plan", "--mechanism", "five_bar", "--poses", 7, "--seed", 3, "--quiet", "per_leg=true", *FAST)
+    for name in ("a.csv", "b.csv"):
+        assert cli(*words, "--out", tmp_path / name) == (0, "", "")
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    table = read_table(tmp_path / "a.csv")
+    assert table.names[0] == "leg"
+    assert np.asarray(table.raw("leg"), dtype=float).tolist() == [1.0] * 7 + [2.0] * 7
+
+
+def test_the_config_says_what_is_free_and_where_poses_may_be(cli: Cli, tmp_path: Path) -> None:
+    config = tmp_path / "plan.yaml"
+    config.write_text(
+        "parameters: {free: [leg1.*], fixed: [k1], prior: {A1x: 1e-4}}\n"
+        "limits: {x: [-0.2, 0.3]}\nnoise: {x: 1e-5, y: 2e-5}\nindex: O3\ncandidates: 300\nleast_gain: 0.5\n"
+    )
+    out = tmp_path / "p.csv"
+    code, told, _ = cli("plan", "--mechanism", "five_bar", "--poses", 8, "--out", out, "--config", config)
+    assert code == 0 and "8 poses for 5 parameters" in told and "After" in told
+    x = np.asarray(read_table(out).raw("x"), dtype=float)
+    assert x.min() >= -0.2 and x.max() <= 0.3
+    assert "so that O3 is largest" in out.with_suffix(".md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--poses", "5", "fixed=[k1]"), "there is no key 'fixed'; did you mean 'parameters.fixed'?"),
+        (("--poses", "5"), "5 poses of 2 equations cannot determine 12 parameters; plan at least 6"),
+        (("--poses", "0"), "--poses: plan at least 1 pose, not 0"),
+        (("--poses", "8", "index=D"), "index: must be 'O1', 'O2', 'O3', 'O4' or 'O5', not D"),
+        (("--poses", "8", "noise={x: 1e-4}"), "noise: gives no standard deviation of y"),
+        (("--poses", "8", "joint_noise={p1: 1e-4}"), "joint_noise.p1: there is no such coordinate"),
+        (("--poses", "8", "limits={z: [0, 1]}"), "has no joint or pose coordinate 'z'"),
+        (("--poses", "8", "parameters.free=[B1x]"), "B1x"),
+        (("--poses", "eight"), "unable to parse string as an integer"),
+    ],
+)
+def test_bad_input_is_one_sentence(cli: Cli, tmp_path: Path, words: tuple[str, ...], sentence: str) -> None:
+    code, _, err = cli("plan", "--mechanism", "five_bar", "--out", tmp_path / "p.csv", *words, *FAST[:1])
+    assert code == 2 and sentence in err
+    assert len(err.strip().splitlines()) == 1 and "Traceback" not in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_is_no_csv_or_cannot_be_written_is_said(cli: Cli, tmp_path: Path) -> None:
+    code, _, err = cli("plan", "--mechanism", "five_bar", "--poses", 8, "--out", tmp_path / "p.txt", *FAST)
+    assert code == 2 and "must end in .csv" in err
+    (tmp_path / "file").write_text("")
+    code, _, err = cli("plan", "--mechanism", "five_bar", "--poses", 8, "--out", tmp_path / "file" / "p.csv", *FAST)
+    assert code == 2 and "cannot be made" in err
+
+
+def test_every_key_is_described_and_an_empty_config_is_the_defaults(tmp_path: Path) -> None:
+    keys = describe_plan_keys()
+    assert all(description for _, _, description in keys)
+    empty = tmp_path / "empty.yaml"
+    empty.write_text("")
+    assert load_plan_config(empty) == load_plan_config(None)
+    assert {key.partition(".")[0] for key, _, _ in keys} == set(PlanConfig.model_fields)
+
+
+def test_a_mechanism_that_is_at_hand_needs_no_name() -> None:
+    told: list[float] = []
+    config = load_plan_config(None, ["candidates=200"])
+    mechanism, plans = make_plan(load_mechanism("tripod"), 6, config, told.append)
+    assert mechanism.name == "tripod" and len(plans) == 1 and told == sorted(told)
+    with pytest.raises(InputError, match="unknown mechanism 'tripot'"):
+        make_plan("tripot", 6, config)
+
+
+def test_the_page_on_planning_lists_every_key_as_it_is() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "planning.md").read_text()
+    for key, default, description in describe_plan_keys():
+        assert f"| `{key}` | `{default}` | {description} |" in page
