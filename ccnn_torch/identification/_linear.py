@@ -21,7 +21,7 @@ _SMALL = 20_000
 
 
 def row_jacobian(
-    function: Callable[..., Tensor], values: Tensor, data: tuple[Tensor, ...], channels: int
+    function: Callable[..., Tensor], values: Tensor, data: tuple[Tensor, ...], channels: int | None = None
 ) -> tuple[Tensor, Tensor]:
     """Residual and Jacobian of every row by reverse differentiation, without a graph that could be differentiated.
 
@@ -32,11 +32,14 @@ def row_jacobian(
         function: `(values, *data)` -> `... x c`, leading dims independent.
         values: `... x k`, one set for each row.
         data: `... x d` each.
-        channels: `c`.
+        channels: `c`; found by a call when None.
 
     Returns:
         residual `... x c` and Jacobian `... x c x k`.
     """
+    if channels is None:
+        with torch.no_grad():
+            channels = function(values[..., :1, :], *(d[..., :1, :] for d in data)).shape[-1]
     together = channels > 1 and values.numel() * channels <= _SMALL
     point = values.detach()
     point = (point.expand(channels, *values.shape) if together else point).clone().requires_grad_()
