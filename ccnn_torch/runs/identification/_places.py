@@ -114,8 +114,8 @@ class Places:
         """A square grid over the first two coordinates, the others in the middle; `m x .`, in reach only."""
         middle = (self.low + self.high) / 2
         lines = [torch.linspace(float(self.low[i]), float(self.high[i]), across, dtype=torch.float64) for i in (0, 1)]
-        grid = torch.cartesian_prod(*lines)
-        place = middle.expand(len(grid), -1).clone()
+        grid: Tensor = torch.cartesian_prod(*lines)
+        place: Tensor = middle.expand(len(grid), -1).clone()
         place[:, :2] = grid
         return place[self.usable(place)]
 
