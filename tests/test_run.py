@@ -22,6 +22,7 @@ from ccnn_torch.report.json_files import load_schema
 from ccnn_torch.runs import RunConfig, calibrate, load_config, resume_run, start_run
 from ccnn_torch.runs._yaml import read_yaml
 from ccnn_torch.runs.config import make_config
+from ccnn_torch.runs.identify_config import load_identify_config
 from ccnn_torch.runs.suite import load_suite
 
 ROOT = Path(__file__).parent.parent
@@ -215,6 +216,9 @@ def test_every_key_of_the_shipped_configs_is_known() -> None:
     for path in sorted((ROOT / "experiments").glob("*.yaml")):
         if "cases" in read_yaml(path):
             assert load_suite(path).name == path.stem
+            continue
+        if "simulate" in read_yaml(path):
+            assert load_identify_config(path).name == path.stem
             continue
         overrides = ["records=x.csv", "mechanism=tripod"] if path.name == "records.yaml" else []
         assert load_config(path, overrides).name == path.stem

@@ -34,13 +34,13 @@ ESTIMATORS = [CCNNRegressor, BPLMRegressor, GRNNRegressor, ENNRegressor]
 STEPPED = [kind for kind in ESTIMATORS if issubclass(kind, SteppedRegressor)]
 # Settings for the tests that need no good model.
 SMALL: dict[type[Any], dict[str, Any]] = {
-    CCNNRegressor: {"hidden", "rival_hidden", "population", "generations", "members", "refinement_iterations"},
+    CCNNRegressor: {"generations": 4, "population": 12, "hidden": 6},
     BPLMRegressor: {"iterations": 6, "restarts": 2, "hidden": 4},
     GRNNRegressor: {"iterations": 4},
     ENNRegressor: {"generations": 30, "population": 20, "density": 0.7},
 }
 GRIDS: dict[type[Any], dict[str, Any]] = {
-    CCNNRegressor: {"hidden", "rival_hidden", "population", "generations", "members", "refinement_iterations"},
+    CCNNRegressor: {"hidden": [(4,), (6, 6)]},
     BPLMRegressor: {"hidden": [(3,), (3, 3)]},
     GRNNRegressor: {"widest": [1.0, 5.0]},
     ENNRegressor: {"hidden": [4, (6, 6)]},
