@@ -4,8 +4,8 @@ from ccnn_torch.compensation._compensator import Compensator as Compensator
 from ccnn_torch.compensation._compensator import Solution as Solution
 from ccnn_torch.compensation._compensator import fit_compensator as fit_compensator
 from ccnn_torch.compensation._domain import Domain as Domain
-from ccnn_torch.compensation._geometry import IdentifiedGeometry as IdentifiedGeometry
-from ccnn_torch.compensation._geometry import load_compensation as load_compensation
+from ccnn_torch.compensation._identified import IdentifiedGeometry as IdentifiedGeometry
+from ccnn_torch.compensation._identified import load_compensation as load_compensation
 from ccnn_torch.compensation._loaded import LoadedModel as LoadedModel
 from ccnn_torch.compensation._loaded import load_model as load_model
 from ccnn_torch.compensation._model_file import FORMS as FORMS
