@@ -4,6 +4,9 @@ from ccnn_torch.compensation._compensator import Compensator as Compensator
 from ccnn_torch.compensation._compensator import Solution as Solution
 from ccnn_torch.compensation._compensator import fit_compensator as fit_compensator
 from ccnn_torch.compensation._domain import Domain as Domain
+from ccnn_torch.compensation._geometry import Geometry as Geometry
+from ccnn_torch.compensation._geometry import fit_geometry_module as fit_geometry_module
+from ccnn_torch.compensation._geometry import geometric_deviation as geometric_deviation
 from ccnn_torch.compensation._loaded import LoadedModel as LoadedModel
 from ccnn_torch.compensation._loaded import load_model as load_model
 from ccnn_torch.compensation._model_file import FORMS as FORMS

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation._domain import Domain
 
-__all__ = ["STEEPEST_DEVIATION", "TOLERANCE", "Steepness", "iterations_needed", "steepest"]
+__all__ = ["STEEPEST_DEVIATION", "TOLERANCE", "Steepness", "iterations_needed", "spread_points", "steepest"]
 
 # Above this slope the fixed point needs more than 17 steps, and sampled slopes are no safe ground.
 STEEPEST_DEVIATION = 0.2
@@ -65,7 +65,7 @@ def steepest(
         return jacobian.abs().sum(-1).amax(-1), (value.detach().abs() / scale).amax(-1)
 
     generator = torch.Generator().manual_seed(0)
-    points = _spread(inputs, domain, generator)
+    points = spread_points(inputs, domain, generator)
     slopes, sizes = slope(points)
     chosen = slopes.topk(min(_CLIMBERS, len(points))).indices
     points, best = points[chosen], slopes[chosen]
@@ -90,7 +90,7 @@ def iterations_needed(found: Steepness, tolerance: float = TOLERANCE) -> int:
     return max(1, math.ceil(exact - 1e-9))
 
 
-def _spread(inputs: Tensor, domain: Domain, generator: torch.Generator) -> Tensor:
+def spread_points(inputs: Tensor, domain: Domain, generator: torch.Generator) -> Tensor:
     """The training inputs, points between them, and points all through the transition around them, `s x d` [SI]."""
     rows = inputs[torch.randperm(len(inputs), generator=generator)[:_POINTS]]
     pick = torch.randint(len(inputs), (2, 2 * _POINTS), generator=generator)
