@@ -7,6 +7,7 @@ from ccnn_torch.compensation._domain import Domain as Domain
 from ccnn_torch.compensation._geometry import Geometry as Geometry
 from ccnn_torch.compensation._geometry import fit_geometry_module as fit_geometry_module
 from ccnn_torch.compensation._geometry import geometric_deviation as geometric_deviation
+from ccnn_torch.compensation._geometry import settled_damping as settled_damping
 from ccnn_torch.compensation._loaded import LoadedModel as LoadedModel
 from ccnn_torch.compensation._loaded import load_model as load_model
 from ccnn_torch.compensation._model_file import FORMS as FORMS

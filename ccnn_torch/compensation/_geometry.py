@@ -5,13 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
+from ccnn_torch.compensation._contraction import STEEPEST_DEVIATION, steepest
+from ccnn_torch.compensation._domain import Domain
 from ccnn_torch.compensation._expanded_geometry import expand_geometry
 from ccnn_torch.compensation._serial_geometry import SerialGeometry
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
-__all__ = ["Geometry", "fit_geometry_module", "geometric_deviation"]
+__all__ = ["Geometry", "fit_geometry_module", "geometric_deviation", "settled_damping"]
+
+# Tried by bisection; without a singular pose near by the first will do.
+_DAMPINGS = tuple(0.01 * 1.25**k for k in range(20))
+# Of the steepest slope that a compensator may have.
+_SHARE = 0.75
+# So many rows show where the domain comes near singular poses.
+_ROWS = 300
 
 
 class Geometry(Protocol):
@@ -82,3 +92,58 @@ def fit_geometry_module(
     if isinstance(deviation, SerialGeometry):
         return deviation
     return expand_geometry(deviation, joints, margin)
+
+
+def settled_damping(
+    mechanism: Mechanism, nominal: Tensor, identified: Tensor, joints: Tensor, rotation_weight: float, margin: float
+) -> float:
+    """The least damping of a serial arm's γ with which it is nowhere so steep that no command could be solved for.
+
+    Near a singular pose γ changes fast, and the faster the less it is damped. Of the steepest slope that a compensator
+    may have, the network's part keeps a quarter.
+
+    Args:
+        nominal, identified: `r x 1 x k` [SI].
+        joints: commanded joints of all rows, `s x n` [SI]; held-out ones may be among them.
+        rotation_weight, margin: as in `fit_geometry_module`.
+
+    Returns:
+        [m per joint unit], one for all repeats; 0 for what is no serial arm.
+    """
+    if not isinstance(mechanism, SerialArm):
+        return 0.0
+    low = 0
+    for pair in zip(nominal[:, 0], identified[:, 0], strict=True):
+        # A repeat that needs no more damping than those before costs one look.
+        if _steepness(mechanism, pair, joints, rotation_weight, margin, _DAMPINGS[low]) <= _SHARE * STEEPEST_DEVIATION:
+            continue
+        high = len(_DAMPINGS) - 1
+        while low + 1 < high:
+            middle = (low + high) // 2
+            if _steepness(mechanism, pair, joints, rotation_weight, margin, _DAMPINGS[middle]) <= _SHARE * (
+                STEEPEST_DEVIATION
+            ):
+                high = middle
+            else:
+                low = middle
+        low = high
+    return _DAMPINGS[low]
+
+
+def _steepness(
+    arm: SerialArm,
+    pair: tuple[Tensor, Tensor],
+    joints: Tensor,
+    rotation_weight: float,
+    margin: float,
+    damping: float,
+) -> float:
+    """Bound of the slope of one repeat's γ over the domain and its transition, in units of its own limits."""
+    module = SerialGeometry(arm, *pair, rotation_weight, damping)
+    limit = 1.5 * module(joints).abs().amax(0).clamp_min(1e-12)
+    domain = Domain.fit(joints, limit, margin)
+
+    def deviation(at: Tensor, _: Tensor | None) -> Tensor:
+        return torch.minimum(torch.maximum(module(domain.cage(at)), -limit), limit)
+
+    return steepest(deviation, joints[:: max(1, len(joints) // _ROWS)], domain, limit).lipschitz

@@ -1,5 +1,6 @@
 """Geometric parameters of a machine from measured records."""
 
+from ccnn_torch.identification.geometry import fit_geometry as fit_geometry
 from ccnn_torch.identification.links import fit_links as fit_links
 from ccnn_torch.identification.problem import Channel as Channel
 from ccnn_torch.identification.problem import Fit as Fit

@@ -74,16 +74,21 @@ class Calibration:
         if not isinstance(network, UncertainNetwork):
             # A learner without a variance of its own has one standard deviation everywhere, here as in the results.
             sd_scale = fitted.sd(prepared.dataset.inputs[:, :1])[repeat, 0] / fitted.scaling.deviation[repeat]
+        inputs, margin = prepared.dataset.inputs[repeat, there], self.config.compensation.margin
+        geometry = None
+        if prepared.geometry is not None:
+            geometry = prepared.geometry.module(repeat, inputs[:, : len(prepared.mechanism.joints)], margin)
         return fit_compensator(
             network,
             fitted.scaling.repeat(repeat),
-            prepared.dataset.inputs[repeat, there],
+            inputs,
             prepared.dataset.deviation[repeat, there],
             prepared.mechanism.joints,
             prepared.covariate_coordinates,
             limit=_limit(self.config, len(prepared.mechanism.joints)),
-            margin=self.config.compensation.margin,
+            margin=margin,
             sd_scale=sd_scale,
+            geometry=geometry,
         )
 
     def save(
