@@ -34,7 +34,11 @@ class Steepness(NamedTuple):
 
 
 def steepest(
-    deviation: Callable[[Tensor, Tensor | None], Tensor], inputs: Tensor, domain: Domain, limit: Tensor
+    deviation: Callable[[Tensor, Tensor | None], Tensor],
+    inputs: Tensor,
+    domain: Domain,
+    limit: Tensor,
+    count: int = _POINTS,
 ) -> Steepness:
     """Find the steepest slope of δ over the domain and the transition around it, by sampling and hill climbing.
 
@@ -46,6 +50,7 @@ def steepest(
         inputs: training inputs, `s x (n + m)` [SI].
         domain: fitted to them.
         limit: `n` [SI].
+        count: inputs that are looked at; of points between and around them there are six times as many.
     """
     n = len(limit)
     positive = limit[limit > 0]
@@ -65,7 +70,7 @@ def steepest(
         return jacobian.abs().sum(-1).amax(-1), (value.detach().abs() / scale).amax(-1)
 
     generator = torch.Generator().manual_seed(0)
-    points = spread_points(inputs, domain, generator)
+    points = spread_points(inputs, domain, generator, count)
     slopes, sizes = slope(points)
     chosen = slopes.topk(min(_CLIMBERS, len(points))).indices
     points, best = points[chosen], slopes[chosen]
@@ -90,11 +95,11 @@ def iterations_needed(found: Steepness, tolerance: float = TOLERANCE) -> int:
     return max(1, math.ceil(exact - 1e-9))
 
 
-def spread_points(inputs: Tensor, domain: Domain, generator: torch.Generator) -> Tensor:
+def spread_points(inputs: Tensor, domain: Domain, generator: torch.Generator, count: int = _POINTS) -> Tensor:
     """The training inputs, points between them, and points all through the transition around them, `s x d` [SI]."""
-    rows = inputs[torch.randperm(len(inputs), generator=generator)[:_POINTS]]
-    pick = torch.randint(len(inputs), (2, 2 * _POINTS), generator=generator)
-    share = torch.rand(3, 2 * _POINTS, 1, generator=generator, dtype=inputs.dtype)
+    rows = inputs[torch.randperm(len(inputs), generator=generator)[:count]]
+    pick = torch.randint(len(inputs), (2, 2 * count), generator=generator)
+    share = torch.rand(3, 2 * count, 1, generator=generator, dtype=inputs.dtype)
     between = inputs[pick[0]] + share[0] * (inputs[pick[1]] - inputs[pick[0]])
     d = len(domain.centre)
     widest = float((1 + domain.width[:d] / domain.radius[:d]).max()) * 1.1

@@ -17,11 +17,11 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm
 __all__ = ["Geometry", "fit_geometry_module", "geometric_deviation", "settled_damping"]
 
 # Tried by bisection; without a singular pose near by the first will do.
-_DAMPINGS = tuple(0.01 * 1.25**k for k in range(20))
+_DAMPINGS = tuple(0.01 * 1.3**k for k in range(16))
 # Of the steepest slope that a compensator may have.
-_SHARE = 0.75
-# So many rows show where the domain comes near singular poses.
-_ROWS = 300
+_SHARE = 0.65
+# So many rows, and the points between and around them, show where the domain comes near singular poses.
+_ROWS = 400
 
 
 class Geometry(Protocol):
@@ -100,7 +100,7 @@ def settled_damping(
     """The least damping of a serial arm's γ with which it is nowhere so steep that no command could be solved for.
 
     Near a singular pose γ changes fast, and the faster the less it is damped. Of the steepest slope that a compensator
-    may have, the network's part keeps a quarter.
+    may have, a third is left to the network's part.
 
     Args:
         nominal, identified: `r x 1 x k` [SI].
@@ -146,4 +146,4 @@ def _steepness(
     def deviation(at: Tensor, _: Tensor | None) -> Tensor:
         return torch.minimum(torch.maximum(module(domain.cage(at)), -limit), limit)
 
-    return steepest(deviation, joints[:: max(1, len(joints) // _ROWS)], domain, limit).lipschitz
+    return steepest(deviation, joints, domain, limit, _ROWS).lipschitz
