@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["Coordinate", "Parameter"]
+from ccnn_torch.errors import InputError
+
+__all__ = ["Coordinate", "Parameter", "plausible_error"]
 
 
 @dataclass(frozen=True)
@@ -22,9 +24,39 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A geometric parameter of a mechanism: SI unit, nominal value, and the leg it belongs to (None = common)."""
+    """A geometric parameter of a mechanism.
+
+    Attributes:
+        name: as configs and results name it.
+        unit: SI unit.
+        nominal: nominal value [SI].
+        leg: number of the leg that it belongs to, and no other; joint i drives leg i. None = common to all.
+        scale: plausible error of a machine as built [SI], one standard deviation; None = `plausible_error` goes by the
+            unit.
+    """
 
     name: str
     unit: str
     nominal: float
     leg: int | None = None
+    scale: float | None = None
+
+
+_PLAUSIBLE = {"m": 1e-3, "rad": 2e-3, "1": 2e-3}
+
+
+def plausible_error(parameter: Parameter) -> float:
+    """How far a parameter of a machine as built may plausibly be off [SI], one standard deviation.
+
+    Its own `scale`; without one, 1 mm, 2 mrad or 2e-3 [1], about what ordinary manufacture and assembly leave.
+
+    Raises:
+        InputError: no scale, and a unit that has none by default.
+    """
+    if parameter.scale is not None:
+        return parameter.scale
+    if parameter.unit not in _PLAUSIBLE:
+        raise InputError(
+            f"parameter '{parameter.name}' has the unit '{parameter.unit}': give it a scale, its plausible error in SI"
+        )
+    return _PLAUSIBLE[parameter.unit]

@@ -18,6 +18,7 @@ __all__ = [
     "matrix_to_quaternion",
     "matrix_to_rotation_vector",
     "quaternion_to_matrix",
+    "rotation_vector_rate",
     "rotation_vector_to_matrix",
     "skew",
     "vee",
@@ -82,6 +83,21 @@ def vee(matrix: Tensor) -> Tensor:
     """Inverse of `skew`, of the skew part of a matrix: `... x 3 x 3`; returns `... x 3`."""
     odd = (matrix - matrix.transpose(-1, -2)) / 2
     return torch.stack([odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]], dim=-1)
+
+
+def rotation_vector_rate(vector: Tensor) -> Tensor:
+    """Rate of rotation, in the fixed axes, per change of the rotation vector (the left Jacobian of the exponential).
+
+    I + (1 - cos θ)/θ² K + (θ - sin θ)/θ³ K², K = skew(vector), θ its length. vector: `... x 3`; returns `... x 3 x 3`.
+    """
+    square = vector.square().sum(-1)[..., None, None]
+    angle = square.sqrt()
+    small = square < 1e-6
+    safe = torch.where(small, 1.0, angle)
+    first = torch.sinc(angle / (2 * torch.pi)).square() / 2
+    second = torch.where(small, 1 / 6 - square / 120, (safe - torch.sin(safe)) / safe**3)
+    k = skew(vector)
+    return torch.eye(3, dtype=vector.dtype) + first * k + second * (k @ k)
 
 
 def wrap_angle(angle: Tensor) -> Tensor:

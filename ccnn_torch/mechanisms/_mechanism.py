@@ -15,7 +15,7 @@ from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import _numeric
 from ccnn_torch.mechanisms._pose import PoseError, frame_from_coordinates, frame_jacobian, pose_error
-from ccnn_torch.rotations import wrap_angle
+from ccnn_torch.rotations import matrix_to_rotation_vector, wrap_angle
 
 __all__ = ["InverseKinematics", "Mechanism"]
 
@@ -163,6 +163,22 @@ class Mechanism(nn.Module):
         """
         return frame_from_coordinates(pose, self.pose, self.name)
 
+    def pose_near(self, position: Tensor, rotation: Tensor | None) -> Tensor:
+        """A pose whose frame is close to a given one: where a search for the closest pose starts, `... x p` [SI].
+
+        The default reads x, y, z and rx, ry, rz by name and takes other coordinates from `home_pose`. A mechanism that
+        overrides `frame` may override this as well, so that the search starts on the right side of the workspace.
+
+        Args:
+            position: `... x 3` [m].
+            rotation: `... x 3 x 3`, or None where it is not known.
+        """
+        known = dict(zip(("x", "y", "z"), position.unbind(-1), strict=True))
+        if rotation is not None:
+            known |= zip(("rx", "ry", "rz"), matrix_to_rotation_vector(rotation).unbind(-1), strict=True)
+        home = self.home_pose.expand(*position.shape[:-1], -1)
+        return torch.stack([known.get(c.name, home[..., i]) for i, c in enumerate(self.pose)], dim=-1)
+
     # Bookkeeping, the same for all.
 
     def resolve(self, parameters: Tensor | None) -> Tensor:
@@ -217,11 +233,48 @@ class Mechanism(nn.Module):
         guess: Tensor | None = None,
     ) -> Tensor:
         """Condition number of the Jacobian with its rotation rows times `rotation_weight` [m/rad]; `...` [1]."""
+        return 1 / self.singularity(joints, rotation_weight, parameters, guess)
+
+    def singularity(
+        self,
+        joints: Tensor,
+        rotation_weight: float = 0.04,
+        parameters: Tensor | None = None,
+        guess: Tensor | None = None,
+    ) -> Tensor:
+        """How far from a singularity: 1 where all directions are alike, 0 at a singularity; `...` [1].
+
+        With the loop closure F(X, q) = 0 the Jacobian is J = -(∂F/∂X)⁻¹ ∂F/∂q. Where ∂F/∂q is singular (first kind:
+        a leg stretched or folded, a serial arm's singularity) the smallest singular value of J goes to 0; where ∂F/∂X
+        is (second kind: the platform can move with the joints held) the largest goes to infinity (Gosselin and Angeles
+        1990). The measure is their ratio, the reciprocal condition number of J with its rotation rows times
+        `rotation_weight` [m/rad]. Unlike determinants of the two matrices it does not depend on how F is written.
+        Which kind is near, `singular_values` tells.
+        """
+        values = self.singular_values(joints, rotation_weight, parameters, guess)
+        ratio = values[..., -1] / values[..., 0]
+        return torch.where(torch.isfinite(ratio), ratio, 0.0)
+
+    def singular_values(
+        self,
+        joints: Tensor,
+        rotation_weight: float = 0.04,
+        parameters: Tensor | None = None,
+        guess: Tensor | None = None,
+    ) -> Tensor:
+        """Singular values of the Jacobian with its rotation rows times `rotation_weight`, largest first [m per joint].
+
+        The last is how little the platform moves when the joints do: 0 at a singularity of the first kind. The first is
+        how much: infinite at one of the second kind.
+
+        Returns:
+            `... x n` (or fewer, as many as the Jacobian has rows); NaN where the joints have no pose.
+        """
         jacobian = self.jacobian(joints, parameters, guess).clone()
         jacobian[..., 3:, :] *= rotation_weight
-        known = torch.isfinite(jacobian).all(-1).all(-1)
-        values = torch.linalg.svdvals(torch.where(known[..., None, None], jacobian, torch.zeros_like(jacobian)))
-        return torch.where(known & (values[..., -1] > 0), values[..., 0] / values[..., -1], torch.inf)
+        known = torch.isfinite(jacobian).all(-1).all(-1)[..., None]
+        values = torch.linalg.svdvals(torch.where(known[..., None], jacobian, torch.zeros_like(jacobian)))
+        return torch.where(known, values, torch.nan)
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Which poses `... x p` have joints on the nominal branch; `...`, bool."""

@@ -16,13 +16,19 @@ __all__ = ["carry_derivative", "least_norm", "solve"]
 _ROOT = 1e-9
 
 
-def solve(closure: Callable[..., Tensor], start: Tensor, data: tuple[Tensor, ...]) -> Tensor:
+def solve(
+    closure: Callable[..., Tensor],
+    start: Tensor,
+    data: tuple[Tensor, ...],
+    jacobian: Callable[..., Tensor] | None = None,
+) -> Tensor:
     """The root that damped Newton reaches from `start`.
 
     Args:
         closure: `(x, *data)` -> `... x c`.
         start: `... x k`, broadcasts with the data.
         data: what the closure needs besides x, `... x d` each.
+        jacobian: `(x, *data)` -> `... x c x k`; by differentiation when not given.
 
     Returns:
         `... x k`; NaN in rows without a root. Differentiable in the data by the implicit function theorem (first
@@ -30,11 +36,11 @@ def solve(closure: Callable[..., Tensor], start: Tensor, data: tuple[Tensor, ...
     """
     lead = leading_shape(start, *data)
     plain = tuple(d.detach() for d in data)
-    found = levenberg_marquardt(closure, start.detach().expand(*lead, start.shape[-1]), data=plain)
+    found = levenberg_marquardt(closure, start.detach().expand(*lead, start.shape[-1]), jacobian, plain)
     root = (2 * found.cost).sqrt() <= _ROOT
     # A row without a root takes part from its start on, so that its NaN stays out of the others' derivatives.
     x = torch.where(root[..., None], found.value, start.detach())
-    slope = jacobian_of(lambda point: closure(point, *plain), x)[1]
+    slope = jacobian_of(lambda point: closure(point, *plain), x)[1] if jacobian is None else jacobian(x, *plain)
     return torch.where(root[..., None], carry_derivative(x, slope, closure(x, *data)), torch.nan)
 
 

@@ -11,16 +11,29 @@ from typing import Any
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.mechanisms.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.dh_file import read_dh_file
+from ccnn_torch.mechanisms.five_bar import FiveBar
 from ccnn_torch.mechanisms.machine_tool import MachineTool
+from ccnn_torch.mechanisms.overconstrained import Overconstrained2Dof
 from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.mechanisms.stewart import Stewart
 from ccnn_torch.mechanisms.tripod import Tripod
 from ccnn_torch.mechanisms.urdf import read_urdf
 from ccnn_torch.plugins import is_plugin, load_plugin
 
 __all__ = ["REGISTRY", "load_mechanism", "mechanism_from_description"]
 
-REGISTRY: dict[str, Callable[..., Mechanism]] = {"tripod": Tripod, "machine_tool": MachineTool, "serial": SerialArm}
+REGISTRY: dict[str, Callable[..., Mechanism]] = {
+    "tripod": Tripod,
+    "machine_tool": MachineTool,
+    "five_bar": FiveBar,
+    "overconstrained_2dof": Overconstrained2Dof,
+    "stewart": Stewart,
+    "delta": Delta,
+    "delta_linear": DeltaLinear,
+    "serial": SerialArm,
+}
 
 _READERS: dict[str, Callable[..., Mechanism]] = {".yaml": read_dh_file, ".yml": read_dh_file, ".urdf": read_urdf}
 

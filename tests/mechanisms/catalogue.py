@@ -72,13 +72,24 @@ URDF = """\
 
 FIVE_BAR = Path(__file__).parent / "five_bar.py"
 
-NAMES = ("tripod", "machine_tool", "ur10", "ur10_positions", "panda", "scara", "urdf", "five_bar")
+NAMES = (
+    "tripod",
+    "machine_tool",
+    "five_bar",
+    "overconstrained_2dof",
+    "ur10",
+    "ur10_positions",
+    "panda",
+    "scara",
+    "urdf",
+    "users_five_bar",
+)
 
 
 def make(name: str, folder: Path) -> Mechanism:
     """A mechanism of the catalogue; geometry files are written to the folder."""
     files = {"ur10": UR10, "ur10_positions": UR10, "panda": PANDA, "scara": SCARA, "urdf": URDF}
-    if name == "five_bar":
+    if name == "users_five_bar":
         return load_mechanism(f"{FIVE_BAR}:FiveBar")
     if name not in files:
         return load_mechanism(name)

@@ -15,7 +15,7 @@ def test_by_name_with_keys():
     assert load_mechanism("tripod", L=1.2).nominal.tolist() == [1.2, 0.3]
     with pytest.raises(InputError, match="did you mean 'tripod'"):
         load_mechanism("tripot")
-    with pytest.raises(InputError, match="known: tripod, machine_tool"):
+    with pytest.raises(InputError, match="known: tripod, machine_tool, five_bar"):
         load_mechanism("xyz")
     with pytest.raises(InputError, match="'radius'; it takes L, r"):
         load_mechanism("tripod", radius=3)
