@@ -324,7 +324,8 @@ def fit_compensator(
     compensator = Compensator(
         frozen, scaling, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale, safe_sd, geometry
     )
-    found = steepest(compensator.deviation, inputs, domain, limit)
+    size = {} if geometry is None else {"count": 512, "at_once": 1024}
+    found = steepest(compensator.deviation, inputs, domain, limit, **size)
     if not math.isfinite(found.lipschitz):
         raise MethodFailedError("the trained network gives values that are not finite within its domain")
     if found.lipschitz > STEEPEST_DEVIATION:

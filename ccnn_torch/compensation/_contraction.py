@@ -39,6 +39,7 @@ def steepest(
     domain: Domain,
     limit: Tensor,
     count: int = _POINTS,
+    at_once: int = _AT_ONCE,
 ) -> Steepness:
     """Find the steepest slope of δ over the domain and the transition around it, by sampling and hill climbing.
 
@@ -51,6 +52,7 @@ def steepest(
         domain: fitted to them.
         limit: `n` [SI].
         count: inputs that are looked at; of points between and around them there are six times as many.
+        at_once: points that one pass takes; a geometry's many small operations take hardly longer for more of them.
     """
     n = len(limit)
     positive = limit[limit > 0]
@@ -58,7 +60,7 @@ def steepest(
 
     def slope(points: Tensor) -> tuple[Tensor, Tensor]:
         # In pieces: a network that compares each point with thousands of rows keeps a matrix for every operation.
-        slopes, sizes = zip(*(slope_of_few(part) for part in torch.split(points, _AT_ONCE)), strict=True)
+        slopes, sizes = zip(*(slope_of_few(part) for part in torch.split(points, at_once)), strict=True)
         return torch.cat(slopes), torch.cat(sizes)
 
     def slope_of_few(points: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,10 +16,12 @@ from ccnn_torch.errors import InputError, MethodFailedError
 __all__ = ["ExpandedGeometry", "expand_geometry"]
 
 _DEGREES = (2, 4, 6, 8, 10, 12, 16)
-_MOST_TERMS = 1000
+_MOST_TERMS = 600
 # Error of the expansion at points it was not fitted to, as a share of the largest deviation: what is aimed at, and what
 # is still written. Geometric errors are known to no more than a few per cent themselves.
-_AIM, _WORST = 1e-6, 1e-3
+_AIM, _WORST = 1e-6, 1e-2
+# Rows taken, twice, with six times as many points between and around them: three times the most terms.
+_SPREAD = 250
 # Keeps coefficients that the points do not determine (corners that no pose reaches) small.
 _RIDGE = 1e-12
 
@@ -93,7 +95,7 @@ def expand_geometry(deviation: Callable[[Tensor], Tensor], joints: Tensor, margi
 
     Raises:
         InputError: the mechanism has more joints than an expansion can have terms for.
-        MethodFailedError: no expansion of up to 1,000 terms is right to 1e-3 of the largest deviation.
+        MethodFailedError: no expansion of up to 600 terms is right to 1e-2 of the largest deviation.
     """
     n = joints.shape[-1]
     degrees = [degree for degree in _DEGREES if math.comb(n + degree, n) <= _MOST_TERMS]
@@ -101,7 +103,7 @@ def expand_geometry(deviation: Callable[[Tensor], Tensor], joints: Tensor, margi
         raise InputError(f"geometry: a mechanism of {n} joints without closed forms cannot be expanded; up to 8 can")
     domain = Domain.fit(joints, torch.zeros_like(joints[0]), margin)
     generator = torch.Generator().manual_seed(2)
-    points = torch.cat([spread_points(joints, domain, generator) for _ in range(2)])
+    points = torch.cat([spread_points(joints, domain, generator, _SPREAD) for _ in range(2)])
     value = deviation(points)
     known = torch.isfinite(value).all(-1)
     inside = (domain.excess(domain.cage(points)).squeeze(-1) == 0) & known

@@ -146,4 +146,4 @@ def _steepness(
     def deviation(at: Tensor, _: Tensor | None) -> Tensor:
         return torch.minimum(torch.maximum(module(domain.cage(at)), -limit), limit)
 
-    return steepest(deviation, joints, domain, limit, _ROWS).lipschitz
+    return steepest(deviation, joints, domain, limit, _ROWS, at_once=4096).lipschitz

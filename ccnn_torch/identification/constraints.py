@@ -230,7 +230,8 @@ def scatter(points: Tensor, group: Tensor, weights: Tensor) -> Tensor:
     if bool((total <= 0).any()):
         raise InputError(f"group {float(numbers[total <= 0][0]):g} has no row that counts, so it has no mean")
     mean = torch.zeros(len(numbers), 3, dtype=points.dtype).index_add(0, which, points * weights[:, None])
-    return torch.linalg.vector_norm(points - (mean / total[:, None])[which], dim=-1)
+    distance: Tensor = torch.linalg.vector_norm(points - (mean / total[:, None])[which], dim=-1)
+    return distance
 
 
 @dataclass(frozen=True)
