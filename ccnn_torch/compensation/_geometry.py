@@ -95,7 +95,13 @@ def fit_geometry_module(
 
 
 def settled_damping(
-    mechanism: Mechanism, nominal: Tensor, identified: Tensor, joints: Tensor, rotation_weight: float, margin: float
+    mechanism: Mechanism,
+    nominal: Tensor,
+    identified: Tensor,
+    joints: Tensor,
+    limit: Tensor,
+    rotation_weight: float,
+    margin: float,
 ) -> float:
     """The least damping of a serial arm's γ with which it is nowhere so steep that no command could be solved for.
 
@@ -105,6 +111,7 @@ def settled_damping(
     Args:
         nominal, identified: `r x 1 x k` [SI].
         joints: commanded joints of all rows, `s x n` [SI]; held-out ones may be among them.
+        limit: of the correction that the compensator will have, about, `n` [SI].
         rotation_weight, margin: as in `fit_geometry_module`.
 
     Returns:
@@ -114,18 +121,18 @@ def settled_damping(
         return 0.0
     low = 0
     for pair in zip(nominal[:, 0], identified[:, 0], strict=True):
+
+        def gentle(step: int, pair: tuple[Tensor, Tensor] = pair) -> bool:
+            slope = _steepness(mechanism, pair, joints, limit, rotation_weight, margin, _DAMPINGS[step])
+            return slope <= _SHARE * STEEPEST_DEVIATION
+
         # A repeat that needs no more damping than those before costs one look.
-        if _steepness(mechanism, pair, joints, rotation_weight, margin, _DAMPINGS[low]) <= _SHARE * STEEPEST_DEVIATION:
+        if gentle(low):
             continue
         high = len(_DAMPINGS) - 1
         while low + 1 < high:
             middle = (low + high) // 2
-            if _steepness(mechanism, pair, joints, rotation_weight, margin, _DAMPINGS[middle]) <= _SHARE * (
-                STEEPEST_DEVIATION
-            ):
-                high = middle
-            else:
-                low = middle
+            low, high = (low, middle) if gentle(middle) else (middle, high)
         low = high
     return _DAMPINGS[low]
 
@@ -134,13 +141,13 @@ def _steepness(
     arm: SerialArm,
     pair: tuple[Tensor, Tensor],
     joints: Tensor,
+    limit: Tensor,
     rotation_weight: float,
     margin: float,
     damping: float,
 ) -> float:
-    """Bound of the slope of one repeat's γ over the domain and its transition, in units of its own limits."""
+    """Bound of the slope of one repeat's γ over the domain and its transition, in units of the limits."""
     module = SerialGeometry(arm, *pair, rotation_weight, damping)
-    limit = 1.5 * module(joints).abs().amax(0).clamp_min(1e-12)
     domain = Domain.fit(joints, limit, margin)
 
     def deviation(at: Tensor, _: Tensor | None) -> Tensor:

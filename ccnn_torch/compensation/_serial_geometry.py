@@ -118,9 +118,9 @@ class SerialGeometry(nn.Module):
     @classmethod
     def from_description(cls, description: dict[str, Any]) -> SerialGeometry:
         """The module as it was described, bit by bit."""
-        pair = (torch.tensor(description[key], dtype=torch.float64) for key in ("nominal", "identified"))
+        nominal, identified = (torch.tensor(description[k], dtype=torch.float64) for k in ("nominal", "identified"))
         arm = SerialArm(**description["arm"])
-        return cls(arm, *pair, rotation_weight=description["rotation_weight"], damping=description["damping"])
+        return cls(arm, nominal, identified, description["rotation_weight"], description["damping"])
 
     def _moved(self, joints: Tensor, links: Tensor) -> Tensor:
         """Transforms of the links, `... x n x 4 x 4`; links `3 x ... x n x 4 x 4`."""

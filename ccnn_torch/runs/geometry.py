@@ -59,22 +59,33 @@ class Fitted:
     Attributes:
         parameters: with fitted frames, `r x 1 x k`, or `r x s x k` where frames are per group; None = nominal.
         geometry: all parameters identified, `r x 1 x k`, for comparison or to be learned beside; None = not fitted.
-        identified: where the network is to learn only what the geometry leaves.
     """
 
     parameters: Tensor | None
     geometry: Tensor | None
-    identified: Identified | None
     notes: list[str]
 
+    def beside(self, mechanism: Mechanism, joints: Tensor, total: Tensor, margin: float) -> Identified:
+        """The identified geometry as a part of a compensator whose network learns what it leaves.
 
-def fit_machine(mechanism: Mechanism, records: Records, splits: list[Split], identify: bool, margin: float) -> Fitted:
+        Args:
+            joints: commanded, `s x n` [SI].
+            total: deviations of the nominal machine, `[r x] s x n` [SI]; they tell how far a correction goes.
+            margin: of the compensator's domain.
+        """
+        assert self.geometry is not None
+        nominal = mechanism.nominal.expand_as(self.geometry) if self.parameters is None else self.parameters
+        limit = 1.5 * total.abs().reshape(-1, total.shape[-1]).amax(0).clamp_min(1e-12)
+        damping = settled_damping(mechanism, nominal, self.geometry, joints, limit, _ROTATION_WEIGHT, margin)
+        return Identified(mechanism, nominal, self.geometry, damping)
+
+
+def fit_machine(mechanism: Mechanism, records: Records, splits: list[Split], identify: bool) -> Fitted:
     """Fit frames that are unknown, and the geometry where it is asked for or costs nothing (a serial arm).
 
     Args:
         splits: one a repeat; only rows that are not held out are looked at.
         identify: whether the geometry is to be a part of the compensator.
-        margin: of the compensator's domain.
 
     Raises:
         InputError: the geometry cannot be identified from such records.
@@ -100,13 +111,9 @@ def fit_machine(mechanism: Mechanism, records: Records, splits: list[Split], ide
     if identify or (parameters is not None and not grouped):
         start = mechanism.nominal.expand(len(splits), -1) if parameters is None else parameters.squeeze(-2)
         geometry = fit_geometry(mechanism, records.joints, records.pose, start, weights).unsqueeze(-2)
-    if not identify:
-        return Fitted(parameters, geometry, None, notes)
-    assert geometry is not None
-    nominal = mechanism.nominal.expand_as(geometry) if parameters is None else parameters
-    damping = settled_damping(mechanism, nominal, geometry, records.joints, _ROTATION_WEIGHT, margin)
-    notes.append(
-        f"Geometry identified on the training rows of each repeat: {len(mechanism.geometry)} parameters, each drawn to "
-        "its nominal value by a plausible error; the network learns only what they leave."
-    )
-    return Fitted(nominal, geometry, Identified(mechanism, nominal, geometry, damping), notes)
+    if identify:
+        notes.append(
+            f"Geometry identified on the training rows of each repeat: {len(mechanism.geometry)} parameters, each "
+            "drawn to its nominal value by a plausible error; the network learns only what they leave."
+        )
+    return Fitted(parameters, geometry, notes)

@@ -196,15 +196,18 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
     if isinstance(mechanism, SerialArm) and records.orientation == "none":
         mechanism = mechanism.with_orientation("none")
     splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds)
-    fitted = fit_machine(mechanism, records, splits, config.geometry == "identify", config.compensation.margin)
+    fitted = fit_machine(mechanism, records, splits, config.geometry == "identify")
     settings = _pseudoerror_settings(config, mechanism)
 
     def solved(parameters: Tensor | None) -> Pseudoerror:
         return joint_deviations(mechanism, records.joints, records.pose, parameters=parameters, **settings)
 
-    total = solved(fitted.parameters)
-    learned = fitted.parameters if fitted.identified is None else fitted.geometry
-    deviations = total if fitted.identified is None else solved(learned)
+    total = deviations = solved(fitted.parameters)
+    learned, identified = fitted.parameters, None
+    if config.geometry == "identify":
+        learned = fitted.geometry
+        deviations = solved(learned)
+        identified = fitted.beside(mechanism, records.joints, total.deviation, config.compensation.margin)
     jacobian = mechanism.jacobian(records.joints, learned, guess=records.pose)
     return Prepared(
         mechanism=mechanism,
@@ -218,7 +221,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         dataset=_dataset(mechanism, records.joints, records.covariates, deviations, splits, seeds, jacobian),
         data_hash=records.data_hash,
         identified=fitted.geometry,
-        geometry=fitted.identified,
+        geometry=identified,
         notes=[*records.notes, *fitted.notes, *deviations.notes()],
     )
 

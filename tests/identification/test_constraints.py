@@ -176,7 +176,7 @@ def test_bad_input_is_one_sentence() -> None:
         distance_problem(arm, joints[:3], placement[:3], points[:3, 0])
     with pytest.raises(InputError, match="at least 4 rows"):
         plane_problem(arm, joints[:3], placement[:3])
-    with pytest.raises(InputError, match="parameters.prior"):
+    with pytest.raises(InputError, match=r"parameters\.prior"):
         socket_problem(arm, joints, placement, points, None, None, replace(CHOICE))
     with pytest.raises(InputError, match="no row that counts"):
         scatter(points, placement, torch.zeros(120, dtype=torch.float64))
