@@ -2,6 +2,7 @@
 
 from ccnn_torch.compensation._compensator import Compensator as Compensator
 from ccnn_torch.compensation._compensator import Solution as Solution
+from ccnn_torch.compensation._compensator import default_limit as default_limit
 from ccnn_torch.compensation._compensator import fit_compensator as fit_compensator
 from ccnn_torch.compensation._domain import Domain as Domain
 from ccnn_torch.compensation._geometry import Geometry as Geometry

@@ -19,7 +19,7 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, OutsideDomainWarning
 from ccnn_torch.training import Scaling
 
-__all__ = ["Compensator", "Solution", "fit_compensator"]
+__all__ = ["Compensator", "Solution", "default_limit", "fit_compensator"]
 
 Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
 
@@ -262,6 +262,11 @@ class Compensator(nn.Module):
         return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)
 
 
+def default_limit(deviations: Tensor) -> Tensor:
+    """Limit of a correction by the training deviations `s x n`: 1.5 times the largest of each joint, `n` [SI]."""
+    return 1.5 * deviations.abs().amax(0)
+
+
 def fit_compensator(
     network: nn.Module,
     scaling: Scaling,
@@ -307,11 +312,10 @@ def fit_compensator(
         geometry = copy.deepcopy(geometry)
         with torch.no_grad():
             total = deviations + geometry(inputs[:, :n] + deviations)
-    largest = total.abs().amax(0)
-    limit = 1.5 * largest if limit is None else limit.detach()
+    limit = default_limit(total) if limit is None else limit.detach()
     if limit.shape != (n,) or not bool((limit >= 0).all() & torch.isfinite(limit).all()):
         raise InputError(f"limit must be one finite number of at least 0 for each of the {n} joints")
-    sd_scale = torch.ones_like(largest) if sd_scale is None else sd_scale.detach().clone()
+    sd_scale = torch.ones_like(limit) if sd_scale is None else sd_scale.detach().clone()
     if sd_scale.shape != (n,) or not bool((sd_scale > 0).all() & torch.isfinite(sd_scale).all()):
         raise InputError(f"sd_scale must be one finite number above 0 for each of the {n} joints")
     fading = deviations if geometry is None or geometry.extrapolates else total

@@ -19,7 +19,7 @@ __all__ = ["Geometry", "fit_geometry_module", "geometric_deviation", "settled_da
 # Tried by bisection; without a singular pose near by the first will do.
 _DAMPINGS = tuple(0.01 * 1.3**k for k in range(16))
 # Of the steepest slope that a compensator may have.
-_SHARE = 0.65
+_SHARE = 0.75
 # So many rows, and the points between and around them, show where the domain comes near singular poses.
 _ROWS = 400
 
@@ -106,7 +106,7 @@ def settled_damping(
     """The least damping of a serial arm's γ with which it is nowhere so steep that no command could be solved for.
 
     Near a singular pose γ changes fast, and the faster the less it is damped. Of the steepest slope that a compensator
-    may have, a third is left to the network's part.
+    may have, a quarter is left to the network's part.
 
     Args:
         nominal, identified: `r x 1 x k` [SI].

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation import Geometry, fit_geometry_module, geometric_deviation, settled_damping
+from ccnn_torch.compensation import Geometry, default_limit, fit_geometry_module, geometric_deviation, settled_damping
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry
 from ccnn_torch.mechanisms import Mechanism, SerialArm
@@ -65,17 +65,22 @@ class Fitted:
     geometry: Tensor | None
     notes: list[str]
 
-    def beside(self, mechanism: Mechanism, joints: Tensor, total: Tensor, margin: float) -> Identified:
+    def beside(
+        self, mechanism: Mechanism, joints: Tensor, total: Tensor, splits: list[Split], margin: float
+    ) -> Identified:
         """The identified geometry as a part of a compensator whose network learns what it leaves.
 
         Args:
             joints: commanded, `s x n` [SI].
-            total: deviations of the nominal machine, `[r x] s x n` [SI]; they tell how far a correction goes.
+            total: deviations of the nominal machine, `[r x] s x n` [SI].
+            splits: one a repeat; the rows that are not held out tell how far a correction goes.
             margin: of the compensator's domain.
         """
         assert self.geometry is not None
         nominal = mechanism.nominal.expand_as(self.geometry) if self.parameters is None else self.parameters
-        limit = 1.5 * total.abs().reshape(-1, total.shape[-1]).amax(0).clamp_min(1e-12)
+        each = total.expand(len(splits), *total.shape[-2:])
+        limits = [default_limit(part[Dataset.part(s, "fit")]) for part, s in zip(each, splits, strict=True)]
+        limit = torch.stack(limits).amin(0).clamp_min(1e-12)
         damping = settled_damping(mechanism, nominal, self.geometry, joints, limit, _ROTATION_WEIGHT, margin)
         return Identified(mechanism, nominal, self.geometry, damping)
 

@@ -207,7 +207,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
     if config.geometry == "identify":
         learned = fitted.geometry
         deviations = solved(learned)
-        identified = fitted.beside(mechanism, records.joints, total.deviation, config.compensation.margin)
+        identified = fitted.beside(mechanism, records.joints, total.deviation, splits, config.compensation.margin)
     jacobian = mechanism.jacobian(records.joints, learned, guess=records.pose)
     return Prepared(
         mechanism=mechanism,
