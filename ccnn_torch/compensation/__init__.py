@@ -2,8 +2,13 @@
 
 from ccnn_torch.compensation._compensator import Compensator as Compensator
 from ccnn_torch.compensation._compensator import Solution as Solution
+from ccnn_torch.compensation._compensator import default_limit as default_limit
 from ccnn_torch.compensation._compensator import fit_compensator as fit_compensator
 from ccnn_torch.compensation._domain import Domain as Domain
+from ccnn_torch.compensation._geometry import Geometry as Geometry
+from ccnn_torch.compensation._geometry import fit_geometry_module as fit_geometry_module
+from ccnn_torch.compensation._geometry import geometric_deviation as geometric_deviation
+from ccnn_torch.compensation._geometry import settled_damping as settled_damping
 from ccnn_torch.compensation._identified import IdentifiedGeometry as IdentifiedGeometry
 from ccnn_torch.compensation._identified import load_compensation as load_compensation
 from ccnn_torch.compensation._loaded import LoadedModel as LoadedModel

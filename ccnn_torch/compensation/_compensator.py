@@ -13,12 +13,13 @@ from torch import Tensor, nn
 
 from ccnn_torch.compensation._contraction import STEEPEST_DEVIATION, iterations_needed, steepest
 from ccnn_torch.compensation._domain import Domain
+from ccnn_torch.compensation._geometry import Geometry
 from ccnn_torch.compensation._networks import UncertainNetwork
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, OutsideDomainWarning
 from ccnn_torch.training import Scaling
 
-__all__ = ["Compensator", "Solution", "fit_compensator"]
+__all__ = ["Compensator", "Solution", "default_limit", "fit_compensator"]
 
 Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
 
@@ -66,6 +67,11 @@ class Compensator(nn.Module):
     ± `limit`, faded by the domain's guard into the constant `safe`. Inputs that are no number give the command of the
     domain's centre, infinite ones that of its edge, both with `safe` and outside the domain.
 
+    With `geometry` the network has learned only what identified geometry leaves: with r(q) the network's guarded part
+    and γ(q) the deviation of the identified geometry, δ(q) = r(q) + γ(q + r(q)), clamped to ± `limit`. Outside the
+    domain r fades into `safe`; γ stays where the geometry `extrapolates` (an arm's links are what they are everywhere)
+    and fades to 0 with r where it does not (a polynomial).
+
     How far a newly measured δ may be from this one is told by `sd`: inside the domain by the network's own `variance`
     and `sd_scale`, outside by how the training deviations scatter about `safe`, between the two by the guard's weight.
 
@@ -74,12 +80,13 @@ class Compensator(nn.Module):
             gives the variance of a newly measured standardised deviation; without one that is 1 everywhere.
         scaling: of one repeat.
         limit: hard limit of |δ|, `n` [SI].
-        safe: correction outside the domain, `n` [SI].
+        safe: correction outside the domain, beside that of a geometry that extrapolates, `n` [SI].
         sd_scale: what the network's standard deviation is multiplied by, as held-out rows demand, `n` [1].
         safe_sd: standard deviation outside the domain, `n` [SI].
         joints, covariates: coordinates in order.
         lipschitz: bound of |∂δ/∂q| with joints in units of their limits (maximum row sum), 1.
         iterations: smallest k with lipschitzᵏ · max|δ| below 1e-12 of the limit.
+        geometry: commanded joints `... x n` -> γ `... x n` [SI], bounded for finite joints; None without one.
     """
 
     limit: Tensor
@@ -100,9 +107,11 @@ class Compensator(nn.Module):
         iterations: int,
         sd_scale: Tensor | None = None,
         safe_sd: Tensor | None = None,
+        geometry: Geometry | None = None,
     ) -> None:
         super().__init__()
         self.network = network
+        self.geometry = geometry
         self.scaling = scaling
         self.domain = domain
         self.register_buffer("limit", limit)
@@ -234,6 +243,9 @@ class Compensator(nn.Module):
         weight = fade * fade
         # Two products instead of safe + weight · (limited - safe): each end is then exact.
         value = self._limited(weight * self._limited(raw) + (1 - weight) * self.safe)
+        if self.geometry is not None:
+            moved = self.geometry(caged[..., : len(self.joints)] + value)
+            value = self._limited(value + (moved if self.geometry.extrapolates else weight * moved))
         return _Deviation(value, weight, excess, features)
 
     def _sd(self, deviation: _Deviation) -> Tensor:
@@ -250,6 +262,11 @@ class Compensator(nn.Module):
         return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)
 
 
+def default_limit(deviations: Tensor) -> Tensor:
+    """Limit of a correction by the training deviations `s x n`: 1.5 times the largest of each joint, `n` [SI]."""
+    return 1.5 * deviations.abs().amax(0)
+
+
 def fit_compensator(
     network: nn.Module,
     scaling: Scaling,
@@ -261,19 +278,23 @@ def fit_compensator(
     margin: float = 0.1,
     transition: float = 0.5,
     sd_scale: Tensor | None = None,
+    geometry: Geometry | None = None,
 ) -> Compensator:
-    """Put guard, limit and fixed point around a trained network.
+    """Put guard, limit and fixed point around a trained network, and identified geometry beside it.
 
     Args:
         network: features -> standardised deviation, of one repeat.
         scaling: of that repeat, without the leading dimension.
         inputs: training inputs, commanded joints and then covariates, `s x (n + m)` [SI].
-        deviations: training deviations, `s x n` [SI]; their mean is the safe correction outside the domain.
+        deviations: training deviations of what the network learned, `s x n` [SI]; with `geometry` what that leaves. The
+            mean of the deviations that fade out is the safe correction outside the domain.
         joints, covariates: coordinates in the order of the inputs.
-        limit: hard limit of |δ|, `n` [SI]; 1.5 times the largest training deviation of each joint when None.
+        limit: hard limit of |δ|, `n` [SI]; 1.5 times the largest training deviation of each joint, geometry included,
+            when None.
         margin: how far beyond the training inputs δ is trusted, as a share of their half range.
         transition: width over which it then fades into the safe correction, as a share of the half range.
         sd_scale: what the network's standard deviation is multiplied by, `n` [1]; 1 when None.
+        geometry: deviation of the identified geometry, of one repeat.
 
     Raises:
         InputError: shapes do not fit together, or a limit or a scale is out of its range.
@@ -286,21 +307,29 @@ def fit_compensator(
             f"{n} joints and {len(covariates)} covariates"
         )
     inputs, deviations = inputs.detach(), deviations.detach()
-    largest = deviations.abs().amax(0)
-    limit = 1.5 * largest if limit is None else limit.detach()
+    total = deviations
+    if geometry is not None:
+        geometry = copy.deepcopy(geometry)
+        with torch.no_grad():
+            total = deviations + geometry(inputs[:, :n] + deviations)
+    limit = default_limit(total) if limit is None else limit.detach()
     if limit.shape != (n,) or not bool((limit >= 0).all() & torch.isfinite(limit).all()):
         raise InputError(f"limit must be one finite number of at least 0 for each of the {n} joints")
-    sd_scale = torch.ones_like(largest) if sd_scale is None else sd_scale.detach().clone()
+    sd_scale = torch.ones_like(limit) if sd_scale is None else sd_scale.detach().clone()
     if sd_scale.shape != (n,) or not bool((sd_scale > 0).all() & torch.isfinite(sd_scale).all()):
         raise InputError(f"sd_scale must be one finite number above 0 for each of the {n} joints")
-    safe = torch.minimum(torch.maximum(deviations.mean(0), -limit), limit)
-    safe_sd = (deviations - safe).square().mean(0).sqrt()
+    fading = deviations if geometry is None or geometry.extrapolates else total
+    safe = torch.minimum(torch.maximum(fading.mean(0), -limit), limit)
+    safe_sd = (fading - safe).square().mean(0).sqrt()
     reach = torch.cat([limit, limit.new_zeros(len(covariates))])
     domain = Domain.fit(inputs, reach, margin, transition)
     # A copy: what is compensated with does not change when the learner trains on.
     frozen = copy.deepcopy(network).requires_grad_(False)
-    compensator = Compensator(frozen, scaling, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale, safe_sd)
-    found = steepest(compensator.deviation, inputs, domain, limit)
+    compensator = Compensator(
+        frozen, scaling, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale, safe_sd, geometry
+    )
+    size = {} if geometry is None else {"count": 512, "at_once": 1024}
+    found = steepest(compensator.deviation, inputs, domain, limit, **size)
     if not math.isfinite(found.lipschitz):
         raise MethodFailedError("the trained network gives values that are not finite within its domain")
     if found.lipschitz > STEEPEST_DEVIATION:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation._domain import Domain
 
-__all__ = ["STEEPEST_DEVIATION", "TOLERANCE", "Steepness", "iterations_needed", "steepest"]
+__all__ = ["STEEPEST_DEVIATION", "TOLERANCE", "Steepness", "iterations_needed", "spread_points", "steepest"]
 
 # Above this slope the fixed point needs more than 17 steps, and sampled slopes are no safe ground.
 STEEPEST_DEVIATION = 0.2
@@ -34,7 +34,12 @@ class Steepness(NamedTuple):
 
 
 def steepest(
-    deviation: Callable[[Tensor, Tensor | None], Tensor], inputs: Tensor, domain: Domain, limit: Tensor
+    deviation: Callable[[Tensor, Tensor | None], Tensor],
+    inputs: Tensor,
+    domain: Domain,
+    limit: Tensor,
+    count: int = _POINTS,
+    at_once: int = _AT_ONCE,
 ) -> Steepness:
     """Find the steepest slope of δ over the domain and the transition around it, by sampling and hill climbing.
 
@@ -46,6 +51,8 @@ def steepest(
         inputs: training inputs, `s x (n + m)` [SI].
         domain: fitted to them.
         limit: `n` [SI].
+        count: inputs that are looked at; of points between and around them there are six times as many.
+        at_once: points that one pass takes; a geometry's many small operations take hardly longer for more of them.
     """
     n = len(limit)
     positive = limit[limit > 0]
@@ -53,7 +60,7 @@ def steepest(
 
     def slope(points: Tensor) -> tuple[Tensor, Tensor]:
         # In pieces: a network that compares each point with thousands of rows keeps a matrix for every operation.
-        slopes, sizes = zip(*(slope_of_few(part) for part in torch.split(points, _AT_ONCE)), strict=True)
+        slopes, sizes = zip(*(slope_of_few(part) for part in torch.split(points, at_once)), strict=True)
         return torch.cat(slopes), torch.cat(sizes)
 
     def slope_of_few(points: Tensor) -> tuple[Tensor, Tensor]:
@@ -65,7 +72,7 @@ def steepest(
         return jacobian.abs().sum(-1).amax(-1), (value.detach().abs() / scale).amax(-1)
 
     generator = torch.Generator().manual_seed(0)
-    points = _spread(inputs, domain, generator)
+    points = spread_points(inputs, domain, generator, count)
     slopes, sizes = slope(points)
     chosen = slopes.topk(min(_CLIMBERS, len(points))).indices
     points, best = points[chosen], slopes[chosen]
@@ -90,11 +97,11 @@ def iterations_needed(found: Steepness, tolerance: float = TOLERANCE) -> int:
     return max(1, math.ceil(exact - 1e-9))
 
 
-def _spread(inputs: Tensor, domain: Domain, generator: torch.Generator) -> Tensor:
+def spread_points(inputs: Tensor, domain: Domain, generator: torch.Generator, count: int = _POINTS) -> Tensor:
     """The training inputs, points between them, and points all through the transition around them, `s x d` [SI]."""
-    rows = inputs[torch.randperm(len(inputs), generator=generator)[:_POINTS]]
-    pick = torch.randint(len(inputs), (2, 2 * _POINTS), generator=generator)
-    share = torch.rand(3, 2 * _POINTS, 1, generator=generator, dtype=inputs.dtype)
+    rows = inputs[torch.randperm(len(inputs), generator=generator)[:count]]
+    pick = torch.randint(len(inputs), (2, 2 * count), generator=generator)
+    share = torch.rand(3, 2 * count, 1, generator=generator, dtype=inputs.dtype)
     between = inputs[pick[0]] + share[0] * (inputs[pick[1]] - inputs[pick[0]])
     d = len(domain.centre)
     widest = float((1 + domain.width[:d] / domain.radius[:d]).max()) * 1.1

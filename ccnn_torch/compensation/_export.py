@@ -166,14 +166,15 @@ def verify(compensator: Compensator, run: Any, form: str) -> None:
     Raises:
         MethodFailedError: it differs by more than 1e-12 of the limit (commands: and the rounding of a joint; standard
             deviations: and 1e-12 of themselves). A network may ask for more than 1e-12, up to 1e-9, by its attribute
-            `export_tolerance`.
+            `export_tolerance`; so may a geometry.
     """
     joints, covariates = probe_points(compensator)
     with torch.no_grad():
         expected = {k: v.numpy() for k, v in compensator.solve(joints, covariates)._asdict().items()}
     given = joints.numpy(), None if covariates is None else covariates.numpy()
     single = joints.numpy()[:1], None if covariates is None else covariates.numpy()[:1]
-    share = min(max(TOLERANCE, getattr(compensator.network, "export_tolerance", TOLERANCE)), _LOOSEST)
+    parts = (compensator.network, compensator.geometry)
+    share = min(max(TOLERANCE, *(getattr(part, "export_tolerance", TOLERANCE) for part in parts)), _LOOSEST)
     tolerance = share * compensator.limit.numpy()
     for found, wanted in ((run(*given), expected), (run(*single), {k: v[:1] for k, v in expected.items()})):
         for name in OUTPUTS:

@@ -19,9 +19,11 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.training import tensor_digest
 
-__all__ = ["FORMAT", "check_keys", "check_tensors", "coordinates", "facts_of", "to_json"]
+__all__ = ["FORMAT", "FORMAT_GEOMETRY", "check_keys", "check_tensors", "coordinates", "facts_of", "to_json"]
 
 FORMAT = "ccnn_torch compensator 2"
+# A reader that does not know of geometry must refuse such a file, not leave the geometry out.
+FORMAT_GEOMETRY = "ccnn_torch compensator 3"
 _FORMATS = "ccnn_torch compensator "
 
 _REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
@@ -44,7 +46,7 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
     pose = mechanism.get("pose", []) if isinstance(mechanism, Mapping) else []
     limits = (v.tolist() for v in (compensator.limit, compensator.safe, compensator.safe_sd, compensator.sd_scale))
     facts: dict[str, Any] = {
-        "format": FORMAT,
+        "format": FORMAT if compensator.geometry is None else FORMAT_GEOMETRY,
         **{key: fields[key] for key in _REQUIRED},
         "joints": [_plain(c) for c in compensator.joints],
         "covariates": [_plain(c) for c in compensator.covariates],
@@ -60,6 +62,8 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
         "versions": {"python": platform.python_version(), "ccnn_torch": __version__}
         | {name: version(name) for name in _PACKAGES},
     }
+    if compensator.geometry is not None:
+        facts["geometry"] = compensator.geometry.describe()
     facts["sha256"] = {"tensors": tensor_digest(dict(compensator.state_dict()))}
     facts["sha256"]["keys"] = _digest(facts)
     return facts
@@ -72,12 +76,13 @@ def check_keys(facts: Any) -> dict[str, Any]:
         ModelFileError: they are not.
     """
     written = str(facts.get("format")) if isinstance(facts, dict) else ""
-    if written != FORMAT and written.startswith(_FORMATS):
+    known = written in (FORMAT, FORMAT_GEOMETRY)
+    if not known and written.startswith(_FORMATS):
         raise ModelFileError(
-            f"it has the form '{written}' of another version of this package, which reads '{FORMAT}'; write it again "
-            "with this version (ccnn run …, or save_model)"
+            f"it has the form '{written}' of another version of this package, which reads '{FORMAT}' and "
+            f"'{FORMAT_GEOMETRY}'; write it again with this version (ccnn run …, or save_model)"
         )
-    if not isinstance(facts, dict) or written != FORMAT:
+    if not isinstance(facts, dict) or not known:
         raise ModelFileError(f"it says nothing of the form '{FORMAT}', so this package did not write it" + TAKE_AGAIN)
     stated = facts.get("sha256")
     if not isinstance(stated, dict) or stated.get("keys") != _digest(facts):

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 import onnx
@@ -22,6 +22,7 @@ from torch import Tensor
 from ccnn_torch.compensation._compensator import Compensator, Hook
 from ccnn_torch.compensation._domain import Domain
 from ccnn_torch.compensation._facts import check_keys, check_tensors, coordinates, to_json
+from ccnn_torch.compensation._geometry import Geometry
 from ccnn_torch.compensation._networks import network_from_description
 from ccnn_torch.compensation._session import (
     METADATA_KEY,
@@ -275,6 +276,9 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
         parts.setdefault(part, {})[rest] = value
     network = network_from_description(facts["network"])
     network.load_state_dict(parts.get("network", {}))
+    geometry = network_from_description(facts["geometry"]) if "geometry" in facts else None
+    if geometry is not None:
+        geometry.load_state_dict(parts.get("geometry", {}))
     return Compensator(
         network.requires_grad_(False),
         Scaling(**parts["scaling"]),
@@ -287,6 +291,7 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
         facts["iterations"],
         tensors["sd_scale"],
         tensors["safe_sd"],
+        cast(Geometry | None, geometry),
     )
 
 

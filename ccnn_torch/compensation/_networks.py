@@ -17,6 +17,8 @@ _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "grnn": "ccnn_torch.learners._grnn_network:GRNNNetwork",
     "gp": "ccnn_torch.learners._gp_posterior:GPNetwork",
     "masked": "ccnn_torch.evolution.masked_network:MaskedNetwork",
+    "serial_geometry": "ccnn_torch.compensation._serial_geometry:SerialGeometry",
+    "expanded_geometry": "ccnn_torch.compensation._expanded_geometry:ExpandedGeometry",
 }
 
 

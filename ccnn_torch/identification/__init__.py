@@ -2,7 +2,13 @@
 
 from ccnn_torch.identification.bootstrap import Bootstrap as Bootstrap
 from ccnn_torch.identification.bootstrap import bootstrap as bootstrap
+from ccnn_torch.identification.constraints import distance_problem as distance_problem
+from ccnn_torch.identification.constraints import plane_problem as plane_problem
+from ccnn_torch.identification.constraints import scatter as scatter
+from ccnn_torch.identification.constraints import socket_problem as socket_problem
+from ccnn_torch.identification.constraints import tool_points as tool_points
 from ccnn_torch.identification.forward import forward_problem as forward_problem
+from ccnn_torch.identification.geometry import fit_geometry as fit_geometry
 from ccnn_torch.identification.inverse import inverse_problem as inverse_problem
 from ccnn_torch.identification.knowledge import Knowledge as Knowledge
 from ccnn_torch.identification.knowledge import require_identifiable as require_identifiable

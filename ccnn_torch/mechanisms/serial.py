@@ -161,11 +161,15 @@ class SerialArm(Mechanism):
         """Flange in the arm's own base, without base and tool frame: rotation `... x 3 x 3`, position `... x 3` [m]."""
         return self.link_frames(joints, self.resolve(parameters))[-1]
 
-    def link_frames(self, joints: Tensor, values: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Frames of the links one after the other, n + 1 of them, from the arm's own base to the flange."""
+    def link_transforms(self, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """From each link to the one before: rotation `... x n x 3 x 3` and translation `... x n x 3` [m]."""
         links = values[..., 6:-6].reshape(*values.shape[:-1], len(self.joints), -1)
         motion = joints * self.signs
-        rotations, translations = self._transform(links, motion * self.revolute, motion * ~self.revolute, self.axes)
+        return self._transform(links, motion * self.revolute, motion * ~self.revolute, self.axes)
+
+    def link_frames(self, joints: Tensor, values: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Frames of the links one after the other, n + 1 of them, from the arm's own base to the flange."""
+        rotations, translations = self.link_transforms(joints, values)
         lead = translations.shape[:-2]
         start = torch.eye(3, dtype=joints.dtype).expand(*lead, 3, 3), torch.zeros(*lead, 3, dtype=joints.dtype)
         frames = [start, (rotations[..., 0, :, :], translations[..., 0, :])]

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, fit_compensator, save_model
+from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import LEARNERS, Learner, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError
@@ -74,16 +74,23 @@ class Calibration:
         if not isinstance(network, UncertainNetwork):
             # A learner without a variance of its own has one standard deviation everywhere, here as in the results.
             sd_scale = fitted.sd(prepared.dataset.inputs[:, :1])[repeat, 0] / fitted.scaling.deviation[repeat]
+        inputs, margin = prepared.dataset.inputs[repeat, there], self.config.compensation.margin
+        limit, geometry = _limit(self.config, len(prepared.mechanism.joints)), None
+        if prepared.geometry is not None:
+            # What the geometry leaves at singular poses can be larger than what was there.
+            limit = default_limit(prepared.total[repeat, there]) if limit is None else limit
+            geometry = prepared.geometry.module(repeat, inputs[:, : len(prepared.mechanism.joints)], margin)
         return fit_compensator(
             network,
             fitted.scaling.repeat(repeat),
-            prepared.dataset.inputs[repeat, there],
+            inputs,
             prepared.dataset.deviation[repeat, there],
             prepared.mechanism.joints,
             prepared.covariate_coordinates,
-            limit=_limit(self.config, len(prepared.mechanism.joints)),
-            margin=self.config.compensation.margin,
+            limit=limit,
+            margin=margin,
             sd_scale=sd_scale,
+            geometry=geometry,
         )
 
     def save(

@@ -201,6 +201,11 @@ class RunConfig(_Part):
         default=None,
         description="mechanism of the records: tripod, machine_tool, a DH file (.yaml), a URDF, or file.py:Name",
     )
+    geometry: Literal["none", "identify"] = Field(
+        default="none",
+        description="identify = find all geometric parameters on the training rows of records, and let the network "
+        "learn only what they leave; the model files hold both. none = the network learns everything",
+    )
     rotation_weight: float = Field(
         default=0.04, gt=0, description="weight of orientation against position in m per rad (η of eq. 5)"
     )
@@ -275,6 +280,8 @@ class RunConfig(_Part):
             raise ValueError("order: a realistic machine visits random poses; remove the key")
         if self.order is not None and self.case is None:
             raise ValueError("order: records have the order in which they were measured; remove the key")
+        if self.case is not None and self.geometry != "none":
+            raise ValueError("geometry: a case is there to compare learners; write geometry=none, or take records")
         folds = self.training.folds > 1 or self.methods == ["auto"]
         if self.training.early_stop and self.split.validation == 0 and not folds:
             raise ValueError(

@@ -22,7 +22,8 @@ class Outcome:
     """A method's figures on every row of every repeat; which rows are held out is for the reader to choose.
 
     Attributes:
-        deviation: predicted deviation at the commanded joints, `r x s x n` [SI].
+        deviation: predicted deviation at the commanded joints, `r x s x n` [SI]; of what the identified geometry leaves
+            where that is a part of the compensator.
         after: pose error with the correction, `r x s`.
         after_systematic: the same without the machine's noise, where it is simulated.
     """
@@ -57,13 +58,16 @@ def evaluate(prepared: Prepared, fitted: Fitted) -> Outcome:
     """Predict on every row, and find the pose error that is left.
 
     Simulated: the machine is commanded q with q + δ(q) = q*, and the pose that it then reaches is solved.
-    Recorded: FK(q + δ(q)) predicts the measured pose.
+    Recorded: FK(q + δ(q)) predicts the measured pose, δ with the identified geometry where there is one.
     """
     mechanism = prepared.mechanism
     joints = prepared.joints
     deviation = _deviation(prepared, fitted, joints)
     if prepared.simulation is None:
-        reached = mechanism.forward_kinematics(joints + deviation, prepared.parameters)
+        total = deviation
+        if prepared.geometry is not None:
+            total = deviation + prepared.geometry.deviation(prepared.pose)(joints + deviation)
+        reached = mechanism.forward_kinematics(joints + total, prepared.parameters)
         return Outcome(fitted, deviation, mechanism.pose_error(prepared.pose, reached))
     command = joints
     for _ in range(_COMMAND_ITERATIONS):

@@ -14,14 +14,13 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification import fit_links
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
-from ccnn_torch.mechanisms.frames import fit_frames
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import check_rows, load_records
 from ccnn_torch.runs.cases import build_case
 from ccnn_torch.runs.config import RunConfig
-from ccnn_torch.runs.dataset import Dataset, pad_rows
+from ccnn_torch.runs.dataset import Dataset
+from ccnn_torch.runs.geometry import Identified, fit_machine
 from ccnn_torch.runs.machines import build_machine
 from ccnn_torch.runs.simulation import CaseSimulation, Simulation, simulate_realistic
 from ccnn_torch.splits import Column, Split, split_rows
@@ -39,9 +38,12 @@ class Prepared:
         joints: commanded joints, `r x s x n` [SI]; the repeats of measured records share their rows.
         covariates: `r x s x m` [SI].
         pose: measured poses, `r x s x p` [SI].
-        pseudoerror: what the poses say about the joints.
-        identified: geometry with links and frames fitted to the training rows of each repeat, like `parameters`: what a
+        pseudoerror: what the poses say about the joints, and what is learned: with `geometry`, that of the identified
+            machine.
+        total: deviation of the joints of the nominal machine, `r x s x n` [SI]; without `geometry` that is learned.
+        identified: geometry with all parameters fitted to the training rows of each repeat, like `parameters`: what a
             geometric calibration would command by, to be compared with; None where it was not fitted.
+        geometry: the same where it is a part of the compensator, so that the network learns what it leaves.
         simulation: the machine behind simulated rows, or None for measured records.
         notes: sentences for the person who reads the results.
     """
@@ -53,9 +55,11 @@ class Prepared:
     covariate_coordinates: tuple[Coordinate, ...]
     pose: Tensor
     pseudoerror: Pseudoerror
+    total: Tensor
     dataset: Dataset
     data_hash: str
     identified: Tensor | None = None
+    geometry: Identified | None = None
     simulation: Simulation | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -128,6 +132,7 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
         covariate_coordinates=tuple(coordinate for _, coordinate in chosen),
         pose=pose,
         pseudoerror=deviations,
+        total=_by_repeat(deviations.deviation, seeds),
         dataset=_dataset(mechanism, case.joints, covariates, deviations, splits, seeds),
         data_hash=_hash(case.joints, covariates, pose),
         simulation=CaseSimulation(case, noise),
@@ -159,6 +164,7 @@ def _from_realistic(config: RunConfig, seeds: list[int]) -> Prepared:
         covariate_coordinates=tuple(chosen),
         pose=machine.measured,
         pseudoerror=deviations,
+        total=deviations.deviation,
         dataset=_dataset(mechanism, joints, covariates, deviations, splits, seeds, jacobian, machine.turns_far),
         data_hash=_hash(joints, covariates, machine.measured),
         simulation=simulate_realistic(machine, lambda pose: solved(pose).deviation, deviations.deviation),
@@ -187,43 +193,36 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
     mechanism = load_mechanism(config.mechanism)
     records = load_records(config.records, mechanism, config.covariates)
     check_rows(records, mechanism)
-    arm = mechanism if isinstance(mechanism, SerialArm) else None
-    if arm is not None and records.orientation == "none":
-        mechanism = arm = arm.with_orientation("none")
+    if isinstance(mechanism, SerialArm) and records.orientation == "none":
+        mechanism = mechanism.with_orientation("none")
     splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds)
-    parameters, identified = None, None
-    notes = list(records.notes)
-    if arm is not None and arm.unknown_frames:
-        rows = pad_rows([Dataset.part(split, "fit") for split in splits])
-        weights = torch.zeros(len(seeds), len(records.joints), dtype=torch.float64)
-        weights.scatter_add_(1, rows.index, rows.weights)
-        parameters = fit_frames(arm, records.joints, records.pose, weights, columns=records.columns)
-        if not (arm.frame_per or arm.tool_per):
-            identified = fit_links(arm, records.joints, records.pose, parameters, weights).unsqueeze(-2)
-            parameters = parameters.unsqueeze(-2)
-        frames = " and ".join(arm.unknown_frames)
-        notes.append(f"Frames fitted first, on the training rows of each repeat: {frames}.")
-    deviations = joint_deviations(
-        mechanism,
-        records.joints,
-        records.pose,
-        parameters=parameters,
-        **_pseudoerror_settings(config, mechanism),
-    )
-    notes += deviations.notes()
-    jacobian = mechanism.jacobian(records.joints, parameters, guess=records.pose)
+    fitted = fit_machine(mechanism, records, splits, config.geometry == "identify")
+    settings = _pseudoerror_settings(config, mechanism)
+
+    def solved(parameters: Tensor | None) -> Pseudoerror:
+        return joint_deviations(mechanism, records.joints, records.pose, parameters=parameters, **settings)
+
+    total = deviations = solved(fitted.parameters)
+    learned, identified = fitted.parameters, None
+    if config.geometry == "identify":
+        learned = fitted.geometry
+        deviations = solved(learned)
+        identified = fitted.beside(mechanism, records.joints, total.deviation, splits, config.compensation.margin)
+    jacobian = mechanism.jacobian(records.joints, learned, guess=records.pose)
     return Prepared(
         mechanism=mechanism,
-        parameters=parameters,
+        parameters=fitted.parameters,
         joints=_by_repeat(records.joints, seeds),
         covariates=_by_repeat(records.covariates, seeds),
         covariate_coordinates=records.covariate_coordinates,
         pose=_by_repeat(records.pose, seeds),
         pseudoerror=deviations,
+        total=_by_repeat(total.deviation, seeds),
         dataset=_dataset(mechanism, records.joints, records.covariates, deviations, splits, seeds, jacobian),
         data_hash=records.data_hash,
-        identified=identified,
-        notes=notes,
+        identified=fitted.geometry,
+        geometry=identified,
+        notes=[*records.notes, *fitted.notes, *deviations.notes()],
     )
 
 
