@@ -100,7 +100,8 @@ def export_onnx(compensator: Compensator, program: torch.export.ExportedProgram,
     Raises:
         MethodFailedError: the file does not give the eager model's numbers; see `verify`.
     """
-    content: bytes = to_onnx(program, None, OUTPUTS, _OPSET, metadata).SerializeToString(deterministic=True)
+    model = to_onnx(program, None, OUTPUTS, _OPSET, metadata, compensator.geometry is None)
+    content: bytes = model.SerializeToString(deterministic=True)
     session = open_onnx(content)
     verify(compensator, lambda joints, covariates: run_onnx(session, joints, covariates), "ONNX")
     return content
@@ -137,7 +138,9 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     twin = twin.float()
     joints, covariates = probe_points(compensator)
     given = [v.float() for v in (joints, covariates) if v is not None]
-    model = to_onnx(_Single(twin), tuple(v[:1] for v in given), _OUTPUTS_FLOAT32, _OPSET_FLOAT32, metadata)
+    example = tuple(v[:1] for v in given)
+    plain = compensator.geometry is None
+    model = to_onnx(_Single(twin), example, _OUTPUTS_FLOAT32, _OPSET_FLOAT32, metadata, plain)
     content: bytes = model.SerializeToString(deterministic=True)
     session = open_onnx(content)
     with torch.no_grad():
@@ -218,8 +221,13 @@ def to_onnx(
     outputs: Sequence[str],
     opset: int,
     metadata: str,
+    optimize: bool = True,
 ) -> onnx.ModelProto:
     """Export a module with its example inputs or a traced one, and leave out what depends on the machine.
+
+    Args:
+        optimize: let the exporter look for patterns, which takes minutes for the unrolled links of an arm and which
+            ONNX Runtime does again when it loads the file.
 
     Raises:
         MethodFailedError: the exporter silently wrote another opset.
@@ -233,6 +241,7 @@ def to_onnx(
             dynamo=True,
             external_data=False,
             verbose=False,
+            optimize=optimize,
         )
     assert program is not None
     model = program.model_proto
