@@ -76,8 +76,8 @@ class ConstraintConfig(_Part):
     """What holds the tool instead of a measuring device; see `ccnn_torch.identification.constraints`."""
 
     kind: Literal["sockets", "distances", "plane"] = Field(
-        description="sockets (a ball in sockets of a plate; columns x, y, z = the socket's place on the plate), distances "
-        "(from an anchor; column distance) or plane (points on a plane; column reading of a dial gauge, or none)"
+        description="sockets (a ball in sockets of a plate; columns x, y, z = the socket's place on the plate), "
+        "distances (from an anchor; column distance) or plane (points on a plane; column reading of a dial gauge, or none)"
     )
     by: Names | None = Field(
         default=None,
@@ -86,8 +86,8 @@ class ConstraintConfig(_Part):
     )
     tolerance: Size | dict[str, Size] = Field(
         default=0.01,
-        description="prior standard deviation of the links' parameters, in m and rad alike, or by name, pattern or unit, "
-        "e.g. {m: 1 mm, rad: 0.1 deg}",
+        description="prior standard deviation of the links' parameters, in m and rad alike, or by name, pattern or "
+        "unit, e.g. {m: 1 mm, rad: 0.1 deg}",
     )
     plate_tolerance: Size | None = Field(
         default=None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -162,7 +163,9 @@ def _priors(config: IdentifyConfig, mechanism: Mechanism, free: list[str]) -> di
     links = [p for p in mechanism.geometry if p.name in free and not p.name.startswith("tool_")]
     values = sizes_by_name(given if isinstance(given, dict) else {}, links, key, [one] * len(links)).tolist()
     if any(not v > 0 for v in values):
-        raise InputError(f"{key}: {min(values):g} is no standard deviation; write a size above 0, or fix the parameters")
+        raise InputError(
+            f"{key}: {min(values):g} is no standard deviation; write a size above 0, or fix the parameters"
+        )
     priors = {p.name: v for p, v in zip(links, values, strict=True)}
     return priors | {n: _TOOL_TOLERANCE for n in free if n.startswith("tool_")}
 
@@ -188,4 +191,4 @@ def _residual(problem: Problem, values: Tensor) -> Tensor:
 def _left(problem: Problem, values: Tensor, noise: float) -> float:
     """Root mean square of the residuals of the rows with weight [m]."""
     square = _residual(problem, values).square().mean(-1) * problem.weights
-    return max(_LEAST_NOISE, noise * float(square.sum() / problem.weights.sum()) ** 0.5)
+    return max(_LEAST_NOISE, noise * math.sqrt(float(square.sum() / problem.weights.sum())))

@@ -50,7 +50,8 @@ class ConstraintRows:
     def cell(self) -> Tensor:
         """Number of the place that each row's tool is held in, `s`: one socket of one placement, or the group."""
         keys = torch.cat([self.group[:, None], self.said], dim=-1) if self.said.shape[-1] == 3 else self.group[:, None]
-        return torch.unique(keys, dim=0, return_inverse=True)[1]
+        number: Tensor = torch.unique(keys, dim=0, return_inverse=True)[1]
+        return number
 
 
 def read_constraint(config: IdentifyConfig, mechanism: Mechanism) -> ConstraintRows:
@@ -102,8 +103,8 @@ def _groups(table: Table, about: ConstraintConfig, there: Tensor) -> tuple[Tenso
     for name in names:
         if name not in table:
             raise InputError(
-                f"constraint.by: {table.path} has no column '{name}', which numbers the {GROUPED_BY[about.kind]} of each "
-                f"row; add it, or name one of {', '.join(table.names)}"
+                f"constraint.by: {table.path} has no column '{name}', which numbers the {GROUPED_BY[about.kind]} of "
+                f"each row; add it, or name one of {', '.join(table.names)}"
             )
     values: NDArray[np.float64] = np.stack([table.column(name) for name in names], axis=-1)[there.numpy()]
     if len(names) == 1:
