@@ -32,12 +32,15 @@ def constraint_table(results: Mapping[str, Any]) -> Table | None:
     for name, block in about["unknowns"].items():
         scale, unit = display_unit(block["unit"], block["sd"] or 1.0)
         sd = "not identifiable" if block["sd"] is None else f"{number_text(block['sd'] / scale, 3)} {unit}"
-        rows.append((name, f"{number_text(block['value'], 6)} {block['unit']}".removesuffix(" 1"), sd.removesuffix(" 1")))
+        rows.append(
+            (name, f"{number_text(block['value'], 6)} {block['unit']}".removesuffix(" 1"), sd.removesuffix(" 1"))
+        )
     count = sum(place["rows"] for place in about["placements"])
     scale, unit = display_unit("m", about["noise"])
     source = "as given" if about["noise_known"] else "from the residuals"
     note = (
         f"{count} rows in {len(about['placements'])} groups; standard deviation of one equation "
-        f"{number_text(about['noise'] / scale, 3)} {unit}, {source}. Turns count from where the nominal machine sees it."
+        f"{number_text(about['noise'] / scale, 3)} {unit}, {source}. "
+        "Turns count from where the nominal machine sees them."
     )
     return Table(f"What held the tool ({about['kind']})", ("unknown", "value", "standard deviation"), tuple(rows), note)

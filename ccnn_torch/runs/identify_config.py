@@ -77,7 +77,8 @@ class ConstraintConfig(_Part):
 
     kind: Literal["sockets", "distances", "plane"] = Field(
         description="sockets (a ball in sockets of a plate; columns x, y, z = the socket's place on the plate), "
-        "distances (from an anchor; column distance) or plane (points on a plane; column reading of a dial gauge, or none)"
+        "distances (from an anchor; column distance) or plane (points on a plane; column reading of a dial gauge, "
+        "or none)"
     )
     by: Names | None = Field(
         default=None,

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm, load_mechanism
 from ccnn_torch.identification import Progress
+from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm, load_mechanism
 from ccnn_torch.runs.identification._assemble import Known, parameter_blocks, versions
 from ccnn_torch.runs.identification._constraint_fit import ConstraintFit, fit_constraint, held_distance
 from ccnn_torch.runs.identification._constraint_rows import ConstraintRows, read_constraint
@@ -21,6 +21,10 @@ from ccnn_torch.runs.identification._solve import Outcome
 from ccnn_torch.runs.identify_config import IdentifyConfig
 
 __all__ = ["identify_by_constraint"]
+
+# An interval above this share of its prior's is the prior's. Turning machine and plates together turns the residuals,
+# too, which the linearised problem takes for a little knowledge.
+_AS_PRIOR = 0.9
 
 
 def identify_by_constraint(
@@ -91,7 +95,8 @@ def _position(distance: Tensor) -> PoseError:
 def _known(found: ConstraintFit) -> Known:
     """The machine's part of what is known; a parameter that only its prior tells has no interval."""
     k, knowledge = len(found.selection.parameters), found.knowledge
-    sd = torch.where(knowledge.identifiable, knowledge.sd, math.inf)[:, :k]
+    told = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * found.after.problem.prior_sd)
+    sd = torch.where(told, knowledge.sd, math.inf)[:, :k]
     noise = knowledge.noise if found.after.problem.noise_known else torch.ones(1, dtype=torch.float64)
     return Known(
         sd=sd,
@@ -122,6 +127,14 @@ def _results(
         "coverage": None,
         "compensation": None,
     }
+    prior = [
+        p.name
+        for p, sd, seen in zip(found.selection.parameters, known.sd[0], found.knowledge.identifiable[0], strict=False)
+        if bool(seen) and not math.isfinite(sd)
+    ]
+    notes = [*measured.notes, *([f"lm: {outcome.message}"] if outcome.message else [])]
+    if prior:
+        notes.append(f"No better known than by the tolerance given: {', '.join(prior)}.")
     return {
         "name": config.name,
         "seed": config.seed,
@@ -140,7 +153,7 @@ def _results(
         "counts": [],
         "paper": None,
         "data_sha256": measured.data_hash,
-        "notes": [*measured.notes, *([f"lm: {outcome.message}"] if outcome.message else [])],
+        "notes": notes,
         "versions": versions(),
     }
 

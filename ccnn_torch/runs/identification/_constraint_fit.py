@@ -76,7 +76,7 @@ def fit_constraint(
 ) -> ConstraintFit:
     """Fit the rows that have weight.
 
-    Priors keep the links near nominal; the tool's offset, which no maker knows, is fitted beforehand with nominal links.
+    Priors keep the links near nominal; the tool's offset, which no maker knows, is fitted first, with nominal links.
     Where the config names no noise, it is that of the residuals, in five rounds; for the intervals it is raised by the
     equations that the fit used up.
 
