@@ -76,9 +76,10 @@ class ConstraintConfig(_Part):
     """What holds the tool instead of a measuring device; see `ccnn_torch.identification.constraints`."""
 
     kind: Literal["sockets", "distances", "plane"] = Field(
+        default="sockets",
         description="sockets (a ball in sockets of a plate; columns x, y, z = the socket's place on the plate), "
         "distances (from an anchor; column distance) or plane (points on a plane; column reading of a dial gauge, "
-        "or none)"
+        "or none)",
     )
     by: Names | None = Field(
         default=None,
