@@ -168,7 +168,9 @@ def test_distances_and_planes_identify_too(kind: str, tmp_path: Path) -> None:
     [
         (["constraint.by=[plate]"], "constraint.by: .*sockets.csv has no column 'plate', which numbers the placement"),
         (["constraint.kind=socket"], "constraint.kind: must be 'sockets', 'distances' or 'plane'"),
-        (["constraint.kind=distances", "constraint.plate_tolerance=null"], "no column 'anchor'"),
+        (["constraint.kind=distances"], "plate_tolerance: a constraint of kind distances has no plate"),
+        (["constraint.kind=distances", "constraint.plate_tolerance=null"], "there is no column 'distance'"),
+        (["constraint={kind: distances}"], "no column 'anchor', which numbers the anchor of each row"),
         (["constraint.where={socket: 7}"], "no row of .*sockets.csv has socket = 7"),
         (["constraint.where={arm: 7}"], "constraint.where: .* has no column 'arm'"),
         (["split.test=0.97"], "split: .*none to identify from|cannot determine"),
