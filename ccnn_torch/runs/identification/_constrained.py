@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Progress
 from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm, load_mechanism
 from ccnn_torch.runs.identification._assemble import Known, parameter_blocks, versions
@@ -81,6 +82,8 @@ def _machine(config: IdentifyConfig) -> tuple[Mechanism, list[str]]:
     mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
     if not isinstance(mechanism, SerialArm):
         return (Framed(mechanism, base=False, tool=True) if config.frame.tool else mechanism), []
+    if config.frame.tool:
+        raise InputError("frame.tool: an arm has a tool offset of its own, which is identified anyway; remove the key")
     ignored = [key for key in ("frame_per", "tool_per") if getattr(mechanism, key)]
     plain = mechanism.with_orientation("none")
     arm = SerialArm(**{**plain.recipe["keys"], "unknown_frames": [], "frame_per": [], "tool_per": []})
