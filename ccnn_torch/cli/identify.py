@@ -35,6 +35,8 @@ def identify(
 
     ccnn identify arm.yaml mechanism=ur10.yaml records=measured.csv out=runs/arm
 
+    ccnn identify experiments/sockets.yaml      without a measuring device: a ball in sockets
+
     ccnn identify --resume runs/arm
 
     ccnn compensate runs/arm/identified.yaml poses.csv commands.csv --pose

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from ccnn_torch.report.display import count_text, display_unit, number_text
+from ccnn_torch.report.identified_constraint import BEFORE_SAYS, constraint_table, holder
 from ccnn_torch.report.identified_paper import paper_tables
 from ccnn_torch.report.table_form import Table, print_table
 from ccnn_torch.report.tables import markdown_table
@@ -37,7 +38,11 @@ def identified_verdict(results: Block) -> str:
         parts.append(f"{name} {_with_unit(block, 'before')} → {_with_unit(block, 'after')} RMS")
     rows = count_text(results["rows"]["test"], "held-out pose")
     machines = f" of {results['machines']} machines" if results["machines"] > 1 else ""
-    text = f"On {rows}{machines} {results['method']} brings the predicted pose nearer to the measured one: "
+    if "constraint" in results:
+        rows = count_text(results["rows"]["test"], "held-out row")
+        text = f"On {rows} {results['method']} brings the tool nearer to where {holder(results)} it: "
+    else:
+        text = f"On {rows}{machines} {results['method']} brings the predicted pose nearer to the measured one: "
     text += ", ".join(parts)
     free = [p for p in results["parameters"].values() if p["free"]]
     lost = sum(not p["identifiable"] for p in free)
@@ -51,6 +56,7 @@ def identified_tables(results: Block) -> list[Table]:
         _parameter_table(results),
         _method_table(results),
         _deviation_table(results),
+        constraint_table(results),
         _compensation_table(results),
         _count_table(results),
         *paper_tables(results),
@@ -146,6 +152,8 @@ def _method_table(results: Block) -> Table:
     columns += ["machines", "converged", "seconds"]
     noise = results["test"]["position"] or {}
     note = "RMS distance of held-out measured poses from the predicted ones."
+    if "constraint" in results:
+        note = f"RMS distance of held-out rows from where {holder(results)} the tool. {BEFORE_SAYS}"
     if noise.get("noise") is not None:
         scale, unit = display_unit("m", noise["noise"])
         note += f" The measurement noise alone is {number_text(noise['noise'] / scale, 3)} {unit} in position."
@@ -250,6 +258,8 @@ def _rows(results: Block) -> Iterator[Row]:
                     yield from of("method", method, found[part], found[part]["unit"], ("after",), f"{kind}_{part}_")
                     yield from of("method", method, found[part], "1", ("removed",), f"{kind}_{part}_")
         yield "method", method, "seconds", "s", block["seconds"], None, None
+    for name, block in results.get("constraint", {}).get("unknowns", {}).items():
+        yield from of("constraint", name, block, block["unit"], ("value", "sd"))
 
 
 def write_identified_csv(path: str | Path, results: Block) -> None:

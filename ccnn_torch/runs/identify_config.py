@@ -19,6 +19,7 @@ from ccnn_torch.runs._yaml import dump_yaml, read_yaml
 
 __all__ = [
     "IDENTIFY_METHODS",
+    "ConstraintConfig",
     "FrameConfig",
     "HeldOutConfig",
     "IdentifyConfig",
@@ -69,6 +70,34 @@ class FrameConfig(_Part):
 
     base: bool = Field(default=False, description="identify where the mechanism stands in the measuring frame")
     tool: bool = Field(default=False, description="identify where the measured target sits on the platform")
+
+
+class ConstraintConfig(_Part):
+    """What holds the tool instead of a measuring device; see `ccnn_torch.identification.constraints`."""
+
+    kind: Literal["sockets", "distances", "plane"] = Field(
+        default="sockets",
+        description="sockets (a ball in sockets of a plate; columns x, y, z = the socket's place on the plate), "
+        "distances (from an anchor; column distance) or plane (points on a plane; column reading of a dial gauge, "
+        "or none)",
+    )
+    by: Names | None = Field(
+        default=None,
+        min_length=1,
+        description="columns whose values number the placement, anchor or plane; default placement, anchor or plane",
+    )
+    tolerance: Size | dict[str, Size] = Field(
+        default=0.01,
+        description="prior standard deviation of the links' parameters, in m and rad alike, or by name, pattern or "
+        "unit, e.g. {m: 1 mm, rad: 0.1 deg}",
+    )
+    plate_tolerance: Size | None = Field(
+        default=None,
+        description="standard deviation of the plate's largest extent (sockets); null = 0.3 mm where there are several",
+    )
+    where: dict[str, float] = Field(
+        default={}, description="values that a row's columns must have to take part, e.g. {robot: 1}"
+    )
 
 
 class HeldOutConfig(_Part):
@@ -148,6 +177,9 @@ class IdentifyConfig(_Part):
     frame: FrameConfig = Field(default_factory=FrameConfig)
     records: str | None = Field(default=None, description="measured records, a CSV file with headers name[unit]")
     simulate: SimulateConfig | None = Field(default=None, description="simulated machines instead of records")
+    constraint: ConstraintConfig | None = Field(
+        default=None, description="what holds the tool in the records, which then have no measured pose"
+    )
     noise: Size | dict[str, Size] | None = Field(
         default=None, description="known noise of the records' pose, as simulate.noise; null = estimated from the fit"
     )
@@ -217,6 +249,8 @@ class IdentifyConfig(_Part):
         if (self.records is None) == (self.simulate is None):
             both = "both records and simulate are given; remove one" if self.records else "no data is named"
             raise ValueError(f"{both}: records=FILE.csv, or a section simulate with machines, poses and noise")
+        if self.constraint is not None:
+            self._constrained(self.constraint)
         if self.simulate is not None and (self.noise is not None or self.joint_noise is not None):
             raise ValueError("noise: simulated data has simulate.noise and simulate.joint_noise; remove the key")
         if self.simulate is not None and self.simulate.points and self.residual == "forward":
@@ -227,6 +261,28 @@ class IdentifyConfig(_Part):
         if wrong:
             raise ValueError(f"settings: '{wrong[0]}' is no method; known are {', '.join(IDENTIFY_METHODS)}")
         return self
+
+    def _constrained(self, constraint: ConstraintConfig) -> None:
+        """Refuse what a constraint has no use for."""
+        refused = {
+            "simulate": (self.simulate is not None, "needs records; write records=FILE.csv"),
+            "methods": (self.methods != ["lm"], "is identified by lm alone; write methods=[lm]"),
+            "residual": (self.residual != "auto", "has a residual of its own; remove the key"),
+            "per_leg": (self.per_leg, "depends on all legs; remove the key"),
+            "frame.base": (self.frame.base, "stands anywhere and cannot show the base frame; remove the key"),
+            "noise": (isinstance(self.noise, dict), "has one noise; write one size, e.g. noise='0.02 mm'"),
+            "joint_noise": (self.joint_noise is not None, "has one noise, that of the whole; remove the key"),
+            "bootstrap": (self.bootstrap > 0, "has the formula's intervals alone; remove the key"),
+            "paper": (self.paper is not None, "stands in no paper; remove the key"),
+            "split.kind": (self.split.kind == "block", "measures no positions to sort by; write random or group"),
+            "constraint.plate_tolerance": (
+                constraint.kind != "sockets" and constraint.plate_tolerance is not None,
+                f"of kind {constraint.kind} has no plate; remove the key",
+            ),
+        }
+        for key, (wrong, why) in refused.items():
+            if wrong:
+                raise ValueError(f"{key}: a constraint {why}")
 
 
 def base_method(method: str) -> str:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ccnn_torch.report.display import display_unit, number_text
+from ccnn_torch.report.identified_constraint import holder
 from ccnn_torch.report.plots._identified_knowledge import correlation_plot, parameter_plot, singular_value_plot
 from ccnn_torch.report.plots._identified_maps import map_plot, poses_plot
 from ccnn_torch.report.plots._style import AFTER, BEFORE, FLOOR, SERIES, Plot, styled
@@ -68,6 +69,8 @@ def pose_distribution_plot(results: Results, arrays: Arrays) -> Plot | None:
         medians = (number_text(float(np.median(v)) / scale, 3) for v in (before, after))
         told.append(f"median {name} error {' → '.join(medians)} {unit}")
     caption = "Share of the held-out poses whose measured pose is at most so far from the predicted one: "
+    if "constraint" in results:
+        caption = f"Share of the held-out rows that are at most so far from where {holder(results)} the tool: "
     return Plot("pose_error", figure, caption + " and ".join(told) + ".")
 
 

@@ -66,6 +66,8 @@ def map_plot(results: Results, arrays: Arrays) -> Plot | None:
 @styled
 def poses_plot(results: Results, arrays: Arrays) -> Plot | None:
     """Where the first machine was measured: common poses and those of each leg (Figure 4 of paper 004)."""
+    if "observed" not in arrays:
+        return None
     sets = {"common": arrays["observed"][0]}
     sets |= {f"leg {name[len('observed_leg') :]}": arrays[name][0] for name in sorted(arrays) if "observed_leg" in name}
     if sets["common"].shape[1] < 2:

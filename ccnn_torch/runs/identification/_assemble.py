@@ -29,7 +29,7 @@ from ccnn_torch.runs.identification._solve import (
 )
 from ccnn_torch.runs.identify_config import IdentifyConfig
 
-__all__ = ["Known", "assemble", "known_of"]
+__all__ = ["Assembled", "Known", "assemble", "known_of", "parameter_blocks", "versions"]
 
 Z95 = 1.959963984540054
 
@@ -135,7 +135,7 @@ def assemble(
             "test": measured.test.joints.shape[1],
         },
         "method": first,
-        "parameters": _parameters(measured, selection, main, known[first], blocks[first], resampled),
+        "parameters": parameter_blocks(measured, selection, main, known[first], resampled),
         "combinations_not_identifiable": known[first].combinations,
         "test": blocks[first]["test"],
         "methods": blocks,
@@ -146,13 +146,18 @@ def assemble(
         "paper": config.paper,
         "data_sha256": measured.data_hash or None,
         "notes": [*measured.notes, *(f"{m}: {o.message}" for m, o in outcomes.items() if o.message)],
-        "versions": {
-            "ccnn_torch": ccnn_torch.__version__,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-        },
+        "versions": versions(),
     }
     return Assembled(results, arrays)
+
+
+def versions() -> dict[str, str]:
+    """What the results were computed with."""
+    return {
+        "ccnn_torch": ccnn_torch.__version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
 
 
 def _method_block(
@@ -225,13 +230,12 @@ def _deviations(selection: Selection, gap: Tensor, error: Tensor) -> dict[str, A
     return answer
 
 
-def _parameters(
+def parameter_blocks(
     measured: Measured,
     selection: Selection,
     outcome: Outcome,
     known: Known,
-    block: Mapping[str, Any],
-    resampled: Tensor | None,
+    resampled: Tensor | None = None,
 ) -> dict[str, Any]:
     """Every parameter of the mechanism; one that is not free has its nominal value and no interval."""
     place = {name: i for i, group in enumerate(selection.groups) for name in group}

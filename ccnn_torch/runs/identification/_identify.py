@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Fit, Progress, bootstrap
 from ccnn_torch.mechanisms import Framed, Mechanism, load_mechanism
 from ccnn_torch.runs.identification._assemble import assemble
+from ccnn_torch.runs.identification._constrained import identify_by_constraint
 from ccnn_torch.runs.identification._counts import count_study
 from ccnn_torch.runs.identification._measured import Measured
 from ccnn_torch.runs.identification._records import from_records
@@ -53,7 +54,7 @@ class Identification:
 
     config: IdentifyConfig
     measured: Measured
-    outcomes: dict[str, Outcome]
+    outcomes: Mapping[str, Outcome]
     results: dict[str, Any]
     arrays: dict[str, Tensor]
 
@@ -104,6 +105,8 @@ def identify(config: IdentifyConfig, store: Path | None = None, watch: Watch | N
     Raises:
         InputError: the config, the mechanism or the data cannot be used; one sentence.
     """
+    if config.constraint is not None:
+        return Identification(config, *identify_by_constraint(config, None if watch is None else watch("lm")))
     mechanism, measured = prepare(config)
     for method in config.methods:  # what cannot be solved is said before anything takes minutes
         solver_of(method, config)

@@ -18,7 +18,7 @@ class Rows:
 
     Attributes:
         joints: as recorded, `r x s x n` [SI].
-        observed: what was measured, `r x s x o` [SI]: pose coordinates of the view.
+        observed: what was measured, `r x s x o` [SI]: pose coordinates of the view, or what a constraint says.
     """
 
     joints: Tensor
