@@ -16,7 +16,7 @@ from ccnn_torch.least_squares import levenberg_marquardt
 from ccnn_torch.mechanisms._links import LINKS, compose
 from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms._numeric import carry_derivative, least_norm
-from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
 
 __all__ = ["SerialArm"]
 
@@ -133,6 +133,35 @@ class SerialArm(Mechanism):
         lengths = rows[:, :3] if self.convention == "urdf" else rows[:, (0, 2)]
         travel = self.limits.abs().amax(-1)[~self.revolute].sum()
         return float(lengths.norm(dim=-1).sum() + self.nominal[-6:-3].norm() + travel)
+
+    def with_link_frames(self) -> SerialArm:
+        """The same arm with six parameters a link, in the URDF form, nominal parameters and kinematics unchanged.
+
+        Four Denavit-Hartenberg parameters cannot tilt one of two parallel axes about the direction that lies across
+        both (Hayati 1983); a UR10 has three such axes. The nominal tool frame takes in the constant part of the last
+        link; frames that are unknown stay so.
+        """
+        if self.convention == "urdf":
+            return self
+        keys, zero = self.recipe["keys"], torch.zeros(len(self.joints), dtype=torch.float64)
+        rotations, places = self.link_transforms(zero, self.nominal)
+        angles = matrix_to_euler_zyx(rotations).flip(-1)
+        links = torch.cat([places, angles], dim=-1)
+        tool_rotation, tool = rotation_vector_to_matrix(self.nominal[-3:]), self.nominal[-6:-3]
+        if self._axis_before:
+            links = torch.cat([torch.zeros_like(links[:1]), links[:-1]])
+            tool_rotation, tool = compose((rotations[-1], places[-1]), (tool_rotation, tool))
+        return SerialArm(
+            **{
+                **keys,
+                "convention": "urdf",
+                "links": links.tolist(),
+                "base": self.nominal[:6].tolist(),
+                "tool": [*tool.tolist(), *matrix_to_rotation_vector(tool_rotation).tolist()],
+                "tool_offset": None,
+                "unknown_frames": list(self.unknown_frames),
+            }
+        )
 
     def with_orientation(self, orientation: str) -> SerialArm:
         """The same arm, nominal parameters included, for poses of another kind: "rotation_vector" or "none"."""
