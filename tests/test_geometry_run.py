@@ -64,13 +64,13 @@ def tripod_records(path: Path, rows: int = 160) -> torch.Tensor:
 def test_commands_of_a_parallel_mechanism(tmp_path: Path) -> None:
     tripod_records(tmp_path / "rows.csv")
     found = calibrate(records=str(tmp_path / "rows.csv"), mechanism="tripod", geometry="identify", methods=["constant"])
-    found.save(tmp_path, forms=("onnx",))
+    found.save(tmp_path, forms=())
     pose = found.results["pose"]["position"]
     assert pose["after"]["rms"]["median"] < 0.4 * pose["before"]["rms"]["median"]
     joints = found.mechanism().joints
 
     def compensate(given: str, written: str, *options: str) -> None:
-        paths = [str(tmp_path / name) for name in ("model.onnx", given, written)]
+        paths = [str(tmp_path / name) for name in ("model.safetensors", given, written)]
         done = CliRunner().invoke(app, ["compensate", *paths, *options])
         assert done.exit_code == 0, done.output
 

@@ -157,9 +157,12 @@ def test_every_file_form_of_an_arm_gives_the_same_commands(tmp_path: Path) -> No
             torch.testing.assert_close(torch.from_numpy(found[name]), value, rtol=1e-9, atol=1e-12)
 
 
-def test_the_deviation_of_an_arm_runs_in_onnx_in_double() -> None:
+@pytest.mark.parametrize("kind", ["arm", "expansion"])
+def test_the_deviation_runs_in_onnx_in_double(kind: str) -> None:
     arm, identified, joints = three_joint_arm()
-    module = SerialGeometry(arm, arm.nominal, identified, *TAMED)
+    module: torch.nn.Module = SerialGeometry(arm, arm.nominal, identified, *TAMED)
+    if kind == "expansion":
+        module = expand_geometry(lambda q: 1e-3 * q * q.roll(1, -1), joints)
     batch = torch.export.Dim("batch")
     with quiet_exporter():
         program = torch.export.export(module, (joints[:3],), dynamic_shapes=({0: batch},))
