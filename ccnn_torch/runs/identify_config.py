@@ -93,7 +93,7 @@ class ConstraintConfig(_Part):
     )
     plate_tolerance: Size | None = Field(
         default=None,
-        description="standard deviation of the plate's largest extent (sockets); null = 0.3 mm where there are several",
+        description="standard deviation of the plate's largest extent (sockets); null = 0.1 mm where there are several",
     )
     where: dict[str, float] = Field(
         default={}, description="values that a row's columns must have to take part, e.g. {robot: 1}"

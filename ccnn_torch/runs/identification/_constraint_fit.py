@@ -37,7 +37,7 @@ __all__ = ["ConstraintFit", "State", "fit_constraint", "held_distance"]
 # Links and noise are estimated in turn, the noise from this size on [m].
 _ROUNDS, _FIRST_NOISE, _LEAST_NOISE = 5, 1e-3, 1e-9
 # Prior of the tool's offset around its first fit, and of a plate's extent around what its records say [m].
-_TOOL_TOLERANCE, _PLATE_TOLERANCE = 0.05, 3e-4
+_TOOL_TOLERANCE, _PLATE_TOLERANCE = 0.05, 1e-4
 
 Build = Callable[[ParameterChoice, Tensor, float | None], Problem]
 
