@@ -8,6 +8,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from ccnn_torch.evolution.harmonics import Harmonics
 from ccnn_torch.evolution.network import alive_nodes, prune
 from ccnn_torch.evolution.waves import Waves
 
@@ -17,11 +18,14 @@ __all__ = ["MaskedNetwork"]
 class MaskedNetwork(nn.Module):
     """A pruned network as dense double-precision linear layers with sigmoids between, ready for export.
 
+    Harmonics of turning joints, where there are any, are added to its output.
+
     Args:
         masks, weights: one a layer, `out x in` and `out x (in or in + 1)`; missing connections become zeros.
         factors, noise: its predictive variance (`evolution.spread.Spread`), `o x q x (h + 1)` and `o`; 1 without them.
         waves: periodic nodes (`evolution.waves`), `k`, whose columns stand last in the output's mask and weights.
         inputs: features in all, where the first layer reads but the leading ones; None = those that it reads.
+        harmonics: of one repeat (`evolution.harmonics`), or None.
     """
 
     factors: Tensor
@@ -37,6 +41,7 @@ class MaskedNetwork(nn.Module):
         noise: Tensor | None = None,
         waves: Waves | None = None,
         inputs: int | None = None,
+        harmonics: Harmonics | None = None,
     ) -> None:
         super().__init__()
         slots = 0 if waves is None else len(waves.frequency)
@@ -67,17 +72,21 @@ class MaskedNetwork(nn.Module):
         # A sum over q as a product: engines with a narrow operator list have no other reduction.
         each = torch.eye(outputs, dtype=factors.dtype, device=factors.device)
         self.register_buffer("_sums", each.repeat_interleave(factors.shape[1], 0), persistent=False)
+        self.harmonics = None if harmonics is None else HarmonicSum(harmonics)
 
     def describe(self) -> dict[str, Any]:
         """What a model file needs to build the module again, beside its tensors."""
         layers = cast("list[nn.Linear]", list(self.layers))
         sizes = [self.frequencies.shape[-1], *(layer.out_features for layer in layers)]
-        return {
+        described = {
             "kind": "masked",
             "sizes": sizes,
             "spread": len(self.factors) // sizes[-1],
             "waves": len(self.frequencies),
         }
+        if self.harmonics is not None:
+            described["harmonics"] = list(self.harmonics.factors.shape)
+        return described
 
     @classmethod
     def from_description(cls, description: dict[str, Any]) -> MaskedNetwork:
@@ -94,19 +103,22 @@ class MaskedNetwork(nn.Module):
             torch.zeros(sizes[-1], spread, widths[-1] + 1, dtype=torch.float64) if spread else None,
             torch.ones(sizes[-1], dtype=torch.float64),
             Waves(torch.zeros_like(frequency, dtype=torch.int64), frequency),
+            harmonics=_blank_harmonics(description.get("harmonics"), sizes[-1]),
         )
 
     def forward(self, inputs: Tensor) -> Tensor:
         """inputs: `... x i` [1]; returns `... x o` [1]."""
         output: Tensor = self.layers[-1](self._hidden(inputs))
-        return output
+        return output if self.harmonics is None else output + self.harmonics(inputs)
 
     def variance(self, inputs: Tensor) -> Tensor:
         """Predictive variance of a newly measured output. inputs: `... x i` [1]; returns `... x o` [1]."""
         if len(self.factors) == 0:
-            return self.noise.expand(*inputs.shape[:-1], len(self.noise))
-        scatter = self._hidden(inputs) @ self.factors[:, :-1].mT + self.factors[:, -1]
-        return (scatter * scatter) @ self._sums + self.noise
+            variance = self.noise.expand(*inputs.shape[:-1], len(self.noise))
+        else:
+            scatter = self._hidden(inputs) @ self.factors[:, :-1].mT + self.factors[:, -1]
+            variance = (scatter * scatter) @ self._sums + self.noise
+        return variance if self.harmonics is None else variance + self.harmonics.variance(inputs)
 
     def _hidden(self, inputs: Tensor) -> Tensor:
         signal = inputs
@@ -116,6 +128,40 @@ class MaskedNetwork(nn.Module):
             return signal
         phase = inputs @ self.frequencies.mT
         return torch.cat([signal, torch.sin(phase), torch.cos(phase)], -1)
+
+
+class HarmonicSum(nn.Module):
+    """Harmonics of turning joints as a module: the same sums, from buffers that a model file holds."""
+
+    step: Tensor
+    amplitude: Tensor
+    factors: Tensor
+    owner: Tensor
+
+    def __init__(self, harmonics: Harmonics) -> None:
+        super().__init__()
+        for name, values in vars(harmonics).items():
+            self.register_buffer(name, values.clone())
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """inputs: `... x i` [1]; returns `... x o` [1]."""
+        return self._plain().deviation(inputs)
+
+    def variance(self, inputs: Tensor) -> Tensor:
+        """inputs: `... x i` [1]; returns `... x o` [1]."""
+        return self._plain().variance(inputs)
+
+    def _plain(self) -> Harmonics:
+        return Harmonics(self.step, self.amplitude, self.factors, self.owner)
+
+
+def _blank_harmonics(shape: Sequence[int] | None, outputs: int) -> Harmonics | None:
+    """Harmonics of a shape (joints, amplitudes, factors), for tensors to be loaded into."""
+    if shape is None:
+        return None
+    joints, amplitudes, _ = shape
+    zeros = torch.zeros(joints, amplitudes, dtype=torch.float64)
+    return Harmonics(zeros[:, 0], zeros, zeros.new_zeros(*shape), zeros.new_zeros(joints, outputs))
 
 
 def _linear(weight: Tensor, width: int) -> nn.Linear:

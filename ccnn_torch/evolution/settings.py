@@ -54,6 +54,9 @@ class CCNNSettings:
         waves: slots for periodic nodes, each a sine and a cosine of one input found in what the refined network leaves,
             since gears and screws repeat their errors; 0 = none (paper: none). They need refinement.
         wave_searches: how often to look for them, each time followed by a refinement.
+        harmonics: harmonics of each turning joint in its own deviation, fitted before anything else (one for every
+            eight rows at most), since gears repeat their errors; 0 = none (paper: none). They need refinement. Inside
+            a UR10's training rows 75 or 100 did better than 30 or 50.
         refinement_iterations: Levenberg-Marquardt iterations of one refinement; 0 = none, as in the paper.
 
     Raises:
@@ -83,6 +86,7 @@ class CCNNSettings:
     refine_every: int = 0
     waves: int = 32
     wave_searches: int = 3
+    harmonics: int = 96
     refinement_iterations: int = 50
 
     def __post_init__(self) -> None:
@@ -99,6 +103,7 @@ class CCNNSettings:
             ("refinement_iterations", 0),
             ("waves", 0),
             ("wave_searches", 0),
+            ("harmonics", 0),
         ):
             if getattr(self, key) < low:
                 raise ValueError(f"{key}={getattr(self, key)} must be at least {low}")

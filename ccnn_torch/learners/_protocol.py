@@ -25,6 +25,8 @@ class TrainingData:
             aside.
         angles: how many of the features, the last ones, are scaled angles that stand among the others by their sines
             and cosines; 0 unless the learner's `reads_angles` asks for them.
+        angle_step: size of these features, `r x angles` [rad]; None = not known.
+        angle_outputs: the output that is the deviation of each of these joints itself; () = not known.
     """
 
     inputs: Tensor
@@ -34,6 +36,8 @@ class TrainingData:
     validation: TrainingData | None = None
     metric: Tensor | None = None
     angles: int = 0
+    angle_step: Tensor | None = None
+    angle_outputs: tuple[int, ...] = ()
 
 
 @runtime_checkable

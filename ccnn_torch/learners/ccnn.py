@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.bundle import averaged, without_waves
 from ccnn_torch.evolution.coevolution import density, diversity
 from ccnn_torch.evolution.evaluation import make_task
+from ccnn_torch.evolution.harmonics import Harmonics, fit_harmonics, harmonic_count
 from ccnn_torch.evolution.masked_network import MaskedNetwork
 from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.random import member_seeds
@@ -30,6 +33,9 @@ class CCNN:
     training error for held-out error, so that training fitness could not choose. Refinement judges errors in the
     channels of `data.metric`, evolution (eq. 11) always in the outputs.
 
+    Where the data tell which output is the deviation of a turning joint itself, the harmonics of its gear are fitted
+    first (with refinement only), and everything else learns what they leave.
+
     Metrics of a step: `fitness_best`, `fitness_mean` (over all individuals), `error_train` (mean square of the model,
     standardised), `evaluations` (joined networks so far, and of each iteration of a refinement as many as there are
     outputs for its Jacobian and one for the steps tried), each `r`; `density` and `diversity`, `r x layers` of the
@@ -46,6 +52,11 @@ class CCNN:
         """Take the data and judge the random first generation."""
         settings = self.settings
         members = settings.members
+        self._gears = _gears(data, settings)
+        if self._gears is not None:
+            there = (data.weights > 0).unsqueeze(-1)
+            left = data.targets - self._gears.deviation(data.inputs)
+            data = replace(data, targets=torch.where(there, left, data.targets))
         inputs, targets, weights = (
             part.repeat_interleave(members, dim=0) for part in (data.inputs, data.targets, data.weights)
         )
@@ -93,6 +104,11 @@ class CCNN:
 
     def predict(self, inputs: Tensor) -> Tensor:
         """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
+        output = self._remainder(inputs)
+        return output if self._gears is None else output + self._gears.deviation(inputs)
+
+    def _remainder(self, inputs: Tensor) -> Tensor:
+        """What the networks say, without the harmonics."""
 
         def one(structure: Structure) -> Tensor:
             model = structure.model()
@@ -107,7 +123,8 @@ class CCNN:
             model = structure.model()
             return spread_variance(model.masks, model.weights, self._spread(structure), inputs, model.waves)
 
-        return self._chosen([one(structure) for structure in self._structures])
+        variance = self._chosen([one(structure) for structure in self._structures])
+        return variance if self._gears is None else variance + self._gears.variance(inputs)
 
     def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
         """Masks and weights of one repeat's model, dead nodes included: `out x in` and `out x (in or in + 1)`.
@@ -139,6 +156,7 @@ class CCNN:
             spread.noise[repeat],
             Waves(*(part[repeat] for part in model.waves)),
             self._features,
+            None if self._gears is None else self._gears.repeat(repeat),
         )
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -218,6 +236,17 @@ class CCNN:
         """Weighted mean squared error of the model on the training rows, `r`."""
         data = self._data
         there = (data.weights > 0).unsqueeze(-1)
-        error = self.predict(data.inputs.masked_fill(~there, 0)) - data.targets
+        error = self._remainder(data.inputs.masked_fill(~there, 0)) - data.targets
         squares = error.masked_fill(~there, 0).square().mean(-1)
         return (squares * data.weights).sum(-1) / data.weights.sum(-1)
+
+
+def _gears(data: TrainingData, settings: CCNNSettings) -> Harmonics | None:
+    """Harmonics of the turning joints, where there are such joints, and rows enough."""
+    count = harmonic_count(settings.harmonics, int((data.weights > 0).sum(-1).min()))
+    if data.angle_step is None or not data.angle_outputs or not settings.refinement_iterations or count == 0:
+        return None
+    first = data.inputs.shape[-1] - data.angles
+    return fit_harmonics(
+        data.inputs[..., first:], data.angle_step, data.targets, data.weights, data.angle_outputs, data.metric, count
+    )

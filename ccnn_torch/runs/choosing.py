@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -203,15 +204,12 @@ def predictive_variance(learner: Learner, data: TrainingData, inputs: Tensor) ->
 
 def moved(data: TrainingData, device: str) -> TrainingData:
     """The same data on a device."""
-    return TrainingData(
-        data.inputs.to(device),
-        data.targets.to(device),
-        data.weights.to(device),
-        data.seeds.to(device),
-        None if data.validation is None else moved(data.validation, device),
-        None if data.metric is None else data.metric.to(device),
-        data.angles,
-    )
+    values = {field.name: getattr(data, field.name) for field in fields(data)}
+    tensors: dict[str, Any] = {
+        name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)
+    }
+    held = None if data.validation is None else moved(data.validation, device)
+    return replace(data, **tensors, validation=held)
 
 
 def evaluations_until(training: Training) -> Tensor | None:

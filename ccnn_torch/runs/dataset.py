@@ -123,6 +123,8 @@ class Dataset:
             held,
             self._metric(rows, targets, scaling),
             scaling.angle_count,
+            scaling.angle_step,
+            tuple(self.periodic.nonzero().flatten().tolist()) if scaling.angle_count else (),
         )
         return data, scaling
 

@@ -88,6 +88,11 @@ class Scaling(nn.Module):
         """Number of features, the last ones, that are scaled angles."""
         return self.centre.shape[-1] - len(self.linear)
 
+    @property
+    def angle_step(self) -> Tensor:
+        """Size of these features, `[r x] angle_count` [rad]."""
+        return self.half_range[..., len(self.linear) :]
+
     def repeat(self, index: int) -> Scaling:
         """The scaling of one repeat, without the leading dimension."""
         return Scaling(
