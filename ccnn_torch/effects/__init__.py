@@ -1,0 +1,13 @@
+"""Physical causes of a gap between model and machine, one file each, all of one protocol."""
+
+from ccnn_torch.effects._protocol import Coefficient as Coefficient
+from ccnn_torch.effects._protocol import Effect as Effect
+from ccnn_torch.effects._protocol import Shape as Shape
+from ccnn_torch.effects._registry import EFFECTS as EFFECTS
+from ccnn_torch.effects._registry import make_effect as make_effect
+from ccnn_torch.effects._situation import Situation as Situation
+from ccnn_torch.effects._situation import default_gravity as default_gravity
+from ccnn_torch.effects.apply import Acting as Acting
+from ccnn_torch.effects.apply import pose_residual as pose_residual
+from ccnn_torch.effects.apply import reached as reached
+from ccnn_torch.effects.apply import signature as signature

@@ -1,0 +1,78 @@
+"""Effects at work: the pose that a machine with them reaches, and what they do to it to first order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.effects._protocol import Effect
+from ccnn_torch.effects._situation import Situation
+from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+
+__all__ = ["Acting", "pose_residual", "reached", "signature"]
+
+
+class Acting(NamedTuple):
+    """An effect with its numbers: `shape` `... x h`, `coefficients` `... x m` [SI]."""
+
+    effect: Effect
+    shape: Tensor
+    coefficients: Tensor
+
+    def change(self, situation: Situation) -> Tensor:
+        """Of joints, parameters or pose channels, by the effect's kind, `... x s x d`."""
+        basis = self.effect.basis(situation, self.shape)
+        return (basis @ self.coefficients.unsqueeze(-2).unsqueeze(-1)).squeeze(-1)
+
+
+def signature(situation: Situation, effect: Effect, shape: Tensor) -> Tensor:
+    """First-order change of position and rotation vector per unit of each coefficient, `... x s x c x m`."""
+    basis = effect.basis(situation, shape)
+    if effect.kind == "joints":
+        return situation.jacobian @ basis
+    if effect.kind == "parameters":
+        return situation.parameter_jacobian @ basis
+    return basis
+
+
+def reached(situation: Situation, acting: Sequence[Acting]) -> Tensor:
+    """Position `... x s x 3` [m] and rotation matrix, as the frame of the pose measured on a machine with the effects.
+
+    Returns:
+        The frame's position and rotation vector side by side, `... x s x c`: c = 3 without orientation, else 6.
+    """
+    mechanism = situation.mechanism
+    joints, parameters = situation.joints, mechanism.resolve(situation.parameters)
+    for one in acting:
+        if one.effect.kind == "joints":
+            joints = joints + one.change(situation)
+        elif one.effect.kind == "parameters":
+            parameters = parameters + one.change(situation)
+    position, rotation = mechanism.frame(mechanism.forward_kinematics(joints, parameters, situation.pose))
+    moved = [one.change(situation) for one in acting if one.effect.kind == "pose"]
+    for change in moved:
+        position = position + change[..., :3]
+        if rotation is not None:
+            rotation = rotation_vector_to_matrix(change[..., 3:]) @ rotation
+    if rotation is None:
+        return position
+    return torch.cat([position, matrix_to_rotation_vector(rotation)], -1)
+
+
+def pose_residual(situation: Situation, measured: Tensor) -> Tensor:
+    """Measured less nominal pose: position [m], and the rotation vector between them in the base frame [rad].
+
+    Args:
+        measured: `... x s x p` [SI].
+
+    Returns:
+        `... x s x c`, c = 3 without orientation, else 6; channels that the mechanism cannot move are 0 in both.
+    """
+    there, nominal = situation.mechanism.frame(measured), situation.mechanism.frame(situation.pose)
+    position = there[0] - nominal[0]
+    if there[1] is None or nominal[1] is None:
+        return position
+    return torch.cat([position, matrix_to_rotation_vector(there[1] @ nominal[1].mT)], -1)
