@@ -3,14 +3,13 @@
 A gear repeats its error with the turns of its shafts, so that the deviation of a joint holds harmonics of that joint's
 own angle; those of a harmonic drive reach far up (past the fortieth on a UR10). Sigmoids cannot follow them, and one
 frequency at a time is a poor way to find dozens. But the map is linear in the amplitudes, so all of them are fitted at
-once, each octave of each joint with a prior precision that the evidence sets (MacKay, "Bayesian interpolation", Neural
-Computation 4, 1992): an octave in which nothing is known is switched off. Where the rows do not cover an angle the
-prior rules, so that the deviation goes to zero there instead of anywhere.
+once, each with a prior precision that the evidence sets (MacKay, "Bayesian interpolation", Neural Computation 4, 1992):
+a harmonic of which nothing is known is switched off. Where the rows do not cover an angle the prior rules, so that the
+deviation goes to zero there instead of anywhere.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -114,13 +113,6 @@ def _basis(step: Tensor, angles: Tensor, count: int) -> Tensor:
     return torch.cat([torch.sin(phase), torch.cos(phase)], -1)
 
 
-def _octaves(joints: int, count: int) -> Tensor:
-    """Which octave of which joint an amplitude belongs to, `a * 2k` int64."""
-    each = int(math.log2(count)) + 1
-    octave = torch.tensor([int(math.log2(k)) for k in range(1, count + 1)] * 2)
-    return (torch.arange(joints).unsqueeze(-1) * each + octave).flatten()
-
-
 def _fit(
     angles: Tensor, step: Tensor, targets: Tensor, rows: Tensor, metric: Tensor, owner: Tensor, count: int
 ) -> tuple[Tensor, Tensor]:
@@ -139,8 +131,9 @@ def _fit(
         moments.append(design.mT @ (wanted[:, channel] * rows))
     gram, moment = torch.stack(grams), torch.stack(moments)
     energy = (wanted.square() * rows.unsqueeze(-1)).sum(0)
-    octave = _octaves(joints, count).to(rows.device)
-    amplitude, covariance = _evidence(gram, moment, energy, rows.sum(), octave, outputs)
+    # Sine and cosine of one harmonic of one joint share a precision.
+    harmonic = torch.arange(joints * count, device=rows.device).reshape(joints, count).repeat(1, 2).flatten()
+    amplitude, covariance = _evidence(gram, moment, energy, rows.sum(), harmonic, outputs)
     own = amplitude.reshape(joints, 2 * count)
     blocks = covariance.reshape(joints, 2 * count, joints, 2 * count)
     blocks = torch.stack([blocks[joint, :, joint] for joint in range(joints)])
