@@ -56,6 +56,7 @@ def identified_tables(results: Block) -> list[Table]:
         _parameter_table(results),
         _method_table(results),
         _deviation_table(results),
+        _transfer_table(results),
         constraint_table(results),
         _compensation_table(results),
         _count_table(results),
@@ -160,6 +161,25 @@ def _method_table(results: Block) -> Table:
     return Table("Held-out pose error", tuple(columns), tuple(rows), note)
 
 
+def _transfer_table(results: Block) -> Table | None:
+    if "transfer" not in results:
+        return None
+    block = results["transfer"]
+    rows = []
+    for name in ("position", "rotation"):
+        test = block["test"][name]
+        if test is not None:
+            scale, unit = display_unit(test["unit"], test["before"] or 1.0)
+            keys = ("before", "after", "max_before", "max_after")
+            rows.append((name, *(f"{_text(test, key, scale)} {unit}" for key in keys)))
+    columns = ("", "nominal links", "identified links", "largest, nominal", "largest, identified")
+    note = (
+        f"RMS distance of {count_text(block['rows']['test'], 'held-out pose')} of {block['records']} from the "
+        f"predicted ones; frames fitted to {count_text(block['rows']['train'], 'other row')} of it, links to none."
+    )
+    return Table("The same arm elsewhere", columns, tuple(rows), note)
+
+
 def _deviation_table(results: Block) -> Table | None:
     if not results["simulated"]:
         return None
@@ -258,6 +278,11 @@ def _rows(results: Block) -> Iterator[Row]:
                     yield from of("method", method, found[part], found[part]["unit"], ("after",), f"{kind}_{part}_")
                     yield from of("method", method, found[part], "1", ("removed",), f"{kind}_{part}_")
         yield "method", method, "seconds", "s", block["seconds"], None, None
+    for part in ("position", "rotation"):
+        test = results.get("transfer", {}).get("test", {}).get(part)
+        if test is not None:
+            sizes = ("before", "after", "max_before", "max_after")
+            yield from of("transfer", results["transfer"]["records"], test, test["unit"], sizes, f"{part}_")
     for name, block in results.get("constraint", {}).get("unknowns", {}).items():
         yield from of("constraint", name, block, block["unit"], ("value", "sd"))
 

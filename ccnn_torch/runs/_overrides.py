@@ -13,7 +13,7 @@ from ccnn_torch.runs._yaml import parse_yaml
 __all__ = ["apply_overrides", "resolve_paths"]
 
 # Keys whose value is text however it looks: a path may hold a colon, a name may be 2024.
-_TEXT = ("name", "out", "records", "mechanism")
+_TEXT = ("name", "out", "records", "transfer", "mechanism")
 
 _METHODS = ("methods", "auto.methods")
 
@@ -65,7 +65,7 @@ def _resolve(key: str, value: Any, folder: Path) -> Any:
 
 
 def _is_path(key: str, value: str) -> bool:
-    if key in ("out", "records"):
+    if key in ("out", "records", "transfer"):
         return value != ""
     if key == "mechanism":
         return ".py:" in value or Path(value).suffix.lower() in (".yaml", ".yml", ".urdf")

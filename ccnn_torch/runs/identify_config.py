@@ -174,11 +174,21 @@ class IdentifyConfig(_Part):
         description="a mechanism's name, a DH file (.yaml), a URDF, an identified.yaml, or file.py:Name",
     )
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    links: Literal["given", "six"] = Field(
+        default="given",
+        description="parameters of a serial arm's links: those of its file (given), or a place and a turn of each "
+        "(six), which can also tilt parallel axes",
+    )
     frame: FrameConfig = Field(default_factory=FrameConfig)
     records: str | None = Field(default=None, description="measured records, a CSV file with headers name[unit]")
     simulate: SimulateConfig | None = Field(default=None, description="simulated machines instead of records")
     constraint: ConstraintConfig | None = Field(
         default=None, description="what holds the tool in the records, which then have no measured pose"
+    )
+    transfer: str | None = Field(
+        default=None,
+        description="records of the same arm in another place: its frames are fitted to them anew, the identified "
+        "links stay, and held-out rows judge (split as the records are)",
     )
     noise: Size | dict[str, Size] | None = Field(
         default=None, description="known noise of the records' pose, as simulate.noise; null = estimated from the fit"
@@ -251,6 +261,8 @@ class IdentifyConfig(_Part):
             raise ValueError(f"{both}: records=FILE.csv, or a section simulate with machines, poses and noise")
         if self.constraint is not None:
             self._constrained(self.constraint)
+        if self.transfer is not None and self.records is None:
+            raise ValueError("transfer: needs measured records; write records=FILE.csv, or remove the key")
         if self.simulate is not None and (self.noise is not None or self.joint_noise is not None):
             raise ValueError("noise: simulated data has simulate.noise and simulate.joint_noise; remove the key")
         if self.simulate is not None and self.simulate.points and self.residual == "forward":
@@ -272,6 +284,7 @@ class IdentifyConfig(_Part):
             "frame.base": (self.frame.base, "stands anywhere and cannot show the base frame; remove the key"),
             "noise": (isinstance(self.noise, dict), "has one noise; write one size, e.g. noise='0.02 mm'"),
             "joint_noise": (self.joint_noise is not None, "has one noise, that of the whole; remove the key"),
+            "transfer": (self.transfer is not None, "has no measured poses to transfer to; remove the key"),
             "bootstrap": (self.bootstrap > 0, "has the formula's intervals alone; remove the key"),
             "paper": (self.paper is not None, "stands in no paper; remove the key"),
             "split.kind": (self.split.kind == "block", "measures no positions to sort by; write random or group"),

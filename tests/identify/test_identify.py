@@ -228,6 +228,36 @@ def test_an_arm_from_records_out_again_as_dh_file_and_urdf(tmp_path: Path) -> No
         assert float((again.forward_frame(joints)[0] - expected[0]).norm(dim=-1).max()) < 2e-4
 
 
+def test_links_hold_where_the_arm_stands_elsewhere(tmp_path: Path) -> None:
+    rows, file, real = arm_rows(tmp_path)
+    moved = real.nominal.clone()
+    moved[:6] = torch.tensor([-0.7, 0.4, 0.2, 0.3, -0.1, 0.8])
+    moved[-6:-3] = torch.tensor([0.0, 0.05, 0.12])
+    again = real.with_nominal(moved)
+    joints = real.sample_joints(40, torch.Generator().manual_seed(11))
+    pose = again.forward_kinematics(joints)
+    columns = {c.header: joints[:, i].numpy() for i, c in enumerate(real.joints)}
+    columns |= {c.header: pose[:, i].numpy() for i, c in enumerate(real.pose)}
+    write_table(tmp_path / "elsewhere.csv", columns)
+    keys = {"mechanism": str(file), "records": str(rows), "noise": 1e-5, "save_report": False}
+    for links in ("given", "six"):
+        found = ccnn_torch.identify(**keys, links=links, transfer=str(tmp_path / "elsewhere.csv"))
+        block = found.results["transfer"]
+        assert block["rows"] == {"train": 28, "test": 12} and block["records"].endswith("/elsewhere.csv")
+        position = block["test"]["position"]
+        assert position["after"] < 1e-4 < 5e-4 < position["before"]
+        found.save(tmp_path / links)
+        assert "elsewhere.csv" in (tmp_path / links / "identified.md").read_text(encoding="utf-8")
+    with pytest.raises(InputError, match="transfer: five_bar has no frame to be fitted anew"):
+        mechanism = load_mechanism("five_bar")
+        bar = mechanism.sample_workspace(20, torch.Generator().manual_seed(0))
+        table = {c.header: mechanism.solve_inverse(bar)[:, i].numpy() for i, c in enumerate(mechanism.joints)}
+        table |= {c.header: bar[:, i].numpy() for i, c in enumerate(mechanism.pose)}
+        write_table(tmp_path / "bar.csv", table)
+        path = str(tmp_path / "bar.csv")
+        ccnn_torch.identify(mechanism="five_bar", records=path, transfer=path)
+
+
 def test_rows_that_cannot_be_are_named(tmp_path: Path) -> None:
     mechanism = load_mechanism("five_bar")
     pose = mechanism.sample_workspace(20, torch.Generator().manual_seed(0))
@@ -254,6 +284,8 @@ def test_rows_that_cannot_be_are_named(tmp_path: Path) -> None:
         ({"simulate": {"errors": {"l*": "100 m"}}}, "hardly any pose"),
         ({"simulate": {}, "settings": {"lm": {"start": 3}}}, "has no setting 'start'; did you mean 'starts'"),
         ({"simulate": {}, "residual": "forward", "methods": ["lm_per_leg"]}, "a pose depends on all legs"),
+        ({"simulate": {}, "transfer": "rows.csv"}, "transfer: needs measured records"),
+        ({"simulate": {}, "links": "six"}, "links: five_bar is no serial arm"),
     ],
 )
 def test_what_cannot_be_identified_is_one_sentence(keys: dict[str, Any], message: str) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Fit, Progress, bootstrap
-from ccnn_torch.mechanisms import Framed, Mechanism, load_mechanism
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, load_mechanism
 from ccnn_torch.runs.identification._assemble import assemble
 from ccnn_torch.runs.identification._constrained import identify_by_constraint
 from ccnn_torch.runs.identification._counts import count_study
@@ -32,6 +32,7 @@ from ccnn_torch.runs.identification._solve import (
     solver_of,
 )
 from ccnn_torch.runs.identification._store import load_outcome, save_outcome
+from ccnn_torch.runs.identification._transfer import read_elsewhere, transferred
 from ccnn_torch.runs.identify_config import IdentifyConfig, base_method, dump_identify_config
 from ccnn_torch.training import write_whole
 
@@ -89,6 +90,10 @@ def prepare(config: IdentifyConfig) -> tuple[Mechanism, Measured]:
         InputError: the mechanism or the data cannot be used.
     """
     mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
+    if config.links == "six":
+        if not isinstance(mechanism, SerialArm):
+            raise InputError(f"links: {mechanism.name} is no serial arm; remove the key")
+        mechanism = mechanism.with_link_frames()
     if config.frame.base or config.frame.tool:
         mechanism = Framed(mechanism, base=config.frame.base, tool=config.frame.tool)
     measured = from_records(config, mechanism) if config.records is not None else simulate(config, mechanism)
@@ -108,6 +113,7 @@ def identify(config: IdentifyConfig, store: Path | None = None, watch: Watch | N
     if config.constraint is not None:
         return Identification(config, *identify_by_constraint(config, None if watch is None else watch("lm")))
     mechanism, measured = prepare(config)
+    elsewhere = read_elsewhere(config, mechanism)
     for method in config.methods:  # what cannot be solved is said before anything takes minutes
         solver_of(method, config)
         pieces_of(measured, config, is_apart(method, config), torch.arange(1))
@@ -123,6 +129,8 @@ def identify(config: IdentifyConfig, store: Path | None = None, watch: Watch | N
         outcomes[method] = outcome
     counts = count_study(config, mechanism)
     done = assemble(config, measured, outcomes, counts, _bootstrap(config, measured, outcomes))
+    if elsewhere is not None:
+        done.results["transfer"] = transferred(config, elsewhere, next(iter(outcomes.values())).values[0])
     return Identification(config, measured, outcomes, done.results, done.arrays)
 
 

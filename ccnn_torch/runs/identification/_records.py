@@ -14,7 +14,7 @@ from ccnn_torch.runs.identification._sizes import size, sizes_by_name, sizes_of_
 from ccnn_torch.runs.identify_config import IdentifyConfig
 from ccnn_torch.splits import split_rows
 
-__all__ = ["from_records"]
+__all__ = ["from_records", "read_records", "split_records"]
 
 
 def from_records(config: IdentifyConfig, mechanism: Mechanism) -> Measured:
@@ -24,31 +24,8 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism) -> Measured:
         InputError: the records cannot be used, or the arm has frames per group of rows, which are no geometry.
     """
     assert config.records is not None
-    records = load_records(config.records, mechanism, [])
-    if isinstance(mechanism, SerialArm):
-        if mechanism.frame_per or mechanism.tool_per:
-            raise InputError(
-                f"{config.mechanism}: frame_per and tool_per give each group of rows a frame of its own; remove them "
-                "to identify one machine, or identify from the rows of one group"
-            )
-        if records.orientation == "none" and mechanism.orientation != "none":
-            mechanism = mechanism.with_orientation("none")
-    elif len(records.pose_coordinates) != len(mechanism.pose):
-        there = {c.name for c in records.pose_coordinates}
-        missing = [c.header for c in mechanism.pose if c.name not in there]
-        raise InputError(f"{records.path}: {mechanism.name} needs the columns {', '.join(missing)}, too")
-    if not config.frame.base and not config.frame.tool:
-        check_rows(records, mechanism)
-    split = split_rows(
-        records.positions,
-        config.split.kind,
-        config.split.by,
-        records.columns,
-        test=config.split.test,
-        validation=0.0,
-        seed=config.seed,
-    )
-    train, test = (Rows(records.joints[None, i], records.pose[None, i]) for i in (split.train, split.test))
+    records, mechanism = read_records(config, config.records, mechanism)
+    train, test = split_records(config, records)
     start, unknown = _frames(mechanism, train)
     return Measured(
         mechanism=mechanism,
@@ -64,6 +41,45 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism) -> Measured:
         data_hash=records.data_hash,
         notes=_notes(records),
     )
+
+
+def read_records(config: IdentifyConfig, path: str, mechanism: Mechanism) -> tuple[Records, Mechanism]:
+    """Records that fit a mechanism, and the mechanism as it was measured there (with or without orientation).
+
+    Raises:
+        InputError: the records cannot be used.
+    """
+    records = load_records(path, mechanism, [])
+    if isinstance(mechanism, SerialArm):
+        if mechanism.frame_per or mechanism.tool_per:
+            raise InputError(
+                f"{config.mechanism}: frame_per and tool_per give each group of rows a frame of its own; remove them "
+                "to identify one machine, or identify from the rows of one group"
+            )
+        if records.orientation == "none" and mechanism.orientation != "none":
+            mechanism = mechanism.with_orientation("none")
+    elif len(records.pose_coordinates) != len(mechanism.pose):
+        there = {c.name for c in records.pose_coordinates}
+        missing = [c.header for c in mechanism.pose if c.name not in there]
+        raise InputError(f"{records.path}: {mechanism.name} needs the columns {', '.join(missing)}, too")
+    if not config.frame.base and not config.frame.tool:
+        check_rows(records, mechanism)
+    return records, mechanism
+
+
+def split_records(config: IdentifyConfig, records: Records) -> tuple[Rows, Rows]:
+    """Rows to identify from, and rows that judge."""
+    split = split_rows(
+        records.positions,
+        config.split.kind,
+        config.split.by,
+        records.columns,
+        test=config.split.test,
+        validation=0.0,
+        seed=config.seed,
+    )
+    train, test = (Rows(records.joints[None, i], records.pose[None, i]) for i in (split.train, split.test))
+    return train, test
 
 
 def _frames(mechanism: Mechanism, rows: Rows) -> tuple[Tensor, tuple[str, ...]]:
