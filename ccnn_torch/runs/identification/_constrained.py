@@ -11,13 +11,14 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Progress
-from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm, load_mechanism
+from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
 from ccnn_torch.runs.identification._assemble import Known, parameter_blocks, versions
 from ccnn_torch.runs.identification._constraint_fit import ConstraintFit, fit_constraint, held_distance
 from ccnn_torch.runs.identification._constraint_rows import ConstraintRows, read_constraint
 from ccnn_torch.runs.identification._figures import before_and_after, figures
 from ccnn_torch.runs.identification._kinematics import Kinematics
 from ccnn_torch.runs.identification._measured import Measured, Rows
+from ccnn_torch.runs.identification._nominal import nominal_machine
 from ccnn_torch.runs.identification._solve import Outcome
 from ccnn_torch.runs.identify_config import IdentifyConfig
 
@@ -79,7 +80,7 @@ def identify_by_constraint(
 
 def _machine(config: IdentifyConfig) -> tuple[Mechanism, list[str]]:
     """The mechanism; of an arm one without frames per group, since the constraint has its own."""
-    mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
+    mechanism = nominal_machine(config)
     if not isinstance(mechanism, SerialArm):
         return (Framed(mechanism, base=False, tool=True) if config.frame.tool else mechanism), []
     if config.frame.tool:

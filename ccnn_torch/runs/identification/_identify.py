@@ -13,11 +13,12 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Fit, Progress, bootstrap
-from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, load_mechanism
+from ccnn_torch.mechanisms import Framed, Mechanism
 from ccnn_torch.runs.identification._assemble import assemble
 from ccnn_torch.runs.identification._constrained import identify_by_constraint
 from ccnn_torch.runs.identification._counts import count_study
 from ccnn_torch.runs.identification._measured import Measured
+from ccnn_torch.runs.identification._nominal import nominal_machine
 from ccnn_torch.runs.identification._records import from_records
 from ccnn_torch.runs.identification._simulate import simulate
 from ccnn_torch.runs.identification._solve import (
@@ -89,11 +90,7 @@ def prepare(config: IdentifyConfig) -> tuple[Mechanism, Measured]:
     Raises:
         InputError: the mechanism or the data cannot be used.
     """
-    mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
-    if config.links == "six":
-        if not isinstance(mechanism, SerialArm):
-            raise InputError(f"links: {mechanism.name} is no serial arm; remove the key")
-        mechanism = mechanism.with_link_frames()
+    mechanism = nominal_machine(config)
     if config.frame.base or config.frame.tool:
         mechanism = Framed(mechanism, base=config.frame.base, tool=config.frame.tool)
     measured = from_records(config, mechanism) if config.records is not None else simulate(config, mechanism)
