@@ -52,8 +52,9 @@ def loss_weights(residual: Tensor, weights: Tensor, loss: str, parameters: int) 
 
 
 def _chi_quantile(probability: float, channels: int) -> float:
-    """Quantile of the length of `channels` standard normals; scipy.stats has it too, and takes half a second to load."""
-    return float(2 * gammaincinv(channels / 2, probability)) ** 0.5
+    """Quantile of the length of `channels` standard normals; scipy.stats has it too, but takes long to load."""
+    length: float = float(2 * gammaincinv(channels / 2, probability)) ** 0.5
+    return length
 
 
 def reweighted(problem: Problem, values: Tensor, loss: str) -> Problem:
