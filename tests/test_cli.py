@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from ccnn_torch.cli import main
 from ccnn_torch.learners import LEARNERS
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
@@ -23,20 +22,6 @@ FAST = ["ccnn.generations=3", "ccnn.population=8", "ccnn.hidden=[3]", "ccnn.memb
 # Pages and pictures take seconds, and have tests of their own.
 NO_REPORT = "save_report=false"
 Cli = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def cli(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
-    """Run `ccnn WORDS…` in this process; returns exit code, stdout and stderr."""
-
-    def call(*words: str | Path) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["ccnn", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        captured = capsys.readouterr()
-        return int(ended.value.code or 0), captured.out, captured.err
-
-    return call
 
 
 def tripod_records(path: Path, rows: int = 60, **changes: np.ndarray) -> Path:
