@@ -10,7 +10,6 @@ from typing import Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ccnn_torch._covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES
@@ -234,6 +233,9 @@ def read_pose(
             f"{table.path}: the quaternion qw, qx, qy, qz at {name_lines(table.lines, wrong)} has norm "
             f"{norm[wrong[0]]:.3g} instead of 1; correct it, or give the orientation as rx[rad], ry[rad], rz[rad]"
         )
+    # Only here: few files give quaternions, and the import takes long.
+    from scipy.spatial.transform import Rotation
+
     vector = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_rotvec()
     return np.concatenate([stack_columns(table, position), vector], axis=1), full, "quaternion"
 

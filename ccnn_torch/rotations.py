@@ -3,11 +3,12 @@
 Warning:
     Quaternions are (w, x, y, z) here and (x, y, z, w) in roma; Euler angles are intrinsic Z-Y'-X'' (yaw, pitch, roll).
     Eq. 2 of the pseudoerror paper (Zhang and Gao 2012) mixes its angle names; this is the proper ZYX matrix.
+
+roma is imported by the functions that call it: it loads torch's compiler, which takes a second.
 """
 
 from __future__ import annotations
 
-import roma
 import torch
 from torch import Tensor
 
@@ -17,6 +18,7 @@ __all__ = [
     "matrix_to_euler_zyx",
     "matrix_to_quaternion",
     "matrix_to_rotation_vector",
+    "nearest_rotation",
     "quaternion_to_matrix",
     "rotation_vector_rate",
     "rotation_vector_to_matrix",
@@ -31,18 +33,24 @@ _SMALL = 1e-9
 
 def rotation_vector_to_matrix(vector: Tensor) -> Tensor:
     """vector: `... x 3` [rad]; returns `... x 3 x 3`."""
+    import roma
+
     matrix: Tensor = roma.rotvec_to_rotmat(vector, epsilon=_SMALL)
     return matrix
 
 
 def matrix_to_rotation_vector(matrix: Tensor) -> Tensor:
     """matrix: `... x 3 x 3`; returns the rotation vector of angle at most pi, `... x 3` [rad]."""
+    import roma
+
     vector: Tensor = roma.rotmat_to_rotvec(matrix)
     return vector
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
     """quaternion: `... x 4` (w, x, y, z), of any length but 0; returns `... x 3 x 3`."""
+    import roma
+
     unit = quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
     matrix: Tensor = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit))
     return matrix
@@ -50,26 +58,42 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
 
 def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     """matrix: `... x 3 x 3`; returns the unit quaternion (w, x, y, z) with w >= 0, `... x 4`."""
+    import roma
+
     quaternion: Tensor = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(matrix))
     return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
 
 
 def euler_zyx_to_matrix(angles: Tensor) -> Tensor:
     """angles: `... x 3` [rad], (yaw about z, pitch about y', roll about x''); returns `... x 3 x 3`."""
+    import roma
+
     matrix: Tensor = roma.euler_to_rotmat("ZYX", angles)
     return matrix
 
 
 def matrix_to_euler_zyx(matrix: Tensor) -> Tensor:
     """Inverse of `euler_zyx_to_matrix`; pitch in [-pi/2, pi/2]."""
+    import roma
+
     angles: Tensor = roma.rotmat_to_euler("ZYX", matrix, as_tuple=False)
     return angles
 
 
 def geodesic_angle(first: Tensor, second: Tensor) -> Tensor:
     """Angle of the rotation between two frames, `... x 3 x 3` each; returns `...` [rad], right down to 1e-9 rad."""
+    import roma
+
     angle: Tensor = roma.rotmat_geodesic_distance(first, second)
     return angle
+
+
+def nearest_rotation(matrix: Tensor) -> Tensor:
+    """The rotation with the least sum of squared differences to a matrix (special Procrustes), both `... x 3 x 3`."""
+    import roma
+
+    rotation: Tensor = roma.special_procrustes(matrix)
+    return rotation
 
 
 def skew(vector: Tensor) -> Tensor:

@@ -1,5 +1,31 @@
-"""One thread for all tests: the tensors are small, and threads of two processes would wait for each other."""
+"""What all tests share: one thread, and the command line in this process.
 
+One thread: the tensors are small, and threads of two processes would wait for each other.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
 import torch
 
+from ccnn_torch.cli import main
+
 torch.set_num_threads(1)
+
+
+@pytest.fixture
+def cli(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Run `ccnn WORDS…` in this process; returns exit code, stdout and stderr."""
+
+    def call(*words: str | Path) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["ccnn", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        captured = capsys.readouterr()
+        return int(ended.value.code or 0), captured.out, captured.err
+
+    return call

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from ccnn_torch.cli import main
 from ccnn_torch.learners import LEARNERS
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
@@ -20,21 +19,9 @@ from ccnn_torch.records import read_table, write_table
 ROOT = Path(__file__).parent.parent
 EXPERIMENTS = ROOT / "experiments"
 FAST = ["ccnn.generations=3", "ccnn.population=8", "ccnn.hidden=[3]", "ccnn.members=1", "ccnn.refinement_iterations=2"]
+# Pages and pictures take seconds, and have tests of their own.
+NO_REPORT = "save_report=false"
 Cli = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def cli(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
-    """Run `ccnn WORDS…` in this process; returns exit code, stdout and stderr."""
-
-    def call(*words: str | Path) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["ccnn", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        captured = capsys.readouterr()
-        return int(ended.value.code or 0), captured.out, captured.err
-
-    return call
 
 
 def tripod_records(path: Path, rows: int = 60, **changes: np.ndarray) -> Path:
@@ -154,7 +141,7 @@ def test_own_records_train_compensate_and_come_back(cli: Cli, tmp_path: Path) ->
     records = tripod_records(tmp_path / "mine.csv")
     out = tmp_path / "run"
     code, shown, err = cli(
-        "run", EXPERIMENTS / "records.yaml", f"records={records}", "mechanism=tripod", f"out={out}", *FAST
+        "run", EXPERIMENTS / "records.yaml", f"records={records}", "mechanism=tripod", f"out={out}", *FAST, NO_REPORT
     )
     assert code == 0, err
     assert "position" in shown
@@ -183,8 +170,11 @@ def test_own_records_train_compensate_and_come_back(cli: Cli, tmp_path: Path) ->
 
 def test_the_real_robot_runs_from_the_shipped_records(cli: Cli, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    code, _, err = cli("run", EXPERIMENTS / "ur10.yaml", f"out={out}", "--quiet", *FAST, "ccnn.refinement_iterations=8")
+    words = [f"out={out}", "--quiet", *FAST, "ccnn.refinement_iterations=8", NO_REPORT]
+    code, _, err = cli("run", EXPERIMENTS / "ur10.yaml", *words)
     assert code == 0, err
+    for name in ("model.safetensors", "model.onnx", "model.pt2"):
+        assert (out / name).is_file(), name
     results = json.loads((out / "results.json").read_text())
     assert results["rows"]["train"] + results["rows"]["validation"] == 350
     # Damped by default, so that rows near a singularity are learned from like all others.
@@ -200,8 +190,8 @@ def test_the_real_robot_runs_from_the_shipped_records(cli: Cli, tmp_path: Path) 
 
 def test_rows_near_a_singularity_are_set_aside_where_asked_for(cli: Cli, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    words = ["damping=0", "rotation_weight=0.3", "methods=[constant]", "save_models=false", f"out={out}", "--quiet"]
-    code, _, err = cli("run", EXPERIMENTS / "ur10.yaml", *words)
+    words = ["damping=0", "rotation_weight=0.3", "methods=[constant]", "save_models=false", NO_REPORT]
+    code, _, err = cli("run", EXPERIMENTS / "ur10.yaml", *words, f"out={out}", "--quiet")
     assert code == 0, err
     results = json.loads((out / "results.json").read_text())
     aside = results["records"]["rows_set_aside"]
@@ -233,9 +223,8 @@ def test_orientation_as_a_quaternion_or_not_at_all(cli: Cli, tmp_path: Path, ori
 def test_a_users_own_learner_takes_part(cli: Cli, tmp_path: Path) -> None:
     out = tmp_path / "run"
     learner = Path(__file__).parent / "toy.py"
-    code, _, err = cli(
-        "run", EXPERIMENTS / "tripod.yaml", f"out={out}", f"methods=[constant,{learner}:Descent]", "save_models=false"
-    )
+    words = [f"out={out}", f"methods=[constant,{learner}:Descent]", "save_models=false", NO_REPORT]
+    code, _, err = cli("run", EXPERIMENTS / "tripod.yaml", *words)
     assert code == 0, err
     assert set(json.loads((out / "results.json").read_text())["methods"]) == {"constant", "Descent"}
     refused(cli("run", EXPERIMENTS / "tripod.yaml", f"methods=[{learner}:linear_data]"), "toy.py", "learner")
@@ -246,9 +235,8 @@ def test_all_methods_name_those_that_failed(cli: Cli, tmp_path: Path, monkeypatc
     for name in ("bp_lm", "grnn", "enn", "gp"):
         monkeypatch.delitem(LEARNERS, name, raising=False)
     refused(cli("run", EXPERIMENTS / "tripod.yaml", f"out={out}", "methods=[gp]"), "gp", "ccnn")
-    code, _, err = cli(
-        "run", EXPERIMENTS / "tripod.yaml", f"out={out}", "methods=all", "save_models=false", "enn.generations=3", *FAST
-    )
+    words = [f"out={out}", "methods=all", "save_models=false", NO_REPORT, "enn.generations=3", *FAST]
+    code, _, err = cli("run", EXPERIMENTS / "tripod.yaml", *words)
     assert code == 0, err
     methods = json.loads((out / "results.json").read_text())["methods"]
     assert set(methods) == {"ccnn", "bp_lm", "grnn", "enn", "constant", "gp"}

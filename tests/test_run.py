@@ -22,6 +22,7 @@ from ccnn_torch.report.json_files import load_schema
 from ccnn_torch.runs import RunConfig, calibrate, load_config, resume_run, start_run
 from ccnn_torch.runs._yaml import read_yaml
 from ccnn_torch.runs.config import make_config
+from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.identify_config import load_identify_config
 from ccnn_torch.runs.suite import load_suite
 
@@ -62,8 +63,15 @@ def short(**keys: Any) -> RunConfig:
     return make_config(**(base | keys))
 
 
-def test_the_folder_of_a_run_holds_what_others_rely_on(tmp_path: Path) -> None:
-    folder = start_run(short(out=str(tmp_path / "run"), repeats=3, methods=["ccnn", "constant"]), quiet=True)
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A finished run of two methods with everything that it writes, to be read only."""
+    out = tmp_path_factory.mktemp("finished") / "run"
+    return start_run(short(out=str(out), repeats=3, methods=["ccnn", "constant"]), quiet=True)
+
+
+def test_the_folder_of_a_run_holds_what_others_rely_on(finished: RunFolder) -> None:
+    folder = finished
     for name in FILES:
         assert (folder.path / name).is_file(), name
     assert (folder.path / "models" / "constant.card.json").is_file()
@@ -152,11 +160,10 @@ def test_a_taken_folder_is_not_written_into(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
 
 
-def test_resuming_a_finished_run_changes_nothing(tmp_path: Path) -> None:
-    folder = start_run(short(out=str(tmp_path / "run"), save_models=False), quiet=True)
-    before = {p: p.stat().st_mtime_ns for p in folder.path.rglob("*")}
-    resume_run(folder.path, quiet=True)
-    assert {p: p.stat().st_mtime_ns for p in folder.path.rglob("*")} == before
+def test_resuming_a_finished_run_changes_nothing(finished: RunFolder) -> None:
+    before = {p: p.stat().st_mtime_ns for p in finished.path.rglob("*")}
+    resume_run(finished.path, quiet=True)
+    assert {p: p.stat().st_mtime_ns for p in finished.path.rglob("*")} == before
 
 
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
@@ -202,7 +209,7 @@ def test_a_killed_run_resumes_to_identical_results(tmp_path: Path, delay: float,
     keys += ["save_models=false", "save_report=false"]
     keys += more
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    subprocess.run(command(str(TRIPOD), *keys, f"out={whole}"), check=True, env=ENVIRONMENT, capture_output=True)
+    start_run(load_config(TRIPOD, [*keys, f"out={whole}"]), quiet=True)
     code, _ = stopped(killed, keys, delay, signal.SIGKILL)
     assert code == -signal.SIGKILL
     subprocess.run(command("--resume", str(killed)), check=True, env=ENVIRONMENT, capture_output=True)

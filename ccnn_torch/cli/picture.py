@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 
-from ccnn_torch.report.run_report import make_picture
-
 __all__ = ["picture"]
 
 
@@ -24,6 +22,8 @@ def picture(
 
     ccnn picture runs/tripod docs/picture.png --joint q3
     """
+    from ccnn_torch.report.run_report import make_picture
+
     caption = make_picture(run_dir, out, joint)
     if not quiet:
         typer.echo(caption)

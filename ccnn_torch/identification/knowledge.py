@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from scipy.stats import norm, t
+from scipy.special import ndtri, stdtrit
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
@@ -59,8 +59,8 @@ class Knowledge:
         is that of the fit."""
         tail = (1 + level) / 2
         if self.noise_known:
-            return self.sd * float(norm.ppf(tail))
-        factor = t.ppf(tail, self.freedom.clamp_min(1e-9).cpu().numpy())
+            return self.sd * float(ndtri(tail))
+        factor = stdtrit(self.freedom.clamp_min(1e-9).cpu().numpy(), tail)
         return self.sd * torch.as_tensor(factor, dtype=self.sd.dtype, device=self.sd.device)[:, None]
 
 

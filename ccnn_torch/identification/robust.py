@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import torch
-from scipy.stats import chi2
+from scipy.special import chdtr, gammaincinv
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
@@ -44,11 +44,17 @@ def loss_weights(residual: Tensor, weights: Tensor, loss: str, parameters: int) 
     middle = torch.where(used, length, torch.nan).nanmedian(-1, keepdim=True).values
     equations = used.sum(-1, keepdim=True) * channels
     spared = (equations / (equations - parameters).clamp_min(1)).sqrt()
-    scale = middle / float(chi2.ppf(0.5, channels)) ** 0.5 * spared
-    bend = float(chi2.ppf(chi2.cdf(_BEND[loss] ** 2, 1), channels)) ** 0.5
+    scale = middle / _chi_quantile(0.5, channels) * spared
+    bend = _chi_quantile(chdtr(1, _BEND[loss] ** 2), channels)
     ratio = length / (scale * bend).clamp_min(torch.finfo(length.dtype).tiny)
     factor: Tensor = 1 / ratio.clamp_min(1) if loss == "huber" else 1 / (1 + ratio.square())
     return factor
+
+
+def _chi_quantile(probability: float, channels: int) -> float:
+    """Quantile of the length of `channels` standard normals; scipy.stats has it too, but takes long to load."""
+    length: float = float(2 * gammaincinv(channels / 2, probability)) ** 0.5
+    return length
 
 
 def reweighted(problem: Problem, values: Tensor, loss: str) -> Problem:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import roma
 import torch
 from torch import Tensor
 
 from ccnn_torch.mechanisms._pose import Frame
-from ccnn_torch.rotations import matrix_to_rotation_vector
+from ccnn_torch.rotations import matrix_to_rotation_vector, nearest_rotation
 
 __all__ = ["closed_form_frames"]
 
@@ -47,7 +46,7 @@ def _rotations_by_kronecker(rotation: Tensor, measured: Tensor, weights: Tensor)
     left, _, right = torch.linalg.svd(mean)
     base, tool = left[..., 0].reshape(*left.shape[:-2], 3, 3), right[..., 0, :].reshape(*left.shape[:-2], 3, 3)
     sign = torch.linalg.det(base).sign()[..., None, None]
-    return roma.special_procrustes(base * sign), roma.special_procrustes(tool * sign).mT
+    return nearest_rotation(base * sign), nearest_rotation(tool * sign).mT
 
 
 def _base_by_relaxation(rotation: Tensor, position: Tensor, measured: Tensor, weights: Tensor) -> Tensor:
@@ -59,8 +58,7 @@ def _base_by_relaxation(rotation: Tensor, position: Tensor, measured: Tensor, we
     design = torch.cat([matrix, -rotation, -eye.expand(s, 3, 3)], dim=-1)
     solved = _weighted_linear(design, position, weights)
     relaxed = solved[..., :9].reshape(*solved.shape[:-1], 3, 3)
-    base: Tensor = roma.special_procrustes(relaxed).mT
-    return base
+    return nearest_rotation(relaxed).mT
 
 
 def _weighted_linear(design: Tensor, right: Tensor, weights: Tensor) -> Tensor:

@@ -17,8 +17,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.report.html import InlineFigure, page_text
 from ccnn_torch.report.identified_tables import identified_tables, identified_verdict, unknown_sentences
 from ccnn_torch.report.json_files import read_json
-from ccnn_torch.report.plots import inline_svg, save_figure
-from ccnn_torch.report.plots._identified import identified_plots
 from ccnn_torch.training import write_whole
 
 __all__ = ["ARRAYS", "save_identified_arrays", "write_identified_report"]
@@ -49,6 +47,10 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
     Raises:
         InputError: a file is not there or damaged.
     """
+    # Loads matplotlib, which only a report waits for.
+    from ccnn_torch.report.plots import inline_svg, save_figure
+    from ccnn_torch.report.plots._identified import identified_plots
+
     folder = Path(folder)
     results = read_json(folder / "identified.json") if results is None else results
     try:

@@ -8,7 +8,6 @@ from typing import Any
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_arrays, load_history
-from ccnn_torch.report.csv_file import write_csv
 from ccnn_torch.report.html import InlineFigure, html_text
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.plots import (
@@ -24,17 +23,11 @@ from ccnn_torch.report.plots import (
     save_figure,
     workspace_plot,
 )
-from ccnn_torch.report.tables import markdown_text
+from ccnn_torch.report.tables import write_tables
 
-__all__ = ["make_picture", "run_plots", "write_report", "write_tables"]
+__all__ = ["make_picture", "run_plots", "write_report"]
 
 _LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "model.onnx", "model.pt2", "config.yaml")
-
-
-def write_tables(folder: Path, results: Mapping[str, Any]) -> None:
-    """Write `results.csv` and `results.md`."""
-    write_csv(folder / "results.csv", results)
-    (folder / "results.md").write_text(markdown_text(results), encoding="utf-8")
 
 
 def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -> Path:

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 
 from ccnn_torch.report.comparison_tables import comparison_table, method_label, pose_by_method_table, reach_table
+from ccnn_torch.report.csv_file import write_csv
 from ccnn_torch.report.display import count_text, display_unit, interval_text, number_text, removed_percent
 from ccnn_torch.report.paper_tables import PAPER, PaperCase
 from ccnn_torch.report.table_form import Table, print_table
 
-__all__ = ["Table", "markdown_table", "markdown_text", "print_tables", "result_tables", "verdict"]
+__all__ = ["Table", "markdown_table", "markdown_text", "print_tables", "result_tables", "verdict", "write_tables"]
 
 Results = Mapping[str, Any]
 
@@ -83,6 +85,12 @@ def markdown_text(results: Results) -> str:
     """The verdict and the tables as Markdown (`results.md`)."""
     parts = [f"# {results['name']}", verdict(results), *map(markdown_table, result_tables(results)), *failures(results)]
     return "\n\n".join(parts) + "\n"
+
+
+def write_tables(folder: Path, results: Results) -> None:
+    """Write `results.csv` and `results.md`."""
+    write_csv(folder / "results.csv", results)
+    (folder / "results.md").write_text(markdown_text(results), encoding="utf-8")
 
 
 def failures(results: Results) -> list[str]:

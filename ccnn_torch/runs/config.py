@@ -10,18 +10,17 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from ccnn_torch._table import nearest
-from ccnn_torch.errors import InputError
 from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.enn import ENNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
-from ccnn_torch.runs._keys import explain, list_keys
-from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
-from ccnn_torch.runs._yaml import dump_yaml, read_yaml
+from ccnn_torch.runs._config_tree import Names, Section, config_from_file, config_from_keys
+from ccnn_torch.runs._keys import list_keys
+from ccnn_torch.runs._yaml import dump_yaml
 
 __all__ = [
     "METHODS",
@@ -37,28 +36,21 @@ __all__ = [
     "load_config",
     "make_config",
     "method_names",
-    "validate_tree",
 ]
 
 METHODS = ("ccnn", "bp_lm", "grnn", "enn", "constant", "gp")
 """The learner names of the framework; `ccnn_torch.learners.LEARNERS` has those that this version can make."""
 
 
-def _listed(value: Any) -> Any:
-    """A single name, or several with commas as a shell would have them, as a list."""
-    return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
-
-
 def _one(value: Any) -> Any:
     return [value] if isinstance(value, int | float) else value
 
 
-Names = Annotated[list[str], BeforeValidator(_listed)]
 Numbers = Annotated[list[Annotated[float, Field(gt=0)]], BeforeValidator(_one)]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True)
+class _Part(Section):
+    model_config = ConfigDict(coerce_numbers_to_str=True)
 
 
 class SplitConfig(_Part):
@@ -302,12 +294,7 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> RunConfig:
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
-    path = Path(path)
-    tree = read_yaml(path)
-    tree.setdefault("name", path.stem)
-    resolve_paths(tree, path.absolute().parent)
-    given = apply_overrides(tree, overrides, Path.cwd())
-    return validate_tree(tree, str(path), given)
+    return config_from_file(RunConfig, path, overrides)
 
 
 def make_config(**keys: Any) -> RunConfig:
@@ -316,26 +303,7 @@ def make_config(**keys: Any) -> RunConfig:
     Raises:
         InputError: keys are wrong: one line that names them all.
     """
-    tree = dict(keys)
-    resolve_paths(tree, Path.cwd())
-    return validate_tree(tree, "config", {})
-
-
-def validate_tree(tree: dict[str, Any], source: str, given: dict[str, str]) -> RunConfig:
-    """A config from a tree of keys whose paths are absolute.
-
-    Args:
-        tree: keys and sections.
-        source: the config's name, which opens the sentence of an error.
-        given: key -> override, for keys that were set on the command line.
-
-    Raises:
-        InputError: keys are wrong: one line that names them all.
-    """
-    try:
-        return RunConfig.model_validate(tree)
-    except ValidationError as error:
-        raise InputError(explain(error, RunConfig, source, given)) from None
+    return config_from_keys(RunConfig, keys)
 
 
 def dump_config(config: RunConfig) -> str:

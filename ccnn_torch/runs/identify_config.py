@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from ccnn_torch._table import nearest
-from ccnn_torch.errors import InputError
-from ccnn_torch.runs._keys import explain, list_keys
-from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
-from ccnn_torch.runs._yaml import dump_yaml, read_yaml
+from ccnn_torch.runs._config_tree import Names, Section, config_from_file, config_from_keys
+from ccnn_torch.runs._keys import list_keys
+from ccnn_torch.runs._yaml import dump_yaml
 
 __all__ = [
     "IDENTIFY_METHODS",
@@ -38,21 +37,11 @@ IDENTIFY_METHODS = ("lm", "hga", "tikhonov", "ga", "sa", "pso")
 PER_LEG = "_per_leg"
 
 
-def _listed(value: Any) -> Any:
-    """A single name, or several with commas as a shell would have them, as a list."""
-    return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
-
-
-Names = Annotated[list[str], BeforeValidator(_listed)]
 Size = float | str
 """A number in SI, or a text of number and unit, such as `0.4 mm` or `0.03 deg`."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class ParameterConfig(_Part):
+class ParameterConfig(Section):
     """Which parameters are identified, by name or pattern (`A*`, `leg1.*`)."""
 
     free: Names | None = Field(default=None, description="parameters to identify, names or patterns; null = all")
@@ -65,14 +54,14 @@ class ParameterConfig(_Part):
     )
 
 
-class FrameConfig(_Part):
+class FrameConfig(Section):
     """Whether the measuring frame and the tool frame are unknown, too (parallel mechanisms)."""
 
     base: bool = Field(default=False, description="identify where the mechanism stands in the measuring frame")
     tool: bool = Field(default=False, description="identify where the measured target sits on the platform")
 
 
-class ConstraintConfig(_Part):
+class ConstraintConfig(Section):
     """What holds the tool instead of a measuring device; see `ccnn_torch.identification.constraints`."""
 
     kind: Literal["sockets", "distances", "plane"] = Field(
@@ -100,7 +89,7 @@ class ConstraintConfig(_Part):
     )
 
 
-class HeldOutConfig(_Part):
+class HeldOutConfig(Section):
     """Which measured rows are held out; see `ccnn_torch.splits`."""
 
     kind: Literal["random", "group", "block"] = Field(default="random", description="random, group or block")
@@ -110,7 +99,7 @@ class HeldOutConfig(_Part):
     test: float = Field(default=0.3, gt=0, lt=1, description="share of the rows (group: of the groups) held out")
 
 
-class SimulateConfig(_Part):
+class SimulateConfig(Section):
     """Simulated machines, each with errors of its own, measured with noise."""
 
     machines: int = Field(default=1, ge=1, description="machines, side by side; machine k has seed + k")
@@ -161,7 +150,7 @@ class SimulateConfig(_Part):
     map: int = Field(default=0, ge=0, description="points across a map of the pose error over the workspace; 0 = none")
 
 
-class IdentifyConfig(_Part):
+class IdentifyConfig(Section):
     """An identification: mechanism, data, parameters, methods."""
 
     name: str = Field(
@@ -309,12 +298,7 @@ def load_identify_config(path: str | Path, overrides: Iterable[str] = ()) -> Ide
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
-    path = Path(path)
-    tree = read_yaml(path)
-    tree.setdefault("name", path.stem)
-    resolve_paths(tree, path.absolute().parent)
-    given = apply_overrides(tree, overrides, Path.cwd())
-    return _validated(tree, str(path), given)
+    return config_from_file(IdentifyConfig, path, overrides)
 
 
 def make_identify_config(**keys: Any) -> IdentifyConfig:
@@ -323,16 +307,7 @@ def make_identify_config(**keys: Any) -> IdentifyConfig:
     Raises:
         InputError: keys are wrong: one line that names them all.
     """
-    tree = dict(keys)
-    resolve_paths(tree, Path.cwd())
-    return _validated(tree, "config", {})
-
-
-def _validated(tree: dict[str, Any], source: str, given: dict[str, str]) -> IdentifyConfig:
-    try:
-        return IdentifyConfig.model_validate(tree)
-    except ValidationError as error:
-        raise InputError(explain(error, IdentifyConfig, source, given)) from None
+    return config_from_keys(IdentifyConfig, keys)
 
 
 def dump_identify_config(config: IdentifyConfig) -> str:

@@ -12,7 +12,7 @@ from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.reach import reach_block
-from ccnn_torch.report.run_report import write_report, write_tables
+from ccnn_torch.report.tables import write_tables
 from ccnn_torch.runs.calibrate import Calibration
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.watch import genome
@@ -32,6 +32,9 @@ def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
     for method, history in curves.items():
         save_history(path, method, history)
     if calibration.config.save_report:
+        # Loads matplotlib, which a run without pictures does not wait for.
+        from ccnn_torch.report.run_report import write_report
+
         write_report(path, results)
     else:
         write_tables(path, results)

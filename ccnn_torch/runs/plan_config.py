@@ -6,29 +6,20 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import Field
 
-from ccnn_torch.errors import InputError
-from ccnn_torch.runs._keys import explain, list_keys
+from ccnn_torch.runs._config_tree import Names, Section, validated
+from ccnn_torch.runs._keys import list_keys
 from ccnn_torch.runs._overrides import apply_overrides
 from ccnn_torch.runs._yaml import read_yaml
 
 __all__ = ["PlanConfig", "describe_plan_keys", "load_plan_config"]
 
 
-def _listed(value: Any) -> Any:
-    return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
-
-
-Names = Annotated[list[str], BeforeValidator(_listed)]
 Positive = Annotated[float, Field(gt=0)]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class PlannedParameters(_Part):
+class PlannedParameters(Section):
     """Which parameters are to be identified, by name or pattern (`A*`, `leg1.*`)."""
 
     free: Names | None = Field(default=None, description="parameters to identify, names or patterns; null = all")
@@ -39,7 +30,7 @@ class PlannedParameters(_Part):
     )
 
 
-class PlanConfig(_Part):
+class PlanConfig(Section):
     """What `ccnn plan` may be told."""
 
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
@@ -91,10 +82,8 @@ def load_plan_config(path: Path | None, overrides: Iterable[str] = ()) -> PlanCo
     """
     tree = {} if path is None else read_yaml(path)
     given = apply_overrides(tree, overrides, Path.cwd())
-    try:
-        return PlanConfig.model_validate({key: value for key, value in tree.items() if value is not None})
-    except ValidationError as error:
-        raise InputError(explain(error, PlanConfig, str(path or "config"), given)) from None
+    filled = {key: value for key, value in tree.items() if value is not None}
+    return validated(PlanConfig, filled, str(path or "config"), given)
 
 
 def describe_plan_keys() -> list[tuple[str, str, str]]:

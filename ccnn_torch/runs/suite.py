@@ -9,17 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.suite import compare, write_suite
 from ccnn_torch.report.suite_tables import case_line, print_suite
-from ccnn_torch.runs._keys import explain
+from ccnn_torch.runs._config_tree import validated
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
 from ccnn_torch.runs._yaml import read_yaml
 from ccnn_torch.runs.calibrate import makers
-from ccnn_torch.runs.config import RunConfig, load_config, validate_tree
+from ccnn_torch.runs.config import RunConfig, load_config
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.runner import resume_run, start_run
 from ccnn_torch.runs.screen import note, stdout
@@ -78,10 +78,7 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
     overrides = list(overrides)
     own = [text for text in overrides if text.partition("=")[0].strip() in _OWN]
     given = apply_overrides(tree, own, Path.cwd())
-    try:
-        file = _File.model_validate(tree)
-    except ValidationError as error:
-        raise InputError(explain(error, _File, str(path), given)) from None
+    file = validated(_File, tree, str(path), given)
     out = Path(file.out) if file.out else Path("runs") / file.name
     others = [text for text in overrides if text not in own]
     cases: dict[str, RunConfig] = {}
@@ -90,7 +87,7 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
         case = _merged(_DEFAULTS, _merged(file.base, keys)) | {"name": name}
         resolve_paths(case, path.absolute().parent)
         changed = apply_overrides(case, others, Path.cwd())
-        cases[name] = validate_tree(case | {"out": str(out / name)}, f"{path}, case '{name}'", changed)
+        cases[name] = validated(RunConfig, case | {"out": str(out / name)}, f"{path}, case '{name}'", changed)
     return Suite(file.name, out, cases)
 
 

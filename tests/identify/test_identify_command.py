@@ -2,14 +2,13 @@
 
 import json
 import shutil
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import jsonschema
 import pytest
 import torch
 
-from ccnn_torch.cli import main
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.mechanisms import load_mechanism
@@ -130,13 +129,11 @@ def test_what_cannot_be_reached_comes_back_as_it_was(folder: Path) -> None:
 
 
 def test_the_command_line(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Callable[..., tuple[int, str, str]]
 ) -> None:
     def ccnn(*words: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["ccnn", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return int(ended.value.code or 0), capsys.readouterr().err
+        code, _, told = cli(*words)
+        return code, told
 
     monkeypatch.chdir(tmp_path)
     poses = load_mechanism("five_bar").sample_workspace(9, torch.Generator().manual_seed(2)) * 0.3

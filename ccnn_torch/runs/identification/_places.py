@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from scipy.stats import qmc
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
@@ -101,6 +100,9 @@ class Places:
 
     def even(self, count: int) -> Tensor:
         """Places of low discrepancy, `count x .`: a Halton sequence in the box, without what is out of reach."""
+        # Only here: scipy.stats takes half a second to load.
+        from scipy.stats import qmc
+
         sequence = qmc.Halton(len(self.low), scramble=False)
         sequence.fast_forward(1)  # its first point is a corner
         return self._filled(count, lambda number: torch.from_numpy(sequence.random(number)))

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from torch import Tensor
 
 from ccnn_torch.runs.machines._structure import Structure
@@ -165,6 +164,9 @@ def draw_climate(seeds: list[int], rows: int, drives: int) -> Climate:
 
 def _follow(hall: Array, lag: float, start: float) -> Array:
     """Temperature of a body of one heat capacity behind that of its surroundings: T' = (hall - T) / lag."""
+    # Only here: scipy.signal takes a quarter of a second to load, which no other run should pay.
+    from scipy.signal import lfilter
+
     keep = np.exp(-_GRID / lag)
     followed, _ = lfilter([1 - keep], [1.0, -keep], hall, zi=[keep * start])
     return np.asarray(followed, dtype=np.float64)

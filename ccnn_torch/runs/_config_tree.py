@@ -1,0 +1,75 @@
+"""What the configs of runs, identifications, plans and suites share: from a tree of keys to one that is checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.runs._keys import explain
+from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
+from ccnn_torch.runs._yaml import read_yaml
+
+__all__ = ["Names", "Section", "config_from_file", "config_from_keys", "validated"]
+
+Config = TypeVar("Config", bound=BaseModel)
+
+
+def _listed(value: Any) -> Any:
+    """A single name, or several with commas as a shell would have them, as a list."""
+    return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+
+
+Names = Annotated[list[str], BeforeValidator(_listed)]
+
+
+class Section(BaseModel):
+    """Keys that are all known, with values that do not change and are finite."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def config_from_file(model: type[Config], path: str | Path, overrides: Iterable[str]) -> Config:
+    """Read a config file and put overrides ``key.sub=value`` over it; its name is the file's unless it has one.
+
+    Raises:
+        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
+    """
+    path = Path(path)
+    tree = read_yaml(path)
+    tree.setdefault("name", path.stem)
+    resolve_paths(tree, path.absolute().parent)
+    given = apply_overrides(tree, overrides, Path.cwd())
+    return validated(model, tree, str(path), given)
+
+
+def config_from_keys(model: type[Config], keys: Mapping[str, Any]) -> Config:
+    """A config from keys; relative paths start from the current folder.
+
+    Raises:
+        InputError: keys are wrong: one line that names them all.
+    """
+    tree = dict(keys)
+    resolve_paths(tree, Path.cwd())
+    return validated(model, tree, "config", {})
+
+
+def validated(model: type[Config], tree: Mapping[str, Any], source: str, given: Mapping[str, str]) -> Config:
+    """A config from a tree of keys whose paths are absolute.
+
+    Args:
+        model: what it is to be.
+        tree: keys and sections.
+        source: the config's name, which opens the sentence of an error.
+        given: key -> override, for keys that were set on the command line.
+
+    Raises:
+        InputError: keys are wrong: one line that names them all.
+    """
+    try:
+        return model.model_validate(tree)
+    except ValidationError as error:
+        raise InputError(explain(error, model, source, given)) from None
