@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 from pathlib import Path
 
 import pytest
@@ -60,6 +61,33 @@ def test_a_stopped_training_goes_on_to_the_same_tensors(tmp_path: Path, stop: in
     # Once more from the last checkpoint: nothing is left to do, and nothing changes.
     done = Descent()
     same(expected, (done, train(done, data, checkpoint=path, every=7)))
+
+
+class Writer:
+    """Is interrupted in the middle of writing a step."""
+
+    def __init__(self) -> None:
+        self.written: list[str] = []
+
+    def on_start(self, learner: Learner, data: TrainingData, step: int) -> None:
+        self.written.append("start")
+
+    def on_step(self, step: int, metrics: dict[str, Tensor]) -> None:
+        self.written.append(f"begin {step}")
+        if step == 2:
+            signal.raise_signal(signal.SIGINT)
+        self.written.append(f"end {step}")
+
+    def on_end(self) -> None:
+        self.written.append("closed")
+
+
+def test_an_interrupt_waits_until_a_step_is_written() -> None:
+    writer = Writer()
+    with pytest.raises(KeyboardInterrupt):
+        train(Descent(), linear_data(), callbacks=[writer])
+    assert writer.written == ["start", "begin 1", "end 1", "begin 2", "end 2", "closed"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_the_first_checkpoint_is_written_before_the_first_step(tmp_path: Path) -> None:

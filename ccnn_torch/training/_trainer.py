@@ -16,6 +16,7 @@ from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners._protocol import Learner, TrainingData
 from ccnn_torch.training._callbacks import Callback
 from ccnn_torch.training._checkpoint import load_checkpoint, save_checkpoint
+from ccnn_torch.training._interrupt import interrupts_held_back
 
 __all__ = ["Training", "past_of", "train", "weighted_mse"]
 
@@ -94,22 +95,25 @@ def train(
         run.restore(checkpoint)
     elif checkpoint is not None:
         run.save(checkpoint)
-    for callback in callbacks:
-        callback.on_start(learner, data, run.step)
+    with interrupts_held_back():
+        for callback in callbacks:
+            callback.on_start(learner, data, run.step)
     try:
         while not run.done and (budget is None or run.seconds < budget):
             with _told(learner, f"in step {run.step + 1}"):
                 metrics = run.advance()
             metrics["seconds"] = torch.full((repeats,), run.seconds, dtype=torch.float64)
-            for callback in callbacks:
-                callback.on_step(run.step, metrics)
+            with interrupts_held_back():
+                for callback in callbacks:
+                    callback.on_step(run.step, metrics)
             del metrics["seconds"]
             run.note(metrics)
             if checkpoint is not None and run.step % every == 0:
                 run.save(checkpoint)
     finally:
-        for callback in callbacks:
-            callback.on_end()
+        with interrupts_held_back():
+            for callback in callbacks:
+                callback.on_end()
     if checkpoint is not None:
         run.save(checkpoint)
     return run.finish()
