@@ -23,7 +23,7 @@ from ccnn_torch.identification import (
 )
 from ccnn_torch.identification.parameters import Selection, select_parameters
 from ccnn_torch.identification.solvers import get_solver
-from ccnn_torch.mechanisms import SerialArm
+from ccnn_torch.mechanisms import Framed, SerialArm
 from ccnn_torch.runs.identification._measured import Measured, Rows
 from ccnn_torch.runs.identification._sizes import size
 from ccnn_torch.runs.identify_config import PER_LEG, IdentifyConfig, base_method
@@ -167,6 +167,8 @@ def frames_first(measured: Measured, config: IdentifyConfig) -> Measured:
     """The rows with those frames fitted that no maker can know: the search and "before" begin from there."""
     if not (config.frame.base or config.frame.tool):
         return measured
+    assert isinstance(measured.mechanism, Framed)
+    closed = measured.mechanism.fitted_frames(measured.rows.joints, measured.view.frame(measured.rows.observed))
     prefixes = tuple(f"{part}_" for part, free in (("base", config.frame.base), ("tool", config.frame.tool)) if free)
     names = tuple(p.name for p in measured.mechanism.geometry if p.name.startswith(prefixes))
     choice = ParameterChoice(free=names)
@@ -178,10 +180,10 @@ def frames_first(measured: Measured, config: IdentifyConfig) -> Measured:
         pose_noise=measured.pose_noise,
         joint_noise=measured.joint_noise,
         rotation_weight=config.rotation_weight,
-        start=measured.start,
+        start=closed,
     )
     found = get_solver("lm")(problem, config.seed)
-    start = select_parameters(measured.mechanism.geometry, choice, measured.start).full(found.values)
+    start = select_parameters(measured.mechanism.geometry, choice, closed).full(found.values)
     return replace(measured, start=start, unknown_frame=names)
 
 
