@@ -92,7 +92,10 @@ def _base_by_relaxation(rotation: Tensor, position: Tensor, measured: Tensor, we
 
 
 def _weighted_linear(design: Tensor, right: Tensor, weights: Tensor) -> Tensor:
-    """Minimum-norm weighted least squares, `... x m`: design `... x s x 3 x m`, right `... x s x 3`, weights `... x s`."""
+    """Minimum-norm weighted least squares, `... x m`.
+
+    design `... x s x 3 x m`, right `... x s x 3`, weights `... x s`.
+    """
     m = design.shape[-1]
     normal = (weights[..., None, :] @ (design.mT @ design).flatten(-2))[..., 0, :]
     normal = normal.reshape(*normal.shape[:-1], m, m)
