@@ -24,6 +24,8 @@ Limits = Mapping[str, tuple[float, float]]
 
 # Candidates drawn and looked at in one call.
 _AT_ONCE = 20_000
+# Configurations after which progress is told.
+_TOLD = 4000
 # Machines with plausible errors that must reach a pose, too.
 _MACHINES = 8
 # Configurations whose forward kinematics are tried on these machines in one call.
@@ -76,22 +78,35 @@ def draw_candidates(
     others = _others(mechanism, uncertainty)
     found: list[tuple[Tensor, Tensor]] = []
     there = drawn = 0
+    shown = 0.0
+
+    def tell(share: float) -> None:
+        """Of the draw at hand: as much of it is kept as of those before, for all that is known."""
+        nonlocal shown
+        kept = there / drawn if there else 1.0
+        shown = max(shown, min(1.0, (there + share * kept * min(count, _AT_ONCE)) / count))
+        if progress is not None:
+            progress(shown)
+
     for _ in range(_DRAWS):
         joints, pose = _draw(mechanism, min(count, _AT_ONCE), generator)
-        drawn += len(joints)
         values = torch.cat([joints, pose], dim=-1)
         good = (torch.isfinite(values) & (values >= bounds[:, 0]) & (values <= bounds[:, 1])).all(-1)
         joints, pose = joints[good], pose[good]
-        condition = mechanism.condition_number(joints, rotation_weight, guess=pose)
+        # By parts, so that whoever waits sees something move.
+        parts = torch.split(torch.arange(len(joints)), _TOLD)
+        condition = torch.empty(len(joints), dtype=torch.float64)
+        for number, part in enumerate(parts):
+            condition[part] = mechanism.condition_number(joints[part], rotation_weight, guess=pose[part])
+            tell(0.5 * (number + 1) / len(parts))
         order = condition.argsort(descending=True)
         order = order[condition[order] <= max_condition]
         if others is not None:
             order = _in_reach(mechanism, joints, pose, order, others)
         kept = order.sort().values
         found.append((joints[kept], pose[kept]))
-        there += len(kept)
-        if progress is not None:
-            progress(min(1.0, there / count))
+        there, drawn = there + len(kept), drawn + min(count, _AT_ONCE)
+        tell(0.0)
         if there >= count:
             joints, pose = (torch.cat(part)[:count] for part in zip(*found, strict=True))
             return Candidates(joints, pose, drawn)

@@ -141,7 +141,8 @@ def choose_poses(
     if index not in INDICES:
         near = nearest(index, INDICES)
         raise InputError(f"index: must be one of {', '.join(INDICES)}, not '{index}'" + (f"; {near}?" if near else ""))
-    rows = identification_rows(problem)
+    tell = progress or (lambda _: None)
+    rows = identification_rows(problem, _share(tell, 0.0, 0.15))
     held = torch.where(torch.isfinite(problem.prior_sd), problem.scale / problem.prior_sd, 0.0)
     seen = what_is_seen(rows, held, problem.parameters, problem.scale)
     rows, held = rows[..., seen.kept], held[seen.kept]
@@ -151,11 +152,10 @@ def choose_poses(
     prior = turn.mT @ torch.diag(held.square()) @ turn
 
     design = make_design(rows @ turn, prior if bool((held > 0).all()) else None, repeat)
-    tell = progress or (lambda _: None)
     design_share = 0.4 if index != "O1" else 0.8
     for step in range(count):
         add_best(design)
-        tell(0.2 * (step + 1) / count)
+        tell(0.15 + 0.05 * (step + 1) / count)
     design.prior = prior
     settled = exchange(design, _share(tell, 0.2, design_share))
     bound = None if bool((held > 0).any()) or index != "O1" else tightest_bound(design)
