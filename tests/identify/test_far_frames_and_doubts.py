@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import ccnn_torch
-from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.mechanisms import Framed, load_mechanism
 from ccnn_torch.records import write_table
 from ccnn_torch.runs.identification import Identification, start_identification
@@ -153,3 +153,10 @@ def test_a_table_has_one_unit_for_each_kind(tmp_path: Path) -> None:
     text = (tmp_path / "out" / "identified.md").read_text()
     assert "base_x [mm]" in text and "l1 [mm]" in text and "µm]" not in text
     assert "e+0" not in text.partition("Held-out")[0]
+
+
+def test_too_few_rows_speak_of_parameters_and_not_of_a_linear_fit(tmp_path: Path) -> None:
+    path = records(tmp_path / "few.csv", "five_bar", count=5)
+    with pytest.raises(InputError, match=r"cannot determine 12 free parameters; measure at least") as said:
+        identified(path, mechanism="five_bar", frame={"base": True}, parameters=FIVE_BAR_FREE)
+    assert "linear" not in str(said.value)

@@ -24,7 +24,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism) -> Measured:
         InputError: the records cannot be used, or the arm has frames per group of rows, which are no geometry.
     """
     assert config.records is not None
-    records = load_records(config.records, mechanism, [])
+    records = load_records(config.records, mechanism, [], learns=False)
     if isinstance(mechanism, SerialArm):
         if mechanism.frame_per or mechanism.tool_per:
             raise InputError(
