@@ -16,7 +16,8 @@ class ModelFileError(InputError):
 
 
 class MethodFailedError(CcnnError):
-    """A learner could not be trained on this data; a run notes the sentence in its results and goes on."""
+    """A learner could not be trained on this data; a run notes the sentence in its results and goes on. Or the first
+    method of an identification did not converge: its files are there, and the command exits with 2."""
 
 
 class OutsideDomainWarning(UserWarning):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib.util
 import inspect
@@ -12,12 +13,26 @@ from typing import Any
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["is_plugin", "load_plugin"]
+__all__ = ["class_hint", "is_plugin", "load_plugin"]
 
 
 def is_plugin(spec: str) -> bool:
     """Whether a name in a config means a class in a Python file."""
     return ".py:" in spec
+
+
+def class_hint(file: str) -> str:
+    """What to write for a Python file that was named without a class; the file is read, not run."""
+    try:
+        tree = ast.parse(Path(file).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError):
+        return f"{file}: there is no such file; write path/to/file.py:Name"
+    except SyntaxError as error:
+        return f"{file} line {error.lineno} is no valid Python: {error.msg}"
+    names = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    if not names:
+        return f"{file}: names no class, and has none; write path/to/file.py:Name"
+    return f"{file}: names no class; write {' or '.join(f'{file}:{name}' for name in names)}"
 
 
 def load_plugin(spec: str) -> Callable[..., Any]:

@@ -116,7 +116,9 @@ class Records:
         return name_lines(self.lines, rows)
 
 
-def load_records(path: str | Path, mechanism: HasCoordinates, covariates: Sequence[str] | None = None) -> Records:
+def load_records(
+    path: str | Path, mechanism: HasCoordinates, covariates: Sequence[str] | None = None, learns: bool = True
+) -> Records:
     """Load records for a mechanism.
 
     Joint and pose columns are named as the mechanism names them. A serial arm (one that lists `orientations`) may have
@@ -124,6 +126,10 @@ def load_records(path: str | Path, mechanism: HasCoordinates, covariates: Sequen
     both, the rotation vector counts. The covariates are by default the columns `time`, `temperature`, `load_*`,
     `direction*` and `speed*` that are there; `covariates` replaces this choice by names or patterns ([] = none). A
     constant covariate is dropped with a note.
+
+    Args:
+        learns: whether a learner is trained on the rows: fewer than a linear fit of the inputs needs, twice, are then
+            refused. How many an identification needs, its number of parameters tells.
 
     Raises:
         InputError: a column is missing, stands twice, or has no unit or one of a wrong dimension; a cell is not a
@@ -134,7 +140,8 @@ def load_records(path: str | Path, mechanism: HasCoordinates, covariates: Sequen
     pose, coordinates, orientation = read_pose(table, mechanism)
     measured = (*coordinates, *(Coordinate(name, "1") for name in _QUATERNION if orientation is not None))
     chosen, notes = choose_covariates(table, mechanism.joints, measured, covariates)
-    _check_enough(table, len(mechanism.joints) + len(chosen))
+    if learns:
+        _check_enough(table, len(mechanism.joints) + len(chosen))
     still = [joint.name for k, joint in enumerate(mechanism.joints) if np.ptp(joints[:, k]) == 0]
     if len(still) == len(mechanism.joints) and not chosen:
         raise InputError(

@@ -211,7 +211,8 @@ def _cell(by: str) -> float:
     match = re.fullmatch(r"position:\s*(\d+\.?\d*|\.\d+)\s*(\D+)", by)
     if match is None or float(match[1]) == 0:
         raise InputError(f"split.by: '{by}' is not of the form position:LENGTH; write e.g. {DEFAULT_BY}")
-    return float(to_si(float(match[1]), match[2].strip(), "m", f"split.by: the length in '{by}'", "position"))
+    where, hint = f"split.by: the length in '{by}'", f"write e.g. {DEFAULT_BY}"
+    return float(to_si(float(match[1]), match[2].strip(), "m", where, hint=hint))
 
 
 def _matching(entry: str, columns: Mapping[str, Column]) -> list[str]:

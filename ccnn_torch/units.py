@@ -124,7 +124,7 @@ def si_unit_of(unit: str, where: str = "") -> str:
 
 
 def to_si(
-    values: ArrayLike, unit: str, si_unit: str | None = None, where: str = "", name: str = ""
+    values: ArrayLike, unit: str, si_unit: str | None = None, where: str = "", name: str = "", hint: str = ""
 ) -> NDArray[np.float64]:
     """Convert values in `unit` to SI; absolute temperatures by their offset, not by a factor.
 
@@ -134,6 +134,7 @@ def to_si(
         si_unit: the SI unit that is wanted, or None for whatever `unit` leads to.
         where: opens the sentence of an error, e.g. ``records.csv: column 'q1'``.
         name: the column's name, for the remedy.
+        hint: the remedy itself where the values stand in no column.
 
     Raises:
         InputError: unknown unit, or one of another dimension (an angle and a plain number differ).
@@ -145,7 +146,7 @@ def to_si(
     if si_unit is not None and _lookup(unit).base != _lookup(si_unit).base:
         kind = f", {_KINDS[found]}," if found in _KINDS else ""
         wanted = _KINDS.get(si_unit, f"in {si_unit}")
-        raise InputError(f"{where} is in '{unit}'{kind} but must be {wanted}; {write_hint(name, si_unit)}")
+        raise InputError(f"{where} is in '{unit}'{kind} but must be {wanted}; {hint or write_hint(name, si_unit)}")
     return np.asarray(_registry().Quantity(array, _lookup(unit).pint_name).to_base_units().magnitude, dtype=np.float64)
 
 

@@ -53,7 +53,10 @@ def test_help_has_examples_and_names_every_command(cli: Cli) -> None:
         assert command in out
         code, text, _ = cli(command, "--help")
         assert code == 0
-        assert "xample" in text and f"ccnn {command}" in text, command
+        assert text.count("xample") and f"ccnn {command}" in text, command
+        # typer shows the whole docstring by itself.
+        lines = [line for line in text.splitlines() if line.strip().startswith(f"ccnn {command} ")]
+        assert len(lines) == len(set(lines)) and text.count("Examples:") <= 1, command
 
 
 def test_module_and_version() -> None:
@@ -242,3 +245,38 @@ def test_all_methods_name_those_that_failed(cli: Cli, tmp_path: Path, monkeypatc
     assert set(methods) == {"ccnn", "bp_lm", "grnn", "enn", "constant", "gp"}
     assert methods["gp"] == {"test": None, "failed": "this version has no learner 'gp'"}
     assert methods["ccnn"]["test"] is not None
+
+
+@pytest.mark.parametrize(
+    ("command", "text", "other"),
+    [
+        ("run", "mechanism: five_bar\nrecords: rows.csv\nnoise: 1e-4\n", "identify"),
+        ("identify", "mechanism: five_bar\nrecords: rows.csv\ntraining: {folds: 3}\n", "run"),
+        ("suite", "mechanism: five_bar\nsimulate: {poses: 20}\n", "identify"),
+        ("identify", "base: {case: tripod}\ncases: [{name: a}]\n", "suite"),
+        ("run", "candidates: 200\nlimits: {x: [0, 1]}\n", "plan --config"),
+    ],
+)
+def test_a_config_of_another_command_is_known(cli: Cli, tmp_path: Path, command: str, text: str, other: str) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    code, _, err = cli(command, path)
+    assert code == 2 and err.strip() == f"{path}: this looks like a config for `ccnn {other}`"
+
+
+def test_a_python_file_without_a_class_is_told_its_classes(cli: Cli, tmp_path: Path) -> None:
+    path, none, broken = (tmp_path / name for name in ("arm.py", "none.py", "broken.py"))
+    path.write_text("raise SystemExit\nclass Arm: ...\nclass Other: ...\n")
+    none.write_text("x = 1\n")
+    broken.write_text("def f(:\n")
+    out = ("--poses", "8", "--out", tmp_path / "p.csv")
+    for file, sentence in (
+        (path, f"{path}: names no class; write {path}:Arm or {path}:Other"),
+        (none, f"{none}: names no class, and has none; write path/to/file.py:Name"),
+        (broken, f"{broken} line 1 is no valid Python: "),
+        (tmp_path / "lost.py", f"{tmp_path / 'lost.py'}: there is no such file"),
+    ):
+        code, _, err = cli("plan", "--mechanism", file, *out)
+        assert code == 2 and err.startswith(sentence)
+    code, _, err = cli("plan", "--mechanism", "xyzzy", *out)
+    assert code == 2 and "framed. Otherwise give" in err

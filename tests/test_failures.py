@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.report.json_files import load_schema, plain
 from ccnn_torch.report.tables import failures, markdown_text
 from ccnn_torch.runs import calibrate
+from ccnn_torch.runs.runner import start_run
 
 LEARNERS = '''
 import torch
@@ -101,3 +103,47 @@ def test_what_did_not_converge_is_marked_in_the_tables(file: Path) -> None:
     assert results["methods"]["constant"]["converged"] is None
     text = markdown_text(results)
     assert "| Descending (2 of 3 repeats not converged) |" in text and "| constant |" in text
+
+
+STEEP = '''
+import torch
+from ccnn_torch.learners.constant import Constant
+
+
+class Steep(Constant):
+    """Has the constant's score and a network that no command can be solved for."""
+
+    def network(self, repeat):
+        return Waves(super().network(repeat))
+
+
+class Waves(torch.nn.Module):
+    def __init__(self, level):
+        super().__init__()
+        self.level = level
+
+    def forward(self, inputs):
+        return self.level(inputs) + 100 * torch.sin(1e3 * inputs[..., :1])
+'''
+
+
+def test_model_files_are_those_of_the_best_method_that_has_some(tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(STEEP)
+    config = short(methods=[f"{path}:Steep", "constant"], out=str(tmp_path / "run"), save_models=True, save_report=True)
+    folder = start_run(config, quiet=True).path
+    results = json.loads((folder / "results.json").read_text())
+    jsonschema.validate(results, load_schema("results"))
+    assert results["best_method"] == "Steep" and results["model"]["method"] == "constant"
+    assert {"model.safetensors", "model.onnx", "model.pt2", "card.json"} <= {p.name for p in folder.iterdir()}
+    assert json.loads((folder / "card.json").read_text())["method"] == "constant"
+    sentence = "The model files model.* and card.json are of constant, not of Steep: the learned deviation changes by"
+    assert (folder / "results.md").read_text().split("\n\n")[2].startswith(sentence)
+    page = (folder / "report.html").read_text()
+    assert page.index(sentence) < page.index("<table>")
+
+
+def test_no_method_with_a_model_file_is_said() -> None:
+    model = {"method": None, "without": {"gp": "too steep", "ccnn": "not finite"}}
+    said = failures({"best_method": "gp", "methods": {}, "model": model})
+    assert said == ["No model file of gp: too steep.", "No model file of ccnn: not finite."]

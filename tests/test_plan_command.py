@@ -66,10 +66,16 @@ def test_the_config_says_what_is_free_and_where_poses_may_be(cli: Cli, tmp_path:
         (("--poses", "5"), "5 poses of 2 equations cannot determine 12 parameters; plan at least 6"),
         (("--poses", "0"), "--poses: plan at least 1 pose, not 0"),
         (("--poses", "8", "index=D"), "index: must be 'O1', 'O2', 'O3', 'O4' or 'O5', not D"),
-        (("--poses", "8", "noise={x: 1e-4}"), "noise: gives no standard deviation of y"),
-        (("--poses", "8", "joint_noise={p1: 1e-4}"), "joint_noise.p1: there is no such coordinate"),
+        (("--poses", "8", "noise={x: 1e-4}"), "noise: gives no size of y"),
+        (("--poses", "8", "joint_noise={p1: 1e-4}"), "joint_noise.p1: there is no such name"),
         (("--poses", "8", "limits={z: [0, 1]}"), "has no joint or pose coordinate 'z'"),
         (("--poses", "8", "parameters.free=[B1x]"), "B1x"),
+        (("--poses", "8", "noise='0.1 deg'"), "noise is in 'deg', an angle, but must be a length; write e.g. 0.4 mm"),
+        (("--poses", "8", "noise=0"), "noise: a standard deviation is above 0"),
+        (("--poses", "8", "joint_noise=-1"), "joint_noise: a standard deviation is not negative"),
+        (("--poses", "8", "limits={x: [0, 1 rad]}"), "limits.x is in 'rad', an angle, but must be a length"),
+        (("--poses", "8", "parameters.prior={l1: 0.5 deg}"), "parameters.prior.l1 is in 'deg', an angle, but must be"),
+        (("--poses", "8", "parameters.prior={'*': 0.5 mm}"), "is in 'mm', a length, but must be a number without unit"),
         (("--poses", "eight"), "unable to parse string as an integer"),
     ],
 )
@@ -110,3 +116,28 @@ def test_the_page_on_planning_lists_every_key_as_it_is() -> None:
     page = (Path(__file__).parent.parent / "docs" / "planning.md").read_text()
     for key, default, description in describe_plan_keys():
         assert f"| `{key}` | `{default}` | {description} |" in page
+
+
+def test_sizes_may_have_units_as_in_identify(cli: Cli, tmp_path: Path) -> None:
+    words = ("plan", "--mechanism", "five_bar", "--poses", 8, "--quiet", "candidates=300")
+    plain = ("noise=1e-4", "joint_noise=1e-5", "limits={x: [-0.2, 0.3]}", "parameters.prior={l1: 5e-4}")
+    sized = (
+        "noise='0.1 mm'",
+        "joint_noise='0.01 mrad'",
+        "limits={x: [-200 mm, 30 cm]}",
+        "parameters.prior={l1: 0.5 mm}",
+    )
+    for name, keys in (("a.csv", plain), ("b.csv", sized)):
+        assert cli(*words, "--out", tmp_path / name, *keys) == (0, "", "")
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+
+
+def test_an_arm_is_planned_for_what_poses_can_tell(cli: Cli, tmp_path: Path) -> None:
+    """Base against first joint, parallel axes, tool against last joint: all are left out in one go, and said."""
+    arm = Path(__file__).parents[1] / "experiments" / "data" / "ur10.yaml"
+    out = tmp_path / "p.csv"
+    code, told, _ = cli("plan", "--mechanism", arm, "--poses", 12, "--out", out, "candidates=300")
+    assert code == 0
+    for text in (told.replace("\n", " "), out.with_suffix(".md").read_text()):
+        assert "No pose tells apart: base_z and d1 only as 1.00 base_z + 1.00 d1;" in text
+        assert "theta6 and tool_rz only as" in text

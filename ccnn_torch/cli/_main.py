@@ -45,7 +45,7 @@ def _common(
 
 
 for _command in (run, suite, identify, compensate, plan, picture, keys):
-    app.command(epilog=(_command.__doc__ or "").partition("\n\n")[2])(_command)
+    app.command()(_command)
 
 
 def main() -> None:

@@ -64,6 +64,9 @@ def compensate(
         raise InputError("--pose and --back exclude each other: --pose takes wanted poses, --back takes commands")
     if sd and back:
         raise InputError("--sd and --back exclude each other: --sd tells how sure a command is, --back takes commands")
+    for file, what in ((input, "IN.csv"), (model, "the model")):
+        if output.resolve() == file.resolve():
+            raise InputError(f"{output}: OUT.csv is {what} itself, which would be overwritten; name another file")
     from ccnn_torch.compensation import load_compensation
     from ccnn_torch.records import read_table, stack_columns, write_table
 
@@ -92,6 +95,12 @@ def compensate(
     write_table(output, kept | added)
     if not quiet:
         _tell(output, inside, trained=bool(loaded.covariates) or "deviation_sd" in found)
+        if pose and _chooses_branch(loaded, table):
+            typer.echo(
+                "An arm takes a pose on several branches (elbow, wrist): these are the joints nearest to those of the "
+                "row before, and may be on another branch than meant; give "
+                f"{_guess_headers(loaded)} near the joints wanted."
+            )
 
 
 def _joints(loaded: Model, table: Table, back: bool) -> tuple[Array, dict[str, str]]:
@@ -155,6 +164,19 @@ def _joints_of_poses(loaded: Model, table: Table) -> Array:
             f"correct or remove it, or give guess_q1[{mechanism.joints[0].unit}]… near the solution"
         )
     return joints.detach().numpy()
+
+
+def _chooses_branch(loaded: Model, table: Table) -> bool:
+    """Whether joints of poses were found without a word on their branch, where there are several."""
+    from ccnn_torch.mechanisms import mechanism_from_description
+
+    arm = bool(mechanism_from_description(loaded.facts["mechanism"]).orientations)
+    return arm and not any(f"guess_{c.name}" in table for c in loaded.joints)
+
+
+def _guess_headers(loaded: Model) -> str:
+    first, last = loaded.joints[0], loaded.joints[-1]
+    return f"guess_{first.header} to guess_{last.header}"
 
 
 def _follow(mechanism: Mechanism, poses: Tensor, guess: Tensor) -> Tensor:

@@ -24,14 +24,13 @@ def plan(
     OUT.csv has a row for each pose: the joints to command, q1[unit]…, and the pose at which they bring the nominal
     machine, in the order of their worth. The page beside it tells what each further pose would give. Keys:
     mechanism_keys, parameters.free, .fixed, .tied, .prior, residual, noise, joint_noise, index, candidates, limits,
-    max_condition, rotation_weight, per_leg, repeat,
-    least_gain, margin, seed.
+    max_condition, rotation_weight, per_leg, repeat, least_gain, margin, seed. Sizes are in SI, or texts with a unit.
 
     Examples:
 
     ccnn plan --mechanism five_bar --poses 36 --out poses.csv
 
-    ccnn plan --mechanism five_bar --poses 18 --out poses.csv per_leg=true noise=1e-4
+    ccnn plan --mechanism five_bar --poses 18 --out poses.csv per_leg=true noise='0.1 mm'
 
     ccnn plan --mechanism my_arm.yaml --poses 40 --out poses.csv 'limits={z: [0.2, 0.8]}' parameters.fixed=[base_*]
 
@@ -39,7 +38,7 @@ def plan(
     """
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from ccnn_torch.report.plan import gain_table, parameter_table, plan_sentence
+    from ccnn_torch.report.plan import gain_table, left_out_sentence, parameter_table, plan_sentence
     from ccnn_torch.report.table_form import print_table
     from ccnn_torch.runs.plan_config import load_plan_config
     from ccnn_torch.runs.planning import make_plan, write_plan
@@ -56,5 +55,7 @@ def plan(
     for part in plans:
         print_table(parameter_table(part), stdout)
         print_table(gain_table(part, short=True), stdout)
+        if said := left_out_sentence(part):
+            typer.echo(said)
         typer.echo(plan_sentence(part, wanted.least_gain))
     typer.echo(f"Written: {', '.join(str(file) for file in files)}")

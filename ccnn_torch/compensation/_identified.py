@@ -25,6 +25,7 @@ _CLOSE = 1e-8
 # How far joints may be from those that the inverse kinematics give for their pose [SI].
 _SAME = 1e-6
 _FORMS = (".yaml", ".yml", ".json")
+MODEL_FORMS = (".safetensors", ".onnx", ".pt2")
 
 
 class IdentifiedGeometry:
@@ -90,7 +91,10 @@ def load_geometry(path: str | Path) -> IdentifiedGeometry:
     """
     path = Path(path)
     source = path.with_suffix(".yaml") if path.suffix == ".json" else path
-    file = read_mechanism_file(str(source))
+    try:
+        file = read_mechanism_file(str(source))
+    except InputError as reason:
+        raise ModelFileError(f"{reason}; {path} is no model file: give identified.yaml or model.safetensors") from None
     if file is None:
         raise ModelFileError(
             f"{path}: there is no identified machine; give the identified.yaml that ccnn identify writes, which holds "
@@ -106,9 +110,14 @@ def load_compensation(path: str | Path) -> LoadedModel | IdentifiedGeometry:
     """A model file (.safetensors, .onnx, .pt2) or an identified machine (.yaml, .json), by what the name ends in.
 
     Raises:
-        ModelFileError: see `load_model` and `load_geometry`.
+        ModelFileError: it is no model file; see `load_model` and `load_geometry`.
     """
-    return load_geometry(path) if Path(path).suffix.lower() in _FORMS else load_model(path)
+    suffix = Path(path).suffix.lower()
+    if suffix not in (*_FORMS, *MODEL_FORMS) and Path(path).is_file():
+        raise ModelFileError(
+            f"{path}: is no model file; one ends in {', '.join(MODEL_FORMS)}, or is an identified.yaml"
+        )
+    return load_geometry(path) if suffix in _FORMS else load_model(path)
 
 
 @torch.no_grad()

@@ -197,7 +197,8 @@ def _card_of(path: Path, digest: str) -> dict[str, Any]:
     present = [name for name in names if name.is_file()]
     if not present:
         raise ModelFileError(
-            f"{path}: there is no card.json beside it to vouch for it; copy the card from the folder it was written to"
+            f"{path}: there is no card.json beside it to vouch for it; copy the card from the folder it was written "
+            "to, or name a model file"
         )
     for name in present:
         try:

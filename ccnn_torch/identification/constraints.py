@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
+from ccnn_torch.identification._rows import check_finite
 from ccnn_torch.identification.checks import check_equations
 from ccnn_torch.identification.parameters import ParameterChoice, Selection, select_parameters
 from ccnn_torch.identification.problem import Channel, Problem
@@ -67,14 +68,15 @@ def socket_problem(
         `plateP_x`, `_y`, `_z` and its turns away from the start `plateP_turn1` ….
 
     Raises:
-        InputError: shapes do not fit, a tolerance without noise, or fewer equations than parameters.
+        InputError: shapes do not fit, joints that have no pose, a tolerance without noise, or fewer equations than
+            parameters.
     """
     machine = _machine(mechanism, joints, weights, choice, start, noise)
     group, labels = _groups(placement, joints, "placement")
     if points.shape != (len(joints), 3):
         raise InputError(f"points must be one place on the plate for each of {len(joints)} rows, got {points.shape}")
     used = (machine.weights > 0).any(0)
-    there = tool_points(mechanism, joints, machine.start)
+    there = _seen(mechanism, joints, machine.start)
     distinct = torch.unique(points, dim=0)
     extent = float(torch.cdist(distinct, distinct).max())
     unknown, turned, turns = [], torch.zeros_like(points), torch.zeros(len(joints), 9, dtype=torch.float64)
@@ -136,7 +138,7 @@ def distance_problem(
     machine = _machine(mechanism, joints, weights, choice, start, noise)
     group, labels = _groups(anchor, joints, "anchor")
     used = (machine.weights > 0).any(0)
-    there = tool_points(mechanism, joints, machine.start)
+    there = _seen(mechanism, joints, machine.start)
     unknown: list[_Unknown] = []
     for g, label in enumerate(labels):
         mine = (group == g) & used
@@ -185,7 +187,7 @@ def plane_problem(
     machine = _machine(mechanism, joints, weights, choice, start, noise)
     group, labels = _groups(plane, joints, "plane")
     used = (machine.weights > 0).any(0)
-    there = tool_points(mechanism, joints, machine.start)
+    there = _seen(mechanism, joints, machine.start)
     reading = torch.zeros(len(joints), dtype=torch.float64) if reading is None else reading
     unknown: list[_Unknown] = []
     normals = torch.zeros(len(joints), 9, dtype=torch.float64)
@@ -304,6 +306,14 @@ def _machine(
         choice = ParameterChoice(fixed=fixed)
     rows = torch.ones(len(joints), dtype=torch.float64) if weights is None else weights
     return _Machine(select_parameters(mechanism.geometry, choice, begin), begin, rows.reshape(-1, len(joints)), noise)
+
+
+def _seen(mechanism: Mechanism, joints: Tensor, start: Tensor) -> Tensor:
+    """Where the machine that the search begins with has its tool, `s x 3` [m]; refuses joints that have no pose."""
+    points = tool_points(mechanism, joints, start)
+    used = torch.ones(1, len(joints), dtype=torch.bool)
+    check_finite(points[None], used, joints[None], mechanism.joints, f"mechanism '{mechanism.name}'", "xyz")
+    return points
 
 
 def _groups(numbers: Tensor, joints: Tensor, what: str) -> tuple[Tensor, list[str]]:

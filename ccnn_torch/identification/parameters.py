@@ -16,7 +16,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Parameter, plausible_error
 from ccnn_torch.errors import InputError
 
-__all__ = ["ParameterChoice", "Selection", "select_parameters"]
+__all__ = ["ParameterChoice", "Selection", "match_parameters", "select_parameters"]
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ def select_parameters(
     names = [g.name for g in geometry]
     nominal = torch.tensor([g.nominal for g in geometry], dtype=torch.float64)
     whole = (nominal if start is None else start.detach()).reshape(-1, len(names))
-    free = set(names) if choice.free is None else _match(geometry, choice.free, "free")
-    free -= _match(geometry, choice.fixed, "fixed")
+    free = set(names) if choice.free is None else match_parameters(geometry, choice.free, "free")
+    free -= match_parameters(geometry, choice.fixed, "fixed")
     if not free:
         raise InputError("parameters: nothing is left free; name at least one in free, or fix fewer")
     groups = _groups(geometry, choice, free, whole)
@@ -105,8 +105,12 @@ def select_parameters(
     )
 
 
-def _match(geometry: Sequence[Parameter], patterns: Sequence[str], key: str) -> set[str]:
-    """Names that any of the patterns fits."""
+def match_parameters(geometry: Sequence[Parameter], patterns: Sequence[str], key: str) -> set[str]:
+    """Names that any of the patterns fits.
+
+    Raises:
+        InputError: a pattern that fits nothing; names the key `parameters.{key}`.
+    """
     found: set[str] = set()
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         of_leg = re.fullmatch(r"leg(\d+)\.(.*)", pattern)
@@ -135,7 +139,7 @@ def _groups(
     names = [g.name for g in geometry]
     leader: dict[str, list[str]] = {}
     for tie in choice.tied:
-        group = sorted(_match(geometry, [tie] if isinstance(tie, str) else tie, "tied"), key=names.index)
+        group = sorted(match_parameters(geometry, [tie] if isinstance(tie, str) else tie, "tied"), key=names.index)
         again = [n for n in group if n in leader]
         if again:
             raise InputError(f"parameters.tied: '{again[0]}' stands in two groups; name it in one")
@@ -166,5 +170,5 @@ def _prior(geometry: Sequence[Parameter], prior: Mapping[str, float], groups: tu
     for pattern, value in prior.items():
         if not float(value) > 0:
             raise InputError(f"parameters.prior: '{pattern}' has the standard deviation {value}; give a positive one")
-        sd.update(dict.fromkeys(_match(geometry, [pattern], "prior"), float(value)))
+        sd.update(dict.fromkeys(match_parameters(geometry, [pattern], "prior"), float(value)))
     return torch.tensor([min(sd[n] for n in group) for group in groups], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""A user's mechanism is tried at one configuration when it is loaded: what is wrong becomes one sentence."""
+"""A user's mechanism is tried when it is loaded: what is wrong becomes one sentence."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms._branch import jump_sentence, settle_home
 from ccnn_torch.mechanisms._mechanism import Mechanism
 
 __all__ = ["checked_plugin"]
@@ -20,6 +21,9 @@ _ADVICE = "ccnn_torch.testing.check_mechanism tells more"
 
 def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
     """Make a user's mechanism and try it at its home configuration, alone and with two sets of parameters.
+
+    Home joints that are only near those of the home pose are settled first; numeric inverse kinematics are then held
+    against a walk through the sampling box, which must not end on another branch.
 
     Args:
         spec: `path/to/file.py:Name`, for the sentences.
@@ -33,7 +37,10 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
         mechanism = make()
         if not isinstance(mechanism, Mechanism):
             raise InputError(f"{spec}: is no mechanism; derive the class from ccnn_torch.mechanisms.Mechanism")
-        wrong = _wrong_names(mechanism) or _wrong_kinematics(mechanism)
+        wrong = _wrong_names(mechanism) or _wrong_shape_of_closure(mechanism)
+        if not wrong:
+            settle_home(mechanism)
+            wrong = _wrong_kinematics(mechanism) or jump_sentence(mechanism)
     except (ArithmeticError, AttributeError, LookupError, NameError, RuntimeError, TypeError, ValueError) as error:
         said = str(error).strip().splitlines() or [""]
         raise InputError(f"{spec}{_line(spec, error)}: {type(error).__name__}: {said[0]}") from error
@@ -61,6 +68,21 @@ def _wrong_names(m: Mechanism) -> str:
     return ""
 
 
+def _wrong_shape_of_closure(m: Mechanism) -> str:
+    """Of a closure of its own, before anything solves it: 2 poses, as many joints, in two sets of parameters."""
+    if type(m).closure is Mechanism.closure:
+        return ""
+    n, p, lead = len(m.joints), len(m.pose), (2, 3)
+    gap = m.closure(m.home_pose.expand(*lead, p), m.home_joints.expand(*lead, n), m.nominal.expand(2, 1, -1))
+    if isinstance(gap, torch.Tensor) and gap.shape[:-1] == lead:
+        return ""
+    got = f"shape {tuple(gap.shape)}" if isinstance(gap, torch.Tensor) else f"a {type(gap).__name__}"
+    return (
+        f"closure returned {got} for 2 x 3 configurations, expected (2, 3, N) with one number for each of N equations: "
+        "stack them along the last dim, torch.stack([…], -1)"
+    )
+
+
 def _wrong_kinematics(m: Mechanism) -> str:
     n, p, sets = len(m.joints), len(m.pose), m.nominal.expand(2, 1, -1)
     pose = m.home_pose.expand(3, -1)
@@ -73,8 +95,6 @@ def _wrong_kinematics(m: Mechanism) -> str:
     if not bool(torch.isfinite(joints).all()):
         return "its home pose has no joints; give home_pose (and home_joints near a solution)"
     gap = m.closure(pose, joints, sets)
-    if gap.shape[:-1] != (2, 3):
-        return f"closure gives shape {tuple(gap.shape)} for 2 x 3 configurations, expected (2, 3, …)"
     if not float(gap.abs().max()) <= _CLOSES:
         return f"closure is {float(gap.abs().max()):.2g} at the joints that solve_inverse gives, expected 0"
     there = m.forward_kinematics(joints, sets, m.home_pose)

@@ -23,7 +23,7 @@ from ccnn_torch.mechanisms.serial import SerialArm
 from ccnn_torch.mechanisms.stewart import Stewart
 from ccnn_torch.mechanisms.tripod import Tripod
 from ccnn_torch.mechanisms.urdf import read_urdf
-from ccnn_torch.plugins import is_plugin, load_plugin
+from ccnn_torch.plugins import class_hint, is_plugin, load_plugin
 
 __all__ = ["REGISTRY", "load_mechanism", "mechanism_from_description"]
 
@@ -110,8 +110,10 @@ def _maker(spec: str) -> Callable[..., Any]:
     reader = _READERS.get(Path(spec).suffix.lower())
     if reader is not None:
         return functools.partial(reader, spec)
+    if Path(spec).suffix == ".py":
+        raise InputError(class_hint(spec))
     near = difflib.get_close_matches(spec, REGISTRY, 1)
-    hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(REGISTRY)}"
+    hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(REGISTRY)}."
     raise InputError(f"unknown mechanism '{spec}'; {hint} Otherwise give {_FORMS}")
 
 

@@ -11,11 +11,12 @@ from ccnn_torch.batching import expand_leading
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.least_squares import jacobian_of, levenberg_marquardt
+from ccnn_torch.mechanisms._frame_start import closed_form_frames, rigid_body_frame
 from ccnn_torch.mechanisms._links import compose
 from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms._numeric import carry_derivative
 from ccnn_torch.mechanisms._pose import Frame
-from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix, skew
+from ccnn_torch.rotations import matrix_to_rotation_vector, nearest_rotation, rotation_vector_to_matrix, skew
 
 __all__ = ["Framed"]
 
@@ -142,6 +143,48 @@ class Framed(Mechanism):
         closest = self._closest(pose, values, self.rotation_weight)
         return self.mechanism.reachable(closest, self._split(values)[1])
 
+    def fitted_frames(self, joints: Tensor, measured: Frame) -> Tensor:
+        """Closed-form frames between the nominal mechanism's poses of the joints and measured ones.
+
+        Args:
+            joints: `... x s x n` [SI].
+            measured: position `... x s x 3` [m] and rotation `... x s x 3 x 3` (or None).
+
+        Returns:
+            All parameters, `... x k` [SI], the mechanism's own nominal. Where fewer than three joints have a pose all
+            are nominal.
+        """
+        values = self.nominal.expand(*joints.shape[:-2], -1)
+        inner = self._split(self.nominal)[1]
+        guess = None
+        # Iterative forward kinematics that start at home may end on another branch than from near the measured pose.
+        for _ in range(2):
+            position, rotation = self.mechanism.frame(self.mechanism.forward_kinematics(joints, inner, guess))
+            known = torch.isfinite(position).all(-1)
+            here = torch.where(known[..., None], position, 0.0), rotation
+            if rotation is not None:
+                here = here[0], torch.where(known[..., None, None], rotation, torch.eye(3, dtype=rotation.dtype))
+            enough = (known.sum(-1) >= 3)[..., None]
+            found = self._frames_between(here, measured, torch.where(enough, known, True).to(position.dtype))
+            values = torch.where(enough, found, self.nominal)
+            guess = self.mechanism.pose_near(*self._unframed(measured, values[..., None, :]))
+        return values.detach()
+
+    def _frames_between(self, here: Frame, measured: Frame, weights: Tensor) -> Tensor:
+        """All parameters, `... x k`, with the free frames in closed form."""
+        inner = self._split(self.nominal)[1].expand(*weights.shape[:-1], -1)
+        if self.base and not self.tool:
+            return torch.cat([rigid_body_frame(here, measured, weights, self.rotation_weight), inner], dim=-1)
+        assert here[1] is not None and measured[1] is not None  # a tool without orientation is refused
+        if self.base:
+            both = closed_form_frames(here[1], here[0], measured, weights)
+            return torch.cat([both[..., :6], inner, both[..., 6:]], dim=-1)
+        share = (weights / weights.sum(-1, keepdim=True))[..., None]
+        back = here[1].mT
+        place = (share * (back @ (measured[0] - here[0])[..., None])[..., 0]).sum(-2)
+        turn = nearest_rotation((share[..., None] * (back @ measured[1])).sum(-3))
+        return torch.cat([inner, place, matrix_to_rotation_vector(turn)], dim=-1)
+
     def _split(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Base frame `... x 6`, the mechanism's parameters, tool frame `... x 6`; 0 where a frame is no parameter."""
         none = torch.zeros_like(values[..., :1]).expand(*values.shape[:-1], 6)
@@ -163,8 +206,12 @@ class Framed(Mechanism):
 
     def _unseen(self, pose: Tensor, values: Tensor) -> Frame:
         """The frame in the mechanism's base that the measuring device sees as the pose."""
+        return self._unframed(self.frame(pose), values)
+
+    def _unframed(self, seen: Frame, values: Tensor) -> Frame:
+        """As `_unseen`, of a frame."""
         base, _, tool = self._split(values)
-        position, rotation = self.frame(pose)
+        position, rotation = seen
         turn = rotation_vector_to_matrix(base[..., 3:]).mT
         there = (turn @ (position - base[..., :3])[..., None])[..., 0]
         if rotation is None:

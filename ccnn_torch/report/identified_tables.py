@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from rich.console import Console
@@ -20,6 +21,7 @@ __all__ = [
     "identified_markdown",
     "identified_tables",
     "identified_verdict",
+    "not_settled",
     "print_identified",
     "unknown_sentences",
     "write_identified_csv",
@@ -33,6 +35,8 @@ def identified_verdict(results: Block) -> str:
     named = [(name, results["test"][name]) for name in ("position", "rotation") if results["test"][name]]
     if not named:
         return "The pose error could not be judged."
+    method = results["method"]
+    failed = not_settled(results)
     parts = []
     for name, block in named:
         parts.append(f"{name} {_with_unit(block, 'before')} → {_with_unit(block, 'after')} RMS")
@@ -40,14 +44,27 @@ def identified_verdict(results: Block) -> str:
     machines = f" of {results['machines']} machines" if results["machines"] > 1 else ""
     if "constraint" in results:
         rows = count_text(results["rows"]["test"], "held-out row")
-        text = f"On {rows} {results['method']} brings the tool nearer to where {holder(results)} it: "
+        text = f"On {rows} {method} brings the tool nearer to where {holder(results)} it: "
     else:
-        text = f"On {rows}{machines} {results['method']} brings the predicted pose nearer to the measured one: "
-    text += ", ".join(parts)
+        text = f"On {rows}{machines} {method} brings the predicted pose nearer to the measured one: "
+    if results["methods"][method]["converged"] == 0:
+        return f"{failed} Its error on {rows}{machines}: {', '.join(parts)}."
+    text = f"{failed} {text}".lstrip() + ", ".join(parts)
     free = [p for p in results["parameters"].values() if p["free"]]
     lost = sum(not p["identifiable"] for p in free)
     text += f"; {len(free) - lost} of {len(free)} parameters are identified"
     return text + (f", {lost} are not told by these rows." if lost else ".")
+
+
+def not_settled(results: Block) -> str:
+    """What is to be said first where the first method did not converge; empty where it did."""
+    method, machines = results["method"], results["methods"][results["method"]]["machines"]
+    failed = round((1 - results["methods"][method]["converged"]) * machines)
+    if failed == 0:
+        return ""
+    if failed < machines:
+        return f"{method} did not converge on {failed} of {machines} machines, which the standard deviations leave out."
+    return f"{method} did not converge, so nothing is identified: the values are those where it stopped."
 
 
 def identified_tables(results: Block) -> list[Table]:
@@ -81,9 +98,10 @@ def print_identified(results: Block, console: Console) -> None:
 
 
 def unknown_sentences(results: Block) -> list[str]:
-    """Which combinations of parameters the rows do not tell, as sentences."""
+    """What speaks against the figures, and which combinations of parameters the rows do not tell, as sentences."""
     found = results["combinations_not_identifiable"]
-    return [f"Not identifiable from these rows: {'; '.join(found)}."] if found else []
+    said = [f"Not identifiable from these rows: {'; '.join(found)}."] if found else []
+    return [*results.get("doubts", []), *said]
 
 
 def _text(block: Block | None, key: str, scale: float = 1.0, digits: int = 3) -> str:
@@ -103,15 +121,30 @@ def _with_unit(block: Block, key: str) -> str:
     return f"{number_text(block[key] / scale, 3)} {unit}"
 
 
+def _shown_units(blocks: Sequence[Block]) -> dict[str, tuple[float, str]]:
+    """For each SI unit the one that all its parameters are shown in: that of the usual size, or a larger one where a
+    number would have more than five digits before the point."""
+    units = {}
+    for si in dict.fromkeys(block["unit"] for block in blocks):
+        mine = [block for block in blocks if block["unit"] == si]
+        moved = [abs(block["value"] - block["nominal"]) for block in mine]
+        usual = median([block["sd"] or move for block, move in zip(mine, moved, strict=True)])
+        scale, unit = display_unit(si, max(usual, 1e-6))
+        largest = max(moved)
+        units[si] = display_unit(si, largest) if largest / scale >= 1e5 else (scale, unit)
+    return units
+
+
 def _parameter_table(results: Block) -> Table:
     simulated = results["simulated"]
+    lost = "not identifiable" if results["methods"][results["method"]]["converged"] else "–"
+    units = _shown_units([block for block in results["parameters"].values() if block["free"]])
     rows = []
     for name, block in results["parameters"].items():
         if not block["free"]:
             continue
-        size = block["sd"] or abs(block["value"] - block["nominal"])
-        scale, unit = display_unit(block["unit"], max(size, 1e-6))
-        sd = _text(block, "sd", scale) if block["identifiable"] else "not identifiable"
+        scale, unit = units[block["unit"]]
+        sd = _text(block, "sd", scale) if block["identifiable"] else lost
         nominal = f"{number_text(block['nominal'], 6)} {block['unit']}".removesuffix(" 1")
         cells = [f"{name} [{unit}]", nominal]
         if simulated:
@@ -129,8 +162,17 @@ def _parameter_table(results: Block) -> Table:
     columns += ["by bootstrap"] * bootstrapped
     several = results["machines"] > 1
     note = f"By {results['method']}." + " Medians over the machines, [5 %, 95 %]." * several
-    note += " 95 % of intervals of ±1.96 standard deviations hold the true value, if the geometry is all that is wrong."
+    note += f" {_interval_note(results)}"
     return Table("Parameters", tuple(columns), tuple(rows), note)
+
+
+def _interval_note(results: Block) -> str:
+    """What a standard deviation is worth here."""
+    if results["methods"][results["method"]]["converged"] == 0:
+        return "Without convergence there are no standard deviations."
+    if results.get("doubts"):
+        return "Standard deviations are for rows that fit the model and the noise, which these do not."
+    return "95 % of intervals of ±1.96 standard deviations hold the true value, if the geometry is all that is wrong."
 
 
 def _method_table(results: Block) -> Table:

@@ -9,7 +9,7 @@ from ccnn_torch.report.display import count_text, display_unit, number_text
 from ccnn_torch.report.table_form import Table
 from ccnn_torch.report.tables import markdown_table
 
-__all__ = ["gain_table", "parameter_table", "plan_markdown", "plan_sentence"]
+__all__ = ["gain_table", "left_out_sentence", "parameter_table", "plan_markdown", "plan_sentence"]
 
 
 def plan_sentence(plan: Plan, least_gain: float) -> str:
@@ -27,6 +27,17 @@ def plan_sentence(plan: Plan, least_gain: float) -> str:
     if recommended > count:
         return f"{text}. Up to {recommended} poses each further one still gives more than {percent}."
     return f"{text}. After {recommended} poses a further one gives less than {percent}."
+
+
+def left_out_sentence(plan: Plan) -> str:
+    """What no pose tells, and that the plan is for the rest; empty where every parameter shows."""
+    if not plan.choice.left_out:
+        return ""
+    whose = f"Of leg {plan.leg} no" if plan.leg is not None else "No"
+    return (
+        f"{whose} pose tells apart: {'; '.join(plan.choice.left_out)}. The plan is for all that poses tell: as if "
+        "those without a row in the table kept their values. A prior or another instrument would tell them."
+    )
 
 
 def gain_table(plan: Plan, short: bool = False) -> Table:
@@ -98,6 +109,7 @@ def plan_markdown(mechanism: str, plans: Sequence[Plan], least_gain: float, pict
         f"near to a singularity) so that {first.index} is largest. The rows stand in the order of their worth: the "
         "first ones alone are good, too.",
         *(plan_sentence(plan, least_gain) for plan in plans),
+        *filter(None, map(left_out_sentence, plans)),
         f"![{caption}]({picture})\n\n{caption}",
     ]
     for plan in plans:

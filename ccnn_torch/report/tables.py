@@ -29,15 +29,17 @@ def verdict(results: Results) -> str:
     """One sentence: what the best method does to the error on held-out rows."""
     position = results["pose"]["position"]
     best = results.get("best_method") or next(iter(results["methods"]), "the model")
+    # What is left is left of both: the identified geometry, and what the method learned of the rest.
+    whose = f"geometry + {best}" if "geometry" in position else best
     rows = count_text(results["rows"]["test"], "held-out row")
     before, after = position["before"]["rms"], position["after"]["rms"]
     removed = removed_percent(before, after)
     if removed is None:
-        return f"On {rows} the pose error of {best} could not be measured."
+        return f"On {rows} the pose error of {whose} could not be measured."
     scale, unit = display_unit("m", before["median"])
     left, right = (number_text(s["median"] / scale, 3) for s in (before, after))
     did = f"removes {removed:.1f} %" if removed >= 0 else f"adds {-removed:.1f} %"
-    text = f"On {rows} {best} {did} of the RMS position error ({left} → {right} {unit})"
+    text = f"On {rows} {whose} {did} of the RMS position error ({left} → {right} {unit})"
     ratio = (results["methods"].get(best) or {}).get("ratio_to_floor")
     if ratio and ratio["median"] is not None:
         text += f"; its mean squared joint error is {number_text(ratio['median'], 3)} times the noise floor"
@@ -83,7 +85,8 @@ def markdown_table(table: Table) -> str:
 
 def markdown_text(results: Results) -> str:
     """The verdict and the tables as Markdown (`results.md`)."""
-    parts = [f"# {results['name']}", verdict(results), *map(markdown_table, result_tables(results)), *failures(results)]
+    parts = [f"# {results['name']}", verdict(results), *failures(results)]
+    parts += map(markdown_table, result_tables(results))
     return "\n\n".join(parts) + "\n"
 
 
@@ -94,8 +97,15 @@ def write_tables(folder: Path, results: Results) -> None:
 
 
 def failures(results: Results) -> list[str]:
-    """One sentence for each method that failed."""
-    return [f"{name} failed: {m['failed']}" for name, m in results["methods"].items() if m["test"] is None]
+    """One sentence for each method that failed, and for each that has no model file; first whose `model.*` are."""
+    said = []
+    model = results.get("model") or {"method": None, "without": {}}
+    without, best = dict(model["without"]), results.get("best_method")
+    if best in without and model["method"] is not None:
+        why = without.pop(best)
+        said.append(f"The model files model.* and card.json are of {model['method']}, not of {best}: {why}.")
+    said += [f"No model file of {name}: {why}." for name, why in without.items()]
+    return said + [f"{name} failed: {m['failed']}" for name, m in results["methods"].items() if m["test"] is None]
 
 
 def _units(results: Results) -> dict[str, str]:

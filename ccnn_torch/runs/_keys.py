@@ -7,11 +7,13 @@ import inspect
 import json
 import re
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
 from ccnn_torch._table import nearest
+from ccnn_torch.runs._yaml import read_yaml
 
 __all__ = ["explain", "list_keys"]
 
@@ -76,7 +78,30 @@ def explain(error: ValidationError, model: type[BaseModel], file: str, given: Ma
         override = override or next((text for name, text in given.items() if key and name.startswith(f"{key}.")), None)
         source = f"'{override}': " if override else ""
         parts[source + _sentence(key, item["type"], item["msg"], item["input"], keys)] = None
-    return f"{file}: " + "; ".join(parts)
+    other = _other_command(file, model)
+    return f"{file}: " + (f"this looks like a config for `ccnn {other}`" if other else "; ".join(parts))
+
+
+def _other_command(file: str, model: type[BaseModel]) -> str:
+    """The command that knows all keys at the top of a file of which this one does not; empty where there is none."""
+    from ccnn_torch.runs.config import RunConfig
+    from ccnn_torch.runs.identify_config import IdentifyConfig
+    from ccnn_torch.runs.plan_config import PlanConfig
+    from ccnn_torch.runs.suite import SuiteFile
+
+    if not Path(file).is_file():
+        return ""
+    there = set(read_yaml(Path(file)))
+    models: dict[str, type[BaseModel]] = {
+        "run": RunConfig,
+        "identify": IdentifyConfig,
+        "suite": SuiteFile,
+        "plan --config": PlanConfig,
+    }
+    # A single strange key is a slip of the pen rather than another command's file.
+    if len(there) < 2 or there <= set(model.model_fields):
+        return ""
+    return next((name for name, kind in models.items() if there <= set(kind.model_fields)), "")
 
 
 def _sentence(key: str, kind: str, message: str, value: Any, keys: Mapping[str, str]) -> str:

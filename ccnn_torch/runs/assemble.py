@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
@@ -28,7 +29,7 @@ from ccnn_torch.runs.prepare import Prepared
 from ccnn_torch.runs.simulation import Simulation
 from ccnn_torch.runs.uncertainty import coverage, inside_domain
 
-__all__ = ["assemble", "best_method", "plan_of", "versions"]
+__all__ = ["assemble", "best_method", "by_score", "plan_of", "versions"]
 
 _PACKAGES = ("ccnn-torch", "torch", "numpy", "scipy", "onnx", "onnxruntime", "safetensors")
 
@@ -51,9 +52,14 @@ def plan_of(config: RunConfig) -> Plan:
     )
 
 
-def best_method(outcomes: dict[str, Outcome]) -> str:
+def best_method(outcomes: Mapping[str, Outcome]) -> str:
     """The method whose median score over the repeats is lowest (validation, or training where none was held out)."""
-    return min(outcomes, key=lambda name: float(outcomes[name].fitted.score.median()))
+    return by_score(outcomes)[0]
+
+
+def by_score(outcomes: Mapping[str, Outcome]) -> list[str]:
+    """The methods, the best first."""
+    return sorted(outcomes, key=lambda name: float(outcomes[name].fitted.score.median()))
 
 
 def assemble(

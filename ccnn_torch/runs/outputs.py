@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.reach import reach_block
 from ccnn_torch.report.tables import write_tables
+from ccnn_torch.runs.assemble import by_score
 from ccnn_torch.runs.calibrate import Calibration
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.watch import genome
@@ -27,7 +30,7 @@ def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
     curves = {name: _history(outcome.fitted.training) for name, outcome in calibration.outcomes.items()}
     results["reach"] = reach_block(curves)
     if calibration.config.save_models:
-        results["notes"] += _save_models(calibration, folder)
+        results["model"] = _save_models(calibration, folder)
     save_arrays(path, _arrays(calibration))
     for method, history in curves.items():
         save_history(path, method, history)
@@ -41,16 +44,23 @@ def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
     write_json(folder.results, results)
 
 
-def _save_models(calibration: Calibration, folder: RunFolder) -> list[str]:
-    """Write every method's model files; returns why one could not be written, a sentence each."""
-    problems = []
-    for method in calibration.outcomes:
-        best = method == calibration.method
+def _save_models(calibration: Calibration, folder: RunFolder) -> dict[str, Any]:
+    """Write every method's model files: `model.*` are those of the best method that can be written.
+
+    Returns:
+        `method`, whose `model.*` are (None where no method has any), and `without`: why a method has none, by method.
+    """
+    chosen: str | None = None
+    without: dict[str, str] = {}
+    for method in by_score(calibration.outcomes):
+        first = chosen is None
         try:
-            calibration.save(folder.path if best else folder.models, method, "model" if best else method)
+            calibration.save(folder.path if first else folder.models, method, "model" if first else method)
         except MethodFailedError as problem:
-            problems.append(f"No model file of {method}: {problem}.")
-    return problems
+            without[method] = str(problem)
+            continue
+        chosen = chosen or method
+    return {"method": chosen, "without": without}
 
 
 def _arrays(calibration: Calibration) -> RunArrays:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -16,7 +16,8 @@ from ccnn_torch.runs._yaml import read_yaml
 __all__ = ["PlanConfig", "describe_plan_keys", "load_plan_config"]
 
 
-Positive = Annotated[float, Field(gt=0)]
+Size = float | str
+"""A number in SI, or a text of number and unit, such as `0.1 mm` or `0.03 deg`."""
 
 
 class PlannedParameters(Section):
@@ -25,8 +26,9 @@ class PlannedParameters(Section):
     free: Names | None = Field(default=None, description="parameters to identify, names or patterns; null = all")
     fixed: Names = Field(default=[], description="parameters that keep their nominal value, names or patterns")
     tied: list[list[str]] = Field(default=[], description="groups of parameters with one common value")
-    prior: dict[str, Positive] = Field(
-        default={}, description="standard deviation of what is known already, by name or pattern, in SI"
+    prior: dict[str, Size] = Field(
+        default={},
+        description="standard deviation of what is known already, by name or pattern, in SI or as '0.5 mm'",
     )
 
 
@@ -40,20 +42,20 @@ class PlanConfig(Section):
         description="how the parameters will be identified: from joints (inverse) or poses (forward); auto = poses "
         "for serial arms and framed mechanisms, else joints",
     )
-    noise: Positive | dict[str, Positive] = Field(
+    noise: Size | dict[str, Size] = Field(
         default=1e-5,
-        description="standard deviation of each measured coordinate in SI: of a position (an angle has it over 0.3 m), "
-        "or by coordinate",
+        description="standard deviation of each measured coordinate, in SI or as '0.1 mm': of a position (an angle has "
+        "it over 0.3 m), or by coordinate",
     )
-    joint_noise: Annotated[float, Field(ge=0)] | dict[str, Annotated[float, Field(ge=0)]] = Field(
-        default=0.0, description="standard deviation of the recorded joints in SI, one number or by joint"
+    joint_noise: Size | dict[str, Size] = Field(
+        default=0.0, description="standard deviation of the recorded joints, in SI or as '0.01 deg', one or by joint"
     )
     index: Literal["O1", "O2", "O3", "O4", "O5"] = Field(
         default="O1", description="observability index to make large: O1 (determinant, as in the paper) to O5"
     )
     candidates: int = Field(default=100_000, ge=10, description="configurations that the poses are chosen from")
-    limits: dict[str, tuple[float, float]] = Field(
-        default={}, description="range of a joint or pose coordinate in SI, {x: [low, high]}"
+    limits: dict[str, tuple[Size, Size]] = Field(
+        default={}, description="range of a joint or pose coordinate in SI or with units, {x: [-200 mm, 0.3]}"
     )
     max_condition: float = Field(
         default=50.0, gt=1, description="largest condition number of the Jacobian: farther is too near to a singularity"

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
-from ccnn_torch._table import nearest
-from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import ParameterChoice
 from ccnn_torch.identification.planning import Plan, plan_poses
@@ -17,12 +15,10 @@ from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import write_table
 from ccnn_torch.report.plan import plan_markdown
 from ccnn_torch.report.plots import plan_plot, save_figure
+from ccnn_torch.runs.identification._sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
 from ccnn_torch.runs.plan_config import PlanConfig
 
 __all__ = ["make_plan", "write_plan"]
-
-# Lever over which the noise of a position makes that of an angle [m].
-_LEVER = 0.3
 
 
 def make_plan(
@@ -37,23 +33,24 @@ def make_plan(
         progress: told the share that is done.
 
     Raises:
-        InputError: as `load_mechanism` and `plan_poses`; a noise that names something unknown.
+        InputError: as `load_mechanism` and `plan_poses`; a size that is none, or of something unknown.
     """
     config = config or PlanConfig()
     if poses < 1:
         raise InputError(f"--poses: plan at least 1 pose, not {poses}")
     machine = load_mechanism(mechanism, **config.mechanism_keys) if isinstance(mechanism, str) else mechanism
     wanted = config.parameters
+    prior = prior_sizes(wanted.prior, machine.geometry, "parameters.prior")
     plans = plan_poses(
         machine,
         poses,
-        choice=ParameterChoice(wanted.free, wanted.fixed, wanted.tied, wanted.prior),
-        pose_noise=_noise(config.noise, machine.pose, "noise"),
-        joint_noise=_noise(config.joint_noise, machine.joints, "joint_noise") if config.joint_noise else None,
+        choice=ParameterChoice(wanted.free, wanted.fixed, wanted.tied, prior),
+        pose_noise=_pose_noise(config, machine),
+        joint_noise=_joint_noise(config, machine),
         residual=config.residual,
         index=config.index,
         candidates=config.candidates,
-        limits=config.limits,
+        limits=_limits(config, machine),
         max_condition=config.max_condition,
         rotation_weight=config.rotation_weight,
         per_leg=config.per_leg,
@@ -98,18 +95,30 @@ def write_plan(path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: 
     return [path, page, *pictures]
 
 
-def _noise(given: float | dict[str, float], coordinates: Iterable[Coordinate], key: str) -> list[float]:
-    """Standard deviation of each coordinate [SI]; one number is that of a length, and an angle has it over a lever."""
-    coordinates = tuple(coordinates)
-    if not isinstance(given, dict):
-        lever = _LEVER if key == "noise" else 1.0
-        return [given / lever if c.unit == "rad" else given for c in coordinates]
-    names = [c.name for c in coordinates]
-    for name in given:
-        if name not in names:
-            near = nearest(name, names)
-            raise InputError(f"{key}.{name}: there is no such coordinate; {f'{near}?' if near else ', '.join(names)}")
-    missing = [name for name in names if name not in given]
-    if missing:
-        raise InputError(f"{key}: gives no standard deviation of {', '.join(missing)}")
-    return [given[name] for name in names]
+def _limits(config: PlanConfig, machine: Mechanism) -> dict[str, tuple[float, float]]:
+    """Limits [SI]; a name that the machine does not have is refused where they are used."""
+    units = {c.name: c.unit for c in (*machine.joints, *machine.pose)}
+    found = {}
+    for name, bounds in config.limits.items():
+        low, high = (size(value, units.get(name), f"limits.{name}") for value in bounds)
+        found[name] = (low, high)
+    return found
+
+
+def _pose_noise(config: PlanConfig, machine: Mechanism) -> Tensor:
+    found = sizes_of_pose(config.noise, machine.pose, "noise")
+    if not bool((found > 0).all()):
+        raise InputError("noise: a standard deviation is above 0; write e.g. noise='0.1 mm'")
+    return found
+
+
+def _joint_noise(config: PlanConfig, machine: Mechanism) -> Tensor | None:
+    """None where there is none."""
+    given, none = config.joint_noise, [0.0] * len(machine.joints)
+    if isinstance(given, dict):
+        found = sizes_by_name(given, machine.joints, "joint_noise", none)
+    else:
+        found = torch.tensor([size(given, j.unit, "joint_noise") for j in machine.joints], dtype=torch.float64)
+    if bool((found < 0).any()):
+        raise InputError("joint_noise: a standard deviation is not negative; write e.g. joint_noise='0.01 deg', or 0")
+    return found if bool((found > 0).any()) else None

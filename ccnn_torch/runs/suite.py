@@ -32,7 +32,7 @@ _OWN = ("name", "out")
 _DEFAULTS = {"save_models": False, "save_report": False}
 
 
-class _File(BaseModel):
+class SuiteFile(BaseModel):
     """The form of a suite's file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, coerce_numbers_to_str=True)
@@ -78,7 +78,7 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
     overrides = list(overrides)
     own = [text for text in overrides if text.partition("=")[0].strip() in _OWN]
     given = apply_overrides(tree, own, Path.cwd())
-    file = validated(_File, tree, str(path), given)
+    file = validated(SuiteFile, tree, str(path), given)
     out = Path(file.out) if file.out else Path("runs") / file.name
     others = [text for text in overrides if text not in own]
     cases: dict[str, RunConfig] = {}

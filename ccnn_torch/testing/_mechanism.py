@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
+from ccnn_torch.mechanisms._branch import jump_sentence
 from ccnn_torch.rotations import vee
 
 __all__ = ["check_mechanism"]
@@ -28,7 +29,9 @@ _RowFunction = Callable[[Tensor], Tensor]
 
 
 def check_mechanism(mechanism: Mechanism, seed: int = 0) -> None:
-    """Check names and units, IK∘FK, derivatives, batch shapes, hooks and the description of a mechanism.
+    """Check names and units, the branch of a numeric inverse, IK∘FK, derivatives, batch shapes, hooks, the description.
+
+    Numeric inverse kinematics are held against a walk from home in small steps, which must end on the same branch.
 
     Args:
         mechanism: any `Mechanism`, at its nominal parameters.
@@ -38,6 +41,8 @@ def check_mechanism(mechanism: Mechanism, seed: int = 0) -> None:
         AssertionError: one sentence that says what is wrong.
     """
     _check_names(mechanism)
+    jump = jump_sentence(mechanism, seed)
+    _require(not jump, mechanism, jump)
     joints, pose = _configurations(mechanism, seed)
     _check_round_trip(mechanism, joints, pose)
     _check_batches(mechanism, joints, pose)

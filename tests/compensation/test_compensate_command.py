@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 from ccnn_torch.cli.compensate import compensate
 from ccnn_torch.compensation import Compensator, fit_compensator, load_model, save_model
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.learners.constant import ConstantNetwork
-from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms import load_mechanism, mechanism_from_description
 from ccnn_torch.records import read_table, write_table
 from ccnn_torch.training import Scaling
 
@@ -172,6 +172,39 @@ def test_a_serial_arm_follows_its_branch_or_the_guess(planar: Path, tmp_path: Pa
     write_table(tmp_path / "in.csv", poses | {"x[m]": x + 1})
     with pytest.raises(InputError, match="no joints of planar were found for the pose at lines"):
         compensate(planar, tmp_path / "in.csv", tmp_path / "out.csv", pose=True)
+
+
+def test_branches_are_spoken_of_where_no_guess_chooses_one(
+    planar: Path, tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arm = mechanism_from_description(load_model(planar).facts["mechanism"])
+    there = arm.forward_kinematics(torch.tensor([0.3, 0.7], dtype=torch.float64)).tolist()
+    poses = dict(zip([c.header for c in arm.pose], [[v] for v in there], strict=True))
+    for guess, said in (({}, True), ({"guess_q1[rad]": [0.3], "guess_q2[rad]": [0.7]}, False)):
+        write_table(tmp_path / "in.csv", poses | guess)
+        compensate(planar, tmp_path / "in.csv", tmp_path / "out.csv", pose=True)
+        assert ("give guess_q1[rad] to guess_q2[rad] near the joints wanted" in capsys.readouterr().out) is said
+    mechanism = load_mechanism("tripod")
+    y, z, phi = mechanism.home_pose.tolist()
+    write_table(tmp_path / "in.csv", {"y[m]": [y], "z[m]": [z], "phi[rad]": [phi]})
+    compensate(folder / "model.pt2", tmp_path / "in.csv", tmp_path / "out.csv", pose=True)
+    assert "several branches" not in capsys.readouterr().out
+
+
+def test_a_file_that_is_no_model_and_an_output_that_would_overwrite(folder: Path, ideal: Path, tmp_path: Path) -> None:
+    out, model = tmp_path / "out.csv", folder / "model.onnx"
+    with pytest.raises(ModelFileError, match=r"ideal\.csv: is no model file; one ends in \.safetensors, \.onnx, \.pt2"):
+        compensate(ideal, ideal, out)
+    config = tmp_path / "config.yaml"
+    config.write_text("mechanism: five_bar\n")
+    with pytest.raises(ModelFileError, match=r"config\.yaml is no model file: give identified\.yaml"):
+        compensate(config, ideal, out)
+    before = ideal.read_bytes()
+    with pytest.raises(InputError, match=r"OUT\.csv is IN\.csv itself, which would be overwritten; name another file"):
+        compensate(model, ideal, tmp_path / "x" / ".." / ideal.name)
+    with pytest.raises(InputError, match=r"OUT\.csv is the model itself"):
+        compensate(model, ideal, model)
+    assert ideal.read_bytes() == before and not out.exists()
 
 
 @pytest.mark.parametrize(

@@ -232,18 +232,22 @@ def test_the_stop_rule_waits_until_both_gains_are_small() -> None:
     assert recommended_count(gains, 1e-6) is None
 
 
-def test_a_parameter_that_no_pose_shows_is_named_unless_it_has_a_prior() -> None:
+def test_combinations_that_no_pose_shows_are_left_out_all_at_once_unless_they_have_a_prior() -> None:
     rows = draw(9, 30, 1, 3)
     rows[..., 2] = 2 * rows[..., 1]
     problem = abstract(rows)
-    with pytest.raises(InputError, match=r"no pose shows a combination of L1, Ax1: fix one of them"):
-        choose_poses(problem, 6)
+    found = choose_poses(problem, 6)
+    assert found.kept.tolist() == [0, 2] and found.gains.sd.shape[-1] == 2
+    assert len(found.left_out) == 1 and found.left_out[0].startswith("L1 and Ax1 only as 1.00 L1 + 2.00 Ax1")
+    # Which of the two is held makes no difference to the plan: with L1 in place of Ax1 it is the same.
+    assert found.chosen.tolist() == choose_poses(abstract(rows[..., :2]), 6).chosen.tolist()
     held = dataclasses.replace(problem, prior_sd=torch.tensor([math.inf, math.inf, 0.5], dtype=torch.float64))
     found = choose_poses(held, 6)
     assert bool(torch.isfinite(found.gains.sd).all()) and found.bound is None
     rows[..., 1:] = 0
-    with pytest.raises(InputError, match=r"no pose shows .*\(parameters: \{fixed: \["):
-        choose_poses(abstract(rows), 6)
+    assert choose_poses(abstract(rows), 6).left_out == ("L1 not at all", "Ax1 not at all")
+    with pytest.raises(InputError, match=r"no pose shows any of the parameters"):
+        choose_poses(abstract(torch.zeros_like(rows)), 6)
 
 
 def test_what_cannot_be_planned_is_said() -> None:

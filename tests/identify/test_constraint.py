@@ -229,3 +229,10 @@ def test_given_noise_and_a_fixed_tool_are_kept() -> None:
     assert fixed.results["constraint"]["noise"] == NOISE and fixed.results["constraint"]["noise_known"]
     assert parameters["tool_z"]["value"] == parameters["tool_z"]["nominal"] == 0
     assert abs(parameters["a3"]["value"] - parameters["a3"]["nominal"]) < 1e-6
+
+
+def test_rows_of_another_machine_are_one_sentence() -> None:
+    """The singular value decomposition behind a plate's start met NaN: joints of an arm have no pose of a five-bar."""
+    config = load_identify_config(SOCKETS, ["mechanism=five_bar"])
+    with pytest.raises(InputError, match=r"row \d+: mechanism 'five_bar' .* is out of reach at q1 = "):
+        identify(config)

@@ -7,7 +7,8 @@ import torch
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.runs.identification._sizes import size, sizes_by_name, sizes_of_pose
+from ccnn_torch.runs.identification import identify
+from ccnn_torch.runs.identification._sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
 from ccnn_torch.runs.identify_config import (
     describe_identify_keys,
     dump_identify_config,
@@ -90,3 +91,27 @@ def test_an_angle_has_the_noise_over_its_arm() -> None:
     assert sizes_of_pose(3e-5, pose, "noise").tolist() == pytest.approx([3e-5, 3e-5, 1e-4])
     with pytest.raises(InputError, match="noise: gives no size of phi"):
         sizes_of_pose({"y": 1e-5, "z": 1e-5}, pose, "noise")
+
+
+def test_a_prior_has_the_unit_of_its_parameter_and_its_errors_speak_of_no_column() -> None:
+    geometry = load_mechanism("five_bar").geometry
+    assert prior_sizes({"l1": "0.5 mm", "gamma*": "1 mrad", "k1": 0.1}, geometry, "parameters.prior") == pytest.approx(
+        {"l1": 5e-4, "gamma*": 1e-3, "k1": 0.1}
+    )
+    wrong = {"l1": "0.5 deg", "gamma1": "1 mm", "leg1.*": "1 mm", "k1": "1 s"}
+    for pattern, value in wrong.items():
+        with pytest.raises(
+            InputError, match=r"parameters\.prior\..* is in '.*, but must be .*or a number in SI$"
+        ) as said:
+            prior_sizes({pattern: value}, geometry, "parameters.prior")
+        assert "[" not in str(said.value)
+    with pytest.raises(InputError, match=r"parameters\.prior: 'b\*' fits no parameter"):
+        prior_sizes({"b*": 1.0}, geometry, "parameters.prior")
+
+
+def test_identify_refuses_a_prior_of_the_wrong_kind() -> None:
+    config = make_identify_config(
+        mechanism="five_bar", simulate={"poses": 20}, parameters={"prior": {"l1": "0.5 deg"}}, save_report=False
+    )
+    with pytest.raises(InputError, match=r"parameters\.prior\.l1 is in 'deg', an angle, but must be a length"):
+        identify(config)

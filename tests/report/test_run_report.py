@@ -99,6 +99,8 @@ def test_verdict(results: dict[str, Any]) -> None:
     text = verdict(results)
     assert text.startswith(f"On 25 held-out rows ccnn removes {removed:.1f} %")
     assert "times the noise floor" in text
+    with_geometry = {"position": {**position, "geometry": position["after"]}, "rotation": None}
+    assert " geometry + ccnn removes " in verdict(results | {"pose": with_geometry})
     swapped = {"unit": "m", "before": position["after"], "after": position["before"]}
     assert "ccnn adds" in verdict(results | {"pose": {"position": swapped, "rotation": None}})
 

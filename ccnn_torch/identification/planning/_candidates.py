@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
+from scipy.linalg import qr
 from torch import Tensor
 
 from ccnn_torch._table import nearest
+from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
+from ccnn_torch.identification._combinations import combinations_in_words
 from ccnn_torch.identification.problem import Problem, Progress
 from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Candidates", "common_coordinates", "draw_candidates", "identification_rows"]
+__all__ = ["Candidates", "Seen", "common_coordinates", "draw_candidates", "identification_rows", "what_is_seen"]
 
 Limits = Mapping[str, tuple[float, float]]
 
 # Candidates drawn and looked at in one call.
 _AT_ONCE = 20_000
+# Configurations after which progress is told.
+_TOLD = 4000
 # Machines with plausible errors that must reach a pose, too.
 _MACHINES = 8
 # Configurations whose forward kinematics are tried on these machines in one call.
@@ -72,22 +78,35 @@ def draw_candidates(
     others = _others(mechanism, uncertainty)
     found: list[tuple[Tensor, Tensor]] = []
     there = drawn = 0
+    shown = 0.0
+
+    def tell(share: float) -> None:
+        """Of the draw at hand: as much of it is kept as of those before, for all that is known."""
+        nonlocal shown
+        kept = there / drawn if there else 1.0
+        shown = max(shown, min(1.0, (there + share * kept * min(count, _AT_ONCE)) / count))
+        if progress is not None:
+            progress(shown)
+
     for _ in range(_DRAWS):
         joints, pose = _draw(mechanism, min(count, _AT_ONCE), generator)
-        drawn += len(joints)
         values = torch.cat([joints, pose], dim=-1)
         good = (torch.isfinite(values) & (values >= bounds[:, 0]) & (values <= bounds[:, 1])).all(-1)
         joints, pose = joints[good], pose[good]
-        condition = mechanism.condition_number(joints, rotation_weight, guess=pose)
+        # By parts, so that whoever waits sees something move.
+        parts = torch.split(torch.arange(len(joints)), _TOLD)
+        condition = torch.empty(len(joints), dtype=torch.float64)
+        for number, part in enumerate(parts):
+            condition[part] = mechanism.condition_number(joints[part], rotation_weight, guess=pose[part])
+            tell(0.5 * (number + 1) / len(parts))
         order = condition.argsort(descending=True)
         order = order[condition[order] <= max_condition]
         if others is not None:
             order = _in_reach(mechanism, joints, pose, order, others)
         kept = order.sort().values
         found.append((joints[kept], pose[kept]))
-        there += len(kept)
-        if progress is not None:
-            progress(min(1.0, there / count))
+        there, drawn = there + len(kept), drawn + min(count, _AT_ONCE)
+        tell(0.0)
         if there >= count:
             joints, pose = (torch.cat(part)[:count] for part in zip(*found, strict=True))
             return Candidates(joints, pose, drawn)
@@ -168,34 +187,63 @@ def _at(problem: Problem, data: tuple[Tensor, ...]) -> Callable[[Tensor], Tensor
     return lambda values: problem.residual(values, *data)
 
 
-def common_coordinates(rows: Tensor, prior: Tensor, names: list[str]) -> Tensor:
+class Seen(NamedTuple):
+    """What candidates can tell: numbers of parameters that they tell when the others are held, ascending `k'`, int64;
+    and what is known of the others' combinations, in words."""
+
+    kept: Tensor
+    left_out: tuple[str, ...]
+
+
+def what_is_seen(rows: Tensor, prior: Tensor, parameters: Sequence[Parameter], scale: Tensor) -> Seen:
+    """Parameters enough to span all that the candidates show, and the combinations that show in none of them.
+
+    Which of the parameters of such a combination is held does not matter to a plan: the determinants of all designs
+    then change by one and the same factor. Those that show best are kept (QR with column pivoting).
+
+    Args:
+        rows: `M x c x k` [1].
+        prior: square roots of the prior's information, `k` [1], 0 where there is none.
+        parameters: the `k`.
+        scale: plausible errors, `k` [SI].
+
+    Raises:
+        InputError: no candidate shows any of them.
+    """
+    factor = _factor(rows, prior)
+    _, values, directions = torch.linalg.svd(factor)
+    seen = values > _UNSEEN * values[0]
+    rank = int(seen.sum())
+    if rank == 0:
+        names = ", ".join(p.name for p in parameters)
+        raise InputError(f"no pose shows any of the parameters {names}; free others, or give them a prior")
+    if rank == len(parameters):
+        return Seen(torch.arange(rank), ())
+    kept = sorted(qr(factor.numpy(), mode="r", pivoting=True)[1][:rank].tolist())
+    return Seen(torch.tensor(kept), combinations_in_words(parameters, directions[~seen], scale))
+
+
+def _factor(rows: Tensor, prior: Tensor) -> Tensor:
+    """Triangular R `k x k` with RᵀR the mean information of a candidate and the prior's; `common_coordinates`."""
+    flat = rows.flatten(0, 1) / len(rows) ** 0.5
+    # By parts, so that no second copy of all rows is needed.
+    parts = [torch.linalg.qr(part).R for part in torch.split(flat, _AT_ONCE)]
+    factor: Tensor = torch.linalg.qr(torch.cat([*parts, torch.diag(prior)])).R
+    return factor
+
+
+def common_coordinates(rows: Tensor, prior: Tensor) -> Tensor:
     """Coordinates in which all candidates together give one unit of information a pose in every direction.
 
     Determinants compare designs alike in all coordinates; in these nothing is lost to rounding.
 
     Args:
-        rows: `M x c x k` [1].
+        rows: `M x c x k` [1], which show every parameter (`what_is_seen`).
         prior: square roots of the prior's information, `k` [1], 0 where there is none.
-        names: of the parameters.
 
     Returns:
         T, `k x k`: rows @ T are the rows there.
-
-    Raises:
-        InputError: some combination of the parameters shows in no candidate.
     """
-    flat = rows.flatten(0, 1) / len(rows) ** 0.5
-    # By parts, so that no second copy of all rows is needed.
-    parts = [torch.linalg.qr(part).R for part in torch.split(flat, _AT_ONCE)]
-    factor = torch.linalg.qr(torch.cat([*parts, torch.diag(prior)])).R
-    _, values, directions = torch.linalg.svd(factor)
-    if not float(values[-1]) > _UNSEEN * float(values[0]):
-        unseen = directions[-1]
-        inside = [name for name, share in zip(names, unseen.abs().tolist(), strict=True) if share > 0.1]
-        several = len(inside) > 1
-        raise InputError(
-            f"no pose shows {'a combination of ' if several else ''}{', '.join(inside)}: "
-            f"{'fix one of them' if several else 'fix it'} (parameters: {{fixed: [{inside[0]}]}}) or give it a prior"
-        )
+    factor = _factor(rows, prior)
     turn: Tensor = torch.linalg.solve_triangular(factor, torch.eye(len(factor), dtype=rows.dtype), upper=True)
     return turn

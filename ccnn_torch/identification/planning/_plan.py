@@ -20,6 +20,7 @@ from ccnn_torch.identification.planning._candidates import (
     common_coordinates,
     draw_candidates,
     identification_rows,
+    what_is_seen,
 )
 from ccnn_torch.identification.planning._design import (
     add_best,
@@ -57,6 +58,8 @@ class Choice:
         settled: whether no exchange of a pose betters the index.
         random_o1: O1 of as many candidates drawn at random, the median of 101 draws.
         random_sd: standard deviation of each parameter with them, likewise, `k` [SI].
+        kept: numbers of the parameters that are planned for, `k` of the problem's; all where every one shows.
+        left_out: what no candidate shows, in words: of each group of parameters the combinations that are seen.
     """
 
     chosen: Tensor
@@ -66,6 +69,8 @@ class Choice:
     recommended: int | None
     bound: float | None
     settled: bool
+    kept: Tensor
+    left_out: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class Plan:
 
     Attributes:
         leg: whose parameters they are for; None for all.
-        parameters: what is to be identified, `k`.
+        parameters: what the poses are planned for, `k`: without those that are held since no pose tells them.
         scale: their plausible errors, `k` [SI].
         joints: commands for the machine, `N x n` [SI].
         pose: where they bring the nominal machine, `N x p` [SI].
@@ -118,7 +123,9 @@ def choose_poses(
 ) -> Choice:
     """Choose rows of a problem (its first machine) so that an observability index of the parameters is largest.
 
-    Any problem will do, so poses are planned for constraints as well as for measured poses.
+    Any problem will do, so poses are planned for constraints as well as for measured poses. Where a combination of
+    parameters shows in no candidate one of them is held, and the plan is for the others (`Choice.kept`): all that the
+    rows can tell. Figures have those `k` parameters.
 
     Args:
         problem: a row for every candidate.
@@ -129,23 +136,26 @@ def choose_poses(
         progress: told the share that is done.
 
     Raises:
-        InputError: too few poses or candidates, an unknown index, or a parameter that shows in no candidate.
+        InputError: too few poses or candidates, an unknown index, or no parameter shows in any candidate.
     """
     if index not in INDICES:
         near = nearest(index, INDICES)
         raise InputError(f"index: must be one of {', '.join(INDICES)}, not '{index}'" + (f"; {near}?" if near else ""))
-    rows = identification_rows(problem)
-    _check_count(problem, count, len(rows), repeat)
+    tell = progress or (lambda _: None)
+    rows = identification_rows(problem, _share(tell, 0.0, 0.15))
     held = torch.where(torch.isfinite(problem.prior_sd), problem.scale / problem.prior_sd, 0.0)
-    turn = common_coordinates(rows, held, [p.name for p in problem.parameters])
+    seen = what_is_seen(rows, held, problem.parameters, problem.scale)
+    rows, held = rows[..., seen.kept], held[seen.kept]
+    scale, prior_sd = problem.scale[seen.kept], problem.prior_sd[seen.kept]
+    _check_count(rows, prior_sd, count, repeat)
+    turn = common_coordinates(rows, held)
     prior = turn.mT @ torch.diag(held.square()) @ turn
 
     design = make_design(rows @ turn, prior if bool((held > 0).all()) else None, repeat)
-    tell = progress or (lambda _: None)
     design_share = 0.4 if index != "O1" else 0.8
     for step in range(count):
         add_best(design)
-        tell(0.2 * (step + 1) / count)
+        tell(0.15 + 0.05 * (step + 1) / count)
     design.prior = prior
     settled = exchange(design, _share(tell, 0.2, design_share))
     bound = None if bool((held > 0).any()) or index != "O1" else tightest_bound(design)
@@ -163,17 +173,19 @@ def choose_poses(
     design.refresh()
     for _ in range(min(max(6, count // 2), len(rows) - count if not repeat else count)):
         add_best(design)
-    gains = gains_of(rows[design.chosen], first, problem.scale, problem.prior_sd)
+    gains = gains_of(rows[design.chosen], first, scale, prior_sd)
     tell(1.0)
     recommended = recommended_count(gains, least_gain)
-    random_o1, random_sd = _random(rows, count, problem)
-    return Choice(torch.tensor(chosen), gains, random_o1, random_sd, recommended, bound, settled)
+    random_o1, random_sd = _random(rows, count, scale, prior_sd)
+    return Choice(
+        torch.tensor(chosen), gains, random_o1, random_sd, recommended, bound, settled, seen.kept, seen.left_out
+    )
 
 
-def _random(rows: Tensor, count: int, problem: Problem) -> tuple[float, Tensor]:
+def _random(rows: Tensor, count: int, scale: Tensor, prior_sd: Tensor) -> tuple[float, Tensor]:
     """O1 and standard deviations of poses taken at random, medians."""
     draws = torch.rand(_RANDOM, len(rows), generator=torch.Generator().manual_seed(0)).topk(count, sorted=False).indices
-    found = gains_of_sets(rows[draws].flatten(1, 2), torch.tensor(count), problem.scale, problem.prior_sd)
+    found = gains_of_sets(rows[draws].flatten(1, 2), torch.tensor(count), scale, prior_sd)
     return float(found.observability.o1.median()), found.sd.median(0).values
 
 
@@ -250,8 +262,9 @@ def plan_poses(
         joints, pose = found.joints[chosen.chosen], found.pose[chosen.chosen]
         leg = part.channels[0].leg if per_leg else None
         around = found.pose[:_AROUND]
+        parameters = tuple(part.parameters[i] for i in chosen.kept.tolist())
         plans.append(
-            Plan(leg, part.parameters, part.scale, joints, pose, index, chosen, candidates, found.drawn, around)
+            Plan(leg, parameters, part.scale[chosen.kept], joints, pose, index, chosen, candidates, found.drawn, around)
         )
     return plans
 
@@ -296,9 +309,9 @@ def _needs_forward(mechanism: Mechanism) -> bool:
     return bool(mechanism.orientations) or any(p.name.startswith(("base_", "tool_")) for p in mechanism.geometry)
 
 
-def _check_count(problem: Problem, count: int, there: int, repeat: bool) -> None:
-    channels, k = len(problem.channels), len(problem.parameters)
-    held = int(torch.isfinite(problem.prior_sd).sum())
+def _check_count(rows: Tensor, prior_sd: Tensor, count: int, repeat: bool) -> None:
+    there, channels, k = rows.shape
+    held = int(torch.isfinite(prior_sd).sum())
     if count * channels + held < k:
         raise InputError(
             f"{count} poses of {channels} equation{'s' if channels > 1 else ''} cannot determine {k} parameters; plan "

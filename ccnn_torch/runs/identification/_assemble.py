@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 import ccnn_torch
-from ccnn_torch.identification import Knowledge
 from ccnn_torch.identification.parameters import Selection
 from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.runs.identification._doubts import doubts_of
 from ccnn_torch.runs.identification._figures import before_and_after, figures, removed
 from ccnn_torch.runs.identification._judge import commanded, map_error, noise_of_test, predicted
 from ccnn_torch.runs.identification._measured import Measured
@@ -44,6 +44,7 @@ class Known:
         correlation: `k x k` of the first machine, NaN where nothing is known.
         singular_values: of the scaled Jacobian, by leg or for all, of the first machine.
         noise: standard deviation of the whitened residual, `r` [1].
+        freedom: equations to spare, of all pieces, `r` [1].
     """
 
     sd: Tensor
@@ -51,6 +52,7 @@ class Known:
     correlation: Tensor
     singular_values: list[list[float]]
     noise: Tensor
+    freedom: Tensor
 
 
 def known_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> Known:
@@ -61,18 +63,16 @@ def known_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> Known:
     combinations: list[str] = []
     singular: list[list[float]] = []
     noise: list[Tensor] = []
+    freedom: list[Tensor] = []
     for piece, knowledge in zip(pieces, knowledge_of(pieces, selection, whole), strict=True):
         at = torch.tensor([names.index(p.name) for p in piece.problem.parameters])
         sd[:, at] = knowledge.sd
         correlation[at[:, None], at] = knowledge.correlation[0]
         combinations += list(knowledge.combinations)
         singular.append(knowledge.singular_values[0].tolist())
-        noise.append(_noise(knowledge, len(whole)))
-    return Known(sd, combinations, correlation, singular, torch.stack(noise).mean(0))
-
-
-def _noise(knowledge: Knowledge, machines: int) -> Tensor:
-    return knowledge.noise.expand(machines)
+        noise.append(knowledge.noise.expand(len(whole)))
+        freedom.append(knowledge.freedom.expand(len(whole)))
+    return Known(sd, combinations, correlation, singular, torch.stack(noise).mean(0), torch.stack(freedom).sum(0))
 
 
 @dataclass
@@ -142,6 +142,7 @@ def assemble(
         "compensation": blocks[first]["compensation"],
         "singular_values": known[first].singular_values,
         "noise_ratio": figures({"value": known[first].noise}),
+        "doubts": _doubts(config, measured, blocks[first]["test"], known[first]),
         "counts": counts,
         "paper": config.paper,
         "data_sha256": measured.data_hash or None,
@@ -149,6 +150,16 @@ def assemble(
         "versions": versions(),
     }
     return Assembled(results, arrays)
+
+
+def _doubts(config: IdentifyConfig, measured: Measured, test: dict[str, Any], known: Known) -> list[str]:
+    """Of a simulated machine the noise is what it is: there only the held-out error is judged."""
+    noise = None if test["position"] is None else test["position"].get("noise")
+    given = config.noise is not None and measured.pose_noise is not None
+    if given and measured.pose_noise is not None:
+        lengths = torch.tensor([c.unit == "m" for c in measured.mechanism.pose])
+        noise = float(measured.pose_noise[lengths].square().sum().sqrt())
+    return doubts_of(test, float(known.noise[0]), float(known.freedom[0]), noise, given)
 
 
 def versions() -> dict[str, str]:
@@ -237,15 +248,21 @@ def parameter_blocks(
     known: Known,
     resampled: Tensor | None = None,
 ) -> dict[str, Any]:
-    """Every parameter of the mechanism; one that is not free has its nominal value and no interval."""
+    """Every parameter of the mechanism; one that is not free has its nominal value and no interval.
+
+    A machine on which the method did not converge has no interval either; where it converged on none, nothing is
+    identified.
+    """
+    settled = outcome.converged
     place = {name: i for i, group in enumerate(selection.groups) for name in group}
     answer: dict[str, Any] = {}
     for column, parameter in enumerate(measured.mechanism.geometry):
         name = parameter.name
         i = place.get(name)
-        identifiable = i is not None and bool(torch.isfinite(known.sd[:, i]).all())
+        # Where the search did not end at a minimum the linearised problem says nothing of the truth.
+        identifiable = i is not None and bool(settled.any()) and bool(torch.isfinite(known.sd[settled, i]).all())
         values: dict[str, Tensor | None] = {"value": outcome.values[:, column]}
-        values["sd"] = known.sd[:, i] if i is not None and identifiable else None
+        values["sd"] = known.sd[settled, i] if i is not None and identifiable else None
         if measured.truth is not None:
             truth = measured.truth[outcome.machines, column]
             start = measured.start[outcome.machines, column]
@@ -262,7 +279,7 @@ def parameter_blocks(
             "leg": parameter.leg,
         }
         if i is not None and resampled is not None:
-            entry["sd_bootstrap"] = float(resampled[i])
+            entry["sd_bootstrap"] = float(resampled[i]) if identifiable else None
         answer[name] = entry
     return answer
 

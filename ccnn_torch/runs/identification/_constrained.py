@@ -15,6 +15,7 @@ from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
 from ccnn_torch.runs.identification._assemble import Known, parameter_blocks, versions
 from ccnn_torch.runs.identification._constraint_fit import ConstraintFit, fit_constraint, held_distance
 from ccnn_torch.runs.identification._constraint_rows import ConstraintRows, read_constraint
+from ccnn_torch.runs.identification._doubts import doubts_of
 from ccnn_torch.runs.identification._figures import before_and_after, figures
 from ccnn_torch.runs.identification._kinematics import Kinematics
 from ccnn_torch.runs.identification._measured import Measured, Rows
@@ -108,6 +109,7 @@ def _known(found: ConstraintFit) -> Known:
         correlation=knowledge.correlation[0, :k, :k].clone(),
         singular_values=[knowledge.singular_values[0].tolist()],
         noise=noise,
+        freedom=knowledge.freedom,
     )
 
 
@@ -154,6 +156,13 @@ def _results(
         "compensation": None,
         "singular_values": known.singular_values,
         "noise_ratio": figures({"value": known.noise}),
+        "doubts": doubts_of(
+            test,
+            float(known.noise),
+            float(known.freedom),
+            None if config.noise is None else found.after.noise,
+            config.noise is not None,
+        ),
         "counts": [],
         "paper": None,
         "data_sha256": measured.data_hash,

@@ -86,7 +86,7 @@ def fit_constraint(
     build = _builder(config, mechanism, rows)
     names = [p.name for p in mechanism.geometry]
     held = [n for n in names if n.startswith(("base_", "tool_r"))]
-    about = choice_of(config)
+    about = choice_of(config, mechanism)
     free = select_parameters(mechanism.geometry, ParameterChoice(about.free, [*about.fixed, *held], about.tied))
     of_machine = [n for group in free.groups for n in group]
     tool = [n for n in of_machine if n.startswith("tool_")]

@@ -8,9 +8,9 @@ from pathlib import Path
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.identification import Progress
-from ccnn_torch.report.identified_tables import print_identified
+from ccnn_torch.report.identified_tables import not_settled, print_identified
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.identification._identify import Identification, identify
 from ccnn_torch.runs.identification._outputs import RESULTS, write_outputs
@@ -25,6 +25,7 @@ def start_identification(config: IdentifyConfig, quiet: bool = False) -> Path:
 
     Raises:
         InputError: the config or its data cannot be used, or the folder is taken.
+        MethodFailedError: everything is written, but the first method did not converge.
     """
     folder = RunFolder.create(config.out, config.name, "ccnn identify --resume")
     try:
@@ -44,6 +45,7 @@ def resume_identification(path: Path, quiet: bool = False) -> Path:
 
     Raises:
         InputError: there is none in the folder, or its records were changed.
+        MethodFailedError: as `start_identification`.
     """
     if not (path / "config.yaml").is_file():
         raise InputError(f"{path} has no config.yaml, so there is nothing to resume; name a folder of ccnn identify")
@@ -65,6 +67,11 @@ def _run(config: IdentifyConfig, path: Path, quiet: bool) -> Identification:
     if not quiet:
         print_identified(found.results, stdout)
         stdout.print(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
+    if found.results["methods"][found.results["method"]]["converged"] == 0:
+        raise MethodFailedError(
+            f"{not_settled(found.results)} What was written to {path} is there to look into it, not to use; more rows, "
+            "more starts (starts=10) or fewer free parameters may help"
+        )
     return found
 
 

@@ -49,7 +49,7 @@ def read_records(config: IdentifyConfig, path: str, mechanism: Mechanism) -> tup
     Raises:
         InputError: the records cannot be used.
     """
-    records = load_records(path, mechanism, [])
+    records = load_records(path, mechanism, [], learns=False)
     if isinstance(mechanism, SerialArm):
         if mechanism.frame_per or mechanism.tool_per:
             raise InputError(

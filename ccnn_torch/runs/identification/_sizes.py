@@ -11,14 +11,16 @@ from torch import Tensor
 from ccnn_torch._table import nearest
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
+from ccnn_torch.identification.parameters import match_parameters
 from ccnn_torch.units import to_si
 
-__all__ = ["ANGLE_ARM", "size", "sizes_by_name", "sizes_of_pose"]
+__all__ = ["ANGLE_ARM", "Size", "prior_sizes", "size", "sizes_by_name", "sizes_of_pose"]
 
 ANGLE_ARM = 0.3
 """An angle found from points this far apart [m] has their noise over it; as in `runs/machines`."""
 
 Size = float | str
+_WRITTEN = {"m": "0.4 mm", "rad": "0.03 deg", "1": "0.002"}
 
 
 def size(value: Size, unit: str | None, key: str) -> float:
@@ -34,7 +36,27 @@ def size(value: Size, unit: str | None, key: str) -> float:
         amount = float(number)
     except ValueError:
         raise InputError(f"{key}: '{value}' is no number with a unit; write e.g. 0.4 mm, or a number in SI") from None
-    return float(to_si(amount, written.strip(), unit, key)) if written.strip() else amount
+    if not written.strip():
+        return amount
+    hint = f"write e.g. {_WRITTEN.get(unit or '', 'a number')}, or a number in SI"
+    return float(to_si(amount, written.strip(), unit, key, hint=hint))
+
+
+def prior_sizes(given: Mapping[str, Size], geometry: Sequence[Parameter], key: str) -> dict[str, float]:
+    """Standard deviation of each prior [SI] by its name or pattern; a text has the unit of what it fits.
+
+    Raises:
+        InputError: a pattern that fits nothing, an entry that is no size, or a unit of another kind than that of a
+            parameter that it fits.
+    """
+    units = {p.name: p.unit for p in geometry}
+    found = {}
+    for pattern, value in given.items():
+        fits = match_parameters(geometry, [pattern], key.partition(".")[2])
+        kinds = list(dict.fromkeys(units[p.name] for p in geometry if p.name in fits))
+        # Every kind that it fits is asked, so that none is passed over that the unit does not suit.
+        found[pattern] = max(size(value, unit, f"{key}.{pattern}") for unit in kinds)
+    return found
 
 
 def sizes_by_name(

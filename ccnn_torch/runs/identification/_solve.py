@@ -23,9 +23,9 @@ from ccnn_torch.identification import (
 )
 from ccnn_torch.identification.parameters import Selection, select_parameters
 from ccnn_torch.identification.solvers import get_solver
-from ccnn_torch.mechanisms import SerialArm
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
 from ccnn_torch.runs.identification._measured import Measured, Rows
-from ccnn_torch.runs.identification._sizes import size
+from ccnn_torch.runs.identification._sizes import prior_sizes
 from ccnn_torch.runs.identify_config import PER_LEG, IdentifyConfig, base_method
 
 __all__ = [
@@ -79,20 +79,20 @@ class Outcome:
     message: str
 
 
-def choice_of(config: IdentifyConfig) -> ParameterChoice:
+def choice_of(config: IdentifyConfig, mechanism: Mechanism) -> ParameterChoice:
     """The parameters of a config; its priors in SI.
 
     Raises:
-        InputError: a prior is no size.
+        InputError: a prior is no size of its parameter, or fits none.
     """
     about = config.parameters
-    prior = {name: size(value, None, f"parameters.prior.{name}") for name, value in about.prior.items()}
+    prior = prior_sizes(about.prior, mechanism.geometry, "parameters.prior")
     return ParameterChoice(free=about.free, fixed=about.fixed, tied=about.tied, prior=prior)
 
 
 def select(measured: Measured, config: IdentifyConfig) -> Selection:
     """The free parameters of all machines."""
-    return select_parameters(measured.mechanism.geometry, choice_of(config), measured.start)
+    return select_parameters(measured.mechanism.geometry, choice_of(config, measured.mechanism), measured.start)
 
 
 def pieces_of(
@@ -140,7 +140,7 @@ def _problem_at(measured: Measured, config: IdentifyConfig, rows: Rows, start: T
             measured.view,
             rows.joints,
             rows.observed,
-            choice=choice_of(config),
+            choice=choice_of(config, measured.mechanism),
             pose_noise=measured.pose_noise,
             joint_noise=measured.joint_noise,
             start=start,
@@ -155,7 +155,7 @@ def _problem_at(measured: Measured, config: IdentifyConfig, rows: Rows, start: T
         measured.view,
         rows.joints,
         rows.observed,
-        choice=choice_of(config),
+        choice=choice_of(config, measured.mechanism),
         pose_noise=measured.pose_noise,
         joint_noise=measured.joint_noise,
         rotation_weight=config.rotation_weight,
@@ -167,6 +167,8 @@ def frames_first(measured: Measured, config: IdentifyConfig) -> Measured:
     """The rows with those frames fitted that no maker can know: the search and "before" begin from there."""
     if not (config.frame.base or config.frame.tool):
         return measured
+    assert isinstance(measured.mechanism, Framed)
+    closed = measured.mechanism.fitted_frames(measured.rows.joints, measured.view.frame(measured.rows.observed))
     prefixes = tuple(f"{part}_" for part, free in (("base", config.frame.base), ("tool", config.frame.tool)) if free)
     names = tuple(p.name for p in measured.mechanism.geometry if p.name.startswith(prefixes))
     choice = ParameterChoice(free=names)
@@ -178,10 +180,10 @@ def frames_first(measured: Measured, config: IdentifyConfig) -> Measured:
         pose_noise=measured.pose_noise,
         joint_noise=measured.joint_noise,
         rotation_weight=config.rotation_weight,
-        start=measured.start,
+        start=closed,
     )
     found = get_solver("lm")(problem, config.seed)
-    start = select_parameters(measured.mechanism.geometry, choice, measured.start).full(found.values)
+    start = select_parameters(measured.mechanism.geometry, choice, closed).full(found.values)
     return replace(measured, start=start, unknown_frame=names)
 
 
