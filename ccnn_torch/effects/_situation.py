@@ -56,7 +56,7 @@ class Situation:
 
     @cached_property
     def jacobian(self) -> Tensor:
-        """Derivative of position and rotation vector by the joints, `... x s x c x n`, c = 3 or 6; NaN where no pose."""
+        """Derivative of position and rotation vector by the joints, `... x s x c x n`, c = 3 or 6; NaN without pose."""
         return self.mechanism.jacobian(self.joints, self.parameters, self.pose).detach()
 
     @cached_property
@@ -163,8 +163,8 @@ class Situation:
     def push(self) -> Tensor:
         """How hard weight and load push each joint along its coordinate, in -1..1, `... x s x n` [1].
 
-        tanh of the force, relative to what a weight of `PLATFORM_WEIGHT` asks of the joint where it pulls straight along
-        the platform's motion.
+        tanh of the force, relative to what a weight of `PLATFORM_WEIGHT` asks of the joint where it pulls straight
+        along the platform's motion.
         """
         lever = torch.linalg.vector_norm(_known(self.jacobian)[..., :3, :], dim=-2)
         force = self.weight_torque * PLATFORM_WEIGHT + self.load_torque
@@ -179,7 +179,8 @@ class Situation:
     def direction(self) -> Tensor:
         """Sign of each joint's last motion, `... x s x n` [1]; 0 for a joint without such a column."""
         columns = [self.covariates.get(f"direction{i + 1}") for i in range(self.joints.shape[-1])]
-        return torch.stack([torch.zeros_like(self.joints[..., 0]) if d is None else d for d in columns], -1)
+        zero = torch.zeros_like(self.joints[..., 0])
+        return torch.stack([zero if d is None else d.expand_as(zero) for d in columns], -1)
 
 
 def _known(values: Tensor) -> Tensor:
