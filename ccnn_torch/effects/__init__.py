@@ -10,6 +10,7 @@ from ccnn_torch.effects._situation import PLATFORM_WEIGHT as PLATFORM_WEIGHT
 from ccnn_torch.effects._situation import Situation as Situation
 from ccnn_torch.effects._situation import default_gravity as default_gravity
 from ccnn_torch.effects.apply import Acting as Acting
+from ccnn_torch.effects.apply import measured_pose as measured_pose
 from ccnn_torch.effects.apply import pose_residual as pose_residual
 from ccnn_torch.effects.apply import reached as reached
 from ccnn_torch.effects.apply import signature as signature
