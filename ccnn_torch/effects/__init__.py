@@ -2,6 +2,7 @@
 
 from ccnn_torch.effects._protocol import Coefficient as Coefficient
 from ccnn_torch.effects._protocol import Effect as Effect
+from ccnn_torch.effects._protocol import Kind as Kind
 from ccnn_torch.effects._protocol import Shape as Shape
 from ccnn_torch.effects._registry import EFFECTS as EFFECTS
 from ccnn_torch.effects._registry import OUTLIER as OUTLIER

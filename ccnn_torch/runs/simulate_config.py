@@ -35,6 +35,9 @@ class SimulateConfig(BaseModel):
     duration: Positive = Field(default=SHIFT, description="time from the first to the last pose at rest, in s")
     step: Positive = Field(default=0.02, description="time between the rows of a move, in s")
     move: Positive = Field(default=1.0, description="how long a move takes, in s")
+    way: float = Field(
+        default=0.25, gt=0, le=1, description="how far a move goes from one configuration to another one, a share"
+    )
     load: Annotated[float, Field(ge=0)] = Field(default=60.0, description="standard deviation of forces, in N")
     moment: Annotated[float, Field(ge=0)] = Field(default=6.0, description="standard deviation of moments, in N*m")
     gravity: tuple[float, float, float] | None = Field(

@@ -15,7 +15,7 @@ from ccnn_torch.effects.covariates import draw_covariates
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
-from ccnn_torch.units import si_unit_of
+from ccnn_torch.units import to_si
 
 __all__ = ["check_effect"]
 
@@ -119,9 +119,10 @@ def _check_names(effect: Effect, situation: Situation) -> None:
 
 def _check_unit(effect: Effect, name: str, unit: str) -> None:
     try:
-        si_unit_of(unit)
+        one = float(to_si([1.0], unit, where="it")[0])
     except InputError as reason:
         raise AssertionError(f"effect '{effect.name}': the unit of '{name}' is none: {reason}") from None
+    _require(one == 1.0, effect, f"the unit '{unit}' of '{name}' is no SI unit")
 
 
 def _check_basis(effect: Effect, situation: Situation) -> None:

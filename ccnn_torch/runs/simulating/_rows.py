@@ -40,7 +40,7 @@ def draw_poses(mechanism: Mechanism, rows: int, config: SimulateConfig, generato
 
 
 def draw_moves(mechanism: Mechanism, rows: int, config: SimulateConfig, generator: torch.Generator) -> Rows:
-    """Rows along moves from one drawn configuration to another, with a pause after each.
+    """Rows along moves from one drawn configuration towards another, with a pause after each.
 
     An arm moves on straight lines in its joints, other machines in their pose, with the least jerk (Flash and Hogan
     1985: 10 u³ - 15 u⁴ + 6 u⁵). The columns have the joints' velocities as well, and their signs as directions.
@@ -59,7 +59,7 @@ def draw_moves(mechanism: Mechanism, rows: int, config: SimulateConfig, generato
         arm = isinstance(mechanism, SerialArm)
         sample = mechanism.sample_joints if arm else mechanism.sample_workspace
         start, end = sample(2 * moves, generator).reshape(2, moves, 1, -1)
-        path = start + (end - start) * share
+        path = start + config.way * (end - start) * share
         joints = path if arm else mechanism.solve_inverse(path)
         speed = (joints[2] - joints[0]) / (2 * _INSTANT * config.move)
         whole = _regular(mechanism, joints[1], config).all(-1) & torch.isfinite(joints).all(-1).all(-1).all(0)
