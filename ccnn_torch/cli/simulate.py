@@ -32,8 +32,8 @@ def simulate(
     compliance, gravity, thermal, drift, frame, tool, coupling, latency, instrument, outlier (bad rows), or
     your own as path/to/file.py:Name. An effect without parameters is drawn in a plausible size; size=2 makes that
     twice as large. Given parameters are SI numbers or have a unit (q1=0.1mm); blanks in names may be underscores;
-    parameters that are not given are 0. Keys: mechanism_keys, covariates, rows, duration, step, move, way, load, moment,
-    gravity, max_condition, rotation_weight.
+    parameters that are not given are 0. Keys: mechanism_keys, covariates, rows, duration, step, move, way, load,
+    moment, gravity, max_condition, rotation_weight.
 
     Examples:
 
