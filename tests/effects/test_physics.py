@@ -142,7 +142,7 @@ def test_an_arm_sags_by_the_slope_of_its_potential_energy() -> None:
         step = torch.zeros(6, dtype=torch.float64)
         step[i] = 1e-6
         slope = (energy(rows.joints + step) - energy(rows.joints - step)) / 2e-6
-        assert torch.allclose(basis[:, i, 2 * i], -slope, atol=1e-8)
+        assert torch.allclose(basis[:, i, 3 * i], -slope, atol=1e-8)
 
 
 def test_a_platform_hangs_in_its_drives_with_its_weight() -> None:
@@ -155,6 +155,34 @@ def test_a_platform_hangs_in_its_drives_with_its_weight() -> None:
     leg = rows.pose[:, None, :3] + (rotation[:, None] @ legs[:, 3:6, None])[..., 0] - legs[:, :3]
     total = (tension[..., None] * leg / leg.norm(dim=-1, keepdim=True)).sum(-2)
     assert torch.allclose(total, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand_as(total), atol=1e-9)
+
+
+def test_a_centre_of_mass_beside_the_measured_point_asks_what_the_shifted_weight_does() -> None:
+    rows = situation("stewart")
+    basis = make_effect("gravity").basis(rows, NO_SHAPE)[..., -3:]
+    shift, weight = torch.tensor([0.02, -0.03, 0.1], dtype=torch.float64), 70.0
+    torque = rows.weight_torque * weight + (basis @ (weight * shift)) / 1e-7
+    # The height of the shifted point, by differences along each joint.
+    step = 1e-6 * torch.eye(6, dtype=torch.float64)[:, None]
+    heights = []
+    for s in (step, -step):
+        pose = rows.mechanism.forward_kinematics(rows.joints + s, guess=rows.pose)
+        heights.append(pose[..., 2] + (rotation_vector_to_matrix(pose[..., 3:]) @ shift)[..., 2])
+    assert torch.allclose(torque, -weight * ((heights[0] - heights[1]) / 2e-6).mT, rtol=1e-6, atol=1e-5)
+
+
+def test_what_a_load_holds_on_a_flank_does_not_depend_on_the_side_of_approach() -> None:
+    rows = situation("tripod")
+    heavy = torch.full((9,), 1e5, dtype=torch.float64)
+    sides = []
+    for sign in (1.0, -1.0):
+        columns = {f"direction{i}": torch.full((9,), sign, dtype=torch.float64) for i in (1, 2, 3)}
+        held = replace(rows, covariates={**columns, "load_z": heavy})
+        play = {f"q{i}{part}": 2e-4 for i in (1, 2, 3) for part in ("", "_soft_edge", "_held")}
+        sides.append(acting("backlash", held, **play).change(held))
+    pushed = held.push.abs() > 20
+    assert bool(pushed.any()) and torch.allclose(sides[0][pushed], sides[1][pushed], atol=1e-12)
+    assert torch.allclose(sides[0][pushed], 1e-4 * held.push[pushed].sign())
 
 
 @pytest.mark.parametrize("name", ["five_bar", "stewart"])
@@ -183,7 +211,7 @@ def test_play_is_the_way_between_both_sides_of_approach() -> None:
         ends.append(rows.joints + acting("backlash", side, q1=3e-4).change(side))
     assert torch.allclose(ends[1] - ends[0], torch.tensor([3e-4, 0.0], dtype=torch.float64).expand(9, 2))
     names = [c.name for c in make_effect("backlash").coefficients(side)]
-    assert names == ["q1", "q1 soft edge"]  # nothing is known of the other joint's side
+    assert names == ["q1", "q1 soft edge", "q1 held"]  # nothing is known of the other joint's side
 
 
 def test_friction_acts_against_the_last_motion_and_grows_with_the_load() -> None:
