@@ -9,8 +9,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.mechanisms._pose import frame_jacobian
+from ccnn_torch.rotations import rotation_vector_to_matrix
 
 __all__ = ["PLATFORM_WEIGHT", "Situation", "default_gravity"]
 
@@ -155,6 +157,27 @@ class Situation:
         torque: Tensor = _known(self.jacobian)[..., :3, :].mT @ self.down
         return torque
 
+    @cached_property
+    def own_weight_torque(self) -> Tensor:
+        """What 1 N of the machine's own weight asks of each joint, `... x s x n` [N or N·m per N].
+
+        Of an arm it is spread evenly over the origins of its links and the tool; of others it is the platform's.
+        """
+        arm = self.mechanism
+        if not isinstance(arm, SerialArm):
+            return self.weight_torque
+        values = arm.resolve(self.parameters)
+        down = (rotation_vector_to_matrix(values[..., 3:6]).mT @ self.down.unsqueeze(-1)).squeeze(-1)
+
+        def along(joints: Tensor) -> Tensor:
+            frames = arm.link_frames(joints, values)
+            rotation, flange = frames[-1]
+            tool = flange + (rotation @ values[..., -6:-3, None]).squeeze(-1)
+            places = torch.stack([*(place for _, place in frames[1:]), tool], -2)
+            return (places @ down.unsqueeze(-1)).squeeze(-1).mean(-1, keepdim=True)
+
+        return jacobian_of(along, self.joints)[1].squeeze(-2).detach()
+
     @property
     def down(self) -> Tensor:
         """Unit vector along gravity, `3`; 0 where there is none."""
@@ -168,9 +191,9 @@ class Situation:
         In units of what a weight of `PLATFORM_WEIGHT` typically asks of the joint in the workspace; of a joint that
         carries little of it, of a tenth of what the others carry.
         """
-        typical = self.samples.weight_torque.square().mean(0).sqrt()
+        typical = self.samples.own_weight_torque.square().mean(0).sqrt()
         typical = torch.maximum(typical, 0.1 * typical.amax()).clamp_min(_LEAST)
-        return self.weight_torque / typical + self.load_torque / (typical * PLATFORM_WEIGHT)
+        return self.own_weight_torque / typical + self.load_torque / (typical * PLATFORM_WEIGHT)
 
     @cached_property
     def directed(self) -> list[int]:

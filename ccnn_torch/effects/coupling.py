@@ -9,13 +9,14 @@ from torch import Tensor
 
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import Situation
+from ccnn_torch.effects.joint_gain import ZERO
 from ccnn_torch.mechanisms import Mechanism
 
 __all__ = ["Coupling"]
 
 
 class Coupling:
-    """Δq_i = Σ c_ij (q_j - middle of its workspace) over j ≠ i."""
+    """Δq_i = Σ c_ij (q_j - middle of its workspace) + z_i over j ≠ i; z (secondary): it may be 0 elsewhere."""
 
     name = "coupling"
     kind: Kind = "joints"
@@ -32,20 +33,22 @@ class Coupling:
         size = {"m/rad": 1e-4, "rad/m": 1e-2}
         pairs = [(i, j) for i in joints for j in joints if i.name != j.name]
         units = ["1" if i.unit == j.unit else f"{i.unit}/{j.unit}" for i, j in pairs]
-        return tuple(
+        found = [
             Coefficient(f"{i.name} by {j.name}", unit, size.get(unit, 1e-3), joint=i.name)
             for (i, j), unit in zip(pairs, units, strict=True)
-        )
+        ]
+        found += [Coefficient(f"{j.name} zero", j.unit, ZERO[j.unit], joint=j.name, secondary=True) for j in joints]
+        return tuple(found)
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """None."""
         return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
-        """`... x s x n x n(n - 1)`."""
+        """`... x s x n x n²`."""
         n = situation.joints.shape[-1]
         others = ~torch.eye(n, dtype=torch.bool)
         eye = torch.eye(n, dtype=situation.joints.dtype, device=situation.joints.device)
         # moved joint, pair (i, j): 1 where the moved joint is i, times where joint j stands.
         moved = eye[:, :, None] * situation.from_middle[..., None, None, :]
-        return moved[..., others]
+        return torch.cat([moved[..., others], eye.expand(*moved.shape[:-2], n)], -1)

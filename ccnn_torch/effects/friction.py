@@ -26,7 +26,8 @@ class Friction:
 
     Coulomb's friction is in proportion to what presses the surfaces together; a drive of compliance C and friction
     coefficient μ stops C μ |τ| short. The weight is that of a platform of 100 N: of another one d is as much larger.
-    The part e that does not depend on the load is secondary: by itself it is what play does.
+    Secondary: load and weight together, |τ_load + τ_weight|, where they pull apart; and the part e that does not depend
+    on them, which by itself is what play does.
     """
 
     name = "friction"
@@ -47,6 +48,9 @@ class Friction:
                 found.append(
                     Coefficient(f"{joint.name} {part}", per_force(joint.unit), size, joint=joint.name, positive=True)
                 )
+            if situation.loaded:
+                unit = per_force(joint.unit)
+                found.append(Coefficient(f"{joint.name} together", unit, size, joint=joint.name, secondary=True))
             constant = _CONSTANT[joint.unit]
             found.append(Coefficient(f"{joint.name} constant", joint.unit, constant, joint=joint.name, secondary=True))
         return tuple(found)
@@ -57,7 +61,8 @@ class Friction:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x m`, joint by joint."""
-        carried = [situation.load_torque.abs()] if situation.loaded else []
-        carried += [situation.weight_torque.abs() * PLATFORM_WEIGHT, torch.ones_like(situation.joints)]
+        load, weight = situation.load_torque, situation.own_weight_torque * PLATFORM_WEIGHT
+        carried = [load.abs(), weight.abs(), (load + weight).abs()] if situation.loaded else [weight.abs()]
+        carried.append(torch.ones_like(situation.joints))
         against = -situation.direction.unsqueeze(-1) * torch.stack(carried, -1)
         return by_joint(against, situation.directed)

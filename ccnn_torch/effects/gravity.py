@@ -11,9 +11,7 @@ from ccnn_torch.effects._columns import by_joint
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import PLATFORM_WEIGHT, Situation
 from ccnn_torch.effects.compliance import SCALE
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.rotations import rotation_vector_to_matrix
 
 __all__ = ["Gravity"]
 
@@ -74,7 +72,7 @@ class Gravity:
         turning = torch.tensor([j.unit == "rad" for j in mechanism.joints])
         lever = torch.where(turning, _LEVER, 1.0)
         arm = isinstance(mechanism, SerialArm)
-        weight = _spread_weight(situation) if arm else situation.weight_torque
+        weight = situation.own_weight_torque
         parts = [weight, weight * weight.abs() / lever]
         parts += [situation.weight_torque] if arm else [torch.cos(joints), torch.sin(joints)]
         columns = by_joint(torch.stack(parts, -1))
@@ -98,20 +96,3 @@ def _off_centre(situation: Situation) -> Tensor:
     jacobian = torch.nan_to_num(situation.jacobian)
     asked: Tensor = jacobian[..., 3:, :].mT @ moment.mT
     return scale[:, None] * asked
-
-
-def _spread_weight(situation: Situation) -> Tensor:
-    """What 1 N over the links' origins and the tool asks of each joint of an arm, `... x s x n` [N or N·m per N]."""
-    arm = situation.mechanism
-    assert isinstance(arm, SerialArm)
-    values = arm.resolve(situation.parameters)
-    down = (rotation_vector_to_matrix(values[..., 3:6]).mT @ situation.down.unsqueeze(-1)).squeeze(-1)
-
-    def along(joints: Tensor) -> Tensor:
-        frames = arm.link_frames(joints, values)
-        rotation, flange = frames[-1]
-        tool = flange + (rotation @ values[..., -6:-3, None]).squeeze(-1)
-        places = torch.stack([*(place for _, place in frames[1:]), tool], -2)
-        return (places @ down.unsqueeze(-1)).squeeze(-1).mean(-1, keepdim=True)
-
-    return jacobian_of(along, situation.joints)[1].squeeze(-2).detach()
