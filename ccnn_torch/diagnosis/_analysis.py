@@ -39,6 +39,7 @@ class Analysis:
         y: what they explain, whitened, `s x c`.
         found: sets, most probable first.
         near_singular: `s`, bool.
+        floor: mean square of the noise in the units of `y`: 1 where it was given, else that of the richest fit.
     """
 
     situation: Situation
@@ -50,6 +51,7 @@ class Analysis:
     y: Tensor
     found: list[Found]
     near_singular: Tensor
+    floor: float
 
     def acting(self, found: Found) -> list[Acting]:
         """The effects of a set with their most probable numbers; catch-alls are left out."""
@@ -85,6 +87,7 @@ def analyse(
     everything = torch.cat([a.columns for a in (*atoms, *rest[:1])], -1) if atoms or rest else residual[..., None]
     white = fitted_whitening(residual, everything, channels, noise, usable)
 
+    rich = white.sigma
     # Shapes by themselves and with the rest of the library beside them: two ways to start, both stay candidates.
     fixed = [a for a in atoms if a.shape.numel() == 0]
     shaped = [a for a in atoms if a.shape.numel()]
@@ -96,7 +99,7 @@ def analyse(
         for nuisance in (alone, beside):
             shape = best_shape(situation, atom.effect, white, white(residual), nuisance)
             starts.append(_cleaned(_atom(situation, situation, atom.effect, shape), usable))
-    result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest], near)
+    result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest], near, white.sigma)
 
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
     for _ in range(2):
@@ -128,7 +131,7 @@ def analyse(
                 old = next(a for a in result.library.atoms if a.effect is effect)
                 so = Shaped(old.shape, old.used, LOG_PRIOR - old.log_prior)
                 atoms.append(_cleaned(_atom(situation, there, effect, so), ok))
-        result = _searched(situation, measured, target, white, [*atoms, *rest], near)
+        result = _searched(situation, measured, target, white, [*atoms, *rest], near, rich)
     return result
 
 
@@ -155,7 +158,7 @@ def _cleaned(atom: Atom, usable: Tensor) -> Atom:
 
 
 def _searched(
-    situation: Situation, measured: Tensor, target: Tensor, white: Whitening, atoms: list[Atom], near: Tensor
+    situation: Situation, measured: Tensor, target: Tensor, white: Whitening, atoms: list[Atom], near: Tensor, rich: Tensor
 ) -> Analysis:
     keep = white.keep()
     columns = white(torch.cat([a.columns for a in atoms], -1)) if atoms else white(target)[..., None][..., :0]
@@ -163,7 +166,8 @@ def _searched(
     ends = torch.tensor([a.columns.shape[-1] for a in atoms]).cumsum(0).tolist()
     groups = tuple(torch.arange(e - a.columns.shape[-1], e) for a, e in zip(atoms, ends, strict=True))
     library = Library(tuple(atoms), groups, grams_of(columns[keep], y[keep]), white.known)
-    return Analysis(situation, measured, target, white, library, columns, y, search(library), near)
+    floor = float((rich / white.sigma).square().mean())
+    return Analysis(situation, measured, target, white, library, columns, y, search(library), near, floor)
 
 
 def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitening:

@@ -44,25 +44,30 @@ def best_shape(
     """
     shapes = effect.shapes(situation)
     value = default_shape(situation, effect) if start is None else start.clone()
-    nuisance = others.flatten(0, 1)
-    factor = torch.linalg.cholesky(torch.eye(nuisance.shape[1], dtype=y.dtype) + nuisance.mT @ nuisance)
-
-    def score(candidates: Tensor, columns: list[int] | None) -> Tensor:
-        basis = scaled_signature(situation, effect, candidates)
-        if columns is not None:
-            basis = basis[..., columns]
-        z = torch.stack([whiten(b) for b in basis]).flatten(1, 2)
-        return _gain(z, y.flatten(), nuisance, factor)
-
-    joined = _joined(shapes)
+    fixed, target = others.flatten(0, 1), y.flatten()
+    groups = [_columns_of(shapes, which) for which in _joined(shapes)]
     gains: list[tuple[float, float, list[int] | None]] = []
-    for which in joined:
-        columns = None if shapes[which[0]].columns is None else sorted({c for h in which for c in shapes[h].columns or ()})
-        for h in which:
-            grid = torch.tensor(shapes[h].grid, dtype=y.dtype)
-            value = _looked_at(value, h, grid, lambda v, columns=columns: score(v, columns))
-        charge = sum(math.log(max(len(shapes[h].grid), 1)) for h in which)
-        gains.append((float(score(value[None], columns)[0]) / 2 - charge, charge, columns))
+    # Twice, the second time with what the first found for the other joints beside it.
+    for sweep in range(2 if len(groups) > 1 else 1):
+        gains = []
+        for which, columns in groups:
+            nuisance = fixed
+            if sweep:
+                own = whiten(scaled_signature(situation, effect, value)).flatten(0, 1)
+                nuisance = torch.cat([fixed, own[:, [c for c in range(own.shape[1]) if c not in (columns or ())]]], -1)
+            left = _Left(target, nuisance)
+
+            def score(candidates: Tensor, columns: list[int] | None = columns, left: _Left = left) -> Tensor:
+                basis = scaled_signature(situation, effect, candidates)
+                if columns is not None:
+                    basis = basis[..., columns]
+                return left.gain(torch.stack([whiten(b) for b in basis]).flatten(1, 2))
+
+            for h in which:
+                grid = torch.tensor(shapes[h].grid, dtype=y.dtype)
+                value = _looked_at(value, h, grid, score)
+            charge = sum(math.log(max(len(shapes[h].grid), 1)) for h in which)
+            gains.append((float(score(value[None])[0]) / 2 - charge, charge, columns))
     return _worth(value, gains)
 
 
@@ -92,20 +97,34 @@ def _looked_at(value: Tensor, h: int, grid: Tensor, score: Callable[[Tensor], Te
     return value
 
 
-def _gain(z: Tensor, y: Tensor, nuisance: Tensor, factor: Tensor) -> Tensor:
-    """Squares that each candidate explains beyond the nuisance, `g`; z: `g x N x m`, y: `N`, nuisance: `N x P`."""
-    if nuisance.shape[1]:
-        project = torch.cholesky_solve(nuisance.mT @ y[:, None], factor)
-        y = y - (nuisance @ project)[:, 0]
-        cross = nuisance.mT @ z
-        inner = z.mT @ z - cross.mT @ torch.cholesky_solve(cross, factor)
-    else:
+class _Left:
+    """What nuisance columns with their prior leave of `y`, and of whatever is put beside them."""
+
+    def __init__(self, y: Tensor, nuisance: Tensor) -> None:
+        """y: `N`; nuisance: `N x P`, whitened, in units of their prior scale."""
+        self.nuisance = nuisance
+        eye = torch.eye(nuisance.shape[1], dtype=y.dtype, device=y.device)
+        self.factor = torch.linalg.cholesky(eye + nuisance.mT @ nuisance)
+        self.y = y - (nuisance @ torch.cholesky_solve(nuisance.mT @ y[:, None], self.factor))[:, 0]
+
+    def gain(self, z: Tensor) -> Tensor:
+        """Squares that each candidate explains, `g`; z: `g x N x m`."""
         inner = z.mT @ z
-    b = (z.mT @ y[:, None])[..., 0]
-    ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
-    inner = inner + torch.diag_embed(ridge[:, None].expand(-1, inner.shape[-1]))
-    solved = torch.linalg.solve(inner, b[..., None])[..., 0]
-    return (b * solved).sum(-1)
+        if self.nuisance.shape[1]:
+            cross = self.nuisance.mT @ z
+            inner = inner - cross.mT @ torch.cholesky_solve(cross, self.factor)
+        b = (z.mT @ self.y[:, None])[..., 0]
+        ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
+        inner = inner + torch.diag_embed(ridge[:, None].expand(-1, inner.shape[-1]))
+        solved = torch.linalg.solve(inner, b[..., None])[..., 0]
+        return (b * solved).sum(-1)
+
+
+def _columns_of(shapes: tuple[Shape, ...], which: list[int]) -> tuple[list[int], list[int] | None]:
+    """Shapes that are looked for together, and the coefficients that depend on them (None = all)."""
+    if any(shapes[h].columns is None for h in which):
+        return which, None
+    return which, sorted({c for h in which for c in shapes[h].columns or ()})
 
 
 def _joined(shapes: tuple[Shape, ...]) -> list[list[int]]:
