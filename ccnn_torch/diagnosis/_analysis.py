@@ -14,7 +14,7 @@ from ccnn_torch.diagnosis._catch_all import catch_alls
 from ccnn_torch.diagnosis._evidence import grams_of
 from ccnn_torch.diagnosis._linear import signature_at, tangent
 from ccnn_torch.diagnosis._search import Found, Library, search
-from ccnn_torch.diagnosis._shapes import Shaped, best_shape
+from ccnn_torch.diagnosis._shapes import Scan, Shaped
 from ccnn_torch.diagnosis._whitening import Whitening, fitted_whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 
@@ -96,9 +96,10 @@ def analyse(
     starts: list[Atom] = []
     for atom in shaped:
         assert atom.effect is not None
+        scan = Scan(situation, situation, atom.effect, _only(white, usable))
         for nuisance in (alone, beside):
-            shape = best_shape(situation, atom.effect, white, white(residual), nuisance)
-            starts.append(_cleaned(_atom(situation, situation, atom.effect, shape), usable))
+            shaped_so = scan.best(white(residual), nuisance)
+            starts.append(_cleaned(_atom(situation, situation, atom.effect, shaped_so), usable))
     result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest], near, white.sigma)
 
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
@@ -125,7 +126,7 @@ def analyse(
                 if a.effect is not effect
             ]
             beside = torch.cat(nuisance, -1) if nuisance else alone
-            shaped_so = best_shape(situation, effect, white, white(target), beside, start)
+            shaped_so = Scan(situation, there, effect, _only(white, ok)).best(white(target), beside, start)
             atoms.append(_cleaned(_atom(situation, there, effect, shaped_so), ok))
             if not inside:
                 old = next(a for a in result.library.atoms if a.effect is effect)
@@ -149,6 +150,11 @@ def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped
     if shaped.used is not None:
         columns = columns[..., list(shaped.used)]
     return Atom(effect.name, effect, shaped.value, columns, LOG_PRIOR - shaped.charge, shaped.used)
+
+
+def _only(white: Whitening, usable: Tensor) -> Whitening:
+    """The same with rows that are left out set to zero."""
+    return replace(white, weight=torch.where(usable, white.weight, 0.0))
 
 
 def _cleaned(atom: Atom, usable: Tensor) -> Atom:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._atoms import default_shape, scaled_signature
+from ccnn_torch.diagnosis._atoms import default_shape, scales
 from ccnn_torch.effects import Effect, Shape, Situation
 
-__all__ = ["Shaped", "best_shape"]
+__all__ = ["Scan", "Shaped"]
+
+# The grid, then twice this many values between the neighbours of the best.
+_FINE, _ROUNDS = 9, 2
 
 
 class Shaped(NamedTuple):
@@ -24,77 +27,112 @@ class Shaped(NamedTuple):
     charge: float
 
 
-def best_shape(
-    situation: Situation,
-    effect: Effect,
-    whiten: Callable[[Tensor], Tensor],
-    y: Tensor,
-    others: Tensor,
-    start: Tensor | None = None,
-) -> Shaped:
-    """The shapes of an effect that explain most of `y`, `h`; found one after the other, then refined.
+class _Part(NamedTuple):
+    """Shapes that share coefficients, and which those are."""
 
-    Args:
-        situation: the rows.
-        effect: with at least one shape.
-        whiten: of signatures, `s x c0 x m` -> `s x c x m`.
-        y: whitened residual, `s x c`.
-        others: whitened columns of what else is there, scaled by their prior, `s x c x P`; may have no columns.
-        start: shapes to start from; the middle of each grid when None.
-    """
-    shapes = effect.shapes(situation)
-    value = default_shape(situation, effect) if start is None else start.clone()
-    fixed, target = others.flatten(0, 1), y.flatten()
-    groups = [_columns_of(shapes, which) for which in _joined(shapes)]
-    gains: list[tuple[float, float, list[int] | None]] = []
-    # Twice, the second time with what the first found for the other joints beside it.
-    for sweep in range(2 if len(groups) > 1 else 1):
-        gains = []
-        for which, columns in groups:
-            nuisance = fixed
-            if sweep:
-                own = whiten(scaled_signature(situation, effect, value)).flatten(0, 1)
-                nuisance = torch.cat([fixed, own[:, [c for c in range(own.shape[1]) if c not in (columns or ())]]], -1)
-            left = _Left(target, nuisance)
-
-            def score(candidates: Tensor, columns: list[int] | None = columns, left: _Left = left) -> Tensor:
-                basis = scaled_signature(situation, effect, candidates)
-                if columns is not None:
-                    basis = basis[..., columns]
-                return left.gain(torch.stack([whiten(b) for b in basis]).flatten(1, 2))
-
-            for h in which:
-                grid = torch.tensor(shapes[h].grid, dtype=y.dtype)
-                value = _looked_at(value, h, grid, score)
-            charge = sum(math.log(max(len(shapes[h].grid), 1)) for h in which)
-            gains.append((float(score(value[None])[0]) / 2 - charge, charge, columns))
-    return _worth(value, gains)
+    shapes: list[int]
+    columns: list[int]
 
 
-def _worth(value: Tensor, gains: list[tuple[float, float, list[int] | None]]) -> Shaped:
-    """Only the parts that pay for their search and half a unit of log evidence a coefficient; at least the best one."""
-    best = max(range(len(gains)), key=lambda i: gains[i][0])
-    kept = [
-        g for i, g in enumerate(gains) if i == best or g[2] is None or g[0] > 1.5 * len(g[2])
-    ]
-    charge = sum(g[1] for g in kept)
-    if any(g[2] is None for g in kept) or len(kept) == len(gains):
-        return Shaped(value, None, charge)
-    return Shaped(value, tuple(sorted({c for g in kept for c in g[2] or ()})), charge)
+class Scan:
+    """The columns of one effect over the grids of its shapes; they serve every search of the same rows."""
 
+    def __init__(
+        self, situation: Situation, there: Situation, effect: Effect, whiten: Callable[[Tensor], Tensor]
+    ) -> None:
+        """situation: the rows; there: the machine about which they are linear; whiten: as `Whitening`."""
+        self.situation, self.effect, self.whiten = situation, effect, whiten
+        self.shapes = effect.shapes(situation)
+        coefficients = effect.coefficients(situation)
+        self.size = scales(coefficients, situation.joints)
+        self.parts = _parts(self.shapes, len(coefficients))
+        self.start = default_shape(situation, effect)
+        kind = {"joints": lambda: there.jacobian, "parameters": lambda: there.parameter_jacobian}.get(effect.kind)
+        self.lead = whiten(torch.nan_to_num(kind())) if kind is not None else None
+        self.coarse: list[tuple[Tensor, list[Tensor]]] | None = None
 
-def _looked_at(value: Tensor, h: int, grid: Tensor, score: Callable[[Tensor], Tensor]) -> Tensor:
-    """`value` with shape h at its best: over the grid, then twice between the neighbours of the best."""
-    for _ in range(3):
-        candidates = value.expand(len(grid), -1).clone()
-        candidates[:, h] = grid
-        k = int(score(candidates).argmax())
-        value = candidates[k]
-        if len(grid) < 2:
-            break
-        low, high = grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)]
-        grid = torch.linspace(0, 1, 9, dtype=grid.dtype) * (high - low) + low
-    return value
+    def columns(self, candidates: Tensor) -> list[Tensor]:
+        """Of each part, whitened, in plausible sizes, `g x N x m`; candidates: `g x h`."""
+        basis = self.effect.basis(self.situation, candidates)
+        found = []
+        for part in self.parts:
+            mine = basis[..., part.columns] * self.size[part.columns]
+            z = self.lead @ mine if self.lead is not None else torch.stack([self.whiten(b) for b in mine])
+            found.append(torch.nan_to_num(z).flatten(1, 2))
+        return found
+
+    def best(self, y: Tensor, others: Tensor, start: Tensor | None = None) -> Shaped:
+        """The shapes that explain most of `y`.
+
+        Args:
+            y: whitened residual, `s x c`.
+            others: whitened columns of what else is there, in units of their prior, `s x c x P`; P may be 0.
+            start: shapes found before, when the effect is known to be there: its parts are then looked for beside each
+                other.
+        """
+        value = self.start if start is None else start
+        target, fixed = y.flatten(), others.flatten(0, 1)
+        gains = [0.0] * len(self.parts)
+        plain = _Left(target, fixed)
+        for level in range(_ROUNDS + 1):
+            for candidates, pieces in self._level(value, level):
+                chosen = [self._nearest(candidates, value, part) for part in self.parts]
+                for sweep in range(2 if start is not None and len(self.parts) > 1 else 1):
+                    for i, z in enumerate(pieces):
+                        left = plain
+                        if sweep:
+                            own = [p[chosen[j]] for j, p in enumerate(pieces) if j != i]
+                            left = _Left(target, torch.cat([fixed, *own], -1))
+                        score = left.gain(z)
+                        chosen[i] = int(score.argmax())
+                        gains[i] = float(score[chosen[i]])
+                value = value.clone()
+                for i, part in enumerate(self.parts):
+                    value[part.shapes] = candidates[chosen[i]][part.shapes]
+        return self._worth(value, gains)
+
+    def _level(self, value: Tensor, level: int) -> list[tuple[Tensor, list[Tensor]]]:
+        """Candidates `g x h` with their columns; every first shape of a part at once, then every second one."""
+        if level == 0 and self.coarse is not None:
+            return self.coarse
+        found = []
+        for turn in range(max((len(p.shapes) for p in self.parts), default=0)):
+            moving = [p.shapes[turn] for p in self.parts if turn < len(p.shapes)]
+            grids = {h: self._grid(h, float(value[h]), level) for h in moving}
+            longest = max(len(g) for g in grids.values())
+            candidates = value.expand(longest, -1).clone()
+            for h, grid in grids.items():
+                candidates[: len(grid), h] = grid
+                candidates[len(grid) :, h] = grid[-1]
+            found.append((candidates, self.columns(candidates)))
+        if level == 0:
+            self.coarse = found
+        return found
+
+    def _grid(self, h: int, value: float, level: int) -> Tensor:
+        grid = torch.tensor(self.shapes[h].grid, dtype=self.size.dtype)
+        if level == 0:
+            return grid
+        k = int((grid - value).abs().argmin())
+        low, high = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
+        half = (high - low) / 2 * (2 / (_FINE - 1)) ** (level - 1)
+        fine = torch.linspace(-1, 1, _FINE, dtype=grid.dtype) * half + value
+        return fine.clamp(float(grid[0]), float(grid[-1]))
+
+    def _nearest(self, candidates: Tensor, value: Tensor, part: _Part) -> int:
+        return int((candidates[:, part.shapes] - value[part.shapes]).abs().sum(-1).argmin())
+
+    def _worth(self, value: Tensor, gains: Sequence[float]) -> Shaped:
+        """Only the parts that pay for their search and half a unit of log evidence a coefficient; at least the best."""
+        charges = [sum(math.log(max(len(self.shapes[h].grid), 1)) for h in p.shapes) for p in self.parts]
+        net = [g / 2 - c for g, c in zip(gains, charges, strict=True)]
+        best = max(range(len(net)), key=lambda i: net[i])
+        kept = [i for i, p in enumerate(self.parts) if i == best or net[i] > 1.5 * len(p.columns)]
+        charge = sum(charges[i] for i in kept)
+        if len(kept) == len(self.parts):
+            return Shaped(value, None, charge)
+        unshaped = set(range(len(self.size))) - {c for p in self.parts for c in p.columns}
+        return Shaped(value, tuple(sorted(unshaped | {c for i in kept for c in self.parts[i].columns})), charge)
 
 
 class _Left:
@@ -120,22 +158,13 @@ class _Left:
         return (b * solved).sum(-1)
 
 
-def _columns_of(shapes: tuple[Shape, ...], which: list[int]) -> tuple[list[int], list[int] | None]:
-    """Shapes that are looked for together, and the coefficients that depend on them (None = all)."""
-    if any(shapes[h].columns is None for h in which):
-        return which, None
-    return which, sorted({c for h in which for c in shapes[h].columns or ()})
-
-
-def _joined(shapes: tuple[Shape, ...]) -> list[list[int]]:
-    """Shapes in groups that share a coefficient."""
-    groups: list[tuple[set[int] | None, list[int]]] = []
+def _parts(shapes: tuple[Shape, ...], coefficients: int) -> list[_Part]:
+    """Shapes in groups that share a coefficient; one with no columns of its own belongs to all."""
+    parts: list[_Part] = []
     for h, shape in enumerate(shapes):
-        mine = None if shape.columns is None else set(shape.columns)
-        for i, (theirs, members) in enumerate(groups):
-            if mine is None or theirs is None or mine & theirs:
-                groups[i] = (None if mine is None or theirs is None else mine | theirs, [*members, h])
-                break
-        else:
-            groups.append((mine, [h]))
-    return [members for _, members in groups]
+        mine = set(range(coefficients) if shape.columns is None else shape.columns)
+        joined = [p for p in parts if mine & set(p.columns)]
+        parts = [p for p in parts if not mine & set(p.columns)]
+        members = sorted({h, *(k for p in joined for k in p.shapes)})
+        parts.append(_Part(members, sorted(mine.union(*(p.columns for p in joined)))))
+    return parts
