@@ -49,17 +49,19 @@ class Scan:
         self.start = default_shape(situation, effect)
         kind = {"joints": lambda: there.jacobian, "parameters": lambda: there.parameter_jacobian}.get(effect.kind)
         self.lead = whiten(torch.nan_to_num(kind())) if kind is not None else None
+        free = [c for c in range(len(coefficients)) if not any(c in p.columns for p in self.parts)]
+        self.unshaped = self._whitened(effect.basis(situation, self.start)[None], free)[0]
         self.coarse: list[tuple[Tensor, list[Tensor]]] | None = None
 
     def columns(self, candidates: Tensor) -> list[Tensor]:
         """Of each part, whitened, in plausible sizes, `g x N x m`; candidates: `g x h`."""
         basis = self.effect.basis(self.situation, candidates)
-        found = []
-        for part in self.parts:
-            mine = basis[..., part.columns] * self.size[part.columns]
-            z = self.lead @ mine if self.lead is not None else torch.stack([self.whiten(b) for b in mine])
-            found.append(torch.nan_to_num(z).flatten(1, 2))
-        return found
+        return [self._whitened(basis, part.columns) for part in self.parts]
+
+    def _whitened(self, basis: Tensor, columns: list[int]) -> Tensor:
+        mine = basis[..., columns] * self.size[columns]
+        z = self.lead @ mine if self.lead is not None else torch.stack([self.whiten(b) for b in mine])
+        return torch.nan_to_num(z).flatten(1, 2)
 
     def best(self, y: Tensor, others: Tensor, start: Tensor | None = None) -> Shaped:
         """The shapes that explain most of `y`.
@@ -71,7 +73,7 @@ class Scan:
                 other.
         """
         value = self.start if start is None else start
-        target, fixed = y.flatten(), others.flatten(0, 1)
+        target, fixed = y.flatten(), torch.cat([others.flatten(0, 1), self.unshaped], -1)
         gains = [0.0] * len(self.parts)
         plain = _Left(target, fixed)
         for level in range(_ROUNDS + 1):
