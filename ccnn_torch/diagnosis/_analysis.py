@@ -84,15 +84,16 @@ def analyse(
     rest = [a for a in catch_alls(situation) if bool(torch.isfinite(a.columns[usable]).all())]
     atoms = [_cleaned(a, usable) for a in atoms]
     rest = [_cleaned(a, usable) for a in rest]
-    everything = torch.cat([a.columns for a in (*atoms, *rest[:1])], -1) if atoms or rest else residual[..., None]
+    fitted = _frame_columns(situation, usable)
+    everything = torch.cat([fitted, *(a.columns for a in (*atoms, *rest[:1]))], -1)
     white = fitted_whitening(residual, everything, channels, noise, usable)
 
     rich = white.sigma
     # Shapes by themselves and with the rest of the library beside them: two ways to start, both stay candidates.
     fixed = [a for a in atoms if a.shape.numel() == 0]
     shaped = [a for a in atoms if a.shape.numel()]
-    beside = white(torch.cat([a.columns for a in fixed], -1)) if fixed else white(residual)[..., None][..., :0]
-    alone = beside[..., :0]
+    alone = white(fitted)
+    beside = torch.cat([alone, *(white(a.columns) for a in fixed)], -1)
     starts: list[Atom] = []
     for atom in shaped:
         assert atom.effect is not None
@@ -100,7 +101,7 @@ def analyse(
         for nuisance in (alone, beside):
             shaped_so = scan.best(white(residual), nuisance)
             starts.append(_cleaned(_atom(situation, situation, atom.effect, shaped_so), usable))
-    result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest], near, white.sigma)
+    result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest], near, rich, fitted)
 
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
     for _ in range(2):
@@ -125,14 +126,14 @@ def analyse(
                 for a in acting
                 if a.effect is not effect
             ]
-            beside = torch.cat(nuisance, -1) if nuisance else alone
+            beside = torch.cat([white(fitted), *nuisance], -1)
             shaped_so = Scan(situation, there, effect, _only(white, ok)).best(white(target), beside, start)
             atoms.append(_cleaned(_atom(situation, there, effect, shaped_so), ok))
             if not inside:
                 old = next(a for a in result.library.atoms if a.effect is effect)
                 so = Shaped(old.shape, old.used, LOG_PRIOR - old.log_prior)
                 atoms.append(_cleaned(_atom(situation, there, effect, so), ok))
-        result = _searched(situation, measured, target, white, [*atoms, *rest], near, rich)
+        result = _searched(situation, measured, target, white, [*atoms, *rest], near, rich, fitted)
     return result
 
 
@@ -143,6 +144,14 @@ def _near_singular(situation: Situation, channels: Tensor) -> Tensor:
     values = torch.linalg.svdvals(jacobian)
     condition = values[:, 0] / values[:, -1].clamp_min(1e-300)
     return (condition > _CONDITION) & (condition > 10 * condition.median())
+
+
+def _frame_columns(situation: Situation, usable: Tensor) -> Tensor:
+    """What frames that were fitted to these rows can do, `s x c0 x r`, in sizes that no evidence holds back."""
+    unknown = getattr(situation.mechanism, "unknown_frames", ())
+    index = [k for k, g in enumerate(situation.mechanism.geometry) if g.name.partition("_")[0] in unknown]
+    columns = situation.parameter_jacobian[..., index] if index else situation.jacobian[..., :0]
+    return torch.where(usable[:, None, None], columns, 0.0)
 
 
 def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped) -> Atom:
@@ -164,15 +173,22 @@ def _cleaned(atom: Atom, usable: Tensor) -> Atom:
 
 
 def _searched(
-    situation: Situation, measured: Tensor, target: Tensor, white: Whitening, atoms: list[Atom], near: Tensor, rich: Tensor
+    situation: Situation, measured: Tensor, target: Tensor, white: Whitening, atoms: list[Atom], near: Tensor, rich: Tensor, fitted: Tensor
 ) -> Analysis:
     keep = white.keep()
     columns = white(torch.cat([a.columns for a in atoms], -1)) if atoms else white(target)[..., None][..., :0]
     y = white(target)
+    if fitted.shape[-1]:
+        # What was fitted before takes its part out of everything.
+        u, s, _ = torch.linalg.svd(white(fitted).flatten(0, 1), full_matrices=False)
+        q = u[:, s > 1e-9 * s[0]]
+        y = (y.flatten() - q @ (q.mT @ y.flatten())).reshape(y.shape)
+        flat = columns.flatten(0, 1)
+        columns = (flat - q @ (q.mT @ flat)).reshape(columns.shape)
     ends = torch.tensor([a.columns.shape[-1] for a in atoms]).cumsum(0).tolist()
     groups = tuple(torch.arange(e - a.columns.shape[-1], e) for a, e in zip(atoms, ends, strict=True))
     library = Library(tuple(atoms), groups, grams_of(columns[keep], y[keep]), white.known)
-    floor = float((rich / white.sigma).square().mean())
+    floor = min(float((rich / white.sigma).square().mean()), 1.0)
     return Analysis(situation, measured, target, white, library, columns, y, search(library), near, floor)
 
 

@@ -18,7 +18,7 @@ from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import EFFECTS, Effect, Situation, make_effect, pose_residual
 from ccnn_torch.errors import InputError
 
-__all__ = ["OUTLIER", "candidates", "diagnose_rows"]
+__all__ = ["OUTLIER", "candidates", "diagnose_rows", "usable_rows"]
 
 OUTLIER = "outlier"
 # More rows than this name a cause no better: so many are drawn.
@@ -58,16 +58,9 @@ def diagnose_rows(
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
     rows = len(situation.joints)
-    if rows < _FEWEST_ROWS:
-        raise InputError(f"{rows} rows are too few for a diagnosis; measure at least {_FEWEST_ROWS}, better 100")
     situation, measured, chosen = _thinned(situation, measured, seed)
+    fine = usable_rows(situation, measured)
     residual = pose_residual(situation, measured)
-    fine = torch.isfinite(residual).all(-1)
-    if float(fine.double().mean()) < _USABLE:
-        raise InputError(
-            f"{int((~fine).sum())} of {len(fine)} rows are outside the reach of {situation.mechanism.name}; check the "
-            "units, the order of the joints, and that this is the machine that was measured"
-        )
     usable, lacking = candidates(situation, effects)
     analysis = analyse(situation, measured, usable, noise)
     judgement = judge(analysis)
@@ -104,6 +97,24 @@ def diagnose_rows(
         analysis=analysis,
         judgement=judgement,
     )
+
+
+def usable_rows(situation: Situation, measured: Tensor) -> Tensor:
+    """Rows that the mechanism can have reached, `s` bool.
+
+    Raises:
+        InputError: too few rows, or most of them out of reach.
+    """
+    rows = len(situation.joints)
+    if rows < _FEWEST_ROWS:
+        raise InputError(f"{rows} rows are too few for a diagnosis; measure at least {_FEWEST_ROWS}, better 100")
+    fine = torch.isfinite(pose_residual(situation, measured)).all(-1)
+    if float(fine.double().mean()) < _USABLE:
+        raise InputError(
+            f"{int((~fine).sum())} of {len(fine)} rows are outside the reach of {situation.mechanism.name}; check the "
+            "units, the order of the joints, and that this is the machine that was measured"
+        )
+    return fine
 
 
 def _thinned(situation: Situation, measured: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:
