@@ -85,6 +85,10 @@ def analyse(
     atoms = [_cleaned(a, usable) for a in atoms]
     rest = [_cleaned(a, usable) for a in rest]
     fitted = _frame_columns(situation, usable)
+    # What does not show at all in these rows is no candidate (latency at rest).
+    size = [float((a.columns[:, channels] / residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)[:, None]).abs().max()) for a in atoms]
+    effects = [e for e, s in zip(effects, size, strict=True) if s > 1e-9]
+    atoms = [a for a, s in zip(atoms, size, strict=True) if s > 1e-9]
     everything = torch.cat([fitted, *(a.columns for a in (*atoms, *rest[:1]))], -1)
     white = fitted_whitening(residual, everything, channels, noise, usable)
 

@@ -10,15 +10,18 @@ from ccnn_torch.diagnosis._search import Found, scored
 
 __all__ = ["Judgement", "judge"]
 
-# A catch-all beside library effects below this share of their energy is how the form of a real effect differs from the
-# textbook, not a cause of its own.
-_FORM = 0.06
+# Share of the gap's energy that goes with a member of a set and not without it: below this a library effect is how the
+# form of the others differs from the textbook; so is a catch-all beside library effects, and so are library effects
+# beside a catch-all, which stands for whatever was not thought of.
+_FORM, _FORM_CATCH_ALL, _BESIDE_CATCH_ALL = 0.002, 0.03, 0.1
 # Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is stood by.
 _VETO = 0.02
 # Odds up to which one name for another is not told apart by the data.
 _ODDS = math.log(20.0)
 # What is claimed grows slower than what the evidence says: its models are not the truth.
 _TEMPER = 1.0
+# Log odds against the most probable set beyond which nobody looks.
+_FAR = 12.0
 
 
 @dataclass(frozen=True)
@@ -49,13 +52,17 @@ class Judgement:
 def judge(analysis: Analysis) -> Judgement:
     """Weigh the sets that the search has found."""
     groups: dict[tuple[frozenset[str], str | None], list[Found]] = {}
-    for found in analysis.found:
-        groups.setdefault(_named(analysis, found), []).append(found)
     top = analysis.found[0].log_posterior
+    tried = {f.members: f for f in analysis.found}
+    for found in analysis.found:
+        if found.log_posterior > top - _FAR:
+            essential = _essential(analysis, found, tried)
+            groups.setdefault(_named(analysis, essential), []).extend([found, essential])
+            tried[essential.members] = essential
     weights = {key: math.exp(_TEMPER * (max(f.log_posterior for f in fs) - top)) for key, fs in groups.items()}
     total = sum(weights.values())
     leading = sorted(
-        ((k[0], k[1], w / total, groups[k][0]) for k, w in weights.items()), key=lambda x: -x[2]
+        ((k[0], k[1], w / total, _plainest(groups[k])) for k, w in weights.items()), key=lambda x: -x[2]
     )
     names, driver, probability, found = leading[0]
     outside = driver is not None
@@ -78,14 +85,36 @@ def judge(analysis: Analysis) -> Judgement:
     return Judgement(found, ordered, classes, min(probability, 1.0), outside, driver, marginal, leading)
 
 
+def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]) -> Found:
+    """The set without members that only mend the form of the others."""
+    atoms = analysis.library.atoms
+    gap = max(float(analysis.library.grams.yy) - analysis.floor * analysis.library.grams.count, 1e-300)
+    while len(found.members) > 1:
+        fewer = {i: tuple(m for m in found.members if m != i) for i in found.members}
+        fresh = [s for s in fewer.values() if s not in tried]
+        tried.update(zip(fresh, scored(analysis.library, fresh), strict=True))
+        beside = any(atoms[i].catch_all for i in found.members)
+        limits = {
+            i: _FORM_CATCH_ALL if atoms[i].catch_all else _BESIDE_CATCH_ALL if beside else _FORM for i in found.members
+        }
+        net = {i: (tried[s].rss - found.rss) / gap / limits[i] for i, s in fewer.items()}
+        least = min(net, key=lambda i: net[i])
+        if net[least] >= 1:
+            break
+        found = tried[fewer[least]]
+    return found
+
+
+def _plainest(found: list[Found]) -> Found:
+    """Of sets that come to the same names the smallest, and of those the most probable."""
+    return min(found, key=lambda f: (len(f.members), -f.log_posterior))
+
+
 def _named(analysis: Analysis, found: Found) -> tuple[frozenset[str], str | None]:
     atoms = analysis.library.atoms
     names = frozenset(atoms[i].name for i in found.members if not atoms[i].catch_all)
-    energy = sum(e for i, e in zip(found.members, found.energy, strict=True) if not atoms[i].catch_all)
-    for i, e in zip(found.members, found.energy, strict=True):
-        if atoms[i].catch_all and not (names and e < _FORM * energy):
-            return names, atoms[i].name
-    return names, None
+    driver = next((atoms[i].name for i in found.members if atoms[i].catch_all), None)
+    return names, driver
 
 
 def _energy(analysis: Analysis, found: Found, name: str) -> float:
