@@ -1,4 +1,4 @@
-"""From rows to the posterior over sets of candidates: whitening, shapes, search, and all of it again where it points."""
+"""From rows to the posterior over sets of candidates: whitening, shapes, search, and again where they point."""
 
 from __future__ import annotations
 
@@ -128,12 +128,12 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
                 none = Shaped(default_shape(situation, effect), None, 0.0)
                 atoms.append(_cleaned(_atom(situation, there, effect, none), ok))
                 continue
-            nuisance = [
+            others = [
                 white(_cleaned(_atom(situation, there, a.effect, Shaped(a.shape, None, 0.0)), ok).columns)
                 for a in acting
                 if a.effect is not effect
             ]
-            beside = torch.cat([white(fitted), *nuisance], -1)
+            beside = torch.cat([white(fitted), *others], -1)
             shaped_so = Scan(situation, there, effect, _only(white, ok)).best(white(target), beside, start)
             atoms.append(_cleaned(_atom(situation, there, effect, shaped_so), ok))
             if not inside:
@@ -150,7 +150,8 @@ def _near_singular(situation: Situation, channels: Tensor) -> Tensor:
     jacobian[:, channels >= 3] *= 0.3
     values = torch.linalg.svdvals(jacobian)
     condition = values[:, 0] / values[:, -1].clamp_min(1e-300)
-    return (condition > _CONDITION) & (condition > 10 * condition.median())
+    far: Tensor = (condition > _CONDITION) & (condition > 10 * condition.median())
+    return far
 
 
 def _frame_columns(situation: Situation, usable: Tensor) -> Tensor:
@@ -215,7 +216,7 @@ def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitenin
     for i, mean in zip(best.members, best.mean, strict=True):
         theta[result.library.groups[i]] = mean
     raw = result.residual - torch.cat([a.columns for a in result.library.atoms], -1) @ theta
-    free = 1 - best.effective / max(result.library.grams.count, 1.0)
+    free = 1 - best.effective / max(result.library.grams.values, 1.0)
     if noise is None:
         rows = (white.weight > 0) & usable
         spread = raw[rows][:, white.channels].abs().median(0).values * 1.4826 / max(free, 0.1) ** 0.5

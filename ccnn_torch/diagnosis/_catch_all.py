@@ -107,4 +107,5 @@ def _reduced(columns: Tensor) -> Tensor:
     weight = columns.square().mean((0, 2), keepdim=True).sqrt().clamp_min(1e-300)
     flat = (columns / weight).flatten(0, 1)
     _, vectors = torch.linalg.eigh(flat.mT @ flat)
-    return columns @ vectors[:, -_MOST:]
+    reduced: Tensor = columns @ vectors[:, -_MOST:]
+    return reduced

@@ -1,7 +1,7 @@
 """Evidence of many sets of groups of columns at once, from Gram matrices that are computed once.
 
-Model of a set: y ~ N(X θ, σ² I), θ of group g ~ N(0, α_g² I), log α_g² ~ N(0, s²), and log σ² flat, or about 0 where the
-noise was given. α and σ are brought to their most probable values by MacKay's updates (1992) and integrated there.
+Model of a set: y ~ N(X θ, σ² I), θ of group g ~ N(0, α_g² I), log α_g² ~ N(0, s²), and log σ² flat, or about 0 where
+the noise was given. α and σ are brought to their most probable values by MacKay's updates (1992) and integrated there.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Grams(NamedTuple):
     xx: Tensor
     xy: Tensor
     yy: Tensor
-    count: float
+    values: float
 
 
 class Fits(NamedTuple):
@@ -87,7 +87,7 @@ def fit_sets(
     # Start where the prior of each group could make the whole gap, and the noise is a tenth of it.
     trace = (member * g.diagonal(dim1=-2, dim2=-1)[..., None]).sum(1).clamp_min(1e-300)
     psi = torch.log((grams.yy.clamp_min(1e-300) / trace).clamp(math.exp(-_LIMIT), math.exp(_LIMIT))) * there
-    noise = (grams.yy / grams.count / 10).clamp_min(1e-12).expand(len(columns)).clone()
+    noise = (grams.yy / grams.values / 10).clamp_min(1e-12).expand(len(columns)).clone()
     noise = torch.where(torch.tensor(noise_dof > 0), torch.ones_like(noise), noise)
     eye = torch.eye(columns.shape[1], dtype=g.dtype, device=g.device)
     for k in range(iterations + 1):
@@ -105,10 +105,10 @@ def fit_sets(
             break
         step = (0.5 * (size - gamma) - psi / spread**2) / (0.5 * gamma + 1 / spread**2)
         psi = (psi + step.clamp(-2.0, 2.0) * there).clamp(-_LIMIT, _LIMIT)
-        left = (grams.count - gamma.sum(-1)).clamp_min(0.02 * grams.count + 1)
+        left = (grams.values - gamma.sum(-1)).clamp_min(0.02 * grams.values + 1)
         noise = ((rss + noise_dof) / (left + noise_dof)).clamp_min(1e-12)
     log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    log_evidence = 0.5 * (-grams.count * noise.log() - grams.yy / noise + (c * u).sum(-1) - log_det)
+    log_evidence = 0.5 * (-grams.values * noise.log() - grams.yy / noise + (c * u).sum(-1) - log_det)
     log_evidence = log_evidence - 0.5 * noise_dof * (noise.log() + 1 / noise - 1)
     hyper = -0.5 * psi.square() / spread**2 - 0.5 * torch.log1p(0.5 * gamma * spread**2)
     log_evidence = log_evidence + (hyper * there).sum(-1)

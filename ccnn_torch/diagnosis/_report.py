@@ -37,7 +37,7 @@ class Blocks:
         white = self.analysis.whitening
         channels = self.position if position else ~self.position
         exact = white.known > 0
-        dof = 0.0 if exact else max(self.analysis.library.grams.count - self.judgement.found.effective, 1.0)
+        dof = 0.0 if exact else max(self.analysis.library.grams.values - self.judgement.found.effective, 1.0)
         return shrink_of(self.before, held, self.floor, channels, dof, self.seed)
 
     def main(self, held: HeldOut) -> Gap:

@@ -157,7 +157,8 @@ class _Left:
         ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
         inner = inner + torch.diag_embed(ridge[:, None].expand(-1, inner.shape[-1]))
         solved = torch.linalg.solve(inner, b[..., None])[..., 0]
-        return (b * solved).sum(-1)
+        gain: Tensor = (b * solved).sum(-1)
+        return gain
 
 
 def _parts(shapes: tuple[Shape, ...], coefficients: int) -> list[_Part]:

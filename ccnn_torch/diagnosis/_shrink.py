@@ -62,7 +62,7 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     for k in range(_FOLDS):
         there = fold == k
         away = grams_of(x[there], y[there])
-        rest = Grams(whole.xx - away.xx, whole.xy - away.xy, whole.yy - away.yy, whole.count - away.count)
+        rest = Grams(whole.xx - away.xx, whole.xy - away.xy, whole.yy - away.yy, whole.values - away.values)
         order = sorted(range(len(sets)), key=lambda i: sum(map(len, groups[i])))
         for part in (order[i : i + 8] for i in range(0, len(order), 8)):
             fits = fit_sets(rest, [groups[i] for i in part], analysis.library.noise_dof, 6)

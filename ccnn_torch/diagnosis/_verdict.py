@@ -92,7 +92,7 @@ def _net(
     analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]
 ) -> dict[int, tuple[float, tuple[int, ...]]]:
     """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
-    gap = max(float(analysis.library.grams.yy) - analysis.floor * analysis.library.grams.count, 1e-300)
+    gap = max(float(analysis.library.grams.yy) - analysis.floor * analysis.library.grams.values, 1e-300)
     fewer = {i: tuple(m for m in found.members if m != i) for i in found.members}
     fresh = [s for s in fewer.values() if s not in tried]
     tried.update(zip(fresh, scored(analysis.library, fresh), strict=True))
@@ -140,7 +140,7 @@ def _energy(analysis: Analysis, found: Found, name: str) -> float:
 
 def _unexplained(analysis: Analysis, found: Found) -> bool:
     """Whether what a set leaves is clearly more than the noise (given, or of the richest fit)."""
-    count = analysis.library.grams.count
+    count = analysis.library.grams.values
     left = found.rss / max(count - found.effective, 1.0)
     floor = analysis.floor
     significant = left > floor * (1 + 5 * math.sqrt(2 / count))

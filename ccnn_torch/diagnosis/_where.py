@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -44,7 +45,8 @@ def _joints(analysis: Analysis, y: Tensor, keep: Tensor) -> Tensor:
     inverse = torch.linalg.pinv(jacobian)
     deviation = (inverse @ y[..., None])[..., 0]
     noise = analysis.floor * inverse.square().sum(-1)
-    return ((deviation.square() - noise) * jacobian.square().sum(-2)).sum(0)
+    energy: Tensor = ((deviation.square() - noise) * jacobian.square().sum(-2)).sum(0)
+    return energy
 
 
 def _shares(parts: dict[str, Tensor]) -> dict[str, float]:
@@ -60,7 +62,8 @@ def _regions(analysis: Analysis, energy: Tensor, keep: Tensor) -> list[dict[str,
     pose = analysis.situation.pose[keep]
     varying = sorted(lengths, key=lambda i: -float(pose[:, i].std()))[:2]
     cell = sum((pose[:, i] > pose[:, i].median()).long() * 2**k for k, i in enumerate(varying))
-    found, total = [], 0.0
+    found: list[dict[str, Any]] = []
+    total = 0.0
     for k in range(2 ** len(varying)):
         inside = cell == k
         if not bool(torch.as_tensor(inside).any()):
@@ -88,7 +91,7 @@ def _bins(value: Tensor, energy: Tensor) -> list[dict[str, float]]:
         edges = [(float(v), float(v)) for v in levels]
     else:
         cuts = torch.quantile(value, torch.tensor([0, 1 / 3, 2 / 3, 1], dtype=value.dtype)).tolist()
-        edges = list(zip(cuts[:-1], cuts[1:], strict=True))
+        edges = list(pairwise(cuts))
     sums = []
     for k, (low, high) in enumerate(edges):
         inside = (value >= low) & ((value <= high) if k == len(edges) - 1 or low == high else (value < high))

@@ -94,4 +94,5 @@ def _confusable(spans: dict[str, Tensor]) -> list[tuple[str, str, float]]:
 def _span(x: Tensor) -> Tensor:
     """Orthonormal columns of what x spans."""
     u, s, _ = torch.linalg.svd(x, full_matrices=False)
-    return u[:, s > 1e-9 * s.max().clamp_min(1e-300)]
+    span: Tensor = u[:, s > 1e-9 * s.max().clamp_min(1e-300)]
+    return span

@@ -42,7 +42,9 @@ def measured(situation: Situation, causes: dict[str, float], seed: int, noise: f
         shape = torch.tensor([s.grid[len(s.grid) // 3] for s in effect.shapes(situation)], dtype=torch.float64)
         for _ in range(3):
             moved = (reached(situation, [Acting(effect, shape, drawn)]) - still)[:, :3]
-            drawn = drawn * size * noise / moved[:, moved.abs().amax(0) > 1e-13].square().mean().sqrt()
+            # The usual row, so that one close to a singularity does not have the whole gap.
+            usual = moved[:, moved.abs().amax(0) > 1e-13].square().mean(-1).median().sqrt()
+            drawn = drawn * size * noise / usual
         acting.append(Acting(effect, shape, drawn))
     there = reached(situation, acting)
     there = there + noise * torch.randn(there.shape, generator=g, dtype=torch.float64)
