@@ -92,7 +92,9 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     ]
     effects = [e for e, s in zip(effects, size, strict=True) if s > 1e-9]
     atoms = [a for a, s in zip(atoms, size, strict=True) if s > 1e-9]
-    everything = torch.cat([fitted, *(a.columns for a in (*atoms, *rest[:1]))], -1)
+    everything = torch.cat(
+        [fitted, *(a.columns for a in (*atoms, *(a for a in rest if not a.name.startswith("joint"))))], -1
+    )
     white = fitted_whitening(residual, everything, channels, noise, usable)
 
     rich = white.sigma

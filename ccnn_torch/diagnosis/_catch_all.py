@@ -14,12 +14,14 @@ from torch import Tensor
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.effects import Situation
 
-__all__ = ["catch_alls"]
+__all__ = ["ANY", "catch_alls"]
 
 # A catch-all is that much less probable than no deviation of its kind, before the data are seen.
 LOG_PRIOR = math.log(1e-3)
 # A joint may be off by this much for reasons that nobody thought of [m], [rad].
 _SCALE = {"m": 3e-4, "rad": 5e-4}
+ANY = "*"
+"""Stands in a driver's name for all of its kind; a verdict names the one that explains most by itself."""
 # What bends with a driver against what is proportional to it.
 _BEND = 0.5
 _MOST = 28
@@ -37,6 +39,7 @@ def catch_alls(situation: Situation) -> list[Atom]:
         found.append(_atom(situation, f"joint {joint.name}", torch.cat([one, q, _BEND * _bumps(q, few)], -1)))
         fine = torch.cat([one, q, _bumps(q, min(_MOST, rows // 6))], -1)
         found.append(_atom(situation, f"joint {joint.name}", fine, only=i))
+    together: dict[str, list[Tensor]] = {}
     for name, value in situation.covariates.items():
         driver = _driver(name)
         if driver is None or float(value.max() - value.min()) <= 0:
@@ -48,6 +51,12 @@ def catch_alls(situation: Situation) -> list[Atom]:
         if driver == "temperature" and "time" in situation.covariates:
             features += [_lagged(value, situation.covariates["time"], k) for k in (0.05, 0.2)]
         found.append(_atom(situation, driver, torch.cat(features, -1)))
+        if " " in driver:
+            together.setdefault(driver.partition(" ")[0], []).extend(features[1:])
+    for kind, features in together.items():
+        # One cause may follow all loads, or all directions, at once.
+        if sum(a.name.startswith(kind) for a in found) > 1:
+            found.append(_atom(situation, f"{kind} {ANY}", torch.cat([one, *features], -1)))
     return found
 
 

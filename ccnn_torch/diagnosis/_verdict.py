@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from ccnn_torch.diagnosis._analysis import Analysis
+from ccnn_torch.diagnosis._catch_all import ANY
 from ccnn_torch.diagnosis._search import Found, scored
 
 __all__ = ["Judgement", "judge"]
@@ -13,7 +14,7 @@ __all__ = ["Judgement", "judge"]
 # Share of the gap's energy that goes with a member of a set and not without it: below this a library effect is how the
 # form of the others differs from the textbook; so is a catch-all beside library effects, and so are library effects
 # beside a catch-all, which stands for whatever was not thought of.
-_FORM, _FORM_CATCH_ALL, _BESIDE_CATCH_ALL = 0.008, 0.03, 0.1
+_FORM, _FORM_CATCH_ALL, _BESIDE_CATCH_ALL = 0.008, 0.015, 0.1
 # Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is stood by.
 _VETO = 0.02
 # Or times the noise's energy, whatever the gap.
@@ -131,7 +132,17 @@ def _named(analysis: Analysis, found: Found) -> tuple[frozenset[str], str | None
     atoms = analysis.library.atoms
     names = frozenset(atoms[i].name for i in found.members if not atoms[i].catch_all)
     driver = next((atoms[i].name for i in found.members if atoms[i].catch_all), None)
+    if driver is not None and driver.endswith(ANY):
+        driver = _leader(analysis, driver.removesuffix(ANY))
     return names, driver
+
+
+def _leader(analysis: Analysis, kind: str) -> str:
+    """Of drivers of one kind the one that explains most by itself."""
+    atoms = analysis.library.atoms
+    alone = (f for f in analysis.found if len(f.members) == 1)
+    names = (atoms[f.members[0]].name for f in alone)
+    return next(n for n in names if n.startswith(kind) and not n.endswith(ANY))
 
 
 def _energy(analysis: Analysis, found: Found, name: str) -> float:

@@ -79,8 +79,10 @@ def diagnosis_table(diagnosis: Diagnosis, most: int = 8) -> Table:
     """The most probable candidates."""
     rows = []
     for effect in diagnosis.effects[:most]:
-        low, high = effect["shrink_ci95"] or (None, None)
-        shrink = "" if low is None else f"{100 * effect['shrink']:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
+        interval = effect["shrink_ci95"]
+        shrink = ""
+        if interval is not None:
+            shrink = f"{100 * effect['shrink']:.0f} % [{100 * interval[0]:.0f}, {100 * interval[1]:.0f}]"
         same = ", ".join(effect["indistinguishable_from"])
         rows.append((effect["name"], f"{effect['probability']:.3f}", shrink, f"{effect['gap_after']:.3g}", same))
     unit = diagnosis.gap["unit"]

@@ -65,4 +65,4 @@ def load_diagnose_config(path: Path | None, overrides: Iterable[str] = ()) -> Di
 
 def describe_diagnose_keys() -> list[tuple[str, str, str]]:
     """Every key with its default and what it means."""
-    return list_keys(DiagnoseConfig)
+    return list(list_keys(DiagnoseConfig))

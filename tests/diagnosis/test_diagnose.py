@@ -94,10 +94,10 @@ def test_rows_out_of_reach_are_set_aside_and_most_of_them_are_too_many() -> None
     situation = rows_of("five_bar", 60, 17)
     pose = measured(situation, {"joint_offset": 10.0}, 18)
     joints = situation.joints.clone()
-    joints[5] = torch.tensor([0.0, 3.1])
+    joints[5] = torch.tensor([3.1, 0.0], dtype=torch.float64)
     lost = replace(situation, joints=joints, guess=None)
     assert 5 in diagnose_rows(lost, pose).rows_set_aside
-    joints[:40] = torch.tensor([0.0, 3.1])
+    joints[:40] = torch.tensor([3.1, 0.0], dtype=torch.float64)
     with pytest.raises(InputError, match="outside the reach"):
         diagnose_rows(replace(situation, joints=joints, guess=None), pose)
     with pytest.raises(InputError, match="too few"):
