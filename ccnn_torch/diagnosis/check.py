@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import analyse
-from ccnn_torch.diagnosis.engine import candidates, usable_rows
+from ccnn_torch.diagnosis.engine import candidates, thinned, usable_rows
 from ccnn_torch.effects import Effect, Situation
 
 __all__ = ["Check", "check_rows"]
@@ -47,7 +47,9 @@ def check_rows(
     situation: Situation, measured: Tensor, noise: Tensor | None = None, effects: Sequence[Effect | str] | None = None
 ) -> Check:
     """Look at rows as `diagnose_rows` does, and say what they can and cannot show; arguments as there."""
-    usable_rows(situation, measured)
+    fine = usable_rows(situation, measured)
+    rows, lost = len(fine), torch.nonzero(~fine).squeeze(-1).tolist()
+    situation, measured, chosen = thinned(situation, measured, fine, 0)
     usable, lacking = candidates(situation, effects)
     analysis = analyse(situation, measured, usable, noise)
     white = analysis.whitening
@@ -65,8 +67,8 @@ def check_rows(
     condition = situation.mechanism.condition_number(situation.joints[keep], parameters=situation.parameters)
     names = ("x", "y", "z", "rx", "ry", "rz")
     return Check(
-        rows=len(situation.joints),
-        aside=torch.nonzero(white.weight <= 0).squeeze(-1).tolist(),
+        rows=rows,
+        aside=sorted([*lost, *chosen[white.weight <= 0].tolist()]),
         noise={names[int(c)]: float(s) for c, s in zip(white.channels, white.sigma, strict=True)},
         covariates=[n for n, v in situation.covariates.items() if float(v.max() - v.min()) > 0],
         missing=lacking,

@@ -18,7 +18,7 @@ from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import EFFECTS, Effect, Situation, make_effect, pose_residual
 from ccnn_torch.errors import InputError
 
-__all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "usable_rows"]
+__all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows"]
 
 OUTLIER = "outlier"
 # More rows than this name a cause no better: so many are drawn.
@@ -60,14 +60,12 @@ def diagnose_rows(
     Raises:
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
-    rows = len(situation.joints)
-    situation, measured, chosen = _thinned(situation, measured, seed)
     fine = usable_rows(situation, measured)
+    situation, measured, chosen = thinned(situation, measured, fine, seed)
     residual = pose_residual(situation, measured)
     usable, lacking = candidates(situation, effects)
     analysis = analyse(situation, measured, usable, noise)
     judgement = judge(analysis)
-    residual = torch.where(fine[:, None], residual, 0.0)
     made = Blocks(analysis, judgement, residual, seed)
     gap, gap_rotation, listed = blocks(made)
     together = made.main(made.together)
@@ -82,11 +80,12 @@ def diagnose_rows(
         "none": nothing and not outlier,
         "outside_library": judgement.outside,
         "driver": judgement.driver,
-        "text": sentence(judgement, together, gap["unit"], len(aside), outlier),
+        "text": sentence(judgement, together, gap["unit"], len(aside) + int((~fine).sum()), outlier),
     }
     notes = [f"{name} cannot be seen without {why}" for name, why in lacking.items()]
-    if len(chosen) < rows:
-        notes.append(f"{len(chosen)} of {rows} rows, drawn at random, were looked at")
+    lost = torch.nonzero(~fine).squeeze(-1).tolist()
+    if len(chosen) < len(fine) - len(lost):
+        notes.append(f"{len(chosen)} of {len(fine)} rows, drawn at random, were looked at")
     return Diagnosis(
         gap=gap,
         gap_rotation=gap_rotation,
@@ -94,7 +93,7 @@ def diagnose_rows(
         effects=listed,
         verdict=verdict,
         next_measurements=next_measurements(analysis, judgement, seed),
-        rows_set_aside=[int(chosen[i]) for i in aside],
+        rows_set_aside=sorted([*lost, *(int(chosen[i]) for i in aside)]),
         notes=notes,
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,
@@ -127,12 +126,13 @@ def usable_rows(situation: Situation, measured: Tensor) -> Tensor:
     return fine
 
 
-def _thinned(situation: Situation, measured: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:
-    """At most `_MOST_ROWS` rows, in order, and which they are."""
-    rows = len(situation.joints)
-    if rows <= _MOST_ROWS:
-        return situation, measured, torch.arange(rows)
-    chosen = torch.randperm(rows, generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS].sort().values
+def thinned(situation: Situation, measured: Tensor, fine: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:
+    """At most `_MOST_ROWS` of the fine rows, in order, and which they are."""
+    rows = len(fine)
+    chosen = torch.nonzero(fine).squeeze(-1)
+    if len(chosen) > _MOST_ROWS:
+        drawn = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]
+        chosen = chosen[drawn.sort().values]
 
     def pick(value: Tensor | None) -> Tensor | None:
         return value[chosen] if value is not None and value.dim() > 1 and len(value) == rows else value
