@@ -85,6 +85,8 @@ def judge(analysis: Analysis) -> Judgement:
         probability = sum(p for _, drive, p, _ in leading if drive is not None) if leading[0][1] is not None else 0.5
     if names and (len(names) > 2 or _smallest(analysis, found, tried) < _SMALL):
         probability *= _UNSURE
+    elif names and not outside and _above_noise(analysis, found):
+        probability *= _UNSURE
     ordered = tuple(sorted(names, key=lambda n: -_energy(analysis, found, n)))
     return Judgement(found, ordered, classes, min(probability, 1.0), outside, driver, marginal, leading)
 
@@ -147,6 +149,12 @@ def _leader(analysis: Analysis, kind: str) -> str:
 
 def _energy(analysis: Analysis, found: Found, name: str) -> float:
     return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.library.atoms[i].name == name)
+
+
+def _above_noise(analysis: Analysis, found: Found) -> bool:
+    """Whether a set leaves more than the noise by three standard deviations."""
+    count = analysis.library.grams.values
+    return found.rss / max(count - found.effective, 1.0) > analysis.floor * (1 + 3 * math.sqrt(2 / count))
 
 
 def _unexplained(analysis: Analysis, found: Found) -> bool:
