@@ -22,7 +22,7 @@ class Blocks:
         white = analysis.whitening
         self.analysis, self.judgement, self.seed = analysis, judgement, seed
         self.before = residual[white.keep()][:, white.channels]
-        self.floor = white.sigma.square() * analysis.floor
+        self.floor = _floor(analysis)
         self.position = white.channels < 3
         atoms = analysis.library.atoms
         self.candidates = _best_alone(analysis)
@@ -51,6 +51,19 @@ def blocks(made: Blocks) -> tuple[dict[str, Any], dict[str, Any] | None, list[di
     gap = _gap(made.main(made.together), "m" if position else "rad")
     turned = _gap(made.gap(made.together, False), "rad") if rotation and position else None
     return gap, turned, [_effect(made, name) for name in _ordered(made)]
+
+
+def _floor(analysis: Analysis) -> Tensor:
+    """Variance of the noise, `c`: given, or the mean square that the most probable set of all leaves, tails and all."""
+    white, best = analysis.whitening, analysis.found[0]
+    if white.known > 0 or not analysis.library.grams.values:
+        return white.sigma.square()
+    keep = white.keep()
+    left = analysis.y[keep]
+    for i, mean in zip(best.members, best.mean, strict=True):
+        left = left - analysis.columns[keep][..., analysis.library.groups[i]] @ mean
+    free = max(1 - best.effective / analysis.library.grams.values, 0.1)
+    return (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * analysis.floor
 
 
 def _gap(gap: Gap, unit: str) -> dict[str, Any]:

@@ -83,9 +83,9 @@ def judge(analysis: Analysis) -> Judgement:
         probability = sum(same)
     else:
         probability = sum(p for _, drive, p, _ in leading if drive is not None) if leading[0][1] is not None else 0.5
-    if names and (len(names) > 2 or _smallest(analysis, found, tried) < _SMALL):
-        probability *= _UNSURE
-    elif names and not outside and _above_noise(analysis, found):
+    if (names and (len(names) > 2 or _smallest(analysis, found, tried) < _SMALL)) or (
+        names and not outside and _above_noise(analysis, found)
+    ):
         probability *= _UNSURE
     ordered = tuple(sorted(names, key=lambda n: -_energy(analysis, found, n)))
     return Judgement(found, ordered, classes, min(probability, 1.0), outside, driver, marginal, leading)
