@@ -14,6 +14,7 @@ from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_m
 from ccnn_torch.runs.blind.body_causes import BODY_CAUSES
 from ccnn_torch.runs.blind.conditions import Conditions, draw_conditions
 from ccnn_torch.runs.blind.deviation import Deviation, measured_pose, stack, weighted
+from ccnn_torch.runs.blind.drivers import own_drivers
 from ccnn_torch.runs.blind.joint_causes import JOINT_CAUSES
 from ccnn_torch.runs.blind.machines import BlindMachine, blind_machine
 from ccnn_torch.runs.blind.outside_causes import outside_cause
@@ -36,7 +37,8 @@ class BlindCase:
     Attributes:
         true: pose without noise, `s x p` [SI].
         sd: standard deviation of the noise of each pose coordinate, `p` [SI].
-        drivers: of a cause outside the library, as a verdict may name them.
+        drivers: of each cause, as a verdict may name them where it says that no effect fits; () where it has none of
+            its own.
         bad: rows that are off, 0-based.
     """
 
@@ -48,7 +50,7 @@ class BlindCase:
     measured: Tensor
     columns: dict[Coordinate, Tensor]
     sd: Tensor
-    drivers: tuple[str, ...]
+    drivers: tuple[tuple[str, ...], ...]
     bad: tuple[int, ...]
 
 
@@ -67,8 +69,12 @@ def simulate(plans: Sequence[CasePlan], seed: int) -> list[BlindCase]:
 
 def _group(machine: BlindMachine, plans: Sequence[CasePlan], seed: int) -> list[BlindCase]:
     """Cases of one machine with equally many rows."""
-    at = [draw_conditions(machine, p.rows, p.moving, np.random.default_rng([seed, p.number, _CONDITIONS])) for p in plans]
-    drawn = [_causes(machine, p, a, np.random.default_rng([seed, p.number, _CAUSES])) for p, a in zip(plans, at, strict=True)]
+    at = [
+        draw_conditions(machine, p.rows, p.moving, np.random.default_rng([seed, p.number, _CONDITIONS])) for p in plans
+    ]
+    drawn = [
+        _causes(machine, p, a, np.random.default_rng([seed, p.number, _CAUSES])) for p, a in zip(plans, at, strict=True)
+    ]
     joints, pose = (torch.stack([getattr(a, name) for a in at]) for name in ("joints", "pose"))
     sd = torch.stack([_spread(machine, p) for p in plans])
     shares = torch.tensor([[*p.shares, 0.0, 0.0][:2] for p in plans], dtype=torch.float64)
@@ -98,14 +104,15 @@ def _group(machine: BlindMachine, plans: Sequence[CasePlan], seed: int) -> list[
 
 def _causes(
     machine: BlindMachine, plan: CasePlan, at: Conditions, generator: np.random.Generator
-) -> tuple[Deviation, tuple[str, ...]]:
-    """Up to two causes side by side, `2 x …`, and the drivers of one outside the library."""
-    if plan.kind == "outside":
-        wrong, drivers = outside_cause(plan.causes[0], machine, at, generator)
-        return stack([wrong, Deviation.none(machine, plan.rows)]), drivers
+) -> tuple[Deviation, tuple[tuple[str, ...], ...]]:
+    """Up to two causes side by side, `2 x …`, and the drivers of each."""
     makers = {**JOINT_CAUSES, **BODY_CAUSES}
+    if plan.kind == "outside":
+        wrong, driver = outside_cause(plan.causes[0], machine, at, generator)
+        return stack([wrong, Deviation.none(machine, plan.rows)]), (driver,)
     found = [makers[cause](machine, at, generator) for cause in plan.causes if cause in makers]
-    return stack([*found, *[Deviation.none(machine, plan.rows)] * (2 - len(found))]), ()
+    drivers = tuple(own_drivers(cause, wrong, machine) for cause, wrong in zip(plan.causes, found, strict=False))
+    return stack([*found, *[Deviation.none(machine, plan.rows)] * (2 - len(found))]), drivers
 
 
 def _sizes(
