@@ -40,7 +40,7 @@ FLOORS = [
         "least_squares",
     ],
     ["mechanisms", "pseudoerror"],
-    ["learners/_protocol", "training", "evolution", "learners"],
+    ["learners/_protocol", "training", "evolution", "learners", "effects"],
     ["identification", "compensation"],
     ["testing", "report", "runs", "sklearn"],
     ["cli", "__init__", "__main__"],
