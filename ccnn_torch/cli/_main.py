@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from ccnn_torch import __version__
+from ccnn_torch.cli.blind_check import blind_check
 from ccnn_torch.cli.compensate import compensate
 from ccnn_torch.cli.identify import identify
 from ccnn_torch.cli.keys import keys
@@ -44,7 +45,7 @@ def _common(
         typer.echo(context.get_help())
 
 
-for _command in (run, suite, identify, compensate, plan, picture, keys):
+for _command in (run, suite, identify, compensate, plan, blind_check, picture, keys):
     app.command(epilog=(_command.__doc__ or "").partition("\n\n")[2])(_command)
 
 

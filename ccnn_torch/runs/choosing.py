@@ -205,9 +205,7 @@ def predictive_variance(learner: Learner, data: TrainingData, inputs: Tensor) ->
 def moved(data: TrainingData, device: str) -> TrainingData:
     """The same data on a device."""
     values = {field.name: getattr(data, field.name) for field in fields(data)}
-    tensors: dict[str, Any] = {
-        name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)
-    }
+    tensors: dict[str, Any] = {name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)}
     held = None if data.validation is None else moved(data.validation, device)
     return replace(data, **tensors, validation=held)
 

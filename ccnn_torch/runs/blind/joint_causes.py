@@ -55,7 +55,7 @@ def joint_offset(machine: BlindMachine, at: Conditions, generator: Generator) ->
 def joint_gain(machine: BlindMachine, at: Conditions, generator: Generator) -> Deviation:
     """A pitch that is off, a little more at the ends of the travel."""
     u = _place(machine, at.joints)
-    uneven = torch.as_tensor(generator.uniform(-0.05, 0.05, u.shape[-1]))
+    uneven = torch.as_tensor(generator.uniform(-0.02, 0.02, u.shape[-1]))
     return of_joints(machine, some_of(u.shape[-1], generator) * (u + uneven * u**3))
 
 
@@ -121,7 +121,7 @@ def coupling(machine: BlindMachine, at: Conditions, generator: Generator) -> Dev
     n, change = u.shape[-1], torch.zeros_like(u)
     for _ in range(int(generator.integers(1, 3))):
         bent, mover = generator.permutation(n)[:2]
-        moved = torch.sin(u[:, mover]) / np.sin(1.0) if generator.random() < 0.5 else u[:, mover]
+        moved = 2 * torch.sin(u[:, mover] / 2) if generator.random() < 0.5 else u[:, mover]
         change[:, bent] += generator.uniform(0.5, 1.5) * generator.choice([-1.0, 1.0]) * moved
     return of_joints(machine, change)
 

@@ -18,7 +18,7 @@ __all__ = ["MACHINES", "BlindMachine", "blind_machine"]
 
 _TURN = 6.0
 """Rotation of the platform that is worth a metre when the condition of a pose is judged, rad/m: a lever of 1/6 m."""
-_CONDITION = 25.0
+_CONDITION = 15.0
 _GRAVITY = 9.80665
 
 

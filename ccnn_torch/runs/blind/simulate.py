@@ -122,7 +122,7 @@ def _sizes(
 
     Strength is nearly proportional to the factor: a few rounds of the rule of three bring it there.
     """
-    size = (alone > 0) * 1e-3
+    size = (alone > 0) * 1e-5
     for cause in range(alone.shape[1]):
         mask = torch.zeros_like(size)
         mask[:, cause] = 1.0
