@@ -18,7 +18,7 @@ from ccnn_torch.effects import EFFECTS, Acting, Effect, Situation, default_gravi
 from ccnn_torch.effects.apply import pose_residual
 from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
-from ccnn_torch.runs.blind.simulate import BlindCase
+from ccnn_torch.runs.blind.case import BlindCase
 
 __all__ = ["AS_WELL", "Explained", "Judge"]
 

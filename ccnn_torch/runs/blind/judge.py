@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ccnn_torch.runs.blind.case import BlindCase
 from ccnn_torch.runs.blind.explain import Judge
-from ccnn_torch.runs.blind.simulate import BlindCase
 
 __all__ = ["judged"]
 

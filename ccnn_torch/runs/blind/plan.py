@@ -22,7 +22,7 @@ STRENGTHS = (3.0, 10.0, 30.0)
 SIMULATORS = (*MACHINES, "mujoco_five_bar")
 CAUSES = (*BODY_CAUSES, *JOINT_CAUSES, "outlier")
 """What can be wrong with a machine, by the names that a verdict may give."""
-_MUJOCO = ("joint_offset", "compliance", "gravity", "friction", "geometry")
+MUJOCO_CAUSES = ("joint_offset", "compliance", "gravity", "friction", "geometry")
 _ROWS, _ROWS_SHARE = (40, 100, 200, 400), (0.15, 0.2, 0.45, 0.2)
 _WEAKEST = 0.3
 """Size of a pair's second cause, at least, in units of the first."""
@@ -43,7 +43,8 @@ class CasePlan:
         shares: size of each cause in units of the first.
         strength: of the gap; 0 for none and for bad rows.
         rows: how many.
-        noise: standard deviation of a measured position [m].
+        noise: standard deviation of a measured position [m]; of the simulator that we did not write it follows from
+            the gap and the strength.
         noise_told: whether the diagnoser is given it.
         moving: whether poses are read in motion.
         disturbance: what else is there: "" or "heavy tails", "bad rows", "uneven noise".
@@ -103,7 +104,7 @@ def plan_cases(count: int, seed: int, machines: Sequence[str], kinds: Sequence[s
 def causes_of(machine: str) -> tuple[str, ...]:
     """Causes that this machine can have and that show in what is measured of it."""
     if machine == "mujoco_five_bar":
-        return _MUJOCO
+        return MUJOCO_CAUSES
     # Without orientation a target elsewhere on the platform is the same as a device elsewhere.
     return tuple(c for c in CAUSES if not (c == "tool" and machine in ("five_bar", "delta")))
 

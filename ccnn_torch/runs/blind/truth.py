@@ -14,7 +14,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.runs.blind.simulate import BlindCase
+from ccnn_torch.runs.blind.case import BlindCase
 
 __all__ = ["digest", "file_digest", "truth_of"]
 
