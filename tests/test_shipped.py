@@ -42,6 +42,7 @@ FLOORS = [
     ["mechanisms", "pseudoerror"],
     ["learners/_protocol", "training", "evolution", "learners", "effects"],
     ["identification", "compensation"],
+    ["diagnosis"],
     ["testing", "report", "runs", "sklearn"],
     ["cli", "__init__", "__main__"],
 ]

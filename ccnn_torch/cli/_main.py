@@ -10,7 +10,9 @@ import typer
 
 from ccnn_torch import __version__
 from ccnn_torch.cli.blind_check import blind_check
+from ccnn_torch.cli.check import check
 from ccnn_torch.cli.compensate import compensate
+from ccnn_torch.cli.diagnose import diagnose
 from ccnn_torch.cli.identify import identify
 from ccnn_torch.cli.keys import keys
 from ccnn_torch.cli.picture import picture
@@ -45,7 +47,7 @@ def _common(
         typer.echo(context.get_help())
 
 
-for _command in (run, suite, identify, compensate, plan, blind_check, picture, keys):
+for _command in (run, suite, identify, compensate, plan, diagnose, check, blind_check, picture, keys):
     app.command(epilog=(_command.__doc__ or "").partition("\n\n")[2])(_command)
 
 

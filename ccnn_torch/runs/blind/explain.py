@@ -170,7 +170,7 @@ class Judge:
             for _ in range(1 + _REFINEMENTS):
                 tried = value.expand(len(grid), -1).clone()
                 tried[:, h] = grid
-                gains = torch.cat([self._gain(effect, t, moving, y, aside) for t in tried.split(_CHUNK)])
+                gains = torch.cat([self._gain(effect, t, moving, y, aside) for t in torch.split(tried, _CHUNK)])
                 best = int(gains.argmax())
                 value = tried[best]
                 low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
@@ -185,7 +185,8 @@ class Judge:
             z, rest = z - aside @ (aside.mT @ z), y - aside @ (aside.mT @ y)
         right = z.mT @ rest
         ridge = z.mT @ z + torch.eye(z.shape[-1], dtype=torch.float64)
-        return (right * torch.linalg.solve(ridge, right)).sum(-1)
+        explained: Tensor = (right * torch.linalg.solve(ridge, right)).sum(-1)
+        return explained
 
 
 def _middle(effect: Effect, situation: Situation) -> Tensor:

@@ -20,11 +20,12 @@ from ccnn_torch.mechanisms.arm_files import dh_text
 from ccnn_torch.mechanisms.mechanism_file import mechanism_text
 from ccnn_torch.records import write_table
 from ccnn_torch.report.json_files import read_json, write_json
+from ccnn_torch.runs.blind.case import BlindCase
 from ccnn_torch.runs.blind.folder import BlindFolder
 from ccnn_torch.runs.blind.judge import judged
 from ccnn_torch.runs.blind.machines import BlindMachine
 from ccnn_torch.runs.blind.plan import plan_cases
-from ccnn_torch.runs.blind.simulate import BlindCase, simulate
+from ccnn_torch.runs.blind.simulate import simulate
 from ccnn_torch.runs.blind.truth import digest, file_digest, truth_of
 
 __all__ = ["judge_cases", "open_cases", "write_cases"]

@@ -80,7 +80,8 @@ def settled(
         data.qvel[:] = 0.0
         mujoco.mj_getState(model, data, state[row], width)
     steps = round((_RAMP + _HOLD) / _STEP)
-    share = np.clip(np.arange(1, steps + 1) * _STEP / _RAMP, 0.0, 1.0)[None, :, None]
+    # Slower towards the end: what arrives at speed swings to the other side of its friction.
+    share = 1 - (1 - np.clip(np.arange(1, steps + 1) * _STEP / _RAMP, 0.0, 1.0)[None, :, None]) ** 2
     goal = start.numpy()[:, None] + share * way.numpy()[:, None]
     force = np.broadcast_to(load.numpy()[:, None], goal.shape)
     states, _ = rollout.rollout(model, data, state, np.concatenate([goal, force], axis=-1))

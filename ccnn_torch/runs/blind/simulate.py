@@ -52,14 +52,12 @@ def simulate(plans: Sequence[CasePlan], seed: int) -> list[BlindCase]:
 
 def _group(machine: BlindMachine, plans: Sequence[CasePlan], seed: int) -> list[BlindCase]:
     """Cases of one machine with equally many rows."""
-    at = [
-        draw_conditions(machine, p.rows, p.moving, np.random.default_rng([seed, p.number, CONDITIONS_STREAM]))
-        for p in plans
-    ]
-    drawn = [
-        _causes(machine, p, a, np.random.default_rng([seed, p.number, CAUSES_STREAM]))
-        for p, a in zip(plans, at, strict=True)
-    ]
+
+    def generator(plan: CasePlan, stream: int) -> np.random.Generator:
+        return np.random.default_rng([seed, plan.number, stream])
+
+    at = [draw_conditions(machine, p.rows, p.moving, generator(p, CONDITIONS_STREAM)) for p in plans]
+    drawn = [_causes(machine, p, a, generator(p, CAUSES_STREAM)) for p, a in zip(plans, at, strict=True)]
     joints, pose = (torch.stack([getattr(a, name) for a in at]) for name in ("joints", "pose"))
     sd = torch.stack([_spread(machine, p) for p in plans])
     shares = torch.tensor([[*p.shares, 0.0, 0.0][:2] for p in plans], dtype=torch.float64)
@@ -69,7 +67,7 @@ def _group(machine: BlindMachine, plans: Sequence[CasePlan], seed: int) -> list[
     true = measured_pose(machine, joints, pose, weighted(parts, size))
     cases = []
     for i, plan in enumerate(plans):
-        step, bad = draw_noise(plan, sd[i], np.random.default_rng([seed, plan.number, NOISE_STREAM]))
+        step, bad = draw_noise(plan, sd[i], generator(plan, NOISE_STREAM))
         cases.append(
             BlindCase(
                 plan=plan,
