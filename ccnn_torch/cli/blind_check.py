@@ -37,7 +37,6 @@ def blind_check(
     ccnn blind-check --cases 500 --out runs/pairs --kinds pair --mechanism five_bar,stewart --seed 7
     """
     from ccnn_torch.diagnosis import diagnose
-    from ccnn_torch.effects import EFFECTS
     from ccnn_torch.runs.blind.check import run_blind_check
     from ccnn_torch.runs.blind.machines import MACHINES
 
@@ -45,7 +44,6 @@ def blind_check(
         cases,
         out,
         diagnose,
-        tuple(EFFECTS),
         seed=seed,
         machines=MACHINES if mechanism is None else tuple(mechanism.split(",")),
         kinds=tuple(kinds.split(",")),

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from ccnn_torch.effects import Effect
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.records import Records
 
@@ -50,9 +51,9 @@ class StandIn:
         mechanism: Mechanism,
         *,
         noise: Mapping[str, float] | None = None,
-        effects: Sequence[str] | None = None,
+        effects: Sequence[Effect] | None = None,
     ) -> Said:
         number = int(records.path.rsplit("/", 1)[-1].removesuffix(".csv"))
-        self.asked.append((number, None if effects is None else tuple(effects)))
+        self.asked.append((number, None if effects is None else tuple(e.name for e in effects)))
         assert noise is None or set(noise) == {c.name for c in mechanism.pose}
         return self.answers.get(number, self.otherwise)

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from ccnn_torch.effects import EFFECTS, Effect, make_effect
 from ccnn_torch.errors import CcnnError, InputError, MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import Records, load_records
@@ -39,16 +40,15 @@ class Diagnoser(Protocol):
         mechanism: Mechanism,
         *,
         noise: Mapping[str, float] | None = None,
-        effects: Sequence[str] | None = None,
+        effects: Sequence[Effect] | None = None,
     ) -> Answer:
-        """Diagnose records; `effects` names the library to use, all of it when None."""
+        """Diagnose records; `effects` is the library to use, all of it when None."""
 
 
 def run_blind_check(
     cases: int,
     out: str | Path,
     diagnose: Diagnoser,
-    library: Sequence[str],
     *,
     seed: int = 0,
     machines: Sequence[str] = MACHINES,
@@ -63,7 +63,6 @@ def run_blind_check(
         cases: how many.
         out: folder.
         diagnose: the diagnosis to check.
-        library: names of its effects.
         seed: of the cases.
         machines: simulators, of `plan.SIMULATORS`.
         kinds: of `plan.KINDS`.
@@ -87,8 +86,8 @@ def run_blind_check(
         note("opening the seal", quiet)
         _generator("open", folder)
     truth = read_json(folder.truth)["cases"]
-    absent = {c["number"]: c["causes"][0] for c in truth if c["kind"] == "single" and c["causes"][0] in library}
-    without = {number: [name for name in library if name != cause] for number, cause in absent.items()}
+    absent = {c["number"]: c["causes"][0] for c in truth if c["kind"] == "single" and c["causes"][0] in EFFECTS}
+    without = {number: [name for name in EFFECTS if name != cause] for number, cause in absent.items()}
     _diagnose_all(folder, [t for t in told if t["number"] in absent], diagnose, without, quiet)
     if not folder.judged.is_file():
         note("judging", quiet)
@@ -147,7 +146,7 @@ def _diagnose_all(
         answer: dict[str, Any]
         try:
             records = load_records(folder.records(number), machines[name])
-            effects = None if without is None else without[number]
+            effects = None if without is None else [make_effect(effect) for effect in without[number]]
             answer = diagnose(records, machines[name], noise=case["noise"], effects=effects).to_json()
         except CcnnError as problem:
             answer = {"failed": str(problem)}
