@@ -27,7 +27,7 @@ __all__ = ["Diagnoser", "run_blind_check"]
 class Answer(Protocol):
     """What a diagnosis gives."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Mapping[str, Any]:
         """The content of diagnosis.json."""
 
 
@@ -147,7 +147,7 @@ def _diagnose_all(
         try:
             records = load_records(folder.records(number), machines[name])
             effects = None if without is None else [make_effect(effect) for effect in without[number]]
-            answer = diagnose(records, machines[name], noise=case["noise"], effects=effects).to_json()
+            answer = dict(diagnose(records, machines[name], noise=case["noise"], effects=effects).to_json())
         except CcnnError as problem:
             answer = {"failed": str(problem)}
         answer["seconds"] = time.perf_counter() - began
