@@ -63,9 +63,7 @@ class Analysis:
         return out
 
 
-def analyse(
-    situation: Situation, measured: Tensor, effects: Sequence[Effect], noise: Tensor | None
-) -> Analysis:
+def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], noise: Tensor | None) -> Analysis:
     """The whole search.
 
     Args:
@@ -85,6 +83,15 @@ def analyse(
     atoms = [_cleaned(a, usable) for a in atoms]
     rest = [_cleaned(a, usable) for a in rest]
     fitted = _frame_columns(situation, usable)
+    # What does not show at all in these rows is no candidate (latency at rest).
+    size = [
+        float(
+            (a.columns[:, channels] / residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)[:, None]).abs().max()
+        )
+        for a in atoms
+    ]
+    effects = [e for e, s in zip(effects, size, strict=True) if s > 1e-9]
+    atoms = [a for a, s in zip(atoms, size, strict=True) if s > 1e-9]
     everything = torch.cat([fitted, *(a.columns for a in (*atoms, *rest[:1]))], -1)
     white = fitted_whitening(residual, everything, channels, noise, usable)
 
@@ -173,7 +180,14 @@ def _cleaned(atom: Atom, usable: Tensor) -> Atom:
 
 
 def _searched(
-    situation: Situation, measured: Tensor, target: Tensor, white: Whitening, atoms: list[Atom], near: Tensor, rich: Tensor, fitted: Tensor
+    situation: Situation,
+    measured: Tensor,
+    target: Tensor,
+    white: Whitening,
+    atoms: list[Atom],
+    near: Tensor,
+    rich: Tensor,
+    fitted: Tensor,
 ) -> Analysis:
     keep = white.keep()
     columns = white(torch.cat([a.columns for a in atoms], -1)) if atoms else white(target)[..., None][..., :0]
@@ -187,7 +201,9 @@ def _searched(
         columns = (flat - q @ (q.mT @ flat)).reshape(columns.shape)
     ends = torch.tensor([a.columns.shape[-1] for a in atoms]).cumsum(0).tolist()
     groups = tuple(torch.arange(e - a.columns.shape[-1], e) for a, e in zip(atoms, ends, strict=True))
-    library = Library(tuple(atoms), groups, grams_of(columns[keep], y[keep]), white.known)
+    # Noise that was given is right to some per cent, however many rows there are.
+    known = white.known * (1 + y[keep].numel() / 100)
+    library = Library(tuple(atoms), groups, grams_of(columns[keep], y[keep]), known)
     floor = min(float((rich / white.sigma).square().mean()), 1.0)
     return Analysis(situation, measured, target, white, library, columns, y, search(library), near, floor)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.effects import Coefficient, Effect, Situation, signature
 
-__all__ = ["Atom", "default_shape", "scales", "scaled_signature"]
+__all__ = ["Atom", "default_shape", "scaled_signature", "scales"]
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ __all__ = ["catch_alls"]
 LOG_PRIOR = math.log(1e-3)
 # A joint may be off by this much for reasons that nobody thought of [m], [rad].
 _SCALE = {"m": 3e-4, "rad": 5e-4}
+# What bends with a driver against what is proportional to it.
+_BEND = 0.5
 _MOST = 28
 
 
@@ -27,24 +29,25 @@ def catch_alls(situation: Situation) -> list[Atom]:
     """One or two atoms for each driver that the records hold."""
     mechanism, rows = situation.mechanism, situation.joints.shape[-2]
     place = _unit(situation.pose)
+    one = torch.ones_like(place[:, :1])
     few = max(4, min(8, rows // 12))
-    found = [_atom(situation, "workspace", _bumps(place, min(24, max(6, rows // 8))))]
+    found = [_atom(situation, "workspace", torch.cat([one, place, _bumps(place, min(24, max(6, rows // 8)))], -1))]
     for i, joint in enumerate(mechanism.joints):
         q = _unit(situation.joints[..., i : i + 1])
-        found.append(_atom(situation, f"joint {joint.name}", _bumps(q, few)))
-        found.append(_atom(situation, f"joint {joint.name}", _bumps(q, min(_MOST, rows // 6)), only=i))
+        found.append(_atom(situation, f"joint {joint.name}", torch.cat([one, q, _BEND * _bumps(q, few)], -1)))
+        fine = torch.cat([one, q, _bumps(q, min(_MOST, rows // 6))], -1)
+        found.append(_atom(situation, f"joint {joint.name}", fine, only=i))
     for name, value in situation.covariates.items():
         driver = _driver(name)
         if driver is None or float(value.max() - value.min()) <= 0:
             continue
         d = _unit(value.unsqueeze(-1))
-        if driver.startswith("direction"):
-            features = torch.cat([d, d * place], -1)
-        else:
-            features = torch.cat([_bumps(d, few), d, d * place], -1)
+        features = [one, d, 0.7 * d * place]
+        if not driver.startswith("direction"):
+            features.append(_BEND * _bumps(d, few))
         if driver == "temperature" and "time" in situation.covariates:
-            features = torch.cat([features, *(_lagged(value, situation.covariates["time"], k) for k in (0.05, 0.2))], -1)
-        found.append(_atom(situation, driver, features))
+            features += [_lagged(value, situation.covariates["time"], k) for k in (0.05, 0.2)]
+        found.append(_atom(situation, driver, torch.cat(features, -1)))
     return found
 
 

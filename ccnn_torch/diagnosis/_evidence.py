@@ -127,5 +127,7 @@ def _padded(sets: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
         if groups:
             flat = torch.cat(list(groups))
             columns[i, : len(flat)] = flat
-            slot[i, : len(flat)] = torch.repeat_interleave(torch.arange(len(groups)), torch.tensor([len(g) for g in groups]))
+            slot[i, : len(flat)] = torch.repeat_interleave(
+                torch.arange(len(groups)), torch.tensor([len(g) for g in groups])
+            )
     return columns, slot

@@ -49,9 +49,7 @@ def signature_at(situation: Situation, there: Situation, effect: Effect, shape: 
     return basis
 
 
-def tangent(
-    situation: Situation, measured: Tensor, acting: Sequence[Acting]
-) -> tuple[Situation, Tensor]:
+def tangent(situation: Situation, measured: Tensor, acting: Sequence[Acting]) -> tuple[Situation, Tensor]:
     """Where the effects bring the machine, and the residual that a linear model about there has to explain, `s x c`.
 
     Rows that the machine with the effects cannot reach come back as NaN.
@@ -63,4 +61,3 @@ def tangent(
         columns = signature_at(situation, there, one.effect, one.shape)
         left = left + (columns @ (one.coefficients / size)[..., None])[..., 0]
     return there, left
-

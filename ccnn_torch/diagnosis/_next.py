@@ -90,9 +90,7 @@ def _predicted(analysis: Analysis, found: Found, there: Situation) -> tuple[Tens
     return x @ torch.cat(found.mean), ((x @ found.covariance) * x).sum(-1)
 
 
-def _chosen(
-    analysis: Analysis, situation: Situation, gain: Tensor, names: list[list[str]]
-) -> list[dict[str, Any]]:
+def _chosen(analysis: Analysis, situation: Situation, gain: Tensor, names: list[list[str]]) -> list[dict[str, Any]]:
     """The rows of most gain, each some way from those before; gain: `rivals x rows`."""
     mechanism = situation.mechanism
     where = situation.pose / (mechanism.high - mechanism.low)

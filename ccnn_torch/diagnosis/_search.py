@@ -16,6 +16,8 @@ __all__ = ["Found", "Library", "scored", "search"]
 
 _MOST = 4
 _BUCKET = 16
+# A third cause at once is rarer still than a second one.
+_CROWD = math.log(0.1)
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def scored(library: Library, sets: Sequence[tuple[int, ...]], iterations: int = 
             library.grams, [[library.groups[i] for i in sets[k]] for k in members], library.noise_dof, iterations
         )
         for row, k in enumerate(members):
-            prior = sum(library.atoms[i].log_prior for i in sets[k])
+            prior = sum(library.atoms[i].log_prior for i in sets[k]) + _CROWD * max(len(sets[k]) - 2, 0)
             evidence = float(fits.log_evidence[row])
             evidence = evidence if math.isfinite(evidence) else -math.inf
             sizes = [len(library.groups[i]) for i in sets[k]]

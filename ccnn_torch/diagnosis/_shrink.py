@@ -72,12 +72,12 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
                 here = x[there][..., columns]
                 left[i][there] = y[there] - here @ fits.mean[row, :m]
                 uncertain[i][there] = ((here @ fits.covariance[row, :m, :m]) * here).sum(-1)
-    return [HeldOut(r / weight * sigma, v / weight.square() * sigma.square()) for r, v in zip(left, uncertain, strict=True)]
+    return [
+        HeldOut(r / weight * sigma, v / weight.square() * sigma.square()) for r, v in zip(left, uncertain, strict=True)
+    ]
 
 
-def shrink_of(
-    before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, floor_dof: float, seed: int
-) -> Gap:
+def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, floor_dof: float, seed: int) -> Gap:
     """Before and after on the channels of one unit.
 
     What is left above the noise is corrected for what the noise of four fifths of the rows does to the fit: it

@@ -10,15 +10,23 @@ from ccnn_torch.diagnosis._search import Found, scored
 
 __all__ = ["Judgement", "judge"]
 
-# A catch-all beside library effects below this share of their energy is how the form of a real effect differs from the
-# textbook, not a cause of its own.
-_FORM = 0.06
+# Share of the gap's energy that goes with a member of a set and not without it: below this a library effect is how the
+# form of the others differs from the textbook; so is a catch-all beside library effects, and so are library effects
+# beside a catch-all, which stands for whatever was not thought of.
+_FORM, _FORM_CATCH_ALL, _BESIDE_CATCH_ALL = 0.008, 0.03, 0.1
 # Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is stood by.
 _VETO = 0.02
+# Or times the noise's energy, whatever the gap.
+_VETO_NOISE = 25.0
+# What a claim is worth where a name carries less than this share of the gap, or where there are three names or more:
+# the textbook forms of effects are too rough to be surer.
+_SMALL, _UNSURE = 0.1, 0.85
 # Odds up to which one name for another is not told apart by the data.
 _ODDS = math.log(20.0)
 # What is claimed grows slower than what the evidence says: its models are not the truth.
 _TEMPER = 1.0
+# Log odds against the most probable set beyond which nobody looks.
+_FAR = 12.0
 
 
 @dataclass(frozen=True)
@@ -49,14 +57,16 @@ class Judgement:
 def judge(analysis: Analysis) -> Judgement:
     """Weigh the sets that the search has found."""
     groups: dict[tuple[frozenset[str], str | None], list[Found]] = {}
-    for found in analysis.found:
-        groups.setdefault(_named(analysis, found), []).append(found)
     top = analysis.found[0].log_posterior
+    tried = {f.members: f for f in analysis.found}
+    for found in analysis.found:
+        if found.log_posterior > top - _FAR:
+            essential = _essential(analysis, found, tried)
+            groups.setdefault(_named(analysis, essential), []).extend([found, essential])
+            tried[essential.members] = essential
     weights = {key: math.exp(_TEMPER * (max(f.log_posterior for f in fs) - top)) for key, fs in groups.items()}
     total = sum(weights.values())
-    leading = sorted(
-        ((k[0], k[1], w / total, groups[k][0]) for k, w in weights.items()), key=lambda x: -x[2]
-    )
+    leading = sorted(((k[0], k[1], w / total, _plainest(groups[k])) for k, w in weights.items()), key=lambda x: -x[2])
     names, driver, probability, found = leading[0]
     outside = driver is not None
     if not outside and _unexplained(analysis, found):
@@ -68,30 +78,64 @@ def judge(analysis: Analysis) -> Judgement:
             marginal[name] += p
     classes = {} if outside else _classes(analysis, found, names)
     if not outside:
-        same = [
-            p for members, drive, p, _ in leading if drive is None and _equals(members, names, classes)
-        ]
+        same = [p for members, drive, p, _ in leading if drive is None and _equals(members, names, classes)]
         probability = sum(same)
     else:
         probability = sum(p for _, drive, p, _ in leading if drive is not None) if leading[0][1] is not None else 0.5
+    if names and (len(names) > 2 or _smallest(analysis, found, tried) < _SMALL):
+        probability *= _UNSURE
     ordered = tuple(sorted(names, key=lambda n: -_energy(analysis, found, n)))
     return Judgement(found, ordered, classes, min(probability, 1.0), outside, driver, marginal, leading)
+
+
+def _net(
+    analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]
+) -> dict[int, tuple[float, tuple[int, ...]]]:
+    """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
+    gap = max(float(analysis.library.grams.yy) - analysis.floor * analysis.library.grams.count, 1e-300)
+    fewer = {i: tuple(m for m in found.members if m != i) for i in found.members}
+    fresh = [s for s in fewer.values() if s not in tried]
+    tried.update(zip(fresh, scored(analysis.library, fresh), strict=True))
+    return {i: ((tried[s].rss - found.rss) / gap, s) for i, s in fewer.items()}
+
+
+def _smallest(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]) -> float:
+    """Share of the gap that the least member of a set carries."""
+    return min(share for share, _ in _net(analysis, found, tried).values())
+
+
+def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]) -> Found:
+    """The set without members that only mend the form of the others."""
+    atoms = analysis.library.atoms
+    while len(found.members) > 1:
+        beside = any(atoms[i].catch_all for i in found.members)
+        limits = {
+            i: _FORM_CATCH_ALL if atoms[i].catch_all else _BESIDE_CATCH_ALL if beside else _FORM for i in found.members
+        }
+        shares = _net(analysis, found, tried)
+        net = {i: share / limits[i] for i, (share, _) in shares.items()}
+        # A catch-all can stand in for much of the library, so it is the first to go.
+        least = min(net, key=lambda i: (not (atoms[i].catch_all and net[i] < 1), net[i]))
+        if net[least] >= 1:
+            break
+        found = tried[shares[least][1]]
+    return found
+
+
+def _plainest(found: list[Found]) -> Found:
+    """Of sets that come to the same names the smallest, and of those the most probable."""
+    return min(found, key=lambda f: (len(f.members), -f.log_posterior))
 
 
 def _named(analysis: Analysis, found: Found) -> tuple[frozenset[str], str | None]:
     atoms = analysis.library.atoms
     names = frozenset(atoms[i].name for i in found.members if not atoms[i].catch_all)
-    energy = sum(e for i, e in zip(found.members, found.energy, strict=True) if not atoms[i].catch_all)
-    for i, e in zip(found.members, found.energy, strict=True):
-        if atoms[i].catch_all and not (names and e < _FORM * energy):
-            return names, atoms[i].name
-    return names, None
+    driver = next((atoms[i].name for i in found.members if atoms[i].catch_all), None)
+    return names, driver
 
 
 def _energy(analysis: Analysis, found: Found, name: str) -> float:
-    return sum(
-        e for i, e in zip(found.members, found.energy, strict=True) if analysis.library.atoms[i].name == name
-    )
+    return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.library.atoms[i].name == name)
 
 
 def _unexplained(analysis: Analysis, found: Found) -> bool:
@@ -101,7 +145,8 @@ def _unexplained(analysis: Analysis, found: Found) -> bool:
     floor = analysis.floor
     significant = left > floor * (1 + 5 * math.sqrt(2 / count))
     gap = float(analysis.library.grams.yy) / count
-    return significant and left - floor > _VETO * max(gap - floor, 0.0) and left > 1.5 * floor
+    much = left - floor > _VETO * max(gap - floor, 0.0) and left > 1.5 * floor
+    return significant and (much or left > _VETO_NOISE * floor)
 
 
 def _driver_of_remainder(analysis: Analysis) -> str | None:

@@ -44,7 +44,7 @@ class Check:
 
 
 def check_rows(
-    situation: Situation, measured: Tensor, noise: Tensor | None = None, effects: Sequence[Effect] | None = None
+    situation: Situation, measured: Tensor, noise: Tensor | None = None, effects: Sequence[Effect | str] | None = None
 ) -> Check:
     """Look at rows as `diagnose_rows` does, and say what they can and cannot show; arguments as there."""
     usable_rows(situation, measured)
@@ -95,4 +95,3 @@ def _span(x: Tensor) -> Tensor:
     """Orthonormal columns of what x spans."""
     u, s, _ = torch.linalg.svd(x, full_matrices=False)
     return u[:, s > 1e-9 * s.max().clamp_min(1e-300)]
-

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._analysis import analyse
+from ccnn_torch.diagnosis._analysis import Analysis, analyse
 from ccnn_torch.diagnosis._next import next_measurements
 from ccnn_torch.diagnosis._report import Blocks, blocks
 from ccnn_torch.diagnosis._verdict import judge
@@ -18,21 +18,24 @@ from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import EFFECTS, Effect, Situation, make_effect, pose_residual
 from ccnn_torch.errors import InputError
 
-__all__ = ["OUTLIER", "candidates", "diagnose_rows", "usable_rows"]
+__all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "usable_rows"]
 
 OUTLIER = "outlier"
 # More rows than this name a cause no better: so many are drawn.
 _MOST_ROWS = 2000
 _FEWEST_ROWS = 20
+# Times the noise from which a row is bad and not unlucky.
+_GROSS = 15.0
 # Half of the rows beyond reach are no outliers any more: the model or the units are wrong.
 _USABLE = 0.5
 
 
 def candidates(
-    situation: Situation, effects: Sequence[Effect] | None = None
+    situation: Situation, effects: Sequence[Effect | str] | None = None
 ) -> tuple[list[Effect], dict[str, str]]:
     """Effects that these records could show, and for the others what is missing."""
-    every = list(effects) if effects is not None else [make_effect(name) for name in EFFECTS]
+    named = list(EFFECTS) if effects is None else effects
+    every = [make_effect(e) if isinstance(e, str) else e for e in named]
     names = [*situation.covariates]
     lacking = {e.name: e.missing(situation.mechanism, names) for e in every}
     return [e for e in every if not lacking[e.name]], {n: why for n, why in lacking.items() if why}
@@ -42,7 +45,7 @@ def diagnose_rows(
     situation: Situation,
     measured: Tensor,
     noise: Tensor | None = None,
-    effects: Sequence[Effect] | None = None,
+    effects: Sequence[Effect | str] | None = None,
     seed: int = 0,
 ) -> Diagnosis:
     """Diagnose rows of commanded joints and measured poses.
@@ -51,7 +54,7 @@ def diagnose_rows(
         situation: `s` rows without further leading dims, in the order measured, with what was measured beside them.
         measured: poses, `s x p` [SI].
         noise: standard deviation of each channel of position and rotation vector, `c` [m, rad]; estimated when None.
-        effects: candidates; the whole library when None.
+        effects: candidates, or their names; the whole library when None.
         seed: of folds and resampling.
 
     Raises:
@@ -70,7 +73,7 @@ def diagnose_rows(
     together = made.main(made.together)
     aside = torch.nonzero(analysis.whitening.weight <= 0).squeeze(-1)
     nothing = not judgement.names and not judgement.outside
-    outlier = nothing and len(aside) > 0 and not bool(analysis.near_singular[aside].all())
+    outlier = nothing and bool(gross_rows(analysis).any())
     verdict = {
         "effects": [OUTLIER] if outlier else list(judgement.names),
         "probability": judgement.probability,
@@ -97,6 +100,13 @@ def diagnose_rows(
         analysis=analysis,
         judgement=judgement,
     )
+
+
+def gross_rows(analysis: Analysis) -> Tensor:
+    """Rows set aside that are so far off that no heavy tail of ordinary noise makes them, `s` bool."""
+    white = analysis.whitening
+    far = (analysis.residual[:, white.channels] / white.sigma).abs().amax(-1) > _GROSS
+    return far & (white.weight <= 0) & ~analysis.near_singular
 
 
 def usable_rows(situation: Situation, measured: Tensor) -> Tensor:
@@ -135,4 +145,3 @@ def _thinned(situation: Situation, measured: Tensor, seed: int) -> tuple[Situati
         guess=pick(situation.guess),
     )
     return fewer, measured[chosen], chosen
-

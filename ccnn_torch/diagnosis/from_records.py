@@ -26,7 +26,7 @@ def diagnose(
     mechanism: Mechanism,
     *,
     noise: float | Mapping[str, float] | None = None,
-    effects: Sequence[Effect] | None = None,
+    effects: Sequence[Effect | str] | None = None,
     gravity: Sequence[float] | None = None,
     seed: int = 0,
 ) -> Diagnosis:
@@ -37,7 +37,7 @@ def diagnose(
         mechanism: the nominal machine.
         noise: standard deviation of the measured pose [SI]: one number for every channel, or by pose coordinate;
             estimated from the rows when None.
-        effects: candidates; the whole library when None.
+        effects: candidates, or their names; the whole library when None.
         gravity: `3` [m/s²] in the base frame; down along -z (planar machines: -y) when None.
         seed: of folds and resampling.
 

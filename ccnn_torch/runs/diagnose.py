@@ -14,7 +14,15 @@ from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.table_form import Table
 from ccnn_torch.runs.diagnose_config import DiagnoseConfig
 
-__all__ = ["check_table", "check_text", "diagnosis_table", "parse_noise", "run_check", "run_diagnosis", "write_diagnosis"]
+__all__ = [
+    "check_table",
+    "check_text",
+    "diagnosis_table",
+    "parse_noise",
+    "run_check",
+    "run_diagnosis",
+    "write_diagnosis",
+]
 
 
 def parse_noise(text: str) -> str:
@@ -42,9 +50,7 @@ def run_diagnosis(config: DiagnoseConfig) -> Diagnosis:
         InputError: something is missing or wrong in the files or keys, or the rows carry no verdict.
     """
     records, mechanism, effects = _loaded(config)
-    return diagnose(
-        records, mechanism, noise=config.noise, effects=effects, gravity=config.gravity, seed=config.seed
-    )
+    return diagnose(records, mechanism, noise=config.noise, effects=effects, gravity=config.gravity, seed=config.seed)
 
 
 def run_check(config: DiagnoseConfig) -> Check:

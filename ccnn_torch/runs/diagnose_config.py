@@ -34,7 +34,8 @@ class DiagnoseConfig(BaseModel):
     out: str | None = Field(default=None, description="folder to write; the same as --out")
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
     covariates: Names | None = Field(
-        default=None, description="covariate columns by name or pattern; null = time, temperature, load_*, direction*, …"
+        default=None,
+        description="covariate columns by name or pattern; null = time, temperature, load_*, direction*, …",
     )
     noise: Positive | dict[str, Positive] | None = Field(
         default=None,
