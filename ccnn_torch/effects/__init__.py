@@ -2,6 +2,7 @@
 
 from ccnn_torch.effects._protocol import Coefficient as Coefficient
 from ccnn_torch.effects._protocol import Effect as Effect
+from ccnn_torch.effects._protocol import Kind as Kind
 from ccnn_torch.effects._protocol import Shape as Shape
 from ccnn_torch.effects._registry import EFFECTS as EFFECTS
 from ccnn_torch.effects._registry import OUTLIER as OUTLIER
@@ -10,6 +11,7 @@ from ccnn_torch.effects._situation import PLATFORM_WEIGHT as PLATFORM_WEIGHT
 from ccnn_torch.effects._situation import Situation as Situation
 from ccnn_torch.effects._situation import default_gravity as default_gravity
 from ccnn_torch.effects.apply import Acting as Acting
+from ccnn_torch.effects.apply import measured_pose as measured_pose
 from ccnn_torch.effects.apply import pose_residual as pose_residual
 from ccnn_torch.effects.apply import reached as reached
 from ccnn_torch.effects.apply import signature as signature

@@ -39,7 +39,7 @@ def by_joint(values: Tensor, joints: Sequence[int] | None = None) -> Tensor:
 
 def per_force(unit: str) -> str:
     """Unit of a compliance of a joint of this unit."""
-    return f"{unit}/{'N' if unit == 'm' else '(N*m)'}"
+    return f"{unit}/{'N' if unit == 'm' else 'N/m'}"
 
 
 def own_parameters(mechanism: Mechanism) -> list[int]:

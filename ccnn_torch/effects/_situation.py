@@ -18,6 +18,8 @@ PLATFORM_WEIGHT = 100.0
 """Weight of a platform of which nothing is known [N]."""
 _STANDARD = 9.80665
 _SAMPLES = 128
+# What 1 N asks of a joint at least [N], [N·m], where gravity does not.
+_LEAST = 0.1
 
 
 def default_gravity(mechanism: Mechanism) -> Tensor:
@@ -56,7 +58,7 @@ class Situation:
 
     @cached_property
     def jacobian(self) -> Tensor:
-        """Derivative of position and rotation vector by the joints, `... x s x c x n`, c = 3 or 6; NaN where no pose."""
+        """Derivative of position and rotation vector by the joints, `... x s x c x n`, c = 3 or 6; NaN without pose."""
         return self.mechanism.jacobian(self.joints, self.parameters, self.pose).detach()
 
     @cached_property
@@ -161,14 +163,14 @@ class Situation:
 
     @cached_property
     def push(self) -> Tensor:
-        """How hard weight and load push each joint along its coordinate, in -1..1, `... x s x n` [1].
+        """How hard weight and load push each joint along its coordinate, `... x s x n` [1].
 
-        tanh of the force, relative to what a weight of `PLATFORM_WEIGHT` asks of the joint where it pulls straight along
-        the platform's motion.
+        In units of what a weight of `PLATFORM_WEIGHT` typically asks of the joint in the workspace; of a joint that
+        carries little of it, of a tenth of what the others carry.
         """
-        lever = torch.linalg.vector_norm(_known(self.jacobian)[..., :3, :], dim=-2)
-        force = self.weight_torque * PLATFORM_WEIGHT + self.load_torque
-        return torch.tanh(force / (lever * PLATFORM_WEIGHT).clamp_min(1e-300))
+        typical = self.samples.weight_torque.square().mean(0).sqrt()
+        typical = torch.maximum(typical, 0.1 * typical.amax()).clamp_min(_LEAST)
+        return self.weight_torque / typical + self.load_torque / (typical * PLATFORM_WEIGHT)
 
     @cached_property
     def directed(self) -> list[int]:
@@ -179,7 +181,8 @@ class Situation:
     def direction(self) -> Tensor:
         """Sign of each joint's last motion, `... x s x n` [1]; 0 for a joint without such a column."""
         columns = [self.covariates.get(f"direction{i + 1}") for i in range(self.joints.shape[-1])]
-        return torch.stack([torch.zeros_like(self.joints[..., 0]) if d is None else d for d in columns], -1)
+        zero = torch.zeros_like(self.joints[..., 0])
+        return torch.stack([zero if d is None else d.expand_as(zero) for d in columns], -1)
 
 
 def _known(values: Tensor) -> Tensor:

@@ -10,9 +10,13 @@ from torch import Tensor
 
 from ccnn_torch.effects._protocol import Effect
 from ccnn_torch.effects._situation import Situation
+from ccnn_torch.mechanisms._pose import frame_jacobian
 from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
-__all__ = ["Acting", "pose_residual", "reached", "signature"]
+__all__ = ["Acting", "measured_pose", "pose_residual", "reached", "signature"]
+
+# Each squares what is left, from a millimetre on.
+_ROUNDS = 4
 
 
 class Acting(NamedTuple):
@@ -60,6 +64,33 @@ def reached(situation: Situation, acting: Sequence[Acting]) -> Tensor:
     if rotation is None:
         return position
     return torch.cat([position, matrix_to_rotation_vector(rotation)], -1)
+
+
+def measured_pose(situation: Situation, frame: Tensor) -> Tensor:
+    """Pose coordinates whose frame is closest to a given one near by, by Gauss and Newton from the nominal pose.
+
+    Args:
+        situation: `... x s` rows.
+        frame: position and rotation vector side by side, as `reached` gives them, `... x s x c` [m, rad].
+
+    Returns:
+        `... x s x p` [SI].
+    """
+    mechanism = situation.mechanism
+    if mechanism.orientations:
+        return frame
+    position = frame[..., :3]
+    rotation = rotation_vector_to_matrix(frame[..., 3:]) if frame.shape[-1] == 6 else None
+    pose = situation.pose.expand(*frame.shape[:-1], -1)
+    for _ in range(_ROUNDS):
+        there = mechanism.frame(pose)
+        gap = position - there[0]
+        if rotation is not None and there[1] is not None:
+            gap = torch.cat([gap, matrix_to_rotation_vector(rotation @ there[1].mT)], -1)
+        slope = frame_jacobian(mechanism.frame, pose).detach()
+        step: Tensor = torch.linalg.solve(slope.mT @ slope, slope.mT @ gap.unsqueeze(-1))
+        pose = pose + step.squeeze(-1)
+    return pose
 
 
 def pose_residual(situation: Situation, measured: Tensor) -> Tensor:

@@ -18,10 +18,12 @@ _SCALE = {"m": 1.5e-4, "rad": 2e-4}
 
 
 class Backlash:
-    """Δq_i = -b_i s_i / 2 + e_i w_i / 2: s the direction of approach, w how hard weight and load push, in -1..1.
+    """Δq_i = -b_i s_i / 2 + e_i tanh(w_i) / 2 + h_i s_i tanh²(w_i) / 2: s the direction of approach, w the push.
 
-    A joint rests on the flank that drove it, half the play b behind the motor's middle, unless what pushes it holds it
-    on the other flank whichever way it came: then the play is not fully taken up, and e says how much of it.
+    A joint rests on the flank that drove it, half the play b behind the motor's middle, unless weight and load push it
+    onto the other flank whichever way it came. Friction f holds it with its motion, so that it rests at
+    b/2 tanh((w - f s) / edge): the part that does not depend on s is odd in w (e, the soft edge), the part with s grows
+    less where w is large (h, held).
     """
 
     name = "backlash"
@@ -36,19 +38,14 @@ class Backlash:
         return "" if there else f"the sign of each joint's last motion before it stopped: direction1[1]…direction{n}[1]"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """Play and soft edge of each joint whose direction is known."""
-        joints = [situation.mechanism.joints[i] for i in situation.directed]
+        """Play, soft edge and what is held, of each joint whose direction is known."""
+        parts = (("", 1.0), (" soft edge", 0.5), (" held", 0.5))
         return tuple(
             Coefficient(
-                f"{j.name}{' soft edge' if secondary else ''}",
-                j.unit,
-                _SCALE[j.unit] * (0.3 if secondary else 1.0),
-                joint=j.name,
-                secondary=secondary,
-                positive=not secondary,
+                f"{j.name}{part}", j.unit, _SCALE[j.unit] * size, joint=j.name, secondary=size < 1, positive=size == 1
             )
-            for j in joints
-            for secondary in (False, True)
+            for j in (situation.mechanism.joints[i] for i in situation.directed)
+            for part, size in parts
         )
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
@@ -56,6 +53,7 @@ class Backlash:
         return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
-        """`... x s x n x 2 · (joints whose direction is known)`."""
-        columns = torch.stack([-situation.direction / 2, situation.push / 2], -1)
+        """`... x s x n x 3 · (joints whose direction is known)`."""
+        pushed, side = torch.tanh(situation.push), situation.direction
+        columns = torch.stack([-side / 2, pushed / 2, side * pushed.square() / 2], -1)
         return by_joint(columns, situation.directed)

@@ -61,7 +61,7 @@ class Compliance:
             tilt = SCALE["rad"] * _SECONDARY
             return (
                 *found,
-                *(Coefficient(f"{j.name} tilt", "rad/(N*m)", tilt, j.name, None, True) for j in mechanism.joints),
+                *(Coefficient(f"{j.name} tilt", "rad/N/m", tilt, j.name, None, True) for j in mechanism.joints),
             )
         stretch = SCALE["m"] * _SECONDARY
         return (*found, *(Coefficient(m.name, "m/N", stretch, m.joint, m.leg, True) for m in members(mechanism)))

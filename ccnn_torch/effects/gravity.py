@@ -18,15 +18,21 @@ from ccnn_torch.rotations import rotation_vector_to_matrix
 __all__ = ["Gravity"]
 
 _SECONDARY = 0.3
+# Lever by which a turning joint carries weight, by and large [m]; a sliding one carries a share of it [1].
+_LEVER = 0.3
+# Weight times the way from the measured point to the centre of mass [N·m].
+_MOMENT = 5.0
 
 
 class Gravity:
     """Δq_i = c_i τ_i, τ = what the machine's own weight asks of the joint per newton, by virtual work.
 
     For an arm the newton is spread evenly over the origins of its links and the tool; for other machines it hangs on
-    the platform. c is compliance times weight: a sag for each metre of lever (turning joints), or along a joint that
-    carries all (sliding ones). Secondary is what another mass distribution does: for an arm a weight at the tool, for a
-    turning drive of another machine its crank, whose weight asks in proportion to cos q and sin q.
+    the measured point of the platform. c is compliance times weight: a sag for each metre of lever (turning joints), or
+    along a joint that carries all (sliding ones). Secondary: a joint that stiffens, d τ|τ| / 0.3 m (or / 1); what
+    another mass distribution does: for an arm a weight at the tool; for a turning drive of another machine its crank,
+    whose weight asks in proportion to cos q and sin q, and for a platform that turns the moment of its weight about
+    the measured point, in its own axes, on drives of plausible compliance.
     """
 
     name = "gravity"
@@ -39,20 +45,23 @@ class Gravity:
         return ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """Sag of each joint, then what a further mass adds, joint by joint."""
-        found = []
-        for joint in situation.mechanism.joints:
-            size = SCALE[joint.unit] * PLATFORM_WEIGHT
-            unit = "rad/m" if joint.unit == "rad" else "m"
+        """Sag of each joint and what goes with it, joint by joint; then the centre of mass."""
+        mechanism, found = situation.mechanism, []
+        for joint in mechanism.joints:
+            turning = joint.unit == "rad"
+            unit, size = "rad/m" if turning else "m", SCALE[joint.unit] * PLATFORM_WEIGHT
             found.append(Coefficient(joint.name, unit, size, joint=joint.name, positive=True))
-            for further in _further(situation.mechanism, joint.unit):
-                # A crank of 0.3 m is the lever of its own weight.
-                apart, lever = (joint.unit, 0.3) if further != "tool" and joint.unit == "rad" else (unit, 1.0)
-                found.append(
-                    Coefficient(
-                        f"{joint.name} {further}", apart, size * _SECONDARY * lever, joint=joint.name, secondary=True
-                    )
-                )
+            parts = [("stiffening", unit, size)]
+            if isinstance(mechanism, SerialArm):
+                parts.append(("tool", unit, size))
+            elif turning:
+                parts += [(f"crank {wave}", "rad", size * _LEVER) for wave in ("cos", "sin")]
+            found += [
+                Coefficient(f"{joint.name} {part}", u, _SECONDARY * v, joint=joint.name, secondary=True)
+                for part, u, v in parts
+            ]
+        if _centred(mechanism):
+            found += [Coefficient(f"centre {axis}", "N*m", _MOMENT, secondary=True) for axis in "xyz"]
         return tuple(found)
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
@@ -61,23 +70,34 @@ class Gravity:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x m`."""
-        if isinstance(situation.mechanism, SerialArm):
-            return by_joint(torch.stack([_spread_weight(situation), situation.weight_torque], -1))
-        columns = by_joint(
-            torch.stack([situation.weight_torque, torch.cos(situation.joints), torch.sin(situation.joints)], -1)
-        )
-        kept = [
-            3 * i + k
-            for i, j in enumerate(situation.mechanism.joints)
-            for k in ((0, 1, 2) if j.unit == "rad" else (0,))
-        ]
-        return columns[..., kept]
+        mechanism, joints = situation.mechanism, situation.joints
+        turning = torch.tensor([j.unit == "rad" for j in mechanism.joints])
+        lever = torch.where(turning, _LEVER, 1.0)
+        arm = isinstance(mechanism, SerialArm)
+        weight = _spread_weight(situation) if arm else situation.weight_torque
+        parts = [weight, weight * weight.abs() / lever]
+        parts += [situation.weight_torque] if arm else [torch.cos(joints), torch.sin(joints)]
+        columns = by_joint(torch.stack(parts, -1))
+        if not arm:
+            kept = [4 * i + k for i, turns in enumerate(turning.tolist()) for k in (range(4) if turns else range(2))]
+            columns = columns[..., kept]
+        return torch.cat([columns, _off_centre(situation)], -1) if _centred(mechanism) else columns
 
 
-def _further(mechanism: Mechanism, unit: str) -> tuple[str, ...]:
-    if isinstance(mechanism, SerialArm):
-        return ("tool",)
-    return ("crank cos", "crank sin") if unit == "rad" else ()
+def _centred(mechanism: Mechanism) -> bool:
+    """Whether the platform's centre of mass has columns: it turns, and is no arm's, whose tool is small."""
+    return not isinstance(mechanism, SerialArm) and mechanism.frame(mechanism.home_pose)[1] is not None
+
+
+def _off_centre(situation: Situation) -> Tensor:
+    """Change of the joints by a moment of 1 N·m of the weight along each axis of the platform, `... x s x n x 3`."""
+    rotation = situation.platform[1]
+    assert rotation is not None
+    moment = torch.linalg.cross(rotation.mT, situation.down.expand_as(rotation), dim=-1)
+    scale = torch.tensor([SCALE[j.unit] for j in situation.mechanism.joints], dtype=rotation.dtype)
+    jacobian = torch.nan_to_num(situation.jacobian)
+    asked: Tensor = jacobian[..., 3:, :].mT @ moment.mT
+    return scale[:, None] * asked
 
 
 def _spread_weight(situation: Situation) -> Tensor:

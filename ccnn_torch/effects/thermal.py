@@ -23,6 +23,8 @@ _STEEL = 1.2e-5
 _UNEVEN, _REFERENCE_OFF = 0.5, 5.0
 # A motor's mount of 0.2 m; a beam warped by its two sides.
 _MOUNT = {"m": 2e-6, "rad": 5e-6}
+# Of a drive warmed by its own work [K], and how long that takes [s]; the legs take on a part.
+_OWN_WARMTH, _WARM_UP, _TAKEN_ON = 10.0, 2000.0, 0.4
 _LAGS = 12
 _SHARES = (0.01, 1.0)
 
@@ -31,8 +33,10 @@ class Thermal:
     """Δp = (α + α_k) p θ for all lengths p (k = their leg or link), Δq_i = β_i q_i θ for sliding drives.
 
     θ is the temperature less 20 degC, as a body of one heat capacity follows it with a lag: θ' = (T - θ) / lag, settled
-    at the first row. Without a column of times there is no lag. Secondary: mounts and beams that move a joint by
-    γ_i θ; a reference that was not 20 degC (a constant growth); a part that follows at once.
+    at the first row. Without a column of times there is no lag. Secondary: mounts that move a joint by γ_i θ; a
+    reference that was not 20 degC (a constant growth); beams that bend by what the surroundings are ahead of the body,
+    T - θ, and a part of the growth that follows at once; and the drives' own warmth, which no thermometer in the hall
+    sees: growth of all and of the sliding drives by 1 - exp(-t / 2000 s).
 
     Lengths are parameters and drives are joints. Both move the measured frame, to first order by the mechanism's
     derivatives, so the effect is one on the pose: no joint has to stand in for a length (near a singularity of an arm
@@ -67,7 +71,18 @@ class Thermal:
         ]
         found.append(Coefficient("reference", "1", _STEEL * _REFERENCE_OFF, secondary=True))
         if "time" in situation.covariates:
+            own = _STEEL * _OWN_WARMTH
             found.append(Coefficient("at once", "1/K", uneven, secondary=True))
+            found += [
+                Coefficient(f"{j.name} bend", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
+                for j in mechanism.joints
+            ]
+            found.append(Coefficient("warm-up", "1", own * _TAKEN_ON, secondary=True))
+            found += [
+                Coefficient(f"{j.name} warm-up", "1", own, joint=j.name, secondary=True)
+                for j in mechanism.joints
+                if j.unit == "m"
+            ]
         return tuple(found)
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
@@ -92,12 +107,14 @@ class Thermal:
         lengths = [k for m in members(mechanism) for k in m.lengths]
         whole = longer[..., lengths].sum(-1, keepdim=True)
         parts = [whole, *(longer[..., m.lengths].sum(-1, keepdim=True) for m in _apart(mechanism))]
-        parts += [(jacobian * situation.joints.unsqueeze(-2))[..., sliding], jacobian]
-        following = torch.cat(parts, -1) * body[..., None, None]
-        constant = [whole.expand(*following.shape[:-1], 1)]
+        travel = (jacobian * situation.joints.unsqueeze(-2))[..., sliding]
+        following = torch.cat([*parts, travel, jacobian], -1) * body[..., None, None]
+        others = [whole]
         if time is not None:
-            constant.append(whole * warm[..., None, None])
-        return torch.cat([following, *(c.expand(*following.shape[:-1], 1) for c in constant)], -1)
+            ahead, own = warm - body, -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
+            others += [whole * warm[..., None, None], jacobian * ahead[..., None, None]]
+            others += [whole * own[..., None, None], travel * own[..., None, None]]
+        return torch.cat([following, *(c.expand(*following.shape[:-1], c.shape[-1]) for c in others)], -1)
 
 
 def _apart(mechanism: Mechanism) -> list[Member]:

@@ -67,6 +67,7 @@ def summary(cases: Sequence[Case]) -> Block:
             "pair, found": _recall(kinds["pair"]),
             "none, false alarms": share(not _is(c, "right") for c in kinds["none"]),
             "outside, right driver": _rate(kinds["outside"], "right"),
+            "outside, right driver and no name beside": _rate(kinds["outside"], "exact"),
             "outside, said": share(bool(c["answer"].get("outside")) for c in kinds["outside"]),
             "withheld with a driver of its own, right": _kept(withheld, lambda w: w["own_driver"], "right"),
             "withheld without, right": _kept(withheld, lambda w: not w["own_driver"], "right"),

@@ -29,7 +29,7 @@ _SHARE = 0.1
 _FREE = 1e3
 """Prior scale of the coefficients in units of what is plausible: it keeps the fit regular and else asks nothing."""
 _STEPS = 3
-_REFINEMENTS = 3
+_SWEEPS, _REFINEMENTS = 3, 3
 _CHUNK = 16
 
 
@@ -124,7 +124,8 @@ class Judge:
         """Shapes first, one after the other, then the coefficients in the true kinematics."""
         values = [self._shapes.get(e.name, _middle(e, self._situation)) for e in effects]
         y = self._white(self._gap)
-        for _ in range(2 if len(effects) > 1 else 1):
+        several = len(effects) > 1 or any(len(v) > 1 for v in values)
+        for _ in range(_SWEEPS if several else 1):
             for i, effect in enumerate(effects):
                 others = [
                     self._columns(e, v[None])[0] for j, (e, v) in enumerate(zip(effects, values, strict=True)) if j != i

@@ -19,6 +19,8 @@ from ccnn_torch.runs.blind.machines import BlindMachine
 __all__ = ["JOINT_CAUSES", "normalised", "of_joints", "some_of"]
 
 Generator = np.random.Generator
+_BALANCED = 0.6
+"""Share of machines whose weight does not press on the drives' friction."""
 
 
 def of_joints(machine: BlindMachine, change: Tensor) -> Deviation:
@@ -80,9 +82,13 @@ def backlash(machine: BlindMachine, at: Conditions, generator: Generator) -> Dev
 
 
 def friction(machine: BlindMachine, at: Conditions, generator: Generator) -> Deviation:
-    """Wind-up behind the motion by a friction that grows with what the drive carries, less than in proportion."""
-    carried = normalised(at.torque + at.weight).abs()
-    held = generator.uniform(0.0, 0.3) + carried ** generator.uniform(0.85, 1.0)
+    """Wind-up behind the motion by a friction that grows with what the drive carries, a little less than in proportion.
+
+    Most axes are balanced, so that the load alone presses; in others it adds to the weight.
+    """
+    balanced = generator.random() < _BALANCED
+    carried = normalised(at.torque if balanced else at.torque + at.weight).abs()
+    held = generator.uniform(0.1, 0.4) + carried ** generator.uniform(0.9, 1.0)
     return of_joints(machine, -some_of(at.joints.shape[-1], generator).abs() * at.direction * held)
 
 

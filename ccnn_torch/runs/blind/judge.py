@@ -64,8 +64,9 @@ def _answer(case: BlindCase, judge: Judge, causes: Sequence[str], answer: Mappin
         right = not names and not outside
         return {**told, "exact": right, "right": right, "found": 0, "shrink": None}
     if kind == "outside":
-        right = outside and verdict["driver"] in case.drivers[0] and not set(names) - {_OUTLIER}
-        return {**told, "exact": right, "right": right, "found": int(outside), "shrink": None}
+        right = outside and verdict["driver"] in case.drivers[0]
+        bare = right and not set(names) - {_OUTLIER}
+        return {**told, "exact": bare, "right": right, "found": int(outside), "shrink": None}
     if case.plan.causes == (_OUTLIER,):
         return {**told, "exact": exact, "right": exact, "found": int(_OUTLIER in names), "shrink": None}
     named = [n for n in names if n != _OUTLIER]

@@ -35,6 +35,7 @@ def _dent(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple[
     width = (high - low) * generator.uniform(0.06, 0.15)
     change = torch.zeros_like(at.joints)
     change[:, i] = torch.exp(-(((at.joints[:, i] - middle) / width) ** 2))
+    change[:, i] -= change[:, i].mean()
     return of_joints(machine, change), (f"joint q{i + 1}",)
 
 
@@ -48,6 +49,7 @@ def _bulge(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple
     middle = torch.as_tensor(generator.uniform(0.25, 0.75, place.shape[-1]))
     square = ((place - middle)[:, lengths] ** 2).sum(-1) / generator.uniform(0.2, 0.3) ** 2
     change = torch.as_tensor(generator.uniform(0.5, 1.5, at.joints.shape[-1])) * torch.exp(-square)[:, None]
+    change = change - change.mean(0)
     # Where a machine has one length alone, what changes along it changes along all joints alike.
     return of_joints(machine, change * torch.as_tensor(generator.choice([-1.0, 1.0], change.shape[-1]))), ("workspace",)
 
@@ -88,13 +90,16 @@ def _hum(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple[D
 
 
 def _moved(machine: BlindMachine, at: Conditions, course: Tensor, generator: Generator) -> Deviation:
-    """The whole platform moved along one way by a course over the rows, `s`: alike wherever it stands."""
+    """The whole platform moved along one way by a course over the rows, `s`: alike wherever it stands.
+
+    Without what is the same in all rows: that would be a device or a target elsewhere, which a library knows.
+    """
     way = torch.as_tensor(generator.normal(size=6))
     way = torch.cat([1e-3 * way[:3], (2e-3 if machine.orientation else 0.0) * way[3:]])
     none = Deviation.none(machine, len(course))
     lengths = {c.name for c in machine.mechanism.pose if c.unit == "m"}
     seen = torch.tensor([name in lengths for name in "xyz"] + [True] * 3, dtype=torch.float64)
-    return replace(none, platform=course[:, None] * way * seen)
+    return replace(none, platform=(course - course.mean())[:, None] * way * seen)
 
 
 _MAKERS = {

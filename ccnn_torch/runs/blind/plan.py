@@ -81,6 +81,8 @@ def plan_cases(count: int, seed: int, machines: Sequence[str], kinds: Sequence[s
         machine, causes, strength = decks[kind].next()
         bad = causes == ("outlier",)
         # A plain case half the time; a disturbance that is itself a finding only where there is another one.
+        moving = "latency" in causes or (bool(g.random() < _MOVING) and machine != "mujoco_five_bar")
+        rows = int(g.choice(_ROWS, p=_ROWS_SHARE))
         choice = ["", "heavy tails", "uneven noise"] + (["bad rows"] if kind in ("single", "pair") else [])
         disturbance = str(g.choice(choice)) if g.random() < 0.4 and not bad else ""
         plans.append(
@@ -91,10 +93,11 @@ def plan_cases(count: int, seed: int, machines: Sequence[str], kinds: Sequence[s
                 causes=causes,
                 shares=(1.0, float(np.exp(g.uniform(np.log(_WEAKEST), 0.0))))[: len(causes)],
                 strength=0.0 if bad or not causes else strength,
-                rows=int(g.choice(_ROWS, p=_ROWS_SHARE)),
+                # Speeds beside all else are more columns than 40 rows may have.
+                rows=max(rows, 60) if moving else rows,
                 noise=float(np.exp(g.uniform(*np.log(_NOISE)))),
                 noise_told=bool(g.random() > _UNTOLD) and disturbance != "uneven noise",
-                moving="latency" in causes or (bool(g.random() < _MOVING) and machine != "mujoco_five_bar"),
+                moving=moving,
                 disturbance=disturbance if machine != "mujoco_five_bar" else "",
             )
         )

@@ -1,0 +1,69 @@
+"""Conditions under which rows might have been measured: times, temperatures, loads, directions of approach."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.effects.thermal import REFERENCE
+from ccnn_torch.mechanisms import Mechanism
+
+__all__ = ["SHIFT", "covariate_units", "draw_covariates"]
+
+SHIFT = 8 * 3600.0
+"""Rows stand evenly over a shift [s]."""
+# Standard deviations of the load along a coordinate [N], [N·m].
+_LOAD = {"m": 60.0, "rad": 6.0}
+
+
+def draw_covariates(
+    mechanism: Mechanism,
+    joints: Tensor,
+    generator: torch.Generator,
+    duration: float = SHIFT,
+    load: Mapping[str, float] | None = None,
+) -> dict[str, Tensor]:
+    """Conditions of rows that were measured one after the other, each at rest.
+
+    The hall drifts by some kelvin over a shift and swings about that; loads are drawn anew for each row; a joint's
+    direction is the sign of its way from the row before.
+
+    Args:
+        mechanism: whose pose coordinates loads act along.
+        joints: commanded, in the order measured, `s x n` [SI].
+        generator: of the random numbers.
+        duration: from the first row to the last [s].
+        load: standard deviation of the load by unit of the pose coordinate [N], [N·m]; None = 60 N and 6 N·m.
+
+    Returns:
+        `time`, `temperature`, `load_NAME`, `direction1`…, each `s` [SI].
+    """
+    rows, n = joints.shape
+
+    def uniform(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator, dtype=torch.float64))
+
+    time = torch.linspace(0.0, duration, rows, dtype=torch.float64)
+    shift = time / SHIFT
+    drift = uniform(3.0, 8.0) * (1.0 if uniform(-1, 1) > 0 else -1.0)
+    swing, swings, phase = uniform(1.0, 3.0), uniform(2.0, 5.0), uniform(0.0, 2 * math.pi)
+    hall = uniform(-2.0, 2.0) + drift * shift + swing * torch.sin(2 * math.pi * swings * shift + phase)
+    found = {"time": time, "temperature": REFERENCE + hall}
+    sizes = {**_LOAD, **(load or {})}
+    for coordinate in mechanism.pose:
+        draw = torch.randn(rows, generator=generator, dtype=torch.float64)
+        found[f"load_{coordinate.name}"] = sizes[coordinate.unit] * draw
+    before = torch.where(torch.rand(1, n, generator=generator, dtype=torch.float64) < 0.5, -1.0, 1.0)
+    way = torch.where(joints.diff(dim=0) < 0, -1.0, 1.0)
+    return found | {f"direction{i + 1}": d for i, d in enumerate(torch.cat([before, way])[:rows].unbind(-1))}
+
+
+def covariate_units(mechanism: Mechanism) -> dict[str, str]:
+    """SI unit of every column that the library's effects know, by name."""
+    units = {"time": "s", "temperature": "K"}
+    units |= {f"load_{c.name}": "N" if c.unit == "m" else "N*m" for c in mechanism.pose}
+    units |= {f"direction{i + 1}": "1" for i in range(len(mechanism.joints))}
+    return units | {f"speed{i + 1}": f"{j.unit}/s" for i, j in enumerate(mechanism.joints)}

@@ -1,0 +1,318 @@
+"""What the effects do, against closed forms, naive loops and the laws that they come from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from torch import Tensor
+
+from ccnn_torch.effects import (
+    Acting,
+    Effect,
+    Situation,
+    default_gravity,
+    make_effect,
+    measured_pose,
+    reached,
+    signature,
+)
+from ccnn_torch.effects._time import lagged, velocity
+from ccnn_torch.effects.covariates import covariate_units, draw_covariates
+from ccnn_torch.effects.thermal import REFERENCE
+from ccnn_torch.mechanisms import SerialArm, load_mechanism
+from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+
+ARM = str(Path(__file__).parent / "arm.yaml")
+
+
+def situation(name: str, rows: int = 9, seed: int = 0, **columns: Tensor) -> Situation:
+    mechanism = load_mechanism(name)
+    generator = torch.Generator().manual_seed(seed)
+    joints = mechanism.sample_joints(20 * rows, generator)
+    joints = joints[mechanism.condition_number(joints) < 30][:rows]
+    drawn = draw_covariates(mechanism, joints, generator)
+    return Situation(mechanism, joints, {**drawn, **columns}, default_gravity(mechanism))
+
+
+def acting(effect: str, rows: Situation, **values: float) -> Acting:
+    """An effect with these coefficients (blanks as underscores), all others 0; shapes by name too."""
+    made = make_effect(effect)
+    coefficients = [values.pop(c.name.replace(" ", "_"), 0.0) for c in made.coefficients(rows)]
+    shapes = [values.pop(s.name.replace(" ", "_"), s.grid[0]) for s in made.shapes(rows)]
+    assert not values
+    return Acting(made, torch.tensor(shapes, dtype=torch.float64), torch.tensor(coefficients, dtype=torch.float64))
+
+
+def columns(effect: Effect, rows: Situation, shape: Tensor) -> dict[str, Tensor]:
+    names = [c.name for c in effect.coefficients(rows)]
+    return dict(zip(names, signature(rows, effect, shape).unbind(-1), strict=True))
+
+
+NO_SHAPE = torch.zeros(0, dtype=torch.float64)
+
+
+def test_a_body_follows_its_surroundings_as_the_differential_equation_says() -> None:
+    rng = np.random.default_rng(3)
+    time = np.sort(rng.uniform(0, 5000, 40))
+    value = rng.normal(size=40)
+    for lag in (30.0, 700.0, 1e5):
+
+        def rate(t: float, y: np.ndarray, lag: float = lag) -> np.ndarray:
+            return (np.interp(t, time, value) - y) / lag
+
+        found = solve_ivp(rate, time[[0, -1]], value[:1], t_eval=time, rtol=1e-9, atol=1e-12, max_step=5.0).y[0]
+        shuffled = rng.permutation(40)
+        got = lagged(torch.as_tensor(time[shuffled]), torch.as_tensor(value[shuffled]), torch.tensor(lag))
+        assert np.abs(got.numpy() - found[shuffled]).max() < 1e-6
+    now = lagged(torch.as_tensor(time), torch.as_tensor(value), torch.tensor(0.0, dtype=torch.float64))
+    assert np.abs(now.numpy() - value).max() < 1e-8
+
+
+def test_velocities_are_those_of_a_parabola_and_none_across_a_pause() -> None:
+    time = torch.tensor([0.0, 0.1, 0.25, 0.3, 0.5, 9.0, 9.2, 20.0], dtype=torch.float64)
+    joints = torch.stack([2 * time + 3 * time**2, -time], -1)
+    order = torch.tensor([3, 0, 7, 2, 5, 1, 6, 4])
+    got = torch.zeros_like(joints)
+    got[order] = velocity(time[order], joints[order])
+    assert torch.allclose(got[1:4, 0], 2 + 6 * time[1:4]) and torch.allclose(got[1:4, 1], torch.tensor(-1.0).double())
+    # The ends know one side only; a row more than a second from a neighbour stands on no trajectory.
+    assert torch.allclose(got[0], torch.tensor([2.3, -1.0], dtype=torch.float64))
+    assert bool((got[4:] == 0).all())
+
+
+@pytest.mark.parametrize("name", ["stewart", "tripod", "machine_tool", "five_bar", ARM])
+def test_a_load_does_the_work_on_the_pose_that_its_torques_do_on_the_joints(name: str) -> None:
+    rows = situation(name)
+    machine = rows.mechanism
+    if isinstance(machine, SerialArm):
+        along = rows.jacobian  # moments about the base frame's axes
+    else:
+        step = 1e-6 * torch.eye(len(machine.joints), dtype=torch.float64)[:, None]
+        ends = [machine.forward_kinematics(rows.joints + s * step, guess=rows.pose) for s in (1, -1)]
+        along = ((ends[0] - ends[1]) / 2e-6).movedim(0, -1)
+    load = torch.stack([rows.covariates[f"load_{c.name}"] for c in machine.pose], -1)
+    expected = (along.mT @ load[..., None])[..., 0]
+    assert torch.allclose(rows.load_torque, expected, rtol=1e-6, atol=1e-5)
+    assert torch.equal(replace(rows, covariates={}).load_torque, torch.zeros_like(rows.joints))
+
+
+@pytest.mark.parametrize("name", ["stewart", "five_bar", ARM])
+def test_what_gives_under_a_load_obeys_maxwell_and_betti(name: str) -> None:
+    """One load's work on the displacement by another is the other's on that by the first, in every linear column."""
+    pair = [situation(name, seed=0), situation(name, seed=1)]
+    pair[1] = replace(pair[0], covariates=pair[1].covariates)
+    effect = make_effect("compliance")
+    first, second = (columns(effect, rows, NO_SHAPE) for rows in pair)
+    linear = [n for n in first if "stiffening" not in n]
+    assert len(linear) > len(pair[0].mechanism.joints)
+    for column in linear:
+        one = (pair[1].wrench * first[column]).sum(-1)
+        other = (pair[0].wrench * second[column]).sum(-1)
+        assert torch.allclose(one, other, rtol=1e-8, atol=1e-12), column
+        # A spring takes work up.
+        assert bool(((pair[0].wrench * first[column]).sum(-1) >= -1e-12).all()), column
+
+
+def test_a_linear_spring_is_twice_as_far_out_under_twice_the_load_and_a_stiffening_one_four_times() -> None:
+    rows = situation("five_bar")
+    double = replace(rows, covariates={k: 2 * v if k.startswith("load") else v for k, v in rows.covariates.items()})
+    effect = make_effect("compliance")
+    once, twice = (columns(effect, r, NO_SHAPE) for r in (rows, double))
+    assert torch.allclose(twice["q1"], 2 * once["q1"]) and torch.allclose(twice["leg 2"], 2 * once["leg 2"])
+    assert torch.allclose(twice["q1 stiffening"], 4 * once["q1 stiffening"])
+
+
+def test_an_arm_sags_by_the_slope_of_its_potential_energy() -> None:
+    rows = situation(ARM, 4)
+    arm = rows.mechanism
+    assert isinstance(arm, SerialArm)
+
+    def energy(joints: Tensor) -> Tensor:
+        heights = [place[..., 2] for _, place in arm.link_frames(joints, arm.nominal)[1:]]
+        return torch.stack([*heights, arm.forward_frame(joints)[0][..., 2]], -1).mean(-1)
+
+    basis = make_effect("gravity").basis(rows, NO_SHAPE)
+    for i in range(6):
+        step = torch.zeros(6, dtype=torch.float64)
+        step[i] = 1e-6
+        slope = (energy(rows.joints + step) - energy(rows.joints - step)) / 2e-6
+        assert torch.allclose(basis[:, i, 3 * i], -slope, atol=1e-8)
+
+
+def test_a_platform_hangs_in_its_drives_with_its_weight() -> None:
+    rows = situation("stewart")
+    tension = rows.weight_torque
+    # The legs' forces on the platform hold it: along z they sum up to its weight, sideways to nothing.
+    machine = rows.mechanism
+    rotation = rotation_vector_to_matrix(rows.pose[:, 3:])
+    legs = machine.nominal.reshape(6, 8)
+    leg = rows.pose[:, None, :3] + (rotation[:, None] @ legs[:, 3:6, None])[..., 0] - legs[:, :3]
+    total = (tension[..., None] * leg / leg.norm(dim=-1, keepdim=True)).sum(-2)
+    assert torch.allclose(total, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand_as(total), atol=1e-9)
+
+
+def test_a_centre_of_mass_beside_the_measured_point_asks_what_the_shifted_weight_does() -> None:
+    rows = situation("stewart")
+    basis = make_effect("gravity").basis(rows, NO_SHAPE)[..., -3:]
+    shift, weight = torch.tensor([0.02, -0.03, 0.1], dtype=torch.float64), 70.0
+    torque = rows.weight_torque * weight + (basis @ (weight * shift)) / 1e-7
+    # The height of the shifted point, by differences along each joint.
+    step = 1e-6 * torch.eye(6, dtype=torch.float64)[:, None]
+    heights = []
+    for s in (step, -step):
+        pose = rows.mechanism.forward_kinematics(rows.joints + s, guess=rows.pose)
+        heights.append(pose[..., 2] + (rotation_vector_to_matrix(pose[..., 3:]) @ shift)[..., 2])
+    assert torch.allclose(torque, -weight * ((heights[0] - heights[1]) / 2e-6).mT, rtol=1e-6, atol=1e-5)
+
+
+def test_what_a_load_holds_on_a_flank_does_not_depend_on_the_side_of_approach() -> None:
+    rows = situation("tripod")
+    heavy = torch.full((9,), 1e5, dtype=torch.float64)
+    sides = []
+    for sign in (1.0, -1.0):
+        columns = {f"direction{i}": torch.full((9,), sign, dtype=torch.float64) for i in (1, 2, 3)}
+        held = replace(rows, covariates={**columns, "load_z": heavy})
+        play = {f"q{i}{part}": 2e-4 for i in (1, 2, 3) for part in ("", "_soft_edge", "_held")}
+        sides.append(acting("backlash", held, **play).change(held))
+    pushed = held.push.abs() > 20
+    assert bool(pushed.any()) and torch.allclose(sides[0][pushed], sides[1][pushed], atol=1e-12)
+    assert torch.allclose(sides[0][pushed], 1e-4 * held.push[pushed].sign())
+
+
+@pytest.mark.parametrize("name", ["five_bar", "stewart"])
+def test_a_machine_that_grows_evenly_is_the_same_machine_larger(name: str) -> None:
+    warm = torch.linspace(-8, 9, 9, dtype=torch.float64)
+    rows = situation(name, temperature=REFERENCE + warm)
+    growth = 1.2e-5
+    travels = {f"{j.name}_travel": growth for j in rows.mechanism.joints if j.unit == "m"}
+    grown = reached(rows, [acting("thermal", rows, growth=growth, **travels)])
+    position = rows.platform[0]
+    assert torch.allclose(grown[:, :3], position * (1 + growth * warm[:, None]), atol=1e-12, rtol=0)
+    turned = reached(rows, [])[:, 3:]
+    assert torch.allclose(grown[:, 3:], turned, atol=1e-12, rtol=0)
+    # The members together are the whole.
+    effect = make_effect("thermal")
+    parts = columns(effect, rows, torch.tensor([500.0], dtype=torch.float64))
+    legs = [v for k, v in parts.items() if k.startswith("leg ")]
+    assert torch.allclose(sum(legs[1:], legs[0]), parts["growth"])
+
+
+def test_play_is_the_way_between_both_sides_of_approach() -> None:
+    rows = situation("five_bar")
+    ends = []
+    for sign in (1.0, -1.0):
+        side = replace(rows, covariates={"direction1": torch.full((9,), sign, dtype=torch.float64)})
+        ends.append(rows.joints + acting("backlash", side, q1=3e-4).change(side))
+    assert torch.allclose(ends[1] - ends[0], torch.tensor([3e-4, 0.0], dtype=torch.float64).expand(9, 2))
+    names = [c.name for c in make_effect("backlash").coefficients(side)]
+    assert names == ["q1", "q1 soft edge", "q1 held"]  # nothing is known of the other joint's side
+
+
+def test_friction_acts_against_the_last_motion_and_grows_with_the_load() -> None:
+    rows = situation("five_bar")
+    change = acting("friction", rows, q2_load=2e-6).change(rows)
+    assert torch.allclose(change[:, 1], -rows.direction[:, 1] * 2e-6 * rows.load_torque[:, 1].abs())
+    assert bool((change[:, 0] == 0).all())
+
+
+def test_geometry_is_that_of_the_mechanism_with_these_parameters() -> None:
+    rows = situation("five_bar")
+    shifted = rows.mechanism.nominal.clone()
+    shifted[0] += 2e-3
+    expected = rows.mechanism.forward_kinematics(rows.joints, shifted)
+    assert torch.equal(reached(rows, [acting("geometry", rows, l1=2e-3)])[:, :2], expected)
+
+
+def test_a_frame_moves_the_machine_as_a_whole_and_a_tool_turns_with_the_platform() -> None:
+    rows = situation("stewart")
+    moved = reached(rows, [acting("frame", rows, x=1e-4, rz=1e-5)])
+    nominal = rows.pose[:, :3]
+    before, after = (torch.cdist(p, p) for p in (nominal, moved[:, :3]))
+    assert float((before - after).abs().max()) < 1e-10  # rigid, to the second order of the turn
+    tool = reached(rows, [acting("tool", rows, y=2e-4, rx=1e-4)])
+    rotation = rotation_vector_to_matrix(rows.pose[:, 3:])
+    assert torch.allclose(tool[:, :3] - nominal, 2e-4 * rotation[:, :, 1], atol=1e-15)
+    turn = rotation.mT @ rotation_vector_to_matrix(tool[:, 3:])
+    expected = torch.tensor([1e-4, 0.0, 0.0], dtype=torch.float64).expand(9, 3)
+    assert torch.allclose(matrix_to_rotation_vector(turn), expected, atol=1e-14)
+
+
+def test_an_instrument_stretches_distances_along_its_axes() -> None:
+    rows = situation("five_bar")
+    far = reached(rows, [acting("instrument", rows, scale_x=1e-3)])
+    nominal = rows.platform[0]
+    ratio = (far[1:] - far[:1]) / (nominal[1:] - nominal[:1])
+    assert torch.allclose(ratio[:, :2], torch.tensor([1.001, 1.0], dtype=torch.float64).expand(8, 2))
+    names = [c.name for c in make_effect("instrument").coefficients(rows)]
+    assert names == ["scale x", "scale y", "shear xy", "zero x", "zero y"]  # what a plane shows
+
+
+def test_what_the_pose_does_not_show_is_no_coefficient() -> None:
+    rows = situation("tripod")
+    # y, z and phi about -y: a shift along x and the turn about z change none of them.
+    assert [c.name for c in make_effect("frame").coefficients(rows)] == ["y", "z", "rx", "ry"]
+    frame = reached(rows, [acting("frame", rows, y=1e-4, ry=-2e-4)])
+    pose = measured_pose(rows, frame)
+    assert torch.allclose((pose - rows.pose)[:, 2], torch.full((9,), 2e-4, dtype=torch.float64), atol=1e-10)
+    position, rotation = rows.mechanism.frame(pose)
+    assert rotation is not None
+    assert torch.allclose(torch.cat([position, matrix_to_rotation_vector(rotation)], -1), frame, atol=1e-9)
+
+
+def test_a_gears_error_comes_back_after_its_period() -> None:
+    rows = situation(ARM)
+    one = acting("transmission", rows, q2_sin=1e-4, q2_cos_2=3e-5, q2_frequency=5.0)
+    turned = replace(rows, joints=rows.joints + 2 * math.pi / 5)
+    assert torch.allclose(one.change(rows), one.change(turned), atol=1e-15)
+    effect = one.effect
+    for i, shape in enumerate(effect.shapes(rows)):
+        moved = [effect.coefficients(rows)[k].joint for k in shape.columns or ()]
+        assert moved == [f"q{i + 1}"] * 4
+
+
+def test_a_random_walk_has_the_variance_of_its_time() -> None:
+    rows = situation("five_bar", 50)
+    basis = make_effect("drift").basis(rows, torch.tensor([600.0], dtype=torch.float64))[:, 0]
+    share = torch.linspace(0, 1, 50, dtype=torch.float64)
+    variance = basis[:, 2:6].square().sum(-1)
+    assert float((variance - share).abs().max()) < 0.06
+    assert torch.allclose(basis[:, 0], share * 8 * 3600) and torch.allclose(
+        basis[:, 1], torch.log1p(share * 8 * 3600 / 600)
+    )
+
+
+def test_one_joints_motion_moves_another_and_a_gain_itself() -> None:
+    rows = situation("stewart")
+    low, high = rows.workspace
+    middle = (low + high) / 2
+    change = acting("coupling", rows, q3_by_q5=1e-3).change(rows)
+    assert torch.allclose(change[:, 2], 1e-3 * (rows.joints[:, 4] - middle[4]))
+    assert bool((change[:, [0, 1, 3, 4, 5]] == 0).all())
+    gain = acting("joint_gain", rows, q4=1e-3).change(rows)
+    assert torch.allclose(gain[:, 3], 1e-3 * (rows.joints[:, 3] - middle[3]))
+
+
+def test_a_machine_that_lags_is_where_it_was_before() -> None:
+    time = torch.arange(40, dtype=torch.float64) * 0.02
+    machine = load_mechanism("five_bar")
+    start, end = machine.sample_joints(2, torch.Generator().manual_seed(2))
+    path = start + (end - start) * (time / 0.8)[:, None]
+    rows = Situation(machine, path, {"time": time}, default_gravity(machine))
+    late = reached(rows, [acting("latency", rows, delay=0.01)])
+    before = machine.forward_kinematics(path - (end - start) * 0.01 / 0.8)
+    assert torch.allclose(late[:, :2], before, atol=1e-12)
+
+
+def test_covariates_are_columns_with_units_and_the_same_for_the_same_seed() -> None:
+    machine = load_mechanism("stewart")
+    joints = machine.sample_joints(30, torch.Generator().manual_seed(0))
+    one, two = (draw_covariates(machine, joints, torch.Generator().manual_seed(5)) for _ in range(2))
+    assert all(torch.equal(one[name], two[name]) for name in one) and set(one) <= set(covariate_units(machine))
+    assert torch.equal(one["direction4"][1:], torch.sign(joints[:, 3].diff()))
+    assert 285 < float(one["temperature"].min()) < float(one["temperature"].max()) < 305
