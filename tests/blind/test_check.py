@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
 import pytest
-import torch
 from blind.stand_in import Said, StandIn
 from blind.test_machines import planned
 
+from ccnn_torch.cli import main
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.blind import share
 from ccnn_torch.report.blind_tables import blind_markdown
@@ -34,7 +35,7 @@ def beside(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccnn_torch.runs.blind.check._generator", lambda what, folder: sides[what](folder))
 
 
-def check(out: Path, diagnose: StandIn, cases: int = 12) -> Path:
+def check(out: Path, diagnose: StandIn, cases: int = 9) -> Path:
     return run_blind_check(cases, out, diagnose, seed=4, machines=("five_bar", "delta"), quiet=True)
 
 
@@ -171,8 +172,24 @@ def test_answers_are_judged() -> None:
     assert judged(single, {"failed": "no."}, None)["answer"] == {"failed": "no."}
 
 
+def test_the_command_refuses_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words, said in (
+        (("--cases", "2", "--mechanism", "crane"), "--mechanism: 'crane' is not there"),
+        (("--cases", "0"), "--cases: generate at least 1 case"),
+        (("--cases", "2", "--kinds", "single,many"), "--kinds: 'many' is not there"),
+    ):
+        monkeypatch.setattr(sys, "argv", ["ccnn", "blind-check", "--out", str(tmp_path / "x"), *words])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        error = capsys.readouterr().err
+        assert ended.value.code == 2 and said in error and error.count("\n") == 1
+    assert not (tmp_path / "x").exists()
+
+
 def test_intervals_of_shares() -> None:
     # Clopper and Pearson: of 0 of 10 the upper end is 1 - 0.025 ** (1 / 10).
     assert share([False] * 10)["high"] == pytest.approx(1 - 0.025**0.1)
     assert share([]) == {"count": 0, "of": 0, "share": None, "low": None, "high": None}
-    assert torch.isclose(torch.tensor(share([True, False])["share"]), torch.tensor(0.5))
+    assert share([True, False])["share"] == 0.5

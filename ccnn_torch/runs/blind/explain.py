@@ -126,12 +126,15 @@ class Judge:
         y = self._white(self._gap)
         several = len(effects) > 1 or any(len(v) > 1 for v in values)
         for _ in range(_SWEEPS if several else 1):
+            before = [value.clone() for value in values]
             for i, effect in enumerate(effects):
                 others = [
                     self._columns(e, v[None])[0] for j, (e, v) in enumerate(zip(effects, values, strict=True)) if j != i
                 ]
                 fixed = torch.cat([y.new_zeros(len(y), 0), *others], dim=-1)
                 values[i] = self._best_shape(effect, values[i], y, fixed)
+            if all(torch.allclose(v, b, rtol=1e-3) for v, b in zip(values, before, strict=True)):
+                break
         if len(effects) == 1:
             self._shapes[effects[0].name] = values[0]
         z = torch.cat(
