@@ -138,8 +138,8 @@ def test_classes_are_what_the_rows_cannot_tell_apart() -> None:
     assert {"joint_offset", "geometry"} <= set(Judge(offset).members(["joint_offset"]))
     assert "compliance" not in Judge(offset).members(["joint_offset"])
     assert Judge(frame).explained(["frame"]).left < 1e-3
-    assert Judge(frame).explained(["frame"]).shrink == pytest.approx(1.0, abs=1e-6)
-    assert Judge(frame).explained(["compliance"]).shrink < 0.5
+    assert Judge(frame).explained(["frame"]).shrink() == pytest.approx(1.0, abs=1e-6)
+    assert Judge(frame).explained(["compliance"]).shrink([0, 3]) < 0.5
     assert Judge(frame).explained([]).left == pytest.approx(100 * frame.true.numel(), rel=1e-4)
     # A tenth of the noise is explained by anything.
     assert len(Judge(weak).members(["compliance"])) > 8

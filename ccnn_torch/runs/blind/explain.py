@@ -40,12 +40,20 @@ class Explained:
     Attributes:
         left: sum of the squares of what is left, in units of the noise.
         coefficients: how many of them these rows determine.
-        shrink: share of the mean squared position error that it takes away.
+        before, after: squares of the position error of each row, `s` [m²].
     """
 
     left: float
     coefficients: float
-    shrink: float
+    before: Tensor
+    after: Tensor
+
+    def shrink(self, set_aside: Sequence[int] = ()) -> float:
+        """Share of the mean squared position error that it takes away, over the rows that were not set aside."""
+        kept = torch.ones(len(self.before), dtype=torch.bool)
+        kept[list(set_aside)] = False
+        before, after = float(self.before[kept].sum()), float(self.after[kept].sum())
+        return 1 - after / before if before > 0 else 0.0
 
 
 class Judge:
@@ -148,8 +156,7 @@ class Judge:
             off = self._remaining(effects, values, found)
         left = self._white(off)
         free = float(torch.linalg.solve(ridge, gram).trace()) if len(gram) else 0.0
-        before, after = (d[..., :3].square().sum() for d in (self._gap, off))
-        return Explained(float(left.square().sum()), free, float(1 - after / before) if float(before) > 0 else 0.0)
+        return Explained(float(left.square().sum()), free, *(d[:, :3].square().sum(-1) for d in (self._gap, off)))
 
     def _remaining(self, effects: Sequence[Effect], values: Sequence[Tensor], found: Tensor) -> Tensor:
         """True pose less the one that the effects reach, as channels `s x c`."""

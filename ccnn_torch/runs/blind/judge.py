@@ -78,7 +78,7 @@ def _answer(case: BlindCase, judge: Judge, causes: Sequence[str], answer: Mappin
         "right": explains and bearable,
         "named": explains,
         "found": sum(_found(cause, named, causes, judge) for cause in causes),
-        "shrink": _shrink(verdict, judge.explained(named).shrink) if named else None,
+        "shrink": _shrink(verdict, judge.explained(named).shrink(answer.get("rows_set_aside", ()))) if named else None,
     }
 
 
