@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from ccnn_torch import __version__
+from ccnn_torch.cli.blind_check import blind_check
 from ccnn_torch.cli.check import check
 from ccnn_torch.cli.compensate import compensate
 from ccnn_torch.cli.diagnose import diagnose
@@ -47,7 +48,7 @@ def _common(
         typer.echo(context.get_help())
 
 
-for _command in (run, suite, identify, compensate, plan, simulate, diagnose, check, picture, keys):
+for _command in (run, suite, identify, compensate, plan, simulate, diagnose, check, blind_check, picture, keys):
     app.command()(_command)
 
 
