@@ -32,6 +32,7 @@ FLOORS = [
         "batching",
         "plugins",
         "units",
+        "_display",
         "_table",
         "_covariates",
         "records",
@@ -42,6 +43,7 @@ FLOORS = [
     ["mechanisms", "pseudoerror"],
     ["learners/_protocol", "training", "evolution", "learners"],
     ["identification", "compensation"],
+    ["diagnosis"],
     ["testing", "report", "runs", "sklearn"],
     ["cli", "__init__", "__main__"],
 ]
