@@ -69,7 +69,7 @@ class About:
         records: the file of records.
         noise: where the noise floor is from, as a sentence.
         units: SI units of joints, covariates and place coordinates by name.
-        in_order: the effects of the verdict added one after the other: `{"name", "gap_after", "shrink", "shrink_ci95"}`.
+        in_order: the verdict's effects added one after the other: `{"name", "gap_after", "shrink", "shrink_ci95"}`.
         network: what a network on the remainder would still gain: `{"gap_after", "gap_after_ci95"}`.
         not_seen: effects that these records cannot show, with the reason as a sentence.
         where_ci95: 95 % intervals in the form of `where`, with `[low, high]` in the place of each share.

@@ -150,7 +150,7 @@ def confusable_table(results: Block, about: About) -> Table | None:
         return None
     note = (
         "On these rows the two leave nearly the same trace, so the numbers cannot say which it is. Angle: between "
-        "their traces, 0 = the same, 90 = unlike. Told apart by: the first of the next measurements that separates them."
+        "their traces, 0 = the same, 90 = unlike. Told apart by: the first of the next measurements that does."
     )
     columns = ("pair", "probability", "angle [°]", "told apart by")
     return Table("What can these rows not tell apart?", columns, tuple(rows), note)
