@@ -96,7 +96,7 @@ def _cause(results: Block) -> str:
             return f"No effect of the library explains it: the residual {follows} ({_probability(verdict)})."
         verb = "explains" if len(names) == 1 else "together explain"
         text = f"{_capital(listed([effect_words(n) for n in names]))} {verb} part of it, but the rest {follows} in a "
-        text += f"way that no effect of the library has ({_probability(verdict)})"
+        text += f"way that no effect of the library describes ({_probability(verdict)})"
         return f"{text}{_removed(results, ', and that part is ')}."
     classes = {e["name"]: [n for n in e["indistinguishable_from"] if n not in names] for e in results["effects"]}
     likes = [classes.get(name, []) for name in names]
@@ -121,13 +121,14 @@ def _removed(results: Block, joint: str) -> str:
     verdict, blocks = results["verdict"], _blocks(results)
     if verdict["shrink"] is None or not blocks:
         return ""
-    text = f"{joint}{100 * verdict['shrink']:.0f} %"
+    # A digit more near the top, where 99.5 % must not be read as all of it.
+    digits = 1 if verdict["shrink"] > 0.985 else 0
+    text = f"{joint}{100 * verdict['shrink']:.{digits}f} %"
     if verdict["shrink_ci95"] is not None:
-        low, high = (f"{100 * v:.0f}" for v in verdict["shrink_ci95"])
+        low, high = (f"{100 * v:.{digits}f}" for v in verdict["shrink_ci95"])
         text += f" [{low}, {high}]"
-    scale, unit = display_unit(blocks[0]["unit"], blocks[0]["before"])
-    before, after = (number_text(blocks[0][key] / scale, 3) for key in ("before", "after"))
-    return f"{text} of what lies above the noise on rows not used for fitting ({before} → {after} {unit})"
+    before, after = (_size(blocks[0][key], blocks[0]) for key in ("before", "after"))
+    return f"{text} of what lies above the noise on rows not used for fitting ({before} → {after})"
 
 
 def _blocks(results: Block) -> list[Block]:

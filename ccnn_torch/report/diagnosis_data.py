@@ -144,7 +144,9 @@ def used_rows(arrays: Mapping[str, Array], count: int) -> tuple[NDArray[np.bool_
 
 def save_diagnosis_arrays(folder: Path, arrays: Mapping[str, Tensor], labels: Mapping[str, Any]) -> None:
     """Write the tensors behind the pictures and the names of their axes."""
-    write_whole(folder / ARRAYS, save({name: value.contiguous() for name, value in arrays.items()}))
+    # Copies: without effects the remainder is the residual itself, and one memory is not written twice.
+    whole = {name: value.detach().cpu().contiguous().clone() for name, value in arrays.items()}
+    write_whole(folder / ARRAYS, save(whole))
     write_json(folder / LABELS, labels)
 
 

@@ -27,7 +27,7 @@ def quantity_text(value: float, unit: str) -> str:
     if unit == "K":
         return f"{value - _KELVIN:.1f} °C"
     scale, shown = display_unit(unit, abs(value) or 1.0) if unit == "m" else (1.0, unit)
-    return f"{number_text(value / scale, 4)} {shown}".removesuffix(" 1")
+    return f"{value / scale:.4g} {shown}".removesuffix(" 1")
 
 
 def shares(results: Block, about: About) -> Iterator[tuple[str, str, float, list[float] | None]]:
@@ -93,7 +93,7 @@ def next_table(results: Block, about: About) -> Table | None:
         rows.append((str(number), *cells, " or ".join(entry["separates"]) or "–", number_text(entry["gain"], 3)))
     columns = ("number", *joints, *covariates, "tells apart", "gain [nat]")
     note = "Gain: expected information on which explanation is right. The same as a file: next_measurements.csv."
-    return Table("What should be measured next?", columns, tuple(rows), note)
+    return Table("What should be measured next?", columns, tuple(rows), note, ("tells apart",))
 
 
 def write_next_csv(path: Path, results: Block, about: About) -> None:
@@ -140,4 +140,4 @@ def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]], about
         for row, reason in zip(cells, about.why_set_aside, strict=True):
             row.append(reason)
     note = "As numbered in diagnosis.json. They speak neither for nor against any effect and count in no figure above."
-    return Table("Which rows were set aside?", tuple(columns), tuple(map(tuple, cells)), note)
+    return Table("Which rows were set aside?", tuple(columns), tuple(map(tuple, cells)), note, ("why",))

@@ -141,7 +141,7 @@ def print_diagnosis(results: Block, console: Console, about: About | None = None
         # Its sentence is in the verdict; on a terminal the column would break the table in two.
         kept = [i for i, column in enumerate(effects.columns) if column != "what it is"]
         columns, *rows = (tuple(line[i] for i in kept) for line in (effects.columns, *effects.rows))
-        effects = Table(effects.title, columns, tuple(rows), effects.note)
+        effects = Table(effects.title, columns, tuple(rows), effects.note, effects.words)
     shown = (
         gap_table(results, about),
         effects,

@@ -85,7 +85,7 @@ def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
     note = f"● in the verdict. The gap without any of them is {before} {unit}. {_SHRINK}"
     if hidden := len(results["effects"]) - len(shown):
         note += f" Not shown: {hidden} with a probability below {least:g}."
-    return Table("Which effect?", columns, tuple(rows), note)
+    return Table("Which effect?", columns, tuple(rows), note, ("what it is", "not told from"))
 
 
 def order_table(results: Block, about: About) -> Table | None:
@@ -120,7 +120,7 @@ def parameter_table(results: Block) -> Table | None:
         return None
     columns = ("parameter", "value", "standard deviation", "95 % interval", "unit")
     note = "Of the effects in the verdict, fitted together; the unit 1 is a number without unit."
-    return Table("How large is the effect?", columns, tuple(rows), note)
+    return Table("How large is the effect?", columns, tuple(rows), note, ("unit",))
 
 
 def confusable_table(results: Block, about: About) -> Table | None:
@@ -153,14 +153,14 @@ def confusable_table(results: Block, about: About) -> Table | None:
         "their traces, 0 = the same, 90 = unlike. Told apart by: the first of the next measurements that does."
     )
     columns = ("pair", "probability", "angle [°]", "told apart by")
-    return Table("What can these rows not tell apart?", columns, tuple(rows), note)
+    return Table("What can these rows not tell apart?", columns, tuple(rows), note, ("told apart by",))
 
 
 def unseen_table(about: About) -> Table | None:
     """Effects that these records cannot show, and why."""
     if not about.not_seen:
         return None
-    return Table("What can these records not show?", ("effect", "why"), tuple(about.not_seen.items()))
+    return Table("What can these records not show?", ("effect", "why"), tuple(about.not_seen.items()), "", ("why",))
 
 
 def _over(value: float | None, scale: float) -> float | None:

@@ -40,7 +40,7 @@ def gap_plot(results: Block, about: About) -> Plot | None:
         floor = block["noise_floor"]
         if floor is not None:
             axes.axvline(
-                floor / scale, color=FLOOR, linestyle="--", label=f"noise floor {number_text(floor / scale, 3)}"
+                floor / scale, color=FLOOR, linestyle="--", label=f"noise floor {number_text(floor / scale, 3)} {unit}"
             )
             axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
         axes.set_xlabel(f"{name} gap, RMS on rows not used for fitting [{unit}]")

@@ -50,7 +50,7 @@ def signature_plot(
         judged = held & ~aside if (held & ~aside).sum() > 2 else ~aside
         share = _explained(signature.y[judged], signature.fit[judged])
         if share is not None:
-            told.append(f"{name} {100 * share:.0f} %")
+            told.append(f"{name} {100 * share:.3g} %")
     for axes in panels[len(signatures) :]:
         axes.set_axis_off()
     handles = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
@@ -59,6 +59,8 @@ def signature_plot(
         "What gives each effect away: the residual along the effect's own direction, the other effects taken off, "
         "against what drives it."
     )
+    if any(used_rows(arrays, len(signature.x))[1].any() for signature in signatures):
+        caption += " Crosses: rows set aside, at the edge where they lie beyond it."
     if told:
         caption += f" Share of the drawn variance on rows not used for fitting that the fit takes: {', '.join(told)}."
     return Plot("signatures", figure, caption)
@@ -83,7 +85,7 @@ def _draw(axes: Axes, signature: Signature, held: NDArray[np.bool_], aside: NDAr
     # Spread in order of the rows, not at random: the same file gives the same picture.
     shift = 0.5 * step * ((np.arange(len(x)) * 0.6180339887498949) % 1 - 0.5) if few else np.zeros(len(x))
     raster = len(x) > RASTER_ABOVE
-    size = float(np.clip(1500 / len(x), 3, 14))
+    size = float(np.clip(3000 / len(x), 4, 18))
     for rows, colour, label in ((~held & ~aside, GREY, "rows fitted on"), (held & ~aside, AFTER, "rows held out")):
         if rows.any():
             axes.scatter((x + shift)[rows], y[rows], s=size, color=colour, linewidths=0, label=label, rasterized=raster)
@@ -113,8 +115,9 @@ def _draw_fit(axes: Axes, x: Array, fit: Array, values: Array | None, step: floa
         return
     order = np.argsort(x, kind="stable")
     ordered = fit[order]
-    variance = float(ordered.var())
-    if variance > 0 and float(np.square(np.diff(ordered)).mean()) / (2 * variance) < _SMOOTH:
+    rough = float(np.square(np.diff(ordered)).mean()) / 2
+    # A constant offset is a line as well, whatever rounding leaves of its variance.
+    if rough <= _SMOOTH * float(ordered.var()) or rough < 1e-6 * float(np.square(ordered).mean()):
         axes.plot(x[order], ordered, color=BEFORE, linewidth=2, label="fit")
     else:
         axes.scatter(x, fit, s=size, color=BEFORE, linewidths=0, alpha=0.8, label="fit")
