@@ -43,6 +43,10 @@ def shares(results: Block, about: About) -> Iterator[tuple[str, str, float, list
             yield name, _regime(name, regime, about.unit(name)), regime["share"], interval
 
 
+def _share_note(results: Block) -> str:
+    return _SHARE + " There is no gap above the noise: these are shares of the noise." * results["verdict"]["none"]
+
+
 def _regime(name: str, regime: Block, unit: str) -> str:
     if regime["from"] == regime["to"]:
         return f"{name} {quantity_text(regime['from'], unit)}"
@@ -55,7 +59,7 @@ def where_table(results: Block, about: About) -> Table | None:
     rows = [(part, percent(share, interval)) for _, part, share, interval in shares(results, about)]
     if not rows:
         return None
-    return Table("Where does the gap lie?", ("part", "share of the gap [%]"), tuple(rows), _SHARE)
+    return Table("Where does the gap lie?", ("part", "share of the gap [%]"), tuple(rows), _share_note(results))
 
 
 def region_table(results: Block, about: About) -> Table | None:
@@ -74,7 +78,7 @@ def region_table(results: Block, about: About) -> Table | None:
             cells.append(f"{low} to {high}")
         rows.append((cells[0], *cells[1:], percent(region["share"], interval), str(region["rows"])))
     columns = (*names, "share of the gap [%]", "rows")
-    return Table("In which region?", columns, tuple(rows), "Largest share first. " + _SHARE)
+    return Table("In which region?", columns, tuple(rows), "Largest share first. " + _share_note(results))
 
 
 def next_table(results: Block, about: About) -> Table | None:

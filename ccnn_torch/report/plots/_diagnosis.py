@@ -68,7 +68,7 @@ def _bars(results: Block, block: Block, about: About, *, alone: bool) -> list[Ba
                 break
     if verdict["effects"]:
         ends = _ends(block["before"], floor, verdict["shrink_ci95"]) if alone else None
-        bars.append((f"with {_joined(verdict['effects'])}", block["after"], ends, AFTER))
+        bars.append((_all_words(verdict["effects"]), block["after"], ends, AFTER))
     if alone and about.network is not None:
         interval = about.network.get("gap_after_ci95")
         label = "with a network on the remainder"
@@ -104,8 +104,8 @@ def _draw_bars(axes: Axes, bars: list[Bar], scale: float, unit: str) -> None:
     axes.grid(axis="y", visible=False)
 
 
-def _joined(names: list[str]) -> str:
-    return " + ".join(names)
+def _all_words(names: list[str]) -> str:
+    return "without the bad rows" if names == ["outlier"] else f"with {' + '.join(names)}"
 
 
 @styled
@@ -119,6 +119,8 @@ def probability_plot(results: Block) -> Plot | None:
         bars.append(("none: noise only", verdict["probability"], AFTER))
     if verdict["outside_library"]:
         bars.append((f"outside the library:\n{driver_words(verdict['driver'])}", verdict["probability"], BEFORE))
+    listed = {e["name"] for e in results["effects"]}
+    bars += [(name, verdict["probability"], AFTER) for name in verdict["effects"] if name not in listed]
     for e in results["effects"]:
         if len(bars) < _DRAWN and (e["name"] in names | like or e["probability"] >= _LEAST):
             colour = AFTER if e["name"] in names else _LIKE if e["name"] in like else GREY
@@ -136,10 +138,8 @@ def probability_plot(results: Block) -> Plot | None:
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1.0])
     axes.set_xlabel("probability [1]")
     axes.grid(axis="y", visible=False)
-    hidden = len(results["effects"]) - sum(bar[0] in {e["name"] for e in results["effects"]} for bar in bars)
+    hidden = len(listed) - sum(bar[0] in listed for bar in bars)
     caption = "How probable each explanation is after seeing these rows: dark blue, in the verdict"
     caption += "; light blue, not told from one in the verdict by these rows" if like else ""
     caption += "; orange, something that no effect of the library describes" if verdict["outside_library"] else ""
-    return Plot(
-        "probabilities", figure, caption + f". {hidden} further effects were tried." * bool(hidden) + "." * (not hidden)
-    )
+    return Plot("probabilities", figure, caption + (f". {hidden} further effects were tried." if hidden else "."))

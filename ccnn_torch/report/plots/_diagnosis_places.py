@@ -84,7 +84,9 @@ def _width(values: Array | None) -> int:
 
 @styled
 def where_plot(results: Block, about: About) -> Plot | None:
-    """Shares of the gap by output, joint, leg and covariate regime, a panel for each."""
+    """Shares of the gap by output, joint, leg and covariate regime, a panel for each; nothing where there is no gap."""
+    if results["verdict"]["none"]:
+        return None
     groups: dict[str, list[tuple[str, float, list[float] | None]]] = {}
     for group, part, share, interval in shares(results, about):
         groups.setdefault(group, []).append((part, share, interval))
@@ -94,7 +96,7 @@ def where_plot(results: Block, about: About) -> Plot | None:
     lines = [list(groups.items())[i : i + columns] for i in range(0, len(groups), columns)]
     heights = [max(len(parts) for _, parts in line) + 1.5 for line in lines]
     figure = Figure(figsize=(9.2, 0.3 * sum(heights) + 0.35 * len(lines) + 0.3), layout="constrained")
-    grid = figure.subplots(len(lines), columns, squeeze=False, height_ratios=heights, sharex=True)
+    grid = figure.subplots(len(lines), columns, squeeze=False, height_ratios=heights)
     reach = max(max(share, interval[1] if interval else 0.0) for ps in groups.values() for _, share, interval in ps)
     for line, panels in zip(lines, grid, strict=True):
         for axes, (group, parts) in zip(panels, line, strict=False):
@@ -113,7 +115,7 @@ def where_plot(results: Block, about: About) -> Plot | None:
             axes.grid(axis="y", visible=False)
         for axes in panels[len(line) :]:
             axes.set_axis_off()
-    for axes in grid[-1]:
-        axes.set_xlabel("share of the gap [%]")
+    for i in range(columns):
+        grid[(len(groups) - 1 - i) // columns, i].set_xlabel("share of the gap [%]")
     caption = "Which share of the gap (of its mean square) lies where; lines are 95 % intervals where they are known."
     return Plot("where", figure, caption)
