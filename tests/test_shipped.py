@@ -41,7 +41,7 @@ FLOORS = [
         "least_squares",
     ],
     ["mechanisms", "pseudoerror"],
-    ["learners/_protocol", "training", "evolution", "learners"],
+    ["learners/_protocol", "training", "evolution", "learners", "effects"],
     ["identification", "compensation"],
     ["diagnosis"],
     ["testing", "report", "runs", "sklearn"],

@@ -88,7 +88,7 @@ def _cause(results: Block) -> str:
     verdict = results["verdict"]
     names = list(verdict["effects"])
     if names == ["outlier"]:
-        rows = count_text(len(results.get("rows_set_aside", ())), "bad row")
+        rows = count_text(len(results["rows_set_aside"]), "bad row")
         return f"It comes from {rows}, set aside, and from no effect of the library ({_probability(verdict)})."
     if verdict["outside_library"] or not names:
         follows = f"follows {driver_words(verdict['driver'])}" if verdict["driver"] else "has no known driver"

@@ -25,6 +25,7 @@ __all__ = [
     "About",
     "Signature",
     "about_of",
+    "gaps_of",
     "load_diagnosis_arrays",
     "load_labels",
     "save_diagnosis_arrays",
@@ -117,6 +118,12 @@ def about_of(labels: Mapping[str, Any]) -> About:
     for name in ("in_order", "angles", "why_set_aside", "notes"):
         given[name] = tuple(given.get(name, ()))
     return About(**given)
+
+
+def gaps_of(results: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+    """The gaps that are there, by what they are of; a machine without a position has its rotation under `gap`."""
+    blocks = [block for block in (results["gap"], results.get("gap_rotation")) if block]
+    return [("rotation" if block["unit"] == "rad" else "position", block) for block in blocks]
 
 
 def signatures_of(arrays: Mapping[str, Array], labels: Mapping[str, Any], names: Iterable[str] = ()) -> list[Signature]:

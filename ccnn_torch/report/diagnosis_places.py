@@ -126,7 +126,7 @@ def _columns(results: Block) -> tuple[list[str], list[str]]:
 
 def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]], about: About) -> Table | None:
     """Rows that were set aside, how far they are off, and why where that is known."""
-    numbers = list(results.get("rows_set_aside", ()))
+    numbers = results["rows_set_aside"]
     if not numbers:
         return None
     columns, cells = ["row"], [[str(number)] for number in numbers]
@@ -143,5 +143,5 @@ def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]], about
         columns.append("why")
         for row, reason in zip(cells, about.why_set_aside, strict=True):
             row.append(reason)
-    note = "As numbered in diagnosis.json. They speak neither for nor against any effect and count in no figure above."
+    note = "Counted from 0. They speak neither for nor against any effect and count in no figure above."
     return Table("Which rows were set aside?", tuple(columns), tuple(map(tuple, cells)), note, ("why",))

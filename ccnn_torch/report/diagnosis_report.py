@@ -110,7 +110,7 @@ def write_diagnosis_report(
         figures[plot.name], pictures[plot.name] = InlineFigure(plot.name, plot.caption, text), png
     page = render(
         "diagnosis",
-        results={"name": about.name, "notes": list(about.notes), "versions": {}},
+        results={"name": about.name, "notes": _notes(results, about), "versions": {}},
         facts=_facts(results, numbers, about),
         verdict=verdict_text(results),
         failures=[],
@@ -130,7 +130,10 @@ def diagnosis_markdown(results: Block, about: About | None = None) -> str:
     """Verdict and tables as Markdown (`diagnosis.md`)."""
     about = about or About()
     tables = [table for section in _sections(results, {}, about, {}) for table in section.tables]
-    return "\n\n".join([f"# {about.name}", verdict_text(results), *map(markdown_table, tables), *about.notes]) + "\n"
+    return (
+        "\n\n".join([f"# {about.name}", verdict_text(results), *map(markdown_table, tables), *_notes(results, about)])
+        + "\n"
+    )
 
 
 def print_diagnosis(results: Block, console: Console, about: About | None = None) -> None:
@@ -154,7 +157,7 @@ def print_diagnosis(results: Block, console: Console, about: About | None = None
     for table in shown:
         if table is not None:
             print_table(table, console)
-    for sentence in about.notes:
+    for sentence in _notes(results, about):
         console.print(escape(sentence), style="yellow")
     console.print(escape(verdict_text(results)), style="bold")
 
@@ -196,6 +199,11 @@ def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str
     return sections
 
 
+def _notes(results: Block, about: About) -> list[str]:
+    """Notes of the diagnosis and of the report, as sentences."""
+    return [note if note.endswith(".") else f"{note}." for note in (*results["notes"], *about.notes)]
+
+
 def _facts(results: Block, arrays: Arrays, about: About) -> str:
     facts = [text for text in (about.mechanism, about.records) if text]
     if "residual" in arrays:
@@ -203,6 +211,6 @@ def _facts(results: Block, arrays: Arrays, about: About) -> str:
         facts.append(count_text(len(held), "row"))
         if held.any():
             facts.append(f"{int((held & ~aside).sum())} of them not used for fitting")
-    if results.get("rows_set_aside"):
+    if results["rows_set_aside"]:
         facts.append(f"{len(results['rows_set_aside'])} set aside")
     return " · ".join(facts)

@@ -7,7 +7,7 @@ from typing import Any
 
 from ccnn_torch._display import display_unit, number_text
 from ccnn_torch.diagnosis.words import effect_words, listed, probability_words
-from ccnn_torch.report.diagnosis_data import About
+from ccnn_torch.report.diagnosis_data import About, gaps_of
 from ccnn_torch.report.table_form import Table
 
 __all__ = [
@@ -41,10 +41,7 @@ def percent(value: float | None, interval: Sequence[float] | None = None) -> str
 def gap_table(results: Block, about: About) -> Table:
     """The gap before and after against the noise floor, of position and of rotation."""
     rows = []
-    for name, key in (("position", "gap"), ("rotation", "gap_rotation")):
-        block = results.get(key)
-        if not block:
-            continue
+    for name, block in gaps_of(results):
         scale, unit = display_unit(block["unit"], block["before"] or 1.0)
         sizes = (number_text(_over(block[part], scale), 4) for part in ("before", "after", "noise_floor"))
         ratio = block["before"] / block["noise_floor"] if block["noise_floor"] and block["before"] is not None else None

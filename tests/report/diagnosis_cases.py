@@ -131,6 +131,7 @@ def one_effect() -> Case:
             {"joints": {"q1": 1.2, "q2": 0.8}, "covariates": {"load_z": 0.0}, "separates": [], "gain": 0.21},
         ],
         "rows_set_aside": [17, 90],
+        "notes": ["latency is not a candidate: the records have no column time"],
     }
     labels = {
         "compliance": _label("load_z", "N"),
@@ -173,6 +174,7 @@ def two_effects() -> Case:
         "verdict": _verdict(["compliance", "backlash"], 0.95, 0.995, shrink_ci95=[0.98, 1.0]),
         "next_measurements": [],
         "rows_set_aside": [17, 90],
+        "notes": [],
     }
     direction = np.where(np.random.default_rng(8).uniform(size=ROWS) > 0.5, 1.0, -1.0)
     load, bend = _compliance()
@@ -191,6 +193,7 @@ def none() -> Case:
         "verdict": _verdict([], 0.992, None, none=True),
         "next_measurements": [],
         "rows_set_aside": [],
+        "notes": [],
     }
     arrays = _arrays(2.1e-5, {})
     arrays["set_aside"].zero_()
@@ -209,6 +212,7 @@ def outside() -> Case:
         "verdict": _verdict(["joint_offset"], 0.97, 0.55, outside_library=True, driver="temperature"),
         "next_measurements": [],
         "rows_set_aside": [17, 90],
+        "notes": [],
     }
     temperature = np.sort(np.random.default_rng(9).uniform(288.15, 298.15, ROWS))
     step = 5e-4 * (np.tanh((temperature - 294) / 0.4) + 0.3 * np.sin(temperature))
@@ -255,7 +259,7 @@ def with_rotation() -> Case:
 def bare() -> Case:
     """Nothing but what the contract demands."""
     results, arrays, _ = one_effect()
-    del results["rows_set_aside"]
+    results |= {"rows_set_aside": [], "notes": []}
     results["where"] = {"outputs": {}, "joints": {}, "legs": {}, "regions": [], "covariates": {}}
     results["effects"] = [e | {"shrink_ci95": None} for e in results["effects"]]
     results["verdict"]["shrink_ci95"] = None

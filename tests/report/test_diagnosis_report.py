@@ -94,7 +94,11 @@ def test_gaps_that_cannot_be_put_against_a_floor() -> None:
     turning["gap"] |= {"before": 0.0, "after": 0.0}
     assert verdict_text(turning).startswith("The gap of 900 µrad is 8.2 times the noise.")
     assert verdict_text(turning).endswith("(900 µrad → 200 µrad).")
+    turning["gap"] = turning["gap_rotation"]
     turning["gap_rotation"] = None
+    assert [row[0] for row in gap_table(turning, About()).rows] == ["rotation [µrad]"]
+    turning["gap"]["before"] = 0.0
+    assert gap_plot(turning, About()) is None
     assert verdict_text(turning).startswith("There is no gap between model and machine")
 
 
@@ -158,7 +162,7 @@ def test_the_page_is_whole_and_fetches_nothing(folder: Path) -> None:
     page.close()
     assert page.open == [] and "script" not in page.count and "link" not in page.count
     assert page.count["svg"] == 5 == page.count["figcaption"] and page.count["table"] == 9
-    outside = {a for a in page.addresses if not a.startswith("#")}
+    outside = {a for a in page.addresses if not a.startswith(("#", "data:"))}
     assert all((folder / address).is_file() for address in outside) and "diagnosis.json" in outside
     assert text.index('class="verdict"') < text.index("<svg") < text.index("What should be measured next?")
     stems = ("gap", "probabilities", "signatures", "map", "where")
@@ -204,7 +208,9 @@ def test_terminal_and_markdown_of_every_case(name: str) -> None:
     print_diagnosis(results, Console(file=screen, width=100), about_of(labels))
     told = " ".join(screen.getvalue().split())
     assert verdict_text(results) in told and "How large is the gap?" in told
-    blocks = diagnosis_markdown(results, about_of(labels)).split("## ")[1:]
+    text = diagnosis_markdown(results, about_of(labels))
+    assert all(f"{note}." in text for note in results["notes"])
+    blocks = text.split("## ")[1:]
     for block in blocks:
         assert len({line.replace("\\|", "").count("|") for line in block.splitlines() if line.startswith("|")}) == 1
 

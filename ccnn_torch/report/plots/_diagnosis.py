@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from ccnn_torch._display import display_unit, number_text
 from ccnn_torch.diagnosis.words import driver_words, probability_words
-from ccnn_torch.report.diagnosis_data import About
+from ccnn_torch.report.diagnosis_data import About, gaps_of
 from ccnn_torch.report.plots._style import AFTER, BEFORE, FLOOR, GREY, SERIES, Plot, styled
 
 __all__ = ["gap_plot", "probability_plot"]
@@ -26,8 +26,7 @@ _DRAWN = 12
 @styled
 def gap_plot(results: Block, about: About) -> Plot | None:
     """The gap before, with each effect alone, and with all of the verdict, as bars against the noise floor."""
-    blocks = [(n, results.get(k)) for n, k in (("position", "gap"), ("rotation", "gap_rotation"))]
-    shown = [(name, block) for name, block in blocks if block and block["before"]]
+    shown = [(name, block) for name, block in gaps_of(results) if block["before"]]
     if not shown:
         return None
     bars = {name: _bars(results, block, about, alone=name == shown[0][0]) for name, block in shown}
