@@ -209,7 +209,9 @@ def _facts(results: Block, arrays: Arrays, about: About) -> str:
     if "residual" in arrays:
         held, aside = used_rows(arrays, len(arrays["residual"]))
         facts.append(count_text(len(held), "row"))
-        if held.any():
+        if (held | aside).all():
+            facts.append("each judged by a fit to other rows")
+        elif held.any():
             facts.append(f"{int((held & ~aside).sum())} of them not used for fitting")
     if results["rows_set_aside"]:
         facts.append(f"{len(results['rows_set_aside'])} set aside")

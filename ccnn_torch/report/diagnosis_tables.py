@@ -93,7 +93,7 @@ def order_table(results: Block, about: About) -> Table | None:
     scale, unit = display_unit(gap["unit"], gap["before"] or 1.0)
     rows = [("the model as it is", number_text(_over(gap["before"], scale), 4), "–")]
     for entry in about.in_order:
-        removed = percent(entry["shrink"], entry.get("shrink_ci95"))
+        removed = percent(entry.get("shrink"), entry.get("shrink_ci95"))
         rows.append((f"+ {entry['name']}", number_text(_over(entry["gap_after"], scale), 4), removed))
     if about.network is not None:
         rows.append(("+ a network on the remainder", number_text(_over(about.network["gap_after"], scale), 4), "–"))

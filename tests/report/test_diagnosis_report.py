@@ -185,10 +185,12 @@ def test_a_browser_shows_all_of_the_page(folder: Path, tmp_path: Path) -> None:
 def test_the_same_files_give_the_same_page_and_text_is_escaped(folder: Path, tmp_path: Path) -> None:
     results, arrays, labels = none()
     labels = {"about": {"name": "<b>a & b</b>", "notes": ["x < y"]}}
+    arrays["held_out"].fill_(1)
     write_json(tmp_path / "diagnosis.json", results)
     first = write_diagnosis_report(tmp_path, results, arrays, labels, tensorboard=False).read_text()
     again = write_diagnosis_report(tmp_path, tensorboard=False).read_text()
     assert first == again and not (tmp_path / "tensorboard").exists()
+    assert "200 rows · each judged by a fit to other rows" in first
     assert "&lt;b&gt;a &amp; b&lt;/b&gt;" in first and "x &lt; y" in first and "<b>a" not in first
 
 
