@@ -32,6 +32,7 @@ FLOORS = [
         "batching",
         "plugins",
         "units",
+        "_display",
         "_table",
         "_covariates",
         "records",

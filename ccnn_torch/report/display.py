@@ -1,45 +1,15 @@
-"""SI numbers as people read them: the unit that gives 1 to 999, four digits, a median with its interval."""
+"""Numbers of a report as people read them; what every floor needs of it stands in `_display`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+from ccnn_torch._display import count_text as count_text
+from ccnn_torch._display import display_unit as display_unit
+from ccnn_torch._display import number_text as number_text
+
 __all__ = ["count_text", "display_unit", "interval_text", "number_text", "removed_percent"]
-
-_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
-
-
-def display_unit(unit: str, magnitude: float) -> tuple[float, str]:
-    """The prefixed unit for numbers of about this magnitude.
-
-    Args:
-        unit: `m` or `rad`; any other SI unit stays as it is.
-        magnitude: a typical number [unit]; 1e-3 and more is shown in mm or mrad, less in µm or µrad, less than 1e-7 in
-            nm or nrad.
-
-    Returns:
-        Divide a number by the first to have it in the second.
-    """
-    if unit not in ("m", "rad"):
-        return 1.0, unit
-    wanted = (10.0, 1e-3, 1e-7, 0.0)
-    scale, prefix = next(
-        entry for entry, least in zip(_PREFIXES, wanted, strict=True) if abs(magnitude) >= least or entry[1] == "n"
-    )
-    return scale, prefix + unit
-
-
-def number_text(value: float | None, digits: int = 4) -> str:
-    """A number to so many significant digits; `–` for None. Exponents are written as 1.234e-10."""
-    if value is None:
-        return "–"
-    if value == 0:
-        return "0"
-    if 1e-3 <= abs(value) < 1e5:
-        text = f"{value:#.{digits}g}"
-        return text.rstrip(".")
-    return f"{value:.{digits - 1}e}"
 
 
 def interval_text(spread: Mapping[str, Any] | None, scale: float = 1.0, digits: int = 4) -> str:
@@ -59,11 +29,6 @@ def interval_text(spread: Mapping[str, Any] | None, scale: float = 1.0, digits: 
         text += f" [{low}, {high}]"
     there = sum(v is not None for v in values)
     return text if there == len(values) else f"{text} ({there} of {len(values)})"
-
-
-def count_text(count: int, word: str) -> str:
-    """`1 repeat`, `30 repeats`."""
-    return f"{count} {word}" if count == 1 else f"{count} {word}s"
 
 
 def removed_percent(before: Mapping[str, Any], after: Mapping[str, Any]) -> float | None:

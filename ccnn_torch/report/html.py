@@ -11,7 +11,7 @@ from markupsafe import Markup
 from ccnn_torch.report.table_form import Table
 from ccnn_torch.report.tables import failures, result_tables, verdict
 
-__all__ = ["InlineFigure", "html_text", "page_text"]
+__all__ = ["InlineFigure", "html_text", "page_text", "render", "trusted"]
 
 
 class InlineFigure(NamedTuple):
@@ -64,6 +64,26 @@ def page_text(
         template: `report` or `identified`.
         best: first cell of the rows that are set in bold.
     """
+    return render(
+        template,
+        results=results,
+        verdict=verdict,
+        tables=tables,
+        failures=failures,
+        figures=trusted(figures),
+        config=config,
+        files=files,
+        best=best,
+    )
+
+
+def render(template: str, **values: Any) -> str:
+    """Fill a page's template in; a name in it that no value has is an error.
+
+    Args:
+        template: the file's name before `.html.jinja`.
+        values: what the template asks for; everything but `Markup` is escaped.
+    """
     environment = Environment(
         loader=PackageLoader("ccnn_torch.report", "."),
         autoescape=True,
@@ -71,14 +91,9 @@ def page_text(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(f"{template}.html.jinja").render(
-        results=results,
-        verdict=verdict,
-        tables=tables,
-        failures=failures,
-        # Markup: the SVG is our own; everything else on the page is escaped.
-        figures=[figure._replace(svg=Markup(figure.svg)) for figure in figures],
-        config=config,
-        files=files,
-        best=best,
-    )
+    return environment.get_template(f"{template}.html.jinja").render(**values)
+
+
+def trusted(figures: Sequence[InlineFigure]) -> list[InlineFigure]:
+    """Figures whose SVG stands on the page as it is: it is our own, everything else on a page is escaped."""
+    return [figure._replace(svg=Markup(figure.svg)) for figure in figures]

@@ -16,12 +16,16 @@ _LONGEST_NAME = 28
 
 @dataclass(frozen=True)
 class Table:
-    """Title, column headers, rows of text (one entry a column), and a sentence below."""
+    """Title, column headers, rows of text (one entry a column), a sentence below, and the columns that hold words.
+
+    The first column holds words as well; all others hold numbers and are set flush right.
+    """
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
+    words: tuple[str, ...] = ()
 
 
 def print_table(table: Table, console: Console) -> None:
@@ -47,8 +51,9 @@ def print_table(table: Table, console: Console) -> None:
 def _shown(table: Table, columns: Sequence[int]) -> RichTable:
     shown = RichTable()
     for i in columns:
+        left = i == 0 or table.columns[i] in table.words
         shown.add_column(
-            escape(table.columns[i]), justify="right" if i else "left", overflow="fold", max_width=_width(table, i)
+            escape(table.columns[i]), justify="left" if left else "right", overflow="fold", max_width=_width(table, i)
         )
     for row in table.rows:
         # The interval below its median: three such columns then fit into 80 characters.

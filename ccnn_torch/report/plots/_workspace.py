@@ -17,7 +17,7 @@ from ccnn_torch.report.display import display_unit, number_text
 from ccnn_torch.report.plots._errors import draw_joint_error
 from ccnn_torch.report.plots._style import RASTER_ABOVE, Plot, styled
 
-__all__ = ["overview_plot", "workspace_plot"]
+__all__ = ["draw_pairs", "height_of", "overview_plot", "planes_of", "workspace_plot"]
 
 Array = NDArray[np.float64]
 
@@ -36,13 +36,13 @@ def workspace_plot(arrays: RunArrays) -> Plot | None:
         None when the machine moves along one line only.
     """
     place, before, after, where = _map_data(arrays)
-    planes = _planes(place, arrays.axes)
+    planes = planes_of(place, arrays.axes)
     if not planes:
         return None
-    shapes = [_shape(place, arrays.axes, plane) for plane in planes]
+    shapes = [height_of(place, arrays.axes, plane) for plane in planes]
     figure = Figure(figsize=(9.2, sum(3.6 * shape + 0.85 for shape in shapes)), layout="constrained")
     grid = figure.subplots(len(planes), 2, squeeze=False, height_ratios=shapes)
-    told = _draw_pairs(figure, grid, arrays.axes, planes, place, before, after)
+    told = draw_pairs(figure, grid, arrays.axes, planes, place, before, after)
     return Plot(
         "workspace", figure, f"Position error over the workspace {where}, before and after on one scale: {told}."
     )
@@ -59,8 +59,8 @@ def overview_plot(arrays: RunArrays, joint: int | None = None) -> Plot:
     if joint is None:
         joint = int(np.argmax(np.abs(arrays.measured).max(0)))
     place, before, after, where = _map_data(arrays)
-    planes = _planes(place, arrays.axes)[:1]
-    shape = _shape(place, arrays.axes, planes[0]) if planes else 1.0
+    planes = planes_of(place, arrays.axes)[:1]
+    shape = height_of(place, arrays.axes, planes[0]) if planes else 1.0
     # The maps take the width that their shape needs at this height; the joint's panel takes the rest.
     wide = float(np.clip(1 / shape, 0.7, 1.4))
     figure = Figure(figsize=(6.5 + 6.2 * wide if planes else 8.2, 4.0), layout="constrained")
@@ -72,7 +72,7 @@ def overview_plot(arrays: RunArrays, joint: int | None = None) -> Plot:
     left.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, handletextpad=0.3, columnspacing=1.2)
     caption = f"Error of joint {arrays.joints[joint].name} before and after compensation"
     if planes:
-        told = _draw_pairs(figure, grid[:, 1:], arrays.axes, planes, place, before, after)
+        told = draw_pairs(figure, grid[:, 1:], arrays.axes, planes, place, before, after)
         caption += f" (left), and position error over the workspace {where}: {told}"
     return Plot("overview", figure, caption + ".")
 
@@ -84,7 +84,7 @@ def _map_data(arrays: RunArrays) -> tuple[Array, Array, Array, str]:
     return arrays.place[test], arrays.position_before[test], arrays.position_after[test], "at the held-out rows"
 
 
-def _planes(place: Array, axes: tuple[Coordinate, ...]) -> list[tuple[int, int]]:
+def planes_of(place: Array, axes: tuple[Coordinate, ...]) -> list[tuple[int, int]]:
     """Pairs of coordinates (across, up) to look along: of three that move, the first with each of the others."""
     ranges = np.ptp(place, axis=0)
     largest = {axis.unit: max(r for r, a in zip(ranges, axes, strict=True) if a.unit == axis.unit) for axis in axes}
@@ -92,7 +92,7 @@ def _planes(place: Array, axes: tuple[Coordinate, ...]) -> list[tuple[int, int]]
     return [(moving[0], other) for other in moving[1:3]]
 
 
-def _shape(place: Array, axes: tuple[Coordinate, ...], plane: tuple[int, int]) -> float:
+def height_of(place: Array, axes: tuple[Coordinate, ...], plane: tuple[int, int]) -> float:
     """Height of a map over its width."""
     across, up = plane
     if axes[across].unit != axes[up].unit:
@@ -100,7 +100,7 @@ def _shape(place: Array, axes: tuple[Coordinate, ...], plane: tuple[int, int]) -
     return float(np.clip(np.ptp(place[:, up]) / np.ptp(place[:, across]), 0.25, 1.6))
 
 
-def _draw_pairs(
+def draw_pairs(
     figure: Figure,
     grid: Any,
     axes: tuple[Coordinate, ...],
@@ -108,17 +108,21 @@ def _draw_pairs(
     place: Array,
     before: Array,
     after: Array,
+    *,
+    titles: tuple[str, str] = ("Before", "After"),
+    quantity: str = "position error",
+    si_unit: str = "m",
 ) -> str:
     """Fill a grid of `planes` lines and two columns, add the colour bar; returns what is to be seen, in words."""
-    scale, unit = display_unit("m", float(np.median(before)))
+    scale, unit = display_unit(si_unit, float(np.median(before)))
     norm = _norm(before / scale, after / scale)
     drawn: Any = None
     for line, plane in zip(grid, planes, strict=True):
-        for panel, values, title in ((line[0], before, "Before"), (line[1], after, "After")):
+        for panel, values, title in ((line[0], before, titles[0]), (line[1], after, titles[1])):
             drawn = _draw_map(panel, axes, plane, place, values / scale, norm)
             panel.set_title(f"{title}: RMS {number_text(_rms(values) / scale, 3)} {unit}")
     bar = figure.colorbar(drawn, ax=list(grid.flat), shrink=0.85, pad=0.02, aspect=28)
-    bar.set_label(f"position error [{unit}]")
+    bar.set_label(f"{quantity} [{unit}]")
     bar.outline.set_visible(False)
     if isinstance(norm, LogNorm):
         bar.ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))

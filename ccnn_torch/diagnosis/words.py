@@ -1,0 +1,158 @@
+"""A verdict in two sentences of plain English, from the numbers of `diagnosis.json` alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ccnn_torch._display import count_text, display_unit, number_text
+
+__all__ = ["SURE", "driver_words", "effect_words", "gap_words", "listed", "probability_words", "verdict_text"]
+
+Block = Mapping[str, Any]
+
+SURE = 0.95
+"""From this probability on a verdict is said as a fact, below it as the likeliest explanation."""
+
+_EFFECTS = {
+    "geometry": "an error of the geometry",
+    "joint_offset": "an offset of the joints",
+    "joint_gain": "a wrong gain of the joints",
+    "transmission": "a periodic error of the transmission",
+    "backlash": "backlash",
+    "friction": "friction in the joints",
+    "compliance": "joint compliance under load",
+    "gravity": "sag under the machine's own weight",
+    "thermal": "growth with temperature",
+    "drift": "drift over time",
+    "frame": "a shifted or tilted base frame",
+    "tool": "a shifted or tilted tool",
+    "coupling": "coupling between the joints",
+    "latency": "a delay between pose and command",
+    "instrument": "an error of the measuring device",
+    "outlier": "a few bad rows",
+}
+_DRIVERS = {"workspace": "the place in the workspace", "temperature": "the temperature", "time": "the time"}
+
+
+def effect_words(name: str) -> str:
+    """What an effect of the library is called in a sentence; a user's own effect goes by its name."""
+    return _EFFECTS.get(name, f"the effect {name}")
+
+
+def driver_words(driver: str | None) -> str:
+    """What `verdict.driver` is called in a sentence.
+
+    Args:
+        driver: `workspace`, `joint qN`, `load NAME`, `temperature`, `direction N`, `time`, or None where none is known.
+    """
+    if driver is None:
+        return "nothing that was recorded"
+    kind, _, name = driver.partition(" ")
+    named = {"joint": f"joint {name}", "load": f"the load {name}", "direction": f"the direction of joint {name}"}
+    return _DRIVERS.get(driver) or (named.get(kind) if name else None) or driver
+
+
+def probability_words(probability: float) -> str:
+    """A probability to two digits that is never said to be 0 or 1."""
+    if probability > 0.99:
+        return "above 0.99"
+    return "below 0.01" if probability < 0.01 else f"{probability:.2f}"
+
+
+def gap_words(results: Block) -> str:
+    """The first sentence: how large the gap is, and how large against the noise."""
+    blocks = _blocks(results)
+    if not blocks:
+        return "There is no gap between model and machine on the rows not used for fitting."
+    gaps = " and ".join(_size(block["before"], block) for block in blocks)
+    times = [_times(block["before"] / block["noise_floor"]) for block in blocks if block["noise_floor"]]
+    if len(times) < len(blocks):
+        return f"The gap is {gaps}; how large the noise is, is not known."
+    return f"The gap of {gaps} is {' and '.join(times)} times the noise."
+
+
+def verdict_text(results: Block) -> str:
+    """Two sentences that an engineer understands without knowing the method: how large the gap is, and what causes it.
+
+    Args:
+        results: as in `diagnosis.json`; of `verdict` all but `text` is read.
+    """
+    verdict = results["verdict"]
+    if verdict["none"]:
+        return f"{gap_words(results)} No cause beyond the noise is to be seen ({_probability(verdict)})."
+    return f"{gap_words(results)} {_cause(results)}"
+
+
+def _cause(results: Block) -> str:
+    verdict = results["verdict"]
+    names = list(verdict["effects"])
+    if names == ["outlier"]:
+        rows = count_text(len(results["rows_set_aside"]), "bad row")
+        return f"It comes from {rows}, set aside, and from no effect of the library ({_probability(verdict)})."
+    if verdict["outside_library"] or not names:
+        follows = f"follows {driver_words(verdict['driver'])}" if verdict["driver"] else "has no known driver"
+        if not names:
+            return f"No effect of the library explains it: the residual {follows} ({_probability(verdict)})."
+        verb = "explains" if len(names) == 1 else "together explain"
+        text = f"{_capital(listed([effect_words(n) for n in names]))} {verb} part of it, but the rest {follows} in a "
+        text += f"way that no effect of the library describes ({_probability(verdict)})"
+        return f"{text}{_removed(results, ', and that part is ')}."
+    classes = {e["name"]: [n for n in e["indistinguishable_from"] if n not in names] for e in results["effects"]}
+    likes = [classes.get(name, []) for name in names]
+    subject = listed([_with_class(n, like) for n, like in zip(names, likes, strict=True)])
+    sure = verdict["probability"] >= SURE
+    if len(names) == 1:
+        verb = "explains it" if sure else "is the likeliest explanation"
+    else:
+        verb = "together explain it" if sure else "together are the likeliest explanation"
+    comma = "," if likes[-1] else ""
+    return f"{_capital(subject)}{comma} {verb} ({_probability(verdict)}){_removed(results, ' and would remove ')}."
+
+
+def _with_class(name: str, like: Sequence[str]) -> str:
+    if not like:
+        return effect_words(name)
+    return f"{effect_words(name)}, or {listed([effect_words(n) for n in like], 'or')} (these rows cannot tell which)"
+
+
+def _removed(results: Block, joint: str) -> str:
+    """What the verdict's effects take away, on the first of position and rotation that has a gap."""
+    verdict, blocks = results["verdict"], _blocks(results)
+    if verdict["shrink"] is None or not blocks:
+        return ""
+    # A digit more near the top, where 99.5 % must not be read as all of it.
+    digits = 1 if verdict["shrink"] > 0.985 else 0
+    text = f"{joint}{100 * verdict['shrink']:.{digits}f} %"
+    if verdict["shrink_ci95"] is not None:
+        low, high = (f"{100 * v:.{digits}f}" for v in verdict["shrink_ci95"])
+        text += f" [{low}, {high}]"
+    before, after = (_size(blocks[0][key], blocks[0]) for key in ("before", "after"))
+    return f"{text} of what lies above the noise on rows not used for fitting ({before} → {after})"
+
+
+def _blocks(results: Block) -> list[Block]:
+    """Of position and rotation those that have a gap."""
+    return [b for b in (results["gap"], results.get("gap_rotation")) if b and b["before"]]
+
+
+def _size(value: float, block: Block) -> str:
+    scale, unit = display_unit(block["unit"], value)
+    return f"{number_text(value / scale, 3)} {unit}"
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.0f}" if ratio >= 10 else f"{ratio:.1f}"
+
+
+def _probability(verdict: Block) -> str:
+    return f"probability {probability_words(verdict['probability'])}"
+
+
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    return f" {last} ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

@@ -1,0 +1,149 @@
+"""Tables of a diagnosis that go by place: where the gap lies, what to measure next, which rows were set aside."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccnn_torch._display import display_unit, number_text
+from ccnn_torch.report.diagnosis_data import About, used_rows
+from ccnn_torch.report.diagnosis_tables import percent
+from ccnn_torch.report.table_form import Table
+
+__all__ = ["aside_table", "next_table", "quantity_text", "region_table", "shares", "where_table", "write_next_csv"]
+
+Block = Mapping[str, Any]
+_KELVIN = 273.15
+_SHARE = "Share: of the gap's mean square that lies there, [95 % interval] where it is known."
+
+
+def quantity_text(value: float, unit: str, digits: int = 4) -> str:
+    """A joint, a coordinate or a covariate with its unit: lengths in mm, temperatures in °C."""
+    if unit == "K":
+        return f"{value - _KELVIN:.1f} °C"
+    scale, shown = display_unit(unit, abs(value) or 1.0) if unit == "m" else (1.0, unit)
+    number = value / scale
+    text = f"{number:.0f}" if abs(number) >= 10**digits else f"{number:.{digits}g}"
+    return f"{text} {shown}".removesuffix(" 1")
+
+
+def shares(results: Block, about: About) -> Iterator[tuple[str, str, float, list[float] | None]]:
+    """Every share of `where` but the regions': group, part, share, and its interval or None."""
+    where, known = results["where"], about.where_ci95
+    for group, single in (("outputs", "output"), ("joints", "joint"), ("legs", "leg")):
+        for name, share in where[group].items():
+            part = name if name.startswith(single) else f"{single} {name}"
+            yield group, part, share, known.get(group, {}).get(name)
+    for name, regimes in where["covariates"].items():
+        intervals = known.get("covariates", {}).get(name) or [None] * len(regimes)
+        for regime, interval in zip(regimes, intervals, strict=True):
+            yield name, _regime(name, regime, about.unit(name)), regime["share"], interval
+
+
+def _share_note(results: Block) -> str:
+    return _SHARE + " There is no gap above the noise: these are shares of the noise." * bool(results["verdict"]["none"])
+
+
+def _regime(name: str, regime: Block, unit: str) -> str:
+    if regime["from"] == regime["to"]:
+        return f"{name} {quantity_text(regime['from'], unit, 3)}"
+    low, high = (quantity_text(regime[key], unit, 3) for key in ("from", "to"))
+    return f"{name} {low} to {high}"
+
+
+def where_table(results: Block, about: About) -> Table | None:
+    """Shares of the gap by output, joint, leg and covariate regime."""
+    rows = [(part, percent(share, interval)) for _, part, share, interval in shares(results, about)]
+    if not rows:
+        return None
+    return Table("Where does the gap lie?", ("part", "share of the gap [%]"), tuple(rows), _share_note(results))
+
+
+def region_table(results: Block, about: About) -> Table | None:
+    """Shares of the gap by region of the workspace, the largest first."""
+    regions = results["where"]["regions"]
+    if not regions:
+        return None
+    names = list(regions[0]["center"])
+    intervals = about.where_ci95.get("regions") or [None] * len(regions)
+    rows = []
+    for region, interval in sorted(zip(regions, intervals, strict=True), key=lambda pair: -pair[0]["share"]):
+        cells = []
+        for name in names:
+            middle, half = region["center"][name], region["half_width"][name]
+            low, high = (quantity_text(middle + side * half, about.unit(name)) for side in (-1, 1))
+            cells.append(f"{low} to {high}")
+        rows.append((cells[0], *cells[1:], percent(region["share"], interval), str(region["rows"])))
+    columns = (*names, "share of the gap [%]", "rows")
+    return Table("In which region?", columns, tuple(rows), "Largest share first. " + _share_note(results))
+
+
+def next_table(results: Block, about: About) -> Table | None:
+    """What to measure next, most telling first."""
+    wanted = results["next_measurements"]
+    if not wanted:
+        return None
+    joints, covariates = _columns(results)
+    rows = []
+    for number, entry in enumerate(wanted, 1):
+        cells = [quantity_text(entry["joints"][n], about.unit(n)) for n in joints]
+        cells += [
+            quantity_text(entry["covariates"][n], about.unit(n)) if n in entry["covariates"] else "–"
+            for n in covariates
+        ]
+        rows.append((str(number), *cells, " or ".join(entry["separates"]) or "–", number_text(entry["gain"], 3)))
+    columns = ("number", *joints, *covariates, "tells apart", "gain [nat]")
+    note = "Gain: expected information on which explanation is right. The same as a file: next_measurements.csv."
+    return Table("What should be measured next?", columns, tuple(rows), note, ("tells apart",))
+
+
+def write_next_csv(path: Path, results: Block, about: About) -> None:
+    """Write `next_measurements.csv`: joints and covariates in SI with the header `name[unit]`, 17 significant digits.
+
+    A covariate that a measurement does not ask for is empty.
+    """
+    joints, covariates = _columns(results)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*(f"{name}[{about.unit(name)}]" for name in (*joints, *covariates)), "gain[1]"])
+        for entry in results["next_measurements"]:
+            both = {**entry["joints"], **entry["covariates"]}
+            cells = [f"{both[n]:.17g}" if n in both else "" for n in (*joints, *covariates)]
+            writer.writerow([*cells, f"{entry['gain']:.17g}"])
+
+
+def _columns(results: Block) -> tuple[list[str], list[str]]:
+    """Names of the joints and covariates that any of the next measurements sets, in the order of their first use."""
+    joints, covariates = (
+        list(dict.fromkeys(name for entry in results["next_measurements"] for name in entry[key]))
+        for key in ("joints", "covariates")
+    )
+    return joints, covariates
+
+
+def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]], about: About) -> Table | None:
+    """Rows that were set aside, how far they are off, and why where that is known."""
+    numbers = results["rows_set_aside"]
+    if not numbers:
+        return None
+    columns, cells = ["row"], [[str(number)] for number in numbers]
+    residual = arrays.get("residual")
+    if residual is not None:
+        _, aside = used_rows(arrays, len(residual))
+        if aside.sum() == len(numbers):
+            size = np.linalg.norm(residual[aside, :3], axis=-1)
+            scale, unit = display_unit("m", float(np.median(size)) or 1.0)
+            columns.append(f"residual [{unit}]")
+            for row, value in zip(cells, size, strict=True):
+                row.append(number_text(float(value) / scale, 4) if np.isfinite(value) else "not within reach")
+    if len(about.why_set_aside) == len(numbers):
+        columns.append("why")
+        for row, reason in zip(cells, about.why_set_aside, strict=True):
+            row.append(reason)
+    note = "Counted from 0. They speak neither for nor against any effect and count in no figure above."
+    return Table("Which rows were set aside?", tuple(columns), tuple(map(tuple, cells)), note, ("why",))

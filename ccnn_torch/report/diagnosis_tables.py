@@ -1,0 +1,179 @@
+"""The tables of a diagnosis: how large the gap is, which effects, with which parameters, and what is like what."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ccnn_torch._display import display_unit, number_text
+from ccnn_torch.diagnosis.words import effect_words, listed, probability_words
+from ccnn_torch.report.diagnosis_data import About, gaps_of
+from ccnn_torch.report.table_form import Table
+
+__all__ = [
+    "confusable_table",
+    "effect_table",
+    "gap_table",
+    "order_table",
+    "parameter_table",
+    "percent",
+    "unseen_table",
+]
+
+Block = Mapping[str, Any]
+_Z95 = 1.96
+_SHRINK = (
+    "Removed: share of the mean square above the noise that goes on rows not used for fitting, [95 % interval]; "
+    "it is unknown (–) where the gap is not above the noise."
+)
+
+
+def percent(value: float | None, interval: Sequence[float] | None = None) -> str:
+    """A share as `93.0 [91.0, 95.0]`, without its unit."""
+    if value is None:
+        return "–"
+    text = f"{100 * value:.1f}"
+    if interval is not None:
+        text += f" [{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]"
+    return text
+
+
+def gap_table(results: Block, about: About) -> Table:
+    """The gap before and after against the noise floor, of position and of rotation."""
+    rows = []
+    for name, block in gaps_of(results):
+        scale, unit = display_unit(block["unit"], block["before"] or 1.0)
+        sizes = (number_text(_over(block[part], scale), 4) for part in ("before", "after", "noise_floor"))
+        ratio = block["before"] / block["noise_floor"] if block["noise_floor"] and block["before"] is not None else None
+        rows.append((f"{name} [{unit}]", *sizes, number_text(ratio, 3), percent(block["reducible_share"])))
+    columns = ("gap", "before", "after", "noise floor", "before / floor [1]", "above the noise [%]")
+    note = (
+        "RMS over the rows not used for fitting of the distance between measured and modelled pose; after: with the "
+        "effects of the verdict in the model; above the noise: share of the mean square that a better model could "
+        "remove."
+    )
+    return Table("How large is the gap?", columns, tuple(rows), f"{note} {about.noise}".rstrip())
+
+
+def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
+    """Every candidate, most probable first: its probability, and the gap with it alone in the model.
+
+    Args:
+        least: probability below which a candidate that is not in the verdict is left out.
+    """
+    chosen = set(results["verdict"]["effects"])
+    shown = [e for e in results["effects"] if e["name"] in chosen or e["probability"] >= least]
+    if not shown:
+        return None
+    scale, unit = display_unit(results["gap"]["unit"], results["gap"]["before"] or 1.0)
+    rows = [
+        (
+            e["name"] + " ●" * (e["name"] in chosen),
+            effect_words(e["name"]),
+            probability_words(e["probability"]),
+            number_text(_over(e["gap_after"], scale), 4),
+            percent(e["shrink"], e["shrink_ci95"]),
+            listed(e["indistinguishable_from"], "or") if e["indistinguishable_from"] else "–",
+        )
+        for e in shown
+    ]
+    columns = ("effect", "what it is", "probability", f"gap with it alone [{unit}]", "removed [%]", "not told from")
+    before = number_text(_over(results["gap"]["before"], scale), 4)
+    note = f"● in the verdict. The gap without any of them is {before} {unit}. {_SHRINK}"
+    if hidden := len(results["effects"]) - len(shown):
+        note += f" Not shown: {hidden} with a probability below {least:g}."
+    return Table("Which effect?", columns, tuple(rows), note, ("what it is", "not told from"))
+
+
+def order_table(results: Block, about: About) -> Table | None:
+    """The verdict's effects added to the model one after the other, and what a network would still gain."""
+    if not about.in_order and about.network is None:
+        return None
+    gap = results["gap"]
+    scale, unit = display_unit(gap["unit"], gap["before"] or 1.0)
+    rows = [("the model as it is", number_text(_over(gap["before"], scale), 4), "–")]
+    for entry in about.in_order:
+        removed = percent(entry.get("shrink"), entry.get("shrink_ci95"))
+        rows.append((f"+ {entry['name']}", number_text(_over(entry["gap_after"], scale), 4), removed))
+    if about.network is not None:
+        rows.append(("+ a network on the remainder", number_text(_over(about.network["gap_after"], scale), 4), "–"))
+    rows.append(("noise floor", number_text(_over(gap["noise_floor"], scale), 4), "–"))
+    columns = ("added to the model", f"gap on held-out rows [{unit}]", "removed in all [%]")
+    return Table("How far does it shrink?", columns, tuple(rows), _SHRINK)
+
+
+def parameter_table(results: Block, most: int = 24) -> Table | None:
+    """The parameters of the verdict's effects with their intervals.
+
+    Args:
+        most: so many are shown, those that are largest against their standard deviations.
+    """
+    rows, sizes = [], []
+    by_name = {e["name"]: e for e in results["effects"]}
+    for effect in results["verdict"]["effects"]:
+        for name, block in by_name.get(effect, {}).get("parameters", {}).items():
+            value, sd = block["value"], block["sd"]
+            scale, unit = display_unit(block["unit"], max(abs(value), sd or 0.0) or 1.0)
+            interval = "–" if sd is None else _interval(value, sd, scale)
+            numbers = (number_text(value / scale, 4), number_text(_over(sd, scale), 2), interval)
+            rows.append((f"{effect}: {name}", *numbers, unit))
+            sizes.append(abs(value) / sd if sd else math.inf)
+    if not rows:
+        return None
+    columns = ("parameter", "value", "standard deviation", "95 % interval", "unit")
+    note = "Of the effects in the verdict, fitted together; the unit 1 is a number without unit."
+    if (hidden := len(rows) - most) > 0:
+        least = sorted(sizes, reverse=True)[most - 1]
+        rows = [row for row, size in zip(rows, sizes, strict=True) if size >= least]
+        note += f" The {hidden} that differ least from 0 stand in diagnosis.json only."
+    return Table("How large is the effect?", columns, tuple(rows), note, ("unit",))
+
+
+def confusable_table(results: Block, about: About) -> Table | None:
+    """Pairs of effects that these rows do not tell apart, and which measurement would."""
+    angles = {frozenset(entry[:2]): float(entry[2]) for entry in about.angles}
+    odds = {e["name"]: e["probability"] for e in results["effects"]}
+    rows, told = [], set()
+    for effect in results["effects"]:
+        for other in effect["indistinguishable_from"]:
+            pair = frozenset((effect["name"], other))
+            if pair in told:
+                continue
+            told.add(pair)
+            angle = angles.get(pair)
+            number = next(
+                (i for i, m in enumerate(results["next_measurements"], 1) if pair <= set(m["separates"])), None
+            )
+            rows.append(
+                (
+                    f"{effect['name']} or {other}",
+                    f"{probability_words(effect['probability'])} or {probability_words(odds.get(other, 0.0))}",
+                    "–" if angle is None else f"{math.degrees(angle):.1f}",
+                    "–" if number is None else f"number {number}",
+                )
+            )
+    if not rows:
+        return None
+    note = (
+        "On these rows the two leave nearly the same trace, so the numbers cannot say which it is. Angle: between "
+        "their traces, 0 = the same, 90 = unlike. Told apart by: the first of the next measurements that does."
+    )
+    columns = ("pair", "probability", "angle [°]", "told apart by")
+    return Table("What can these rows not tell apart?", columns, tuple(rows), note, ("told apart by",))
+
+
+def unseen_table(about: About) -> Table | None:
+    """Effects that these records cannot show, and why."""
+    if not about.not_seen:
+        return None
+    return Table("What can these records not show?", ("effect", "why"), tuple(about.not_seen.items()), "", ("why",))
+
+
+def _over(value: float | None, scale: float) -> float | None:
+    return None if value is None else value / scale
+
+
+def _interval(value: float, sd: float, scale: float) -> str:
+    low, high = (number_text((value + side * _Z95 * sd) / scale, 3) for side in (-1, 1))
+    return f"{low} to {high}"

@@ -1,0 +1,44 @@
+"""The figures of a diagnosis for TensorBoard."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.image import imread
+
+__all__ = ["write_diagnosis_events"]
+
+
+def write_diagnosis_events(
+    folder: Path, results: Mapping[str, Any], verdict: str, pictures: Mapping[str, Path]
+) -> None:
+    """Write the verdict as text, the gap and the probabilities as scalars, and the pictures as images.
+
+    Event files of an earlier diagnosis in the same folder are removed, for TensorBoard would mix the two.
+
+    Args:
+        folder: where the event files go.
+        results: as in `diagnosis.json`.
+        verdict: its two sentences.
+        pictures: PNG files by name.
+    """
+    # TensorBoard takes a second to import, which only those who want events should pay.
+    from torch.utils.tensorboard import SummaryWriter
+
+    for old in folder.glob("events.out.tfevents.*"):
+        old.unlink()
+    with SummaryWriter(str(folder)) as writer:
+        writer.add_text("diagnosis/verdict", verdict, 0)
+        for key in ("gap", "gap_rotation"):
+            for part in ("before", "after", "noise_floor"):
+                value = (results.get(key) or {}).get(part)
+                if value is not None:
+                    writer.add_scalar(f"{key}/{part}", value, 0)
+        for effect in results["effects"]:
+            writer.add_scalar(f"probability/{effect['name']}", effect["probability"], 0)
+        for name, path in pictures.items():
+            pixels = np.asarray(imread(path))
+            writer.add_image(f"diagnosis/{name}", pixels[..., :3], 0, dataformats="HWC")

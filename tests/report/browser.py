@@ -1,0 +1,44 @@
+"""A real browser without a screen, where this machine has one, that opens a page offline and measures it."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "chrome")
+# Nothing may be looked up outside: a browser left to itself asks for updates at every start.
+_OFFLINE = ("--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-quic")
+_MEASURE = """<script>
+addEventListener("load", () => {
+  const box = e => { const r = e.getBoundingClientRect(); return {width: r.width, height: r.height, top: r.top}; };
+  const all = s => [...document.querySelectorAll(s)].map(box);
+  document.body.innerHTML = "<pre id=measured></pre>".replace("><", ">" + JSON.stringify({
+    page: document.documentElement.scrollWidth, window: innerWidth, verdict: box(document.querySelector(".verdict")),
+    figures: all("figure svg"), tables: all("table"), text: document.body.innerText,
+    fetched: performance.getEntriesByType("resource").length,
+  }).replace(/&/g, "&amp;").replace(/</g, "&lt;") + "<");
+});
+</script>"""
+
+
+def find_browser() -> str | None:
+    """The first browser of `NAMES` that is installed."""
+    return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+def measured(browser: str, page: Path, folder: Path, width: int) -> dict[str, Any]:
+    """Sizes of what a browser shows of a page in a window of this width, in pixels, its text, and what it fetched."""
+    copy = folder / f"measured-{width}.html"
+    copy.write_text(page.read_text(encoding="utf-8").replace("</body>", _MEASURE + "</body>"), encoding="utf-8")
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", *_OFFLINE]
+    command += [f"--user-data-dir={folder / 'profile'}", f"--window-size={width},900", "--dump-dom", copy.as_uri()]
+    dom = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+    found = re.search(r'<pre id="?measured"?>(.*?)</pre>', dom, re.DOTALL)
+    assert found, dom[-500:]
+    result: dict[str, Any] = json.loads(html.unescape(found[1]))
+    return result

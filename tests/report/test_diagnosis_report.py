@@ -1,0 +1,302 @@
+"""Reports of made-up diagnoses, read back: the words, the tables, the pictures, and the page in a browser."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from browser import find_browser, measured
+from diagnosis_cases import CASES, indistinguishable, none, one_effect, outlier, outside, two_effects, with_rotation
+from matplotlib.figure import Figure
+from rich.console import Console
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_run_report import Page
+
+from ccnn_torch.diagnosis.words import driver_words, effect_words, probability_words, verdict_text
+from ccnn_torch.errors import InputError
+from ccnn_torch.report.diagnosis_data import About, about_of, load_diagnosis_arrays, signatures_of
+from ccnn_torch.report.diagnosis_places import aside_table, next_table, region_table, shares
+from ccnn_torch.report.diagnosis_report import diagnosis_markdown, print_diagnosis, write_diagnosis_report
+from ccnn_torch.report.diagnosis_tables import confusable_table, effect_table, gap_table, parameter_table
+from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.plots._diagnosis import gap_plot, probability_plot
+from ccnn_torch.report.plots._diagnosis_places import remainder_map, where_plot
+from ccnn_torch.report.plots._diagnosis_signature import signature_plot
+
+
+def _numpy(arrays: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
+    return {name: value.numpy() for name, value in arrays.items()}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report of a class that the rows do not tell apart, to be read only."""
+    folder = tmp_path_factory.mktemp("diagnosis")
+    results, arrays, labels = indistinguishable()
+    write_json(folder / "diagnosis.json", results)
+    write_diagnosis_report(folder, results, arrays, labels)
+    return folder
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_verdict_is_two_sentences_with_its_figures(name: str) -> None:
+    results = CASES[name]()[0]
+    text = verdict_text(results)
+    assert text.endswith(".") and text.count(". ") == 1 and "_" not in text and "None" not in text
+    gap, verdict = results["gap"], results["verdict"]
+    assert f"{gap['before'] / gap['noise_floor']:.{0 if gap['before'] > 10 * gap['noise_floor'] else 1}f}" in text
+    assert probability_words(verdict["probability"]) in text
+    for effect in verdict["effects"]:
+        assert effect == "outlier" or effect_words(effect).lower() in text.lower()
+    if verdict["shrink_ci95"] and verdict["effects"] != ["outlier"]:
+        low, high = (float(v) for v in text.partition("% [")[2].partition("]")[0].split(","))
+        assert [low, high] == pytest.approx([100 * v for v in verdict["shrink_ci95"]], abs=0.51)
+
+
+def test_the_verdict_of_each_kind() -> None:
+    assert verdict_text(one_effect()[0]) == (
+        "The gap of 420 µm is 20 times the noise. Joint compliance under load explains it (probability 0.98) and would "
+        "remove 93 % [91, 95] of what lies above the noise on rows not used for fitting (420 µm → 113 µm)."
+    )
+    assert "backlash together explain it (probability 0.95) and would remove 99.5 % [98.0" in verdict_text(
+        two_effects()[0]
+    )
+    assert verdict_text(none()[0]).endswith("No cause beyond the noise is to be seen (probability above 0.99).")
+    assert "It comes from 2 bad rows, set aside" in verdict_text(outlier()[0])
+    assert "or an error of the geometry or a shifted or tilted base frame (these rows cannot tell which), explains" in (
+        verdict_text(indistinguishable()[0])
+    )
+    assert "420 µm and 900 µrad is 20 and 8.2 times" in verdict_text(with_rotation()[0])
+    results = outside()[0]
+    assert "explains part of it, but the rest follows the temperature" in verdict_text(results)
+    results["verdict"] |= {"effects": [], "shrink": None, "shrink_ci95": None, "driver": "joint q2"}
+    assert verdict_text(results).endswith(
+        "No effect of the library explains it: the residual follows joint q2 (probability 0.97)."
+    )
+    results["verdict"]["driver"] = None
+    assert "has no known driver" in verdict_text(results)
+    unsure = one_effect()[0]
+    unsure["verdict"]["probability"] = 0.6
+    assert "under load is the likeliest explanation (probability 0.60) and would remove" in verdict_text(unsure)
+
+
+def test_gaps_that_cannot_be_put_against_a_floor() -> None:
+    results = one_effect()[0]
+    results["gap"]["noise_floor"] = None
+    assert verdict_text(results).startswith("The gap is 420 µm; how large the noise is, is not known. Joint")
+    turning = with_rotation()[0]
+    turning["gap"] |= {"before": 0.0, "after": 0.0}
+    assert verdict_text(turning).startswith("The gap of 900 µrad is 8.2 times the noise.")
+    assert verdict_text(turning).endswith("(900 µrad → 200 µrad).")
+    turning["gap"] = turning["gap_rotation"]
+    turning["gap_rotation"] = None
+    assert [row[0] for row in gap_table(turning, About()).rows] == ["rotation [µrad]"]
+    turning["gap"]["before"] = 0.0
+    assert gap_plot(turning, About()) is None
+    assert verdict_text(turning).startswith("There is no gap between model and machine")
+
+
+def test_words() -> None:
+    assert effect_words("my_effect") == "the effect my_effect"
+    told = [driver_words(d) for d in ("workspace", "load z", "direction 2", "joint", "odd", None)]
+    assert told[1:3] == ["the load z", "the direction of joint 2"]
+    assert told[3:] == ["joint", "odd", "nothing that was recorded"]
+    assert [probability_words(p) for p in (1.0, 0.983, 0.004)] == ["above 0.99", "0.98", "below 0.01"]
+
+
+def test_tables_hold_the_numbers() -> None:
+    results, arrays, labels = with_rotation()
+    about = about_of(labels)
+    gap = gap_table(results, about)
+    assert [row[0] for row in gap.rows] == ["position [µm]", "rotation [µrad]"]
+    assert gap.rows[0][1:4] == ("420.0", "113.0", "21.00") and gap.note.endswith("(--noise).")
+    effects = effect_table(results)
+    assert effects is not None and len(effects.rows) == len(results["effects"])
+    assert effects.rows[0][:5] == ("compliance ●", "joint compliance under load", "0.98", "113.0", "93.0 [91.0, 95.0]")
+    parameters = parameter_table(results)
+    assert parameters is not None
+    assert parameters.rows[0] == ("compliance: q1", "4.100e-06", "2.0e-07", "3.71e-06 to 4.49e-06", "rad/(N*m)")
+    fewest = parameter_table(results, 1)
+    assert fewest is not None and [row[0] for row in fewest.rows] == ["compliance: q1"] and "The 1 that" in fewest.note
+    regions = region_table(results, about)
+    assert regions is not None
+    assert regions.rows[0] == ("0 mm to 100 mm", "300 mm to 400 mm", "40.0 [34.0, 46.0]", "50")
+    told = {part: (share, interval) for _, part, share, interval in shares(results, about)}
+    assert told["output x"] == (0.7, [0.66, 0.74]) and told["load_z 60 N to 120 N"] == (0.85, [0.8, 0.9])
+    aside = aside_table(results, _numpy(arrays), about)
+    assert aside is not None and aside.columns == ("row", "residual [mm]", "why")
+    expected = [1e3 * float(arrays["residual"][i, :3].norm()) for i in (17, 90)]
+    assert [float(row[1]) for row in aside.rows] == pytest.approx(expected, rel=1e-3)
+
+
+def test_pairs_are_told_once_with_their_angle_and_what_separates_them() -> None:
+    results, _, labels = indistinguishable()
+    table = confusable_table(results, about_of(labels))
+    assert table is not None
+    assert table.rows == (
+        ("joint_offset or geometry", "0.52 or 0.31", f"{math.degrees(0.03):.1f}", "number 1"),
+        ("joint_offset or frame", "0.52 or 0.13", f"{math.degrees(0.2):.1f}", "–"),
+    )
+    assert confusable_table(one_effect()[0], About()) is None
+
+
+def test_next_measurements_as_table_and_as_records_for_the_machine(folder: Path) -> None:
+    results, _, labels = indistinguishable()
+    table = next_table(results, about_of(labels))
+    assert table is not None
+    assert table.rows[0] == ("1", "0.6 rad", "1.4 rad", "100 N", "25.0 °C", "joint_offset or geometry", "0.420")
+    with (folder / "next_measurements.csv").open(newline="") as file:
+        header, first, second = csv.reader(file)
+    assert header == ["q1[rad]", "q2[rad]", "load_z[N]", "temperature[K]", "gain[1]"]
+    assert [float(v) for v in first] == [0.6, 1.4, 100.0, 298.15, 0.42] and second[3] == ""
+
+
+def test_the_page_is_whole_and_fetches_nothing(folder: Path) -> None:
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    page = Page()
+    page.feed(text)
+    page.close()
+    assert page.open == [] and "script" not in page.count and "link" not in page.count
+    assert page.count["svg"] == 5 == page.count["figcaption"] and page.count["table"] == 9
+    outside = {a for a in page.addresses if not a.startswith(("#", "data:"))}
+    assert all((folder / address).is_file() for address in outside) and "diagnosis.json" in outside
+    assert text.index('class="verdict"') < text.index("<svg") < text.index("What should be measured next?")
+    stems = ("gap", "probabilities", "signatures", "map", "where")
+    assert {p.name for p in (folder / "plots").iterdir()} == {f"{s}.{kind}" for s in stems for kind in ("png", "svg")}
+
+
+def test_a_browser_shows_all_of_the_page(folder: Path, tmp_path: Path) -> None:
+    browser = find_browser()
+    # A machine without a browser still holds the page to the test above.
+    for width in (1280, 640) if browser else ():
+        seen = measured(browser, folder / "report.html", tmp_path, width)
+        assert seen["page"] <= seen["window"], "the page is wider than the window"
+        assert seen["fetched"] == 0
+        assert 0 < seen["verdict"]["top"] < 200 and seen["verdict"]["height"] > 20
+        assert len(seen["figures"]) == 5 and len(seen["tables"]) == 9
+        assert all(0.5 * min(width, 600) < f["width"] <= width and f["height"] > 60 for f in seen["figures"])
+        assert "these rows cannot tell which" in seen["text"] and "&amp;" not in seen["text"]
+
+
+def test_the_same_files_give_the_same_page_and_text_is_escaped(folder: Path, tmp_path: Path) -> None:
+    results, arrays, labels = none()
+    labels = {"about": {"name": "<b>a & b</b>", "notes": ["x < y"]}}
+    arrays["held_out"].fill_(1)
+    write_json(tmp_path / "diagnosis.json", results)
+    first = write_diagnosis_report(tmp_path, results, arrays, labels, tensorboard=False).read_text()
+    again = write_diagnosis_report(tmp_path, tensorboard=False).read_text()
+    assert first == again and not (tmp_path / "tensorboard").exists()
+    assert "200 rows · each judged by a fit to other rows" in first
+    assert "&lt;b&gt;a &amp; b&lt;/b&gt;" in first and "x &lt; y" in first and "<b>a" not in first
+
+
+def test_tensorboard_gets_the_same_figures_once(folder: Path) -> None:
+    events = EventAccumulator(str(folder / "tensorboard")).Reload()
+    stems = ("gap", "probabilities", "signatures", "map", "where")
+    assert set(events.Tags()["images"]) == {f"diagnosis/{stem}" for stem in stems}
+    assert events.Scalars("gap/before")[0].value == pytest.approx(4.2e-4)
+    assert events.Scalars("probability/geometry")[0].value == pytest.approx(0.31)
+    assert len(list((folder / "tensorboard").iterdir())) == 1
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_terminal_and_markdown_of_every_case(name: str) -> None:
+    results, _, labels = CASES[name]()
+    screen = io.StringIO()
+    print_diagnosis(results, Console(file=screen, width=100), about_of(labels))
+    told = " ".join(screen.getvalue().split())
+    assert verdict_text(results) in told and "How large is the gap?" in told
+    text = diagnosis_markdown(results, about_of(labels))
+    assert all(f"{note}." in text for note in results["notes"])
+    blocks = text.split("## ")[1:]
+    for block in blocks:
+        assert len({line.replace("\\|", "").count("|") for line in block.splitlines() if line.startswith("|")}) == 1
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_pictures_of_every_case_show_the_numbers(name: str) -> None:
+    results, tensors, labels = CASES[name]()
+    arrays, about = _numpy(tensors), about_of(labels)
+    gap = gap_plot(results, about)
+    assert gap is not None
+    bars = [bar.get_width() for bar in gap.figure.axes[0].patches]
+    assert bars[0] == pytest.approx(results["gap"]["before"] / (1e-3 if results["gap"]["before"] > 1e-3 else 1e-6))
+    verdict = results["verdict"]
+    texts = _texts(gap.figure)
+    assert (f"with {' + '.join(verdict['effects'])}" in texts) == bool(verdict["effects"] not in ([], ["outlier"]))
+    chances = probability_plot(results)
+    assert chances is not None
+    shown = _texts(chances.figure)
+    assert all(effect in shown for effect in verdict["effects"])
+    assert any("the temperature" in text for text in shown) == (name == "outside")
+    signatures = signatures_of(arrays, labels, verdict["effects"])
+    drawn = signature_plot(signatures, arrays, verdict["effects"])
+    assert (drawn is None) == (name in ("none", "outlier", "bare"))
+    assert drawn is None or len(drawn.figure.axes) == len(signatures)
+    assert remainder_map(arrays, about) is not None
+    assert (where_plot(results, about) is None) == (name in ("none", "bare"))
+
+
+def _texts(figure: Figure) -> list[str]:
+    return [label.get_text() for axes in figure.axes for label in axes.get_yticklabels()]
+
+
+def test_a_bar_beyond_its_shrink_has_its_whisker_and_a_few_far_rows_are_cut_off() -> None:
+    results, tensors, labels = one_effect()
+    results["effects"][1] |= {"gap_after": 5e-4, "shrink": 0.0, "shrink_ci95": [0.0, 0.2], "probability": 0.1}
+    plot = gap_plot(results, About())
+    assert plot is not None
+    lines = [c for c in plot.figure.axes[0].collections if len(c.get_segments()) == 1]
+    assert np.array(lines[0].get_segments()[0])[:, 0].max() == pytest.approx(500.0)
+    arrays = _numpy(tensors)
+    arrays["signature.compliance.y"][3] = 1.0
+    drawn = signature_plot(signatures_of(arrays, labels), arrays, ["compliance"])
+    assert drawn is not None and drawn.figure.axes[0].get_ylim()[1] < 1000
+
+
+def test_whiskers_of_the_gap_are_the_shrink_turned_round() -> None:
+    results = two_effects()[0]
+    plot = gap_plot(results, About())
+    assert plot is not None
+    gap, floor = results["gap"]["before"], results["gap"]["noise_floor"]
+    # Lines across, in pairs with their ends: the last is that of the verdict.
+    lines = [c for c in plot.figure.axes[0].collections if len(c.get_segments()) == 1]
+    ends = np.array(lines[-1].get_segments()[0])[:, 0] * 1e-3
+    shrink = 1 - (ends**2 - floor**2) / (gap**2 - floor**2)
+    assert shrink[::-1] == pytest.approx(results["verdict"]["shrink_ci95"], abs=1e-9)
+
+
+def test_rows_without_a_place_are_drawn_over_the_joints() -> None:
+    _, tensors, labels = with_rotation()
+    arrays = _numpy(tensors)
+    arrays["place"] = np.zeros_like(arrays["place"])
+    arrays["residual"][:, :3] = 0
+    arrays["joints"][3] = np.nan
+    plot = remainder_map(arrays, about_of(labels))
+    assert plot is not None and "rotation gap over the joints" in plot.caption and "µrad" in plot.caption
+    assert plot.figure.axes[0].get_xlabel() == "q1 [mrad]"
+    arrays["residual"][:] = 0
+    assert remainder_map(arrays, about_of(labels)) is None
+
+
+def test_what_is_not_as_promised_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"diagnosis\.safetensors: is not there or damaged"):
+        load_diagnosis_arrays(tmp_path)
+    with pytest.raises(InputError, match="'about' holds 'colour', which is not known"):
+        about_of({"about": {"colour": "red"}})
+    with pytest.raises(InputError, match=r"diagnosis\.json is not there"):
+        write_diagnosis_report(tmp_path)
+
+
+def test_units_of_columns_that_nobody_named() -> None:
+    about = about_of({"thermal": {"x": {"name": "coolant", "unit": "K"}, "y": {"name": "r", "unit": "m"}}})
+    named = ("coolant", "load_x", "load_rx", "direction2", "time", "z", "q1")
+    assert [about.unit(n) for n in named] == ["K", "N", "N*m", "1", "s", "m", "SI"]
+    bare: dict[str, Any] = {"signature.a.x": np.arange(3.0), "signature.a.y": np.arange(3.0)}
+    assert signatures_of(bare, {}) == []
