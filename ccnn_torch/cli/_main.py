@@ -9,7 +9,9 @@ from typing import Annotated
 import typer
 
 from ccnn_torch import __version__
+from ccnn_torch.cli.check import check
 from ccnn_torch.cli.compensate import compensate
+from ccnn_torch.cli.diagnose import diagnose
 from ccnn_torch.cli.identify import identify
 from ccnn_torch.cli.keys import keys
 from ccnn_torch.cli.picture import picture
@@ -44,7 +46,7 @@ def _common(
         typer.echo(context.get_help())
 
 
-for _command in (run, suite, identify, compensate, plan, picture, keys):
+for _command in (run, suite, identify, compensate, plan, diagnose, check, picture, keys):
     app.command(epilog=(_command.__doc__ or "").partition("\n\n")[2])(_command)
 
 

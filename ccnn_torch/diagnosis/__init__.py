@@ -1,1 +1,9 @@
 """Which effect causes the gap between model and machine, where it lies, and how far it shrinks."""
+
+from ccnn_torch.diagnosis.engine import OUTLIER as OUTLIER
+from ccnn_torch.diagnosis.engine import candidates as candidates
+from ccnn_torch.diagnosis.engine import diagnose_rows as diagnose_rows
+from ccnn_torch.diagnosis.from_records import diagnose as diagnose
+from ccnn_torch.diagnosis.from_records import noise_of as noise_of
+from ccnn_torch.diagnosis.from_records import situation_of as situation_of
+from ccnn_torch.diagnosis.result import Diagnosis as Diagnosis

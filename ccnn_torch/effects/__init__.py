@@ -4,7 +4,9 @@ from ccnn_torch.effects._protocol import Coefficient as Coefficient
 from ccnn_torch.effects._protocol import Effect as Effect
 from ccnn_torch.effects._protocol import Shape as Shape
 from ccnn_torch.effects._registry import EFFECTS as EFFECTS
+from ccnn_torch.effects._registry import OUTLIER as OUTLIER
 from ccnn_torch.effects._registry import make_effect as make_effect
+from ccnn_torch.effects._situation import PLATFORM_WEIGHT as PLATFORM_WEIGHT
 from ccnn_torch.effects._situation import Situation as Situation
 from ccnn_torch.effects._situation import default_gravity as default_gravity
 from ccnn_torch.effects.apply import Acting as Acting

@@ -28,6 +28,7 @@ class Coefficient:
         leg: number of the leg that it belongs to alone, or None.
         secondary: whether it stands for what the textbook form leaves out (a stiffening spring, a second harmonic); a
             simulation leaves it 0 unless told otherwise, and it does not speak for the effect by itself.
+        positive: whether physics allows it no negative value (play, compliance); for drawing it in a simulation.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Coefficient:
     joint: str | None = None
     leg: int | None = None
     secondary: bool = False
+    positive: bool = False
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,47 @@ from collections.abc import Callable
 from typing import cast
 
 from ccnn_torch.effects._protocol import Effect, missing_verbs
+from ccnn_torch.effects.backlash import Backlash
 from ccnn_torch.effects.compliance import Compliance
+from ccnn_torch.effects.coupling import Coupling
+from ccnn_torch.effects.drift import Drift
+from ccnn_torch.effects.frame import Frame
+from ccnn_torch.effects.friction import Friction
+from ccnn_torch.effects.geometry import Geometry
+from ccnn_torch.effects.gravity import Gravity
+from ccnn_torch.effects.instrument import Instrument
+from ccnn_torch.effects.joint_gain import JointGain
 from ccnn_torch.effects.joint_offset import JointOffset
+from ccnn_torch.effects.latency import Latency
+from ccnn_torch.effects.thermal import Thermal
+from ccnn_torch.effects.tool import Tool
+from ccnn_torch.effects.transmission import Transmission
 from ccnn_torch.errors import InputError
 from ccnn_torch.plugins import is_plugin, load_plugin
 
-__all__ = ["EFFECTS", "make_effect"]
+__all__ = ["EFFECTS", "OUTLIER", "make_effect"]
 
-EFFECTS: dict[str, Callable[[], Effect]] = {"joint_offset": JointOffset, "compliance": Compliance}
+EFFECTS: dict[str, Callable[[], Effect]] = {
+    "geometry": Geometry,
+    "joint_offset": JointOffset,
+    "joint_gain": JointGain,
+    "transmission": Transmission,
+    "backlash": Backlash,
+    "friction": Friction,
+    "compliance": Compliance,
+    "gravity": Gravity,
+    "thermal": Thermal,
+    "drift": Drift,
+    "frame": Frame,
+    "tool": Tool,
+    "coupling": Coupling,
+    "latency": Latency,
+    "instrument": Instrument,
+}
 """Name -> maker. The order is that of listings."""
+
+OUTLIER = "outlier"
+"""What verdicts and simulations call bad rows. No effect: no other column foretells them."""
 
 
 def make_effect(name: str) -> Effect:

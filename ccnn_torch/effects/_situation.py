@@ -9,13 +9,15 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ccnn_torch.least_squares import jacobian_of
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.mechanisms._pose import frame_jacobian
 
-__all__ = ["Situation", "default_gravity"]
+__all__ = ["PLATFORM_WEIGHT", "Situation", "default_gravity"]
 
+PLATFORM_WEIGHT = 100.0
+"""Weight of a platform of which nothing is known [N]."""
 _STANDARD = 9.80665
+_SAMPLES = 128
 
 
 def default_gravity(mechanism: Mechanism) -> Tensor:
@@ -54,7 +56,7 @@ class Situation:
 
     @cached_property
     def jacobian(self) -> Tensor:
-        """Derivative of position and rotation vector by the joints, `... x s x c x n`, c = 3 or 6."""
+        """Derivative of position and rotation vector by the joints, `... x s x c x n`, c = 3 or 6; NaN where no pose."""
         return self.mechanism.jacobian(self.joints, self.parameters, self.pose).detach()
 
     @cached_property
@@ -68,13 +70,71 @@ class Situation:
         return frame_jacobian(frame, values).detach()
 
     @cached_property
-    def coordinate_jacobian(self) -> Tensor:
-        """Derivative of the pose coordinates by the joints, `... x s x p x n`."""
+    def frame_slope(self) -> Tensor:
+        """Derivative of position and rotation vector by the pose coordinates, `... x s x c x p`."""
+        return frame_jacobian(self.mechanism.frame, _known(self.pose)).detach()
 
-        def pose(joints: Tensor) -> Tensor:
-            return self.mechanism.forward_kinematics(joints, self.parameters, self.pose)
+    @cached_property
+    def visible(self) -> Tensor:
+        """Projection onto what the pose coordinates can express, `... x s x c x c`.
 
-        return jacobian_of(pose, self.joints)[1].detach()
+        A machine with the pose y, z, phi is measured in these three: nobody sees its platform shift along x.
+        """
+        rows = self.frame_slope
+        if rows.shape[-1] == rows.shape[-2]:
+            return torch.eye(rows.shape[-1], dtype=rows.dtype).expand_as(rows)
+        span: Tensor = torch.linalg.qr(rows)[0]
+        return span @ span.mT
+
+    @cached_property
+    def platform(self) -> tuple[Tensor, Tensor | None]:
+        """Nominal position `... x s x 3` [m] and rotation matrix of the measured frame; 0 where there is no pose.
+
+        An arm has a rotation also where only its position is measured.
+        """
+        if isinstance(self.mechanism, SerialArm):
+            return self.mechanism.forward_frame(self.joints, self.parameters)
+        return self.mechanism.frame(_known(self.pose))
+
+    @cached_property
+    def samples(self) -> Situation:
+        """The nominal machine at configurations all over its own workspace, without covariates.
+
+        What an effect takes from here (a middle, a range) means the same whatever rows it is looked at on.
+        """
+        joints = self.mechanism.sample_joints(_SAMPLES, torch.Generator().manual_seed(0))
+        return Situation(self.mechanism, joints[torch.isfinite(joints).all(-1)], {}, self.gravity)
+
+    @cached_property
+    def workspace(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest joints in samples of the mechanism's workspace, `n` each [joint's unit]."""
+        return self.samples.joints.amin(0), self.samples.joints.amax(0)
+
+    @cached_property
+    def from_middle(self) -> Tensor:
+        """Commanded joints less the middle of their workspace, `... x s x n` [joint's unit]."""
+        low, high = self.workspace
+        return self.joints - (low + high) / 2
+
+    @property
+    def loaded(self) -> bool:
+        """Whether a load on the platform was recorded."""
+        return any(f"load_{c.name}" in self.covariates for c in self.mechanism.pose)
+
+    @cached_property
+    def wrench(self) -> Tensor:
+        """Force and moment about the base frame's axes of the load on the platform, `... x s x c` [N, N·m].
+
+        The load is given along the pose coordinates; moments on an arm are about the axes of the base frame.
+        """
+        zero = torch.zeros_like(self.joints[..., 0])
+        along = [self.covariates.get(f"load_{c.name}") for c in self.mechanism.pose]
+        force = torch.stack([zero if q is None else q.expand_as(zero) for q in along], -1)
+        if self.mechanism.orientations:
+            return force
+        rows = self.frame_slope
+        held: Tensor = rows @ torch.linalg.solve(rows.mT @ rows, force.unsqueeze(-1))
+        return held.squeeze(-1)
 
     @cached_property
     def load_torque(self) -> Tensor:
@@ -82,20 +142,46 @@ class Situation:
 
         Drives hold minus this.
         """
-        along = [self.covariates.get(f"load_{c.name}") for c in self.mechanism.pose]
-        force = torch.stack([torch.zeros_like(self.joints[..., 0]) if q is None else q for q in along], -1)
-        torque: Tensor = self.coordinate_jacobian.mT @ force.unsqueeze(-1)
+        if not self.loaded:
+            return torch.zeros_like(self.joints)
+        torque: Tensor = _known(self.jacobian).mT @ self.wrench.unsqueeze(-1)
         return torque.squeeze(-1)
 
     @cached_property
     def weight_torque(self) -> Tensor:
         """What 1 N of weight on the platform asks of each joint, `... x s x n` [N or N·m per N]."""
-        down = self.gravity / torch.linalg.vector_norm(self.gravity).clamp_min(1e-300)
-        torque: Tensor = self.jacobian[..., :3, :].mT @ down
+        torque: Tensor = _known(self.jacobian)[..., :3, :].mT @ self.down
         return torque
+
+    @property
+    def down(self) -> Tensor:
+        """Unit vector along gravity, `3`; 0 where there is none."""
+        size: Tensor = torch.linalg.vector_norm(self.gravity)
+        return self.gravity / size.clamp_min(1e-300)
+
+    @cached_property
+    def push(self) -> Tensor:
+        """How hard weight and load push each joint along its coordinate, in -1..1, `... x s x n` [1].
+
+        tanh of the force, relative to what a weight of `PLATFORM_WEIGHT` asks of the joint where it pulls straight along
+        the platform's motion.
+        """
+        lever = torch.linalg.vector_norm(_known(self.jacobian)[..., :3, :], dim=-2)
+        force = self.weight_torque * PLATFORM_WEIGHT + self.load_torque
+        return torch.tanh(force / (lever * PLATFORM_WEIGHT).clamp_min(1e-300))
+
+    @cached_property
+    def directed(self) -> list[int]:
+        """Numbers, from 0, of the joints whose direction of approach is known."""
+        return [i for i in range(self.joints.shape[-1]) if f"direction{i + 1}" in self.covariates]
 
     @cached_property
     def direction(self) -> Tensor:
         """Sign of each joint's last motion, `... x s x n` [1]; 0 for a joint without such a column."""
         columns = [self.covariates.get(f"direction{i + 1}") for i in range(self.joints.shape[-1])]
         return torch.stack([torch.zeros_like(self.joints[..., 0]) if d is None else d for d in columns], -1)
+
+
+def _known(values: Tensor) -> Tensor:
+    """0 where the nominal machine has no pose: an effect does nothing there."""
+    return torch.nan_to_num(values, posinf=0.0, neginf=0.0)

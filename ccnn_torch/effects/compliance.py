@@ -1,4 +1,4 @@
-"""Joints that give under an external load, and stiffen."""
+"""Joints, legs and links that give under an external load, and stiffen."""
 
 from __future__ import annotations
 
@@ -7,22 +7,33 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ccnn_torch.effects._columns import per_force
+from ccnn_torch.effects._members import arm_axes, members
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import Situation
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm
 
-__all__ = ["Compliance"]
+__all__ = ["SCALE", "Compliance"]
 
-# Plausible compliance of a drive: 1e-7 m/N (10 N/µm), 2e-6 rad/(N·m).
-_SCALE = {"m": 1e-7, "rad": 2e-6}
+SCALE = {"m": 1e-7, "rad": 2e-6}
+"""Plausible compliance of a drive: 1e-7 m/N (10 N/µm), 2e-6 rad/(N·m)."""
+_SECONDARY = 0.3
+# What a joint carries, by and large [N], [N·m]: stiffening is given there.
+_TYPICAL = {"m": 100.0, "rad": 30.0}
 
 
 class Compliance:
-    """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_rms, τ = what the external load asks of the joint."""
+    """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0, τ = what the load asks of the joint; and members that give, e_k.
+
+    τ_0 = 100 N or 30 N·m: d is the change of compliance there. Secondary as well, the members: a leg stretches in all
+    its lengths p in proportion to what the load asks of them, Δp = e (∂x/∂p) · load (virtual work); a link of an arm
+    tilts at its joint under the part of the moment that the joint does not carry. All to first order about the nominal
+    pose, so that the effect is one on the pose.
+    """
 
     name = "compliance"
-    kind: Kind = "joints"
-    description = "joints that give under an external load (and stiffen or soften with it)"
+    kind: Kind = "pose"
+    description = "joints, legs and links that give under an external load (and stiffen or soften with it)"
     ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
@@ -32,25 +43,61 @@ class Compliance:
         return "" if there else f"a column of the load on the platform: {along}"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """One a joint, then one a joint for what is not proportional."""
-        return tuple(
+        """One a joint, then one a joint for what is not proportional, then the members."""
+        mechanism = situation.mechanism
+        found = [
             Coefficient(
                 f"{j.name}{' stiffening' if secondary else ''}",
-                f"{j.unit}/{'N' if j.unit == 'm' else '(N*m)'}",
-                _SCALE[j.unit] * (0.3 if secondary else 1.0),
+                per_force(j.unit),
+                SCALE[j.unit] * (_SECONDARY if secondary else 1.0),
                 joint=j.name,
                 secondary=secondary,
+                positive=not secondary,
             )
             for secondary in (False, True)
-            for j in situation.mechanism.joints
-        )
+            for j in mechanism.joints
+        ]
+        if isinstance(mechanism, SerialArm):
+            tilt = SCALE["rad"] * _SECONDARY
+            return (
+                *found,
+                *(Coefficient(f"{j.name} tilt", "rad/(N*m)", tilt, j.name, None, True) for j in mechanism.joints),
+            )
+        stretch = SCALE["m"] * _SECONDARY
+        return (*found, *(Coefficient(m.name, "m/N", stretch, m.joint, m.leg, True) for m in members(mechanism)))
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """None."""
         return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
-        """`... x s x n x 2n`."""
-        torque = situation.load_torque
-        rms = torque.square().mean(-2, keepdim=True).sqrt().clamp_min(1e-300)
-        return torch.cat([torch.diag_embed(torque), torch.diag_embed(torque * torque.abs() / rms)], -1)
+        """`... x s x c x m`."""
+        jacobian, torque = torch.nan_to_num(situation.jacobian), situation.load_torque
+        typical = torch.tensor([_TYPICAL[j.unit] for j in situation.mechanism.joints], dtype=torch.float64)
+        parts = [jacobian * torque.unsqueeze(-2), jacobian * (torque * torque.abs() / typical).unsqueeze(-2)]
+        arm = isinstance(situation.mechanism, SerialArm)
+        return torch.cat([*parts, _tilting(situation) if arm else _stretching(situation)], -1)
+
+
+def _stretching(situation: Situation) -> Tensor:
+    """Change of the pose by the members of a machine with legs, `... x s x c x (members)`."""
+    slope = torch.nan_to_num(situation.parameter_jacobian)
+    asked = slope.mT @ situation.wrench.unsqueeze(-1)
+    found = members(situation.mechanism)
+    moved = [slope[..., m.lengths] @ asked[..., m.lengths, :] for m in found]
+    return torch.cat(moved, -1) if found else slope[..., :0]
+
+
+def _tilting(situation: Situation) -> Tensor:
+    """Change of the pose by links that tilt at their joints, `... x s x c x n`."""
+    arm = situation.mechanism
+    assert isinstance(arm, SerialArm)
+    points, axes = arm_axes(arm, situation.joints, arm.resolve(situation.parameters))
+    lever = situation.platform[0].unsqueeze(-2) - points
+    wrench = situation.wrench.unsqueeze(-2)
+    moment = torch.linalg.cross(*torch.broadcast_tensors(lever, wrench[..., :3]), dim=-1)  # type: ignore[no-untyped-call]
+    if wrench.shape[-1] == 6:
+        moment = moment + wrench[..., 3:]
+    across = moment - (moment * axes).sum(-1, keepdim=True) * axes
+    shift = torch.linalg.cross(across, lever, dim=-1)
+    return (shift if wrench.shape[-1] == 3 else torch.cat([shift, across], -1)).mT

@@ -1,0 +1,37 @@
+"""The options that `ccnn diagnose` and `ccnn check` share, as one config."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ccnn_torch.runs.diagnose_config import DiagnoseConfig
+
+__all__ = ["configured"]
+
+
+def configured(
+    overrides: list[str] | None,
+    records: Path | None,
+    mechanism: str | None,
+    noise: str | None,
+    effects: str | None,
+    config: Path | None,
+    seed: int | None,
+    out: Path | None = None,
+) -> DiagnoseConfig:
+    """The config file with what the command line says over it."""
+    from ccnn_torch.runs.diagnose import parse_noise
+    from ccnn_torch.runs.diagnose_config import load_diagnose_config
+
+    wanted = load_diagnose_config(config, [*(overrides or []), *([] if noise is None else [parse_noise(noise)])])
+    names = None if effects is None else [e.strip() for e in effects.split(",") if e.strip()]
+    given = {
+        "records": None if records is None else str(records),
+        "mechanism": mechanism,
+        "effects": names,
+        "seed": seed,
+        "out": None if out is None else str(out),
+    }
+    return wanted.model_copy(update={k: v for k, v in given.items() if v is not None})

@@ -1,0 +1,110 @@
+"""Catch-alls: what no effect of the library describes, one candidate for each driver it may follow.
+
+A catch-all lets the joints deviate by a smooth function of its driver, alone and times the pose: physical causes act
+through the joints, and the Jacobian then carries most of the dependence on the pose.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis._atoms import Atom
+from ccnn_torch.effects import Situation
+
+__all__ = ["catch_alls"]
+
+# A catch-all is that much less probable than no deviation of its kind, before the data are seen.
+LOG_PRIOR = math.log(1e-3)
+# A joint may be off by this much for reasons that nobody thought of [m], [rad].
+_SCALE = {"m": 3e-4, "rad": 5e-4}
+# What bends with a driver against what is proportional to it.
+_BEND = 0.5
+_MOST = 28
+
+
+def catch_alls(situation: Situation) -> list[Atom]:
+    """One or two atoms for each driver that the records hold."""
+    mechanism, rows = situation.mechanism, situation.joints.shape[-2]
+    place = _unit(situation.pose)
+    one = torch.ones_like(place[:, :1])
+    few = max(4, min(8, rows // 12))
+    found = [_atom(situation, "workspace", torch.cat([one, place, _bumps(place, min(24, max(6, rows // 8)))], -1))]
+    for i, joint in enumerate(mechanism.joints):
+        q = _unit(situation.joints[..., i : i + 1])
+        found.append(_atom(situation, f"joint {joint.name}", torch.cat([one, q, _BEND * _bumps(q, few)], -1)))
+        fine = torch.cat([one, q, _bumps(q, min(_MOST, rows // 6))], -1)
+        found.append(_atom(situation, f"joint {joint.name}", fine, only=i))
+    for name, value in situation.covariates.items():
+        driver = _driver(name)
+        if driver is None or float(value.max() - value.min()) <= 0:
+            continue
+        d = _unit(value.unsqueeze(-1))
+        features = [one, d, 0.7 * d * place]
+        if not driver.startswith("direction"):
+            features.append(_BEND * _bumps(d, few))
+        if driver == "temperature" and "time" in situation.covariates:
+            features += [_lagged(value, situation.covariates["time"], k) for k in (0.05, 0.2)]
+        found.append(_atom(situation, driver, torch.cat(features, -1)))
+    return found
+
+
+def _driver(name: str) -> str | None:
+    if name.startswith("load_"):
+        return f"load {name.removeprefix('load_')}"
+    if name.startswith("direction"):
+        return f"direction {name.removeprefix('direction')}"
+    return name if name in ("temperature", "time") else None
+
+
+def _unit(values: Tensor) -> Tensor:
+    """Each column brought to [-1, 1] over the rows."""
+    low, high = values.amin(-2, keepdim=True), values.amax(-2, keepdim=True)
+    return (2 * values - low - high) / (high - low).clamp_min(1e-300)
+
+
+def _bumps(points: Tensor, count: int) -> Tensor:
+    """A constant-free set of Gaussian bumps about rows far from each other, `s x count`."""
+    centres = _spread_out(points, count)
+    distance = torch.cdist(points, centres)
+    apart = torch.cdist(centres, centres) + 1e9 * torch.eye(len(centres), dtype=points.dtype)
+    width = 1.5 * apart.amin(-1).median().clamp_min(1e-6)
+    features = torch.exp(-0.5 * (distance / width).square())
+    return features - features.mean(-2, keepdim=True)
+
+
+def _spread_out(points: Tensor, count: int) -> Tensor:
+    """Rows, each as far as possible from those before (farthest-point sampling)."""
+    chosen = [int((points - points.mean(0)).square().sum(-1).argmin())]
+    nearest = (points - points[chosen[0]]).square().sum(-1)
+    for _ in range(min(count, len(points)) - 1):
+        chosen.append(int(nearest.argmax()))
+        nearest = torch.minimum(nearest, (points - points[chosen[-1]]).square().sum(-1))
+    return points[chosen]
+
+
+def _lagged(value: Tensor, time: Tensor, share: float) -> Tensor:
+    """First-order lag by a share of the time that the records span, `s x 1`, brought to [-1, 1]."""
+    span = (time.max() - time.min()).clamp_min(1e-300) * share
+    weight = torch.exp(-(time[:, None] - time[None, :]) / span) * (time[:, None] >= time[None, :])
+    return _unit(((weight @ value) / weight.sum(-1)).unsqueeze(-1))
+
+
+def _atom(situation: Situation, driver: str, features: Tensor, only: int | None = None) -> Atom:
+    """features: `s x f`; columns = joints' Jacobian times the features, reduced to the directions that matter."""
+    sizes = torch.tensor([_SCALE.get(j.unit, 5e-4) for j in situation.mechanism.joints], dtype=features.dtype)
+    jacobian = situation.jacobian * sizes
+    if only is not None:
+        jacobian = jacobian[..., only : only + 1]
+    columns = (jacobian.unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
+    return Atom(driver, None, features.new_zeros(0), _reduced(columns), LOG_PRIOR)
+
+
+def _reduced(columns: Tensor) -> Tensor:
+    """The leading principal columns: with one prior scale for all, the rest is the least of what the prior allows."""
+    weight = columns.square().mean((0, 2), keepdim=True).sqrt().clamp_min(1e-300)
+    flat = (columns / weight).flatten(0, 1)
+    _, vectors = torch.linalg.eigh(flat.mT @ flat)
+    return columns @ vectors[:, -_MOST:]

@@ -1,0 +1,127 @@
+"""The blocks of a diagnosis from an analysis and its judgement."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from torch import Tensor
+
+from ccnn_torch.diagnosis._analysis import Analysis
+from ccnn_torch.diagnosis._shrink import Gap, HeldOut, held_out, shrink_of
+from ccnn_torch.diagnosis._verdict import Judgement
+
+__all__ = ["Blocks", "blocks"]
+
+
+class Blocks:
+    """Gap, effects and shrink, all on the same held-out rows."""
+
+    def __init__(self, analysis: Analysis, judgement: Judgement, residual: Tensor, seed: int) -> None:
+        """residual: nominal, `s x c0` [m, rad]; seed: of folds and draws."""
+        white = analysis.whitening
+        self.analysis, self.judgement, self.seed = analysis, judgement, seed
+        self.before = residual[white.keep()][:, white.channels]
+        self.floor = white.sigma.square() * analysis.floor
+        self.position = white.channels < 3
+        atoms = analysis.library.atoms
+        self.candidates = _best_alone(analysis)
+        chosen = [i for i in judgement.found.members if not atoms[i].catch_all]
+        alone = [[i] for i in self.candidates.values()]
+        held = held_out(analysis, [chosen, *alone], seed)
+        self.together = held[0]
+        self.alone: dict[str, HeldOut] = dict(zip(self.candidates, held[1:], strict=True))
+
+    def gap(self, held: HeldOut, position: bool) -> Gap:
+        """In position [m] or rotation [rad]."""
+        white = self.analysis.whitening
+        channels = self.position if position else ~self.position
+        exact = white.known > 0
+        dof = 0.0 if exact else max(self.analysis.library.grams.count - self.judgement.found.effective, 1.0)
+        return shrink_of(self.before, held, self.floor, channels, dof, self.seed)
+
+    def main(self, held: HeldOut) -> Gap:
+        """In position where the machine has one, else in rotation."""
+        return self.gap(held, bool(self.position.any()))
+
+
+def blocks(made: Blocks) -> tuple[dict[str, Any], dict[str, Any] | None, list[dict[str, Any]]]:
+    """`gap`, `gap_rotation`, `effects` of diagnosis.json."""
+    position, rotation = bool(made.position.any()), bool((~made.position).any())
+    gap = _gap(made.main(made.together), "m" if position else "rad")
+    turned = _gap(made.gap(made.together, False), "rad") if rotation and position else None
+    return gap, turned, [_effect(made, name) for name in _ordered(made)]
+
+
+def _gap(gap: Gap, unit: str) -> dict[str, Any]:
+    share = max(0.0, 1 - (gap.floor / gap.before) ** 2) if gap.before > 0 else 0.0
+    return {
+        "unit": unit,
+        "before": gap.before,
+        "after": gap.after,
+        "noise_floor": gap.floor,
+        "reducible_share": share,
+    }
+
+
+def _effect(made: Blocks, name: str) -> dict[str, Any]:
+    alone = made.main(made.alone[name])
+    return {
+        "name": name,
+        "probability": made.judgement.marginal.get(name, 0.0),
+        "parameters": _parameters(made, name),
+        "gap_before": alone.before,
+        "gap_after": alone.after,
+        "shrink": alone.shrink,
+        "shrink_ci95": None if alone.interval is None else list(alone.interval),
+        "indistinguishable_from": list(made.judgement.classes.get(name, ())),
+    }
+
+
+def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
+    """Value and standard deviation in the most probable set that has it, else by itself."""
+    analysis = made.analysis
+    atoms = analysis.library.atoms
+    own = made.judgement.found
+    if not any(atoms[i].name == name for i in own.members):
+        alone = made.candidates[name]
+        own = next(f for f in analysis.found if f.members == (alone,))
+    place = next(k for k, i in enumerate(own.members) if atoms[i].name == name)
+    atom = atoms[own.members[place]]
+    assert atom.effect is not None
+    start = sum(len(m) for m in own.mean[:place])
+    deviation = own.covariance.diagonal()[start : start + len(own.mean[place])].clamp_min(0).sqrt()
+    coefficients = atom.coefficients(analysis.situation)
+    found: dict[str, dict[str, Any]] = {
+        c.name: {"value": float(v) * c.scale, "sd": float(d) * c.scale, "unit": c.unit}
+        for c, v, d in zip(coefficients, own.mean[place], deviation, strict=True)
+    }
+    used = None if atom.used is None else set(atom.used)
+    for shape, value in zip(atom.effect.shapes(analysis.situation), atom.shape.tolist(), strict=True):
+        if used is None or shape.columns is None or used & set(shape.columns):
+            found[shape.name] = {"value": value, "sd": None, "unit": shape.unit}
+    return found
+
+
+def _best_alone(analysis: Analysis) -> dict[str, int]:
+    """Of each library name the atom that the verdict's set uses, or that is most probable by itself."""
+    atoms = analysis.library.atoms
+    best: dict[str, int] = {}
+    for found in analysis.found:
+        if len(found.members) == 1 and not atoms[found.members[0]].catch_all:
+            best.setdefault(atoms[found.members[0]].name, found.members[0])
+    return best
+
+
+def _ordered(made: Blocks) -> list[str]:
+    marginal = made.judgement.marginal
+    tie = {n: made.alone[n].left.square().sum() for n in made.alone}
+    return sorted(made.alone, key=lambda n: (-marginal.get(n, 0.0), float(tie[n]), n))
+
+
+def amount(value: float, unit: str) -> str:
+    """A length or an angle as people say it."""
+    steps = [(1.0, "m"), (1e-3, "mm"), (1e-6, "µm")] if unit == "m" else [(1.0, "rad"), (1e-3, "mrad"), (1e-6, "µrad")]
+    size, name = next((s for s in steps if abs(value) >= s[0]), steps[-1])
+    digits = max(0, 2 - math.floor(math.log10(max(abs(value / size), 1e-12))))
+    return f"{value / size:.{min(digits, 3)}f} {name}"

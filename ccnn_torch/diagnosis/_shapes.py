@@ -1,0 +1,172 @@
+"""Shapes (periods, lags, rates): looked for over their grids with what else may be there projected out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis._atoms import default_shape, scales
+from ccnn_torch.effects import Effect, Shape, Situation
+
+__all__ = ["Scan", "Shaped"]
+
+# The grid, then twice this many values between the neighbours of the best.
+_FINE, _ROUNDS = 9, 2
+
+
+class Shaped(NamedTuple):
+    """Shapes found: `value` `h`; `used`, the coefficients whose shape is worth its charge (None = all); and `charge`,
+    what looking for them costs in log odds, the logarithm of how many values were looked at."""
+
+    value: Tensor
+    used: tuple[int, ...] | None
+    charge: float
+
+
+class _Part(NamedTuple):
+    """Shapes that share coefficients, and which those are."""
+
+    shapes: list[int]
+    columns: list[int]
+
+
+class Scan:
+    """The columns of one effect over the grids of its shapes; they serve every search of the same rows."""
+
+    def __init__(
+        self, situation: Situation, there: Situation, effect: Effect, whiten: Callable[[Tensor], Tensor]
+    ) -> None:
+        """situation: the rows; there: the machine about which they are linear; whiten: as `Whitening`."""
+        self.situation, self.effect, self.whiten = situation, effect, whiten
+        self.shapes = effect.shapes(situation)
+        coefficients = effect.coefficients(situation)
+        self.size = scales(coefficients, situation.joints)
+        self.parts = _parts(self.shapes, len(coefficients))
+        self.start = default_shape(situation, effect)
+        kind = {"joints": lambda: there.jacobian, "parameters": lambda: there.parameter_jacobian}.get(effect.kind)
+        self.lead = whiten(torch.nan_to_num(kind())) if kind is not None else None
+        free = [c for c in range(len(coefficients)) if not any(c in p.columns for p in self.parts)]
+        self.unshaped = self._whitened(effect.basis(situation, self.start)[None], free)[0]
+        self.coarse: list[tuple[Tensor, list[Tensor]]] | None = None
+
+    def columns(self, candidates: Tensor) -> list[Tensor]:
+        """Of each part, whitened, in plausible sizes, `g x N x m`; candidates: `g x h`."""
+        basis = self.effect.basis(self.situation, candidates)
+        return [self._whitened(basis, part.columns) for part in self.parts]
+
+    def _whitened(self, basis: Tensor, columns: list[int]) -> Tensor:
+        mine = basis[..., columns] * self.size[columns]
+        z = self.lead @ mine if self.lead is not None else torch.stack([self.whiten(b) for b in mine])
+        return torch.nan_to_num(z).flatten(1, 2)
+
+    def best(self, y: Tensor, others: Tensor, start: Tensor | None = None) -> Shaped:
+        """The shapes that explain most of `y`.
+
+        Args:
+            y: whitened residual, `s x c`.
+            others: whitened columns of what else is there, in units of their prior, `s x c x P`; P may be 0.
+            start: shapes found before, when the effect is known to be there: its parts are then looked for beside each
+                other.
+        """
+        value = self.start if start is None else start
+        target, fixed = y.flatten(), torch.cat([others.flatten(0, 1), self.unshaped], -1)
+        gains = [0.0] * len(self.parts)
+        plain = _Left(target, fixed)
+        for level in range(_ROUNDS + 1):
+            for candidates, pieces in self._level(value, level):
+                chosen = [self._nearest(candidates, value, part) for part in self.parts]
+                for sweep in range(2 if start is not None and len(self.parts) > 1 else 1):
+                    for i, z in enumerate(pieces):
+                        left = plain
+                        if sweep:
+                            own = [p[chosen[j]] for j, p in enumerate(pieces) if j != i]
+                            left = _Left(target, torch.cat([fixed, *own], -1))
+                        score = left.gain(z)
+                        chosen[i] = int(score.argmax())
+                        gains[i] = float(score[chosen[i]])
+                value = value.clone()
+                for i, part in enumerate(self.parts):
+                    value[part.shapes] = candidates[chosen[i]][part.shapes]
+        return self._worth(value, gains)
+
+    def _level(self, value: Tensor, level: int) -> list[tuple[Tensor, list[Tensor]]]:
+        """Candidates `g x h` with their columns; every first shape of a part at once, then every second one."""
+        if level == 0 and self.coarse is not None:
+            return self.coarse
+        found = []
+        for turn in range(max((len(p.shapes) for p in self.parts), default=0)):
+            moving = [p.shapes[turn] for p in self.parts if turn < len(p.shapes)]
+            grids = {h: self._grid(h, float(value[h]), level) for h in moving}
+            longest = max(len(g) for g in grids.values())
+            candidates = value.expand(longest, -1).clone()
+            for h, grid in grids.items():
+                candidates[: len(grid), h] = grid
+                candidates[len(grid) :, h] = grid[-1]
+            found.append((candidates, self.columns(candidates)))
+        if level == 0:
+            self.coarse = found
+        return found
+
+    def _grid(self, h: int, value: float, level: int) -> Tensor:
+        grid = torch.tensor(self.shapes[h].grid, dtype=self.size.dtype)
+        if level == 0:
+            return grid
+        k = int((grid - value).abs().argmin())
+        low, high = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
+        half = (high - low) / 2 * (2 / (_FINE - 1)) ** (level - 1)
+        fine = torch.linspace(-1, 1, _FINE, dtype=grid.dtype) * half + value
+        return fine.clamp(float(grid[0]), float(grid[-1]))
+
+    def _nearest(self, candidates: Tensor, value: Tensor, part: _Part) -> int:
+        return int((candidates[:, part.shapes] - value[part.shapes]).abs().sum(-1).argmin())
+
+    def _worth(self, value: Tensor, gains: Sequence[float]) -> Shaped:
+        """Only the parts that pay for their search and half a unit of log evidence a coefficient; at least the best."""
+        charges = [sum(math.log(max(len(self.shapes[h].grid), 1)) for h in p.shapes) for p in self.parts]
+        net = [g / 2 - c for g, c in zip(gains, charges, strict=True)]
+        best = max(range(len(net)), key=lambda i: net[i])
+        kept = [i for i, p in enumerate(self.parts) if i == best or net[i] > 1.5 * len(p.columns)]
+        charge = sum(charges[i] for i in kept)
+        if len(kept) == len(self.parts):
+            return Shaped(value, None, charge)
+        unshaped = set(range(len(self.size))) - {c for p in self.parts for c in p.columns}
+        return Shaped(value, tuple(sorted(unshaped | {c for i in kept for c in self.parts[i].columns})), charge)
+
+
+class _Left:
+    """What nuisance columns with their prior leave of `y`, and of whatever is put beside them."""
+
+    def __init__(self, y: Tensor, nuisance: Tensor) -> None:
+        """y: `N`; nuisance: `N x P`, whitened, in units of their prior scale."""
+        self.nuisance = nuisance
+        eye = torch.eye(nuisance.shape[1], dtype=y.dtype, device=y.device)
+        self.factor = torch.linalg.cholesky(eye + nuisance.mT @ nuisance)
+        self.y = y - (nuisance @ torch.cholesky_solve(nuisance.mT @ y[:, None], self.factor))[:, 0]
+
+    def gain(self, z: Tensor) -> Tensor:
+        """Squares that each candidate explains, `g`; z: `g x N x m`."""
+        inner = z.mT @ z
+        if self.nuisance.shape[1]:
+            cross = self.nuisance.mT @ z
+            inner = inner - cross.mT @ torch.cholesky_solve(cross, self.factor)
+        b = (z.mT @ self.y[:, None])[..., 0]
+        ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
+        inner = inner + torch.diag_embed(ridge[:, None].expand(-1, inner.shape[-1]))
+        solved = torch.linalg.solve(inner, b[..., None])[..., 0]
+        return (b * solved).sum(-1)
+
+
+def _parts(shapes: tuple[Shape, ...], coefficients: int) -> list[_Part]:
+    """Shapes in groups that share a coefficient; one with no columns of its own belongs to all."""
+    parts: list[_Part] = []
+    for h, shape in enumerate(shapes):
+        mine = set(range(coefficients) if shape.columns is None else shape.columns)
+        joined = [p for p in parts if mine & set(p.columns)]
+        parts = [p for p in parts if not mine & set(p.columns)]
+        members = sorted({h, *(k for p in joined for k in p.shapes)})
+        parts.append(_Part(members, sorted(mine.union(*(p.columns for p in joined)))))
+    return parts

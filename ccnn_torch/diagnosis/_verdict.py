@@ -1,0 +1,187 @@
+"""From the posterior over sets to a name that can be stood by: outside or not, classes, probabilities."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ccnn_torch.diagnosis._analysis import Analysis
+from ccnn_torch.diagnosis._search import Found, scored
+
+__all__ = ["Judgement", "judge"]
+
+# Share of the gap's energy that goes with a member of a set and not without it: below this a library effect is how the
+# form of the others differs from the textbook; so is a catch-all beside library effects, and so are library effects
+# beside a catch-all, which stands for whatever was not thought of.
+_FORM, _FORM_CATCH_ALL, _BESIDE_CATCH_ALL = 0.008, 0.03, 0.1
+# Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is stood by.
+_VETO = 0.02
+# Or times the noise's energy, whatever the gap.
+_VETO_NOISE = 25.0
+# What a claim is worth where a name carries less than this share of the gap, or where there are three names or more:
+# the textbook forms of effects are too rough to be surer.
+_SMALL, _UNSURE = 0.1, 0.85
+# Odds up to which one name for another is not told apart by the data.
+_ODDS = math.log(20.0)
+# What is claimed grows slower than what the evidence says: its models are not the truth.
+_TEMPER = 1.0
+# Log odds against the most probable set beyond which nobody looks.
+_FAR = 12.0
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What is stood by.
+
+    Attributes:
+        found: the set that speaks for the verdict.
+        names: library effects, the favourite of each class.
+        classes: for each of them the names that cannot be told from it.
+        probability: that the verdict, classes taken as one, is right.
+        outside: whether something is there that no library effect describes; `driver` says what it follows.
+        driver: of the catch-all, or None.
+        marginal: probability of each candidate's name.
+        leading: name sets by probability, most probable first (library names, driver or None, probability, set).
+    """
+
+    found: Found
+    names: tuple[str, ...]
+    classes: dict[str, tuple[str, ...]]
+    probability: float
+    outside: bool
+    driver: str | None
+    marginal: dict[str, float]
+    leading: list[tuple[frozenset[str], str | None, float, Found]]
+
+
+def judge(analysis: Analysis) -> Judgement:
+    """Weigh the sets that the search has found."""
+    groups: dict[tuple[frozenset[str], str | None], list[Found]] = {}
+    top = analysis.found[0].log_posterior
+    tried = {f.members: f for f in analysis.found}
+    for found in analysis.found:
+        if found.log_posterior > top - _FAR:
+            essential = _essential(analysis, found, tried)
+            groups.setdefault(_named(analysis, essential), []).extend([found, essential])
+            tried[essential.members] = essential
+    weights = {key: math.exp(_TEMPER * (max(f.log_posterior for f in fs) - top)) for key, fs in groups.items()}
+    total = sum(weights.values())
+    leading = sorted(((k[0], k[1], w / total, _plainest(groups[k])) for k, w in weights.items()), key=lambda x: -x[2])
+    names, driver, probability, found = leading[0]
+    outside = driver is not None
+    if not outside and _unexplained(analysis, found):
+        outside = True
+        driver = _driver_of_remainder(analysis)
+    marginal: dict[str, float] = {a.name: 0.0 for a in analysis.library.atoms if not a.catch_all}
+    for members, _, p, _ in leading:
+        for name in members:
+            marginal[name] += p
+    classes = {} if outside else _classes(analysis, found, names)
+    if not outside:
+        same = [p for members, drive, p, _ in leading if drive is None and _equals(members, names, classes)]
+        probability = sum(same)
+    else:
+        probability = sum(p for _, drive, p, _ in leading if drive is not None) if leading[0][1] is not None else 0.5
+    if names and (len(names) > 2 or _smallest(analysis, found, tried) < _SMALL):
+        probability *= _UNSURE
+    ordered = tuple(sorted(names, key=lambda n: -_energy(analysis, found, n)))
+    return Judgement(found, ordered, classes, min(probability, 1.0), outside, driver, marginal, leading)
+
+
+def _net(
+    analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]
+) -> dict[int, tuple[float, tuple[int, ...]]]:
+    """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
+    gap = max(float(analysis.library.grams.yy) - analysis.floor * analysis.library.grams.count, 1e-300)
+    fewer = {i: tuple(m for m in found.members if m != i) for i in found.members}
+    fresh = [s for s in fewer.values() if s not in tried]
+    tried.update(zip(fresh, scored(analysis.library, fresh), strict=True))
+    return {i: ((tried[s].rss - found.rss) / gap, s) for i, s in fewer.items()}
+
+
+def _smallest(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]) -> float:
+    """Share of the gap that the least member of a set carries."""
+    return min(share for share, _ in _net(analysis, found, tried).values())
+
+
+def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]) -> Found:
+    """The set without members that only mend the form of the others."""
+    atoms = analysis.library.atoms
+    while len(found.members) > 1:
+        beside = any(atoms[i].catch_all for i in found.members)
+        limits = {
+            i: _FORM_CATCH_ALL if atoms[i].catch_all else _BESIDE_CATCH_ALL if beside else _FORM for i in found.members
+        }
+        shares = _net(analysis, found, tried)
+        net = {i: share / limits[i] for i, (share, _) in shares.items()}
+        # A catch-all can stand in for much of the library, so it is the first to go.
+        least = min(net, key=lambda i: (not (atoms[i].catch_all and net[i] < 1), net[i]))
+        if net[least] >= 1:
+            break
+        found = tried[shares[least][1]]
+    return found
+
+
+def _plainest(found: list[Found]) -> Found:
+    """Of sets that come to the same names the smallest, and of those the most probable."""
+    return min(found, key=lambda f: (len(f.members), -f.log_posterior))
+
+
+def _named(analysis: Analysis, found: Found) -> tuple[frozenset[str], str | None]:
+    atoms = analysis.library.atoms
+    names = frozenset(atoms[i].name for i in found.members if not atoms[i].catch_all)
+    driver = next((atoms[i].name for i in found.members if atoms[i].catch_all), None)
+    return names, driver
+
+
+def _energy(analysis: Analysis, found: Found, name: str) -> float:
+    return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.library.atoms[i].name == name)
+
+
+def _unexplained(analysis: Analysis, found: Found) -> bool:
+    """Whether what a set leaves is clearly more than the noise (given, or of the richest fit)."""
+    count = analysis.library.grams.count
+    left = found.rss / max(count - found.effective, 1.0)
+    floor = analysis.floor
+    significant = left > floor * (1 + 5 * math.sqrt(2 / count))
+    gap = float(analysis.library.grams.yy) / count
+    much = left - floor > _VETO * max(gap - floor, 0.0) and left > 1.5 * floor
+    return significant and (much or left > _VETO_NOISE * floor)
+
+
+def _driver_of_remainder(analysis: Analysis) -> str | None:
+    """The driver of the most probable set that has one."""
+    for found in analysis.found:
+        driver = _named(analysis, found)[1]
+        if driver is not None:
+            return driver
+    return None
+
+
+def _classes(analysis: Analysis, found: Found, names: frozenset[str]) -> dict[str, tuple[str, ...]]:
+    """For each name of the set those that can stand in its place, as far as these rows can tell."""
+    atoms = analysis.library.atoms
+    library = [i for i, a in enumerate(atoms) if not a.catch_all]
+    classes: dict[str, tuple[str, ...]] = {}
+    for i in found.members:
+        if atoms[i].catch_all:
+            continue
+        others = [j for j in library if atoms[j].name not in names]
+        sets = [tuple(sorted(j if m == i else m for m in found.members)) for j in others]
+        trials = scored(analysis.library, sets)
+        like = {
+            atoms[j].name: t.log_posterior
+            for j, t in zip(others, trials, strict=True)
+            if t.log_posterior > found.log_posterior - _ODDS
+        }
+        classes[atoms[i].name] = tuple(sorted(like, key=lambda n: -like[n]))
+    return classes
+
+
+def _equals(members: frozenset[str], names: frozenset[str], classes: dict[str, tuple[str, ...]]) -> bool:
+    """Whether a set of names is the verdict's, up to its classes."""
+    if len(members) != len(names):
+        return False
+    left = list(names - members)
+    new = members - names
+    return all(any(n in classes.get(e, ()) for e in left) for n in new)

@@ -1,0 +1,97 @@
+"""What records can show, before any verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis._analysis import analyse
+from ccnn_torch.diagnosis.engine import candidates, usable_rows
+from ccnn_torch.effects import Effect, Situation
+
+__all__ = ["Check", "check_rows"]
+
+# Cosine of the angle between what two effects can do beyond which these rows do not tell them apart.
+_ALIKE = 0.95
+
+
+@dataclass(frozen=True)
+class Check:
+    """What rows can show.
+
+    Attributes:
+        rows: how many.
+        aside: rows that no fit can use: near-singular ones, outliers, rows out of reach.
+        noise: standard deviation of each moving channel [m, rad], `c`, by the channel's name.
+        covariates: that were measured and vary.
+        missing: by effect, what the records lack for it.
+        weak: by effect, its plausible size in units of the noise where that is below 1: it could hide.
+        confusable: pairs of effects with the share of the first that the second can take over (cosine), largest first.
+        condition: largest condition number of the Jacobian over the rows that count.
+    """
+
+    rows: int
+    aside: list[int]
+    noise: dict[str, float]
+    covariates: list[str]
+    missing: dict[str, str]
+    weak: dict[str, float]
+    confusable: list[tuple[str, str, float]]
+    condition: float
+
+
+def check_rows(
+    situation: Situation, measured: Tensor, noise: Tensor | None = None, effects: Sequence[Effect | str] | None = None
+) -> Check:
+    """Look at rows as `diagnose_rows` does, and say what they can and cannot show; arguments as there."""
+    usable_rows(situation, measured)
+    usable, lacking = candidates(situation, effects)
+    analysis = analyse(situation, measured, usable, noise)
+    white = analysis.whitening
+    keep = white.keep()
+    spans: dict[str, Tensor] = {}
+    weak = {}
+    for atom, group in zip(analysis.library.atoms, analysis.library.groups, strict=True):
+        if atom.catch_all or atom.name in spans:
+            continue
+        x = analysis.columns[keep][..., group].flatten(0, 1)
+        spans[atom.name] = x
+        size = float(x.square().sum(-1).mean().sqrt())
+        if size < 1:
+            weak[atom.name] = size
+    condition = situation.mechanism.condition_number(situation.joints[keep], parameters=situation.parameters)
+    names = ("x", "y", "z", "rx", "ry", "rz")
+    return Check(
+        rows=len(situation.joints),
+        aside=torch.nonzero(white.weight <= 0).squeeze(-1).tolist(),
+        noise={names[int(c)]: float(s) for c, s in zip(white.channels, white.sigma, strict=True)},
+        covariates=[n for n, v in situation.covariates.items() if float(v.max() - v.min()) > 0],
+        missing=lacking,
+        weak=weak,
+        confusable=_confusable(spans),
+        condition=float(condition.max()),
+    )
+
+
+def _confusable(spans: dict[str, Tensor]) -> list[tuple[str, str, float]]:
+    """For every ordered pair how much of what the first is likely to do the second can do as well."""
+    found = []
+    basis = {n: _span(x) for n, x in spans.items()}
+    for first, x in spans.items():
+        total = x.square().sum()
+        if float(total) <= 0:
+            continue
+        for second, q in basis.items():
+            share = float(((q.mT @ x).square().sum() / total).clamp(0, 1).sqrt()) if first != second else 0.0
+            if share > _ALIKE:
+                found.append((first, second, share))
+    return sorted(found, key=lambda f: -f[2])
+
+
+def _span(x: Tensor) -> Tensor:
+    """Orthonormal columns of what x spans."""
+    u, s, _ = torch.linalg.svd(x, full_matrices=False)
+    return u[:, s > 1e-9 * s.max().clamp_min(1e-300)]

@@ -1,0 +1,147 @@
+"""Diagnosis of rows: which effect makes the gap, where it lies, and how far it shrinks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis._analysis import Analysis, analyse
+from ccnn_torch.diagnosis._next import next_measurements
+from ccnn_torch.diagnosis._report import Blocks, blocks
+from ccnn_torch.diagnosis._verdict import judge
+from ccnn_torch.diagnosis._where import where
+from ccnn_torch.diagnosis._words import sentence
+from ccnn_torch.diagnosis.result import Diagnosis
+from ccnn_torch.effects import EFFECTS, Effect, Situation, make_effect, pose_residual
+from ccnn_torch.errors import InputError
+
+__all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "usable_rows"]
+
+OUTLIER = "outlier"
+# More rows than this name a cause no better: so many are drawn.
+_MOST_ROWS = 2000
+_FEWEST_ROWS = 20
+# Times the noise from which a row is bad and not unlucky.
+_GROSS = 15.0
+# Half of the rows beyond reach are no outliers any more: the model or the units are wrong.
+_USABLE = 0.5
+
+
+def candidates(
+    situation: Situation, effects: Sequence[Effect | str] | None = None
+) -> tuple[list[Effect], dict[str, str]]:
+    """Effects that these records could show, and for the others what is missing."""
+    named = list(EFFECTS) if effects is None else effects
+    every = [make_effect(e) if isinstance(e, str) else e for e in named]
+    names = [*situation.covariates]
+    lacking = {e.name: e.missing(situation.mechanism, names) for e in every}
+    return [e for e in every if not lacking[e.name]], {n: why for n, why in lacking.items() if why}
+
+
+def diagnose_rows(
+    situation: Situation,
+    measured: Tensor,
+    noise: Tensor | None = None,
+    effects: Sequence[Effect | str] | None = None,
+    seed: int = 0,
+) -> Diagnosis:
+    """Diagnose rows of commanded joints and measured poses.
+
+    Args:
+        situation: `s` rows without further leading dims, in the order measured, with what was measured beside them.
+        measured: poses, `s x p` [SI].
+        noise: standard deviation of each channel of position and rotation vector, `c` [m, rad]; estimated when None.
+        effects: candidates, or their names; the whole library when None.
+        seed: of folds and resampling.
+
+    Raises:
+        InputError: too few rows, or too many of them that the mechanism cannot have reached.
+    """
+    rows = len(situation.joints)
+    situation, measured, chosen = _thinned(situation, measured, seed)
+    fine = usable_rows(situation, measured)
+    residual = pose_residual(situation, measured)
+    usable, lacking = candidates(situation, effects)
+    analysis = analyse(situation, measured, usable, noise)
+    judgement = judge(analysis)
+    residual = torch.where(fine[:, None], residual, 0.0)
+    made = Blocks(analysis, judgement, residual, seed)
+    gap, gap_rotation, listed = blocks(made)
+    together = made.main(made.together)
+    aside = torch.nonzero(analysis.whitening.weight <= 0).squeeze(-1)
+    nothing = not judgement.names and not judgement.outside
+    outlier = nothing and bool(gross_rows(analysis).any())
+    verdict = {
+        "effects": [OUTLIER] if outlier else list(judgement.names),
+        "probability": judgement.probability,
+        "shrink": together.shrink,
+        "shrink_ci95": None if together.interval is None else list(together.interval),
+        "none": nothing and not outlier,
+        "outside_library": judgement.outside,
+        "driver": judgement.driver,
+        "text": sentence(judgement, together, gap["unit"], len(aside), outlier),
+    }
+    notes = [f"{name} cannot be seen without {why}" for name, why in lacking.items()]
+    if len(chosen) < rows:
+        notes.append(f"{len(chosen)} of {rows} rows, drawn at random, were looked at")
+    return Diagnosis(
+        gap=gap,
+        gap_rotation=gap_rotation,
+        where=where(analysis, residual),
+        effects=listed,
+        verdict=verdict,
+        next_measurements=next_measurements(analysis, judgement, seed),
+        rows_set_aside=[int(chosen[i]) for i in aside],
+        notes=notes,
+        acting=tuple(analysis.acting(judgement.found)),
+        analysis=analysis,
+        judgement=judgement,
+    )
+
+
+def gross_rows(analysis: Analysis) -> Tensor:
+    """Rows set aside that are so far off that no heavy tail of ordinary noise makes them, `s` bool."""
+    white = analysis.whitening
+    far = (analysis.residual[:, white.channels] / white.sigma).abs().amax(-1) > _GROSS
+    return far & (white.weight <= 0) & ~analysis.near_singular
+
+
+def usable_rows(situation: Situation, measured: Tensor) -> Tensor:
+    """Rows that the mechanism can have reached, `s` bool.
+
+    Raises:
+        InputError: too few rows, or most of them out of reach.
+    """
+    rows = len(situation.joints)
+    if rows < _FEWEST_ROWS:
+        raise InputError(f"{rows} rows are too few for a diagnosis; measure at least {_FEWEST_ROWS}, better 100")
+    fine = torch.isfinite(pose_residual(situation, measured)).all(-1)
+    if float(fine.double().mean()) < _USABLE:
+        raise InputError(
+            f"{int((~fine).sum())} of {len(fine)} rows are outside the reach of {situation.mechanism.name}; check the "
+            "units, the order of the joints, and that this is the machine that was measured"
+        )
+    return fine
+
+
+def _thinned(situation: Situation, measured: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:
+    """At most `_MOST_ROWS` rows, in order, and which they are."""
+    rows = len(situation.joints)
+    if rows <= _MOST_ROWS:
+        return situation, measured, torch.arange(rows)
+    chosen = torch.randperm(rows, generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS].sort().values
+
+    def pick(value: Tensor | None) -> Tensor | None:
+        return value[chosen] if value is not None and value.dim() > 1 and len(value) == rows else value
+
+    fewer = replace(
+        situation,
+        joints=situation.joints[chosen],
+        covariates={n: v[chosen] for n, v in situation.covariates.items()},
+        parameters=pick(situation.parameters),
+        guess=pick(situation.guess),
+    )
+    return fewer, measured[chosen], chosen

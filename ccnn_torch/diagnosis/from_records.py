@@ -1,0 +1,93 @@
+"""From measured records to rows with a situation: covariates by name, frames that nobody knows fitted first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.engine import diagnose_rows
+from ccnn_torch.diagnosis.result import Diagnosis
+from ccnn_torch.effects import Effect, Situation, default_gravity
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms.frames import fit_frames
+from ccnn_torch.records import Records
+
+__all__ = ["diagnose", "noise_of", "situation_of"]
+
+_POSITION = {"x": 0, "y": 1, "z": 2}
+_TURN = {"rx": 3, "ry": 4, "rz": 5}
+
+
+def diagnose(
+    records: Records,
+    mechanism: Mechanism,
+    *,
+    noise: float | Mapping[str, float] | None = None,
+    effects: Sequence[Effect | str] | None = None,
+    gravity: Sequence[float] | None = None,
+    seed: int = 0,
+) -> Diagnosis:
+    """Which effect makes the gap between a model and measured records, where it lies, how far it shrinks.
+
+    Args:
+        records: as `load_records` reads them.
+        mechanism: the nominal machine.
+        noise: standard deviation of the measured pose [SI]: one number for every channel, or by pose coordinate;
+            estimated from the rows when None.
+        effects: candidates, or their names; the whole library when None.
+        gravity: `3` [m/s²] in the base frame; down along -z (planar machines: -y) when None.
+        seed: of folds and resampling.
+
+    Raises:
+        InputError: too few rows, most of them out of reach, or noise of a coordinate that there is not.
+    """
+    situation = situation_of(records, mechanism, gravity)
+    return diagnose_rows(situation, records.pose, noise_of(noise, situation), effects, seed)
+
+
+def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float] | None = None) -> Situation:
+    """Rows of records on the nominal machine; unknown frames of an arm are fitted to them."""
+    if isinstance(mechanism, SerialArm) and records.orientation == "none":
+        mechanism = mechanism.with_orientation("none")
+    parameters = None
+    if isinstance(mechanism, SerialArm) and mechanism.unknown_frames:
+        parameters = fit_frames(mechanism, records.joints, records.pose, columns=records.columns)
+    down = default_gravity(mechanism) if gravity is None else torch.tensor(list(gravity), dtype=torch.float64)
+    if down.shape != (3,):
+        raise InputError(f"gravity: needs three numbers (x, y, z in m/s²), not {len(down)}")
+    covariates = {c.name: records.covariates[:, i] for i, c in enumerate(records.covariate_coordinates)}
+    guess = records.pose if records.pose.shape[-1] == len(mechanism.pose) else None
+    return Situation(mechanism, records.joints, covariates, down, parameters, guess)
+
+
+def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) -> Tensor | None:
+    """Standard deviation of each channel of position and rotation vector, `c` [m, rad].
+
+    Raises:
+        InputError: a coordinate that the pose does not have, one that is missing, or a value that is not positive.
+    """
+    if noise is None:
+        return None
+    count = situation.jacobian.shape[-2]
+    names = [c.name for c in situation.mechanism.pose]
+    if not isinstance(noise, Mapping):
+        noise = dict.fromkeys(names, float(noise))
+    wrong = [n for n in noise if n not in names]
+    missing = [n for n in names if n not in noise]
+    if wrong or missing:
+        said = f"there is no pose coordinate {wrong[0]}" if wrong else f"gives nothing for {', '.join(missing)}"
+        raise InputError(f"noise: {said}; the pose is {', '.join(names)}")
+    low = [n for n, v in noise.items() if not 0 < float(v) < float("inf")]
+    if low:
+        raise InputError(f"noise: must be above 0, not {noise[low[0]]!r} for {low[0]}")
+    lengths = [v for n, v in noise.items() if n in _POSITION]
+    angles = [v for n, v in noise.items() if n not in _POSITION]
+    values = [max(lengths, default=1.0)] * 3 + [max(angles, default=1.0)] * 3
+    for name, value in noise.items():
+        channel = {**_POSITION, **_TURN}.get(name)
+        if channel is not None:
+            values[channel] = float(value)
+    return torch.tensor(values[:count], dtype=torch.float64)

@@ -1,0 +1,63 @@
+"""Friction that winds up the drives: it acts against the last motion and grows with what the joint carries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.effects._columns import by_joint, per_force
+from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects._situation import PLATFORM_WEIGHT, Situation
+from ccnn_torch.effects.backlash import Backlash
+from ccnn_torch.effects.compliance import SCALE
+from ccnn_torch.mechanisms import Mechanism
+
+__all__ = ["Friction"]
+
+# A joint's friction is some tenths of what it carries, its constant part like that of a tenth of the platform's weight.
+_SHARE = 0.3
+_CONSTANT = {"m": 3e-5, "rad": 5e-5}
+
+
+class Friction:
+    """Δq_i = -s_i (c_i |τ_load,i| + d_i |τ_weight,i| + e_i): s the direction of approach, τ what the joint carries.
+
+    Coulomb's friction is in proportion to what presses the surfaces together; a drive of compliance C and friction
+    coefficient μ stops C μ |τ| short. The weight is that of a platform of 100 N: of another one d is as much larger.
+    The part e that does not depend on the load is secondary: by itself it is what play does.
+    """
+
+    name = "friction"
+    kind: Kind = "joints"
+    description = "friction that winds up the drives against their last motion, the more the more they carry"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """The direction of approach of at least one joint."""
+        return Backlash().missing(mechanism, covariates)
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """By load (where one was recorded), by weight, constant: for each joint whose direction is known."""
+        found = []
+        for joint in (situation.mechanism.joints[i] for i in situation.directed):
+            size = SCALE[joint.unit] * _SHARE
+            for part in ("load", "weight") if situation.loaded else ("weight",):
+                found.append(
+                    Coefficient(f"{joint.name} {part}", per_force(joint.unit), size, joint=joint.name, positive=True)
+                )
+            constant = _CONSTANT[joint.unit]
+            found.append(Coefficient(f"{joint.name} constant", joint.unit, constant, joint=joint.name, secondary=True))
+        return tuple(found)
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """None."""
+        return ()
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x m`, joint by joint."""
+        carried = [situation.load_torque.abs()] if situation.loaded else []
+        carried += [situation.weight_torque.abs() * PLATFORM_WEIGHT, torch.ones_like(situation.joints)]
+        against = -situation.direction.unsqueeze(-1) * torch.stack(carried, -1)
+        return by_joint(against, situation.directed)

@@ -1,0 +1,57 @@
+"""Lengths, places and angles of a machine as built that are not those of its drawing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.coordinates import plausible_error
+from ccnn_torch.effects._columns import own_parameters
+from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects._situation import Situation
+from ccnn_torch.mechanisms import Mechanism, SerialArm
+
+__all__ = ["Geometry"]
+
+
+class Geometry:
+    """Δp_k = c_k, p = the mechanism's own parameters; base and tool frames are effects of their own."""
+
+    name = "geometry"
+    kind: Kind = "parameters"
+    description = "lengths, places and angles of the machine as built that differ from its drawing"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Parameters."""
+        return "" if own_parameters(mechanism) else f"geometric parameters: mechanism '{mechanism.name}' has none"
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """One a parameter."""
+        mechanism = situation.mechanism
+        chosen = own_parameters(mechanism)
+        # The parameters of an arm's link i stand behind its joint i.
+        links = len(chosen) // len(mechanism.joints) if isinstance(mechanism, SerialArm) else 0
+        return tuple(
+            Coefficient(
+                mechanism.geometry[k].name,
+                mechanism.geometry[k].unit,
+                plausible_error(mechanism.geometry[k]),
+                joint=mechanism.joints[place // links].name if links else None,
+                leg=mechanism.geometry[k].leg,
+            )
+            for place, k in enumerate(chosen)
+        )
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """None."""
+        return ()
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """Columns of the identity at every row, `... x s x k x m`."""
+        count = len(situation.mechanism.geometry)
+        eye = torch.eye(count, dtype=situation.joints.dtype, device=situation.joints.device)
+        chosen = eye[:, own_parameters(situation.mechanism)]
+        return chosen.expand(*situation.joints.shape[:-1], *chosen.shape)

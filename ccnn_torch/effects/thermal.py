@@ -1,0 +1,106 @@
+"""A machine that grows with the temperature of its surroundings, and follows it late."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.effects._members import Member, members
+from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects._situation import Situation
+from ccnn_torch.effects._time import elapsed, lagged
+from ccnn_torch.mechanisms import Mechanism
+
+__all__ = ["REFERENCE", "Thermal"]
+
+REFERENCE = 293.15
+"""Temperature at which a machine has its dimensions, ISO 1 [K]."""
+_STEEL = 1.2e-5
+# Of a member against the whole machine, and kelvins by which the reference may be off.
+_UNEVEN, _REFERENCE_OFF = 0.5, 5.0
+# A motor's mount of 0.2 m; a beam warped by its two sides.
+_MOUNT = {"m": 2e-6, "rad": 5e-6}
+_LAGS = 12
+_SHARES = (0.01, 1.0)
+
+
+class Thermal:
+    """Δp = (α + α_k) p θ for all lengths p (k = their leg or link), Δq_i = β_i q_i θ for sliding drives.
+
+    θ is the temperature less 20 degC, as a body of one heat capacity follows it with a lag: θ' = (T - θ) / lag, settled
+    at the first row. Without a column of times there is no lag. Secondary: mounts and beams that move a joint by
+    γ_i θ; a reference that was not 20 degC (a constant growth); a part that follows at once.
+
+    Lengths are parameters and drives are joints. Both move the measured frame, to first order by the mechanism's
+    derivatives, so the effect is one on the pose: no joint has to stand in for a length (near a singularity of an arm
+    that would take a large one), and growth of 1e-4 leaves 1e-8 to the second order.
+    """
+
+    name = "thermal"
+    kind: Kind = "pose"
+    description = "growth with the temperature, which the machine follows with a lag"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Temperature, and something that has a length."""
+        if not members(mechanism) and all(j.unit != "m" for j in mechanism.joints):
+            return f"lengths: mechanism '{mechanism.name}' has no parameter in metres"
+        return "" if "temperature" in covariates else "the temperature of the surroundings: temperature[degC]"
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """The whole machine, its members, its sliding drives; then what is secondary."""
+        mechanism = situation.mechanism
+        found = [Coefficient("growth", "1/K", _STEEL, positive=True)]
+        uneven = _STEEL * _UNEVEN
+        found += [Coefficient(m.name, "1/K", uneven, joint=m.joint, leg=m.leg) for m in _apart(mechanism)]
+        found += [
+            Coefficient(f"{j.name} travel", "1/K", _STEEL, joint=j.name, positive=True)
+            for j in mechanism.joints
+            if j.unit == "m"
+        ]
+        found += [
+            Coefficient(f"{j.name} mount", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
+            for j in mechanism.joints
+        ]
+        found.append(Coefficient("reference", "1", _STEEL * _REFERENCE_OFF, secondary=True))
+        if "time" in situation.covariates:
+            found.append(Coefficient("at once", "1/K", uneven, secondary=True))
+        return tuple(found)
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """The lag, from none to the time of all rows; () without times."""
+        if "time" not in situation.covariates:
+            return ()
+        whole = max(float(elapsed(situation.covariates["time"]).max()), 1e-6)
+        low, high = (math.log(share * whole) for share in _SHARES)
+        lags = [math.exp(low + (high - low) * k / (_LAGS - 1)) for k in range(_LAGS)]
+        return (Shape("lag", "s", (0.0, *lags)),)
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x c x m`."""
+        mechanism = situation.mechanism
+        warm = (situation.covariates["temperature"] - REFERENCE).expand(situation.joints.shape[:-1])
+        time = situation.covariates.get("time")
+        body = warm if time is None else lagged(time, warm, shape[..., 0])
+        values = mechanism.resolve(situation.parameters).unsqueeze(-2)
+        longer = torch.nan_to_num(situation.parameter_jacobian) * values
+        jacobian = torch.nan_to_num(situation.jacobian)
+        sliding = [i for i, j in enumerate(mechanism.joints) if j.unit == "m"]
+        lengths = [k for m in members(mechanism) for k in m.lengths]
+        whole = longer[..., lengths].sum(-1, keepdim=True)
+        parts = [whole, *(longer[..., m.lengths].sum(-1, keepdim=True) for m in _apart(mechanism))]
+        parts += [(jacobian * situation.joints.unsqueeze(-2))[..., sliding], jacobian]
+        following = torch.cat(parts, -1) * body[..., None, None]
+        constant = [whole.expand(*following.shape[:-1], 1)]
+        if time is not None:
+            constant.append(whole * warm[..., None, None])
+        return torch.cat([following, *(c.expand(*following.shape[:-1], 1) for c in constant)], -1)
+
+
+def _apart(mechanism: Mechanism) -> list[Member]:
+    """Members that may grow unlike each other; a single one is the whole machine."""
+    found = members(mechanism)
+    return found if len(found) > 1 else []

@@ -1,0 +1,76 @@
+"""Periodic errors of the drives: a gear's eccentricity, a screw's wobble, an encoder's interpolation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.effects._columns import by_joint
+from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects._situation import Situation
+from ccnn_torch.mechanisms import Mechanism
+
+__all__ = ["Transmission"]
+
+_SCALE = {"m": 5e-5, "rad": 1e-4}
+# Waves: harmonics of the period, and how large they are likely to be.
+_HARMONICS = (("sin", 1.0), ("cos", 1.0), ("sin 2", 0.5), ("cos 2", 0.5))
+# Harmonics of a turn; those of a harmonic drive's ball cage and teeth lie near the hundredth.
+_MOST_PER_TURN = 130
+# Periods over the travel of a sliding joint; fewer than the first cannot be told from a bend.
+_PERIODS = (1.5, 40.0)
+# Of a period over the travel between neighbours of the grid; a wave is lost from a whole one on.
+_PERIOD_STEP = 1 / 3
+
+
+class Transmission:
+    """Δq_i = a_i sin(f_i q_i) + b_i cos(f_i q_i) and their second harmonic; f_i unknown."""
+
+    name = "transmission"
+    kind: Kind = "joints"
+    description = "a periodic error of a drive, of unknown period, as of a gear, a screw or an encoder"
+    ordered = False
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """Nothing is needed."""
+        return ""
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """Sine and cosine of a joint's period, then of half of it, joint by joint."""
+        return tuple(
+            Coefficient(f"{j.name} {wave}", j.unit, _SCALE[j.unit] * size, joint=j.name, secondary=size < 1)
+            for j in situation.mechanism.joints
+            for wave, size in _HARMONICS
+        )
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """The frequency of each joint's error: whole numbers a turn, or from 1.5 periods over the travel upward."""
+        low, high = (edge.tolist() for edge in situation.workspace)
+        count = len(_HARMONICS)
+        return tuple(
+            Shape(
+                f"{j.name} frequency",
+                f"rad/{j.unit}" if j.unit != "rad" else "1",
+                _frequencies(j.unit, high[i] - low[i]),
+                tuple(range(count * i, count * (i + 1))),
+            )
+            for i, j in enumerate(situation.mechanism.joints)
+        )
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """`... x s x n x 4n`."""
+        angle = situation.joints * shape.unsqueeze(-2)
+        waves = [torch.sin(angle), torch.cos(angle), torch.sin(2 * angle), torch.cos(2 * angle)]
+        return by_joint(torch.stack(waves, -1))
+
+
+def _frequencies(unit: str, travel: float) -> tuple[float, ...]:
+    """Grid of a joint's frequencies, ascending [rad per joint's unit]."""
+    if unit == "rad":
+        return tuple(float(k) for k in range(1, _MOST_PER_TURN + 1))
+    steps = round((_PERIODS[1] - _PERIODS[0]) / _PERIOD_STEP)
+    whole = 2 * math.pi / max(travel, 1e-6)
+    return tuple(whole * (_PERIODS[0] + _PERIOD_STEP * k) for k in range(steps + 1))

@@ -1,0 +1,115 @@
+"""Causes that a diagnosis was not told, and what it may not say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jsonschema
+import pytest
+import torch
+from diagnosis._machines import NOISE, measured, rows_of
+
+from ccnn_torch.diagnosis import diagnose_rows
+from ccnn_torch.diagnosis.check import check_rows
+from ccnn_torch.errors import InputError
+from ccnn_torch.report.json_files import load_schema, plain
+
+
+@pytest.mark.parametrize(
+    ("machine", "causes"),
+    [
+        ("five_bar", ["backlash"]),
+        ("five_bar", ["transmission"]),
+        ("five_bar", ["compliance", "joint_offset"]),
+        ("tripod", ["geometry"]),
+        ("tripod", ["thermal", "friction"]),
+        ("delta", ["compliance"]),
+    ],
+)
+def test_it_names_the_causes(machine: str, causes: list[str]) -> None:
+    situation = rows_of(machine, 150, 3)
+    pose = measured(situation, dict.fromkeys(causes, 12.0), 4)
+    said = diagnose_rows(situation, pose)
+    verdict = said.verdict
+    assert set(verdict["effects"]) == set(causes), verdict
+    assert not verdict["outside_library"] and not verdict["none"]
+    assert verdict["shrink"] > 0.95 and verdict["shrink_ci95"][1] == 1.0
+    assert said.gap["after"] == pytest.approx(said.gap["noise_floor"], rel=0.25)
+    assert {a.effect.name for a in said.acting} == set(causes)
+    jsonschema.validate(plain(said.to_json()), load_schema("diagnosis"))
+
+
+def test_noise_alone_is_no_cause() -> None:
+    situation = rows_of("five_bar", 200, 5)
+    said = diagnose_rows(situation, measured(situation, {}, 6))
+    assert said.verdict["none"] and said.verdict["effects"] == []
+    assert said.gap["reducible_share"] < 0.2
+
+
+def test_a_cause_that_the_library_lacks_is_outside_and_its_driver_is_named() -> None:
+    situation = rows_of("five_bar", 200, 7)
+    pose = measured(situation, {"compliance": 15.0}, 8)
+    said = diagnose_rows(situation, pose, effects=["geometry", "joint_offset", "backlash", "transmission", "gravity"])
+    assert said.verdict["outside_library"] and said.verdict["driver"] in ("load x", "load y")
+    assert "compliance" not in said.verdict["effects"]
+
+
+def test_bad_rows_are_set_aside_and_do_not_hide_the_cause() -> None:
+    situation = rows_of("five_bar", 200, 9)
+    pose = measured(situation, {"backlash": 10.0}, 10)
+    bad = [3, 50, 51, 120, 199]
+    pose[bad] += 100 * NOISE
+    said = diagnose_rows(situation, pose)
+    assert said.verdict["effects"] == ["backlash"]
+    assert said.rows_set_aside == bad
+
+
+def test_nothing_but_bad_rows_is_outlier() -> None:
+    situation = rows_of("five_bar", 200, 11)
+    pose = measured(situation, {}, 12)
+    pose[[10, 20, 30]] += 80 * NOISE
+    said = diagnose_rows(situation, pose)
+    assert said.verdict["effects"] == ["outlier"] and not said.verdict["none"]
+    assert said.rows_set_aside == [10, 20, 30]
+
+
+def test_what_the_records_lack_is_said_and_not_a_candidate() -> None:
+    situation = rows_of("five_bar", 100, 13)
+    bare = replace(situation, covariates={})
+    said = diagnose_rows(bare, measured(situation, {"joint_offset": 10.0}, 14))
+    assert "joint_offset" in said.verdict["effects"]
+    assert not {"compliance", "backlash", "thermal"} & {e["name"] for e in said.effects}
+    assert any("compliance" in n and "load" in n for n in said.notes)
+
+
+def test_the_seed_decides_and_nothing_else() -> None:
+    situation = rows_of("five_bar", 60, 15)
+    pose = measured(situation, {"joint_gain": 10.0}, 16)
+    state = torch.random.get_rng_state()
+    assert diagnose_rows(situation, pose, seed=1).to_json() == diagnose_rows(situation, pose, seed=1).to_json()
+    assert torch.equal(state, torch.random.get_rng_state())
+
+
+def test_rows_out_of_reach_are_set_aside_and_most_of_them_are_too_many() -> None:
+    situation = rows_of("five_bar", 60, 17)
+    pose = measured(situation, {"joint_offset": 10.0}, 18)
+    joints = situation.joints.clone()
+    joints[5] = torch.tensor([0.0, 3.1])
+    lost = replace(situation, joints=joints, guess=None)
+    assert 5 in diagnose_rows(lost, pose).rows_set_aside
+    joints[:40] = torch.tensor([0.0, 3.1])
+    with pytest.raises(InputError, match="outside the reach"):
+        diagnose_rows(replace(situation, joints=joints, guess=None), pose)
+    with pytest.raises(InputError, match="too few"):
+        diagnose_rows(replace(situation, joints=situation.joints[:10], covariates={}, guess=None), pose[:10])
+
+
+def test_the_check_tells_noise_and_what_looks_alike() -> None:
+    situation = rows_of("five_bar", 150, 19)
+    found = check_rows(situation, measured(situation, {"backlash": 5.0}, 20))
+    assert found.noise["x"] == pytest.approx(NOISE, rel=0.3)
+    pairs = {(a, b) for a, b, _ in found.confusable}
+    # The five-bar's own parameters have the drives' offsets and gains among them.
+    assert ("joint_offset", "geometry") in pairs and ("joint_gain", "geometry") in pairs
+    assert ("backlash", "geometry") not in pairs
+    assert "tool" in found.missing

@@ -1,0 +1,50 @@
+"""The evidence against the textbook's, and the search for shapes against a brute one."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+
+from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
+
+
+def _columns(seed: int, rows: int, width: int) -> torch.Tensor:
+    return torch.randn(rows, 1, width, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_the_evidence_is_that_of_the_marginal_normal_with_the_hyperpriors() -> None:
+    x, y = _columns(0, 30, 4), _columns(1, 30, 1)[..., 0] * 0.7
+    y = y + (x[..., :2] @ torch.tensor([1.0, -2.0], dtype=torch.float64))
+    fit = fit_sets(grams_of(x, y), [[torch.tensor([0, 1])], [torch.tensor([0, 1]), torch.tensor([2, 3])]], 0.0, 25)
+    for row, groups in enumerate(([[0, 1]], [[0, 1], [2, 3]])):
+        noise, scale = float(fit.noise[row]), fit.log_scale[row].exp()
+        covariance = noise * torch.eye(30, dtype=torch.float64)
+        for k, group in enumerate(groups):
+            covariance += scale[k] * x[:, 0, group] @ x[:, 0, group].T
+        plain = multivariate_normal(cov=covariance.numpy()).logpdf(y.flatten().numpy()) + 15 * math.log(2 * math.pi)
+        # Normal prior of log α² with spread 4, and the width that the data leave to it (Laplace).
+        inverse = torch.linalg.inv(covariance)
+        for k, group in enumerate(groups):
+            kernel = scale[k] * x[:, 0, group].T @ inverse @ x[:, 0, group]
+            plain += -0.5 * float(scale[k].log()) ** 2 / 16 - 0.5 * math.log1p(8 * float(kernel.trace()))
+        assert float(fit.log_evidence[row]) == pytest.approx(plain, abs=1e-6)
+
+
+def test_sets_side_by_side_are_as_sets_alone() -> None:
+    x, y = _columns(2, 40, 7), _columns(3, 40, 1)[..., 0]
+    sets = [[torch.tensor([0])], [torch.tensor([1, 2]), torch.tensor([3, 4, 5])], []]
+    together = fit_sets(grams_of(x, y), sets, 10.0)
+    for row, one in enumerate(sets):
+        alone = fit_sets(grams_of(x, y), [one], 10.0)
+        assert float(together.log_evidence[row]) == pytest.approx(float(alone.log_evidence[0]), rel=1e-12)
+
+
+def test_the_noise_that_was_given_counts_more_the_surer_it_is() -> None:
+    y = 2 * _columns(4, 200, 1)[..., 0]
+    x = _columns(5, 200, 2)
+    found = [float(fit_sets(grams_of(x, y), [[]], dof).noise[0]) for dof in (0.0, 200.0, 1e6)]
+    assert found[0] == pytest.approx(float(y.square().mean()), rel=1e-6)
+    assert found[0] > found[1] > found[2] == pytest.approx(1.0, abs=1e-2)
