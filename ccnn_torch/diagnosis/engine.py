@@ -13,8 +13,8 @@ from ccnn_torch.diagnosis._next import next_measurements
 from ccnn_torch.diagnosis._report import Blocks, blocks
 from ccnn_torch.diagnosis._verdict import judge
 from ccnn_torch.diagnosis._where import where
-from ccnn_torch.diagnosis._words import sentence
 from ccnn_torch.diagnosis.result import Diagnosis
+from ccnn_torch.diagnosis.words import verdict_text
 from ccnn_torch.effects import EFFECTS, Effect, Situation, make_effect, pose_residual
 from ccnn_torch.errors import InputError
 
@@ -82,8 +82,10 @@ def diagnose_rows(
         "none": nothing and not outlier,
         "outside_library": judgement.outside,
         "driver": judgement.driver,
-        "text": sentence(judgement, together, gap["unit"], len(aside), outlier),
+        "text": "",
     }
+    told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict}
+    verdict["text"] = verdict_text(told | {"rows_set_aside": aside.tolist()})
     notes = [f"{name} cannot be seen without {why}" for name, why in lacking.items()]
     if len(chosen) < rows:
         notes.append(f"{len(chosen)} of {rows} rows, drawn at random, were looked at")
