@@ -22,12 +22,14 @@ _KELVIN = 273.15
 _SHARE = "Share: of the gap's mean square that lies there, [95 % interval] where it is known."
 
 
-def quantity_text(value: float, unit: str) -> str:
+def quantity_text(value: float, unit: str, digits: int = 4) -> str:
     """A joint, a coordinate or a covariate with its unit: lengths in mm, temperatures in °C."""
     if unit == "K":
         return f"{value - _KELVIN:.1f} °C"
     scale, shown = display_unit(unit, abs(value) or 1.0) if unit == "m" else (1.0, unit)
-    return f"{value / scale:.4g} {shown}".removesuffix(" 1")
+    number = value / scale
+    text = f"{number:.0f}" if abs(number) >= 10**digits else f"{number:.{digits}g}"
+    return f"{text} {shown}".removesuffix(" 1")
 
 
 def shares(results: Block, about: About) -> Iterator[tuple[str, str, float, list[float] | None]]:
@@ -49,8 +51,8 @@ def _share_note(results: Block) -> str:
 
 def _regime(name: str, regime: Block, unit: str) -> str:
     if regime["from"] == regime["to"]:
-        return f"{name} {quantity_text(regime['from'], unit)}"
-    low, high = (quantity_text(regime[key], unit) for key in ("from", "to"))
+        return f"{name} {quantity_text(regime['from'], unit, 3)}"
+    low, high = (quantity_text(regime[key], unit, 3) for key in ("from", "to"))
     return f"{name} {low} to {high}"
 
 

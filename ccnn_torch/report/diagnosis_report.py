@@ -149,7 +149,7 @@ def print_diagnosis(results: Block, console: Console, about: About | None = None
         gap_table(results, about),
         effects,
         order_table(results, about),
-        parameter_table(results),
+        parameter_table(results, 12),
         where_table(results, about),
         next_table(results, about),
         unseen_table(about),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -102,9 +103,13 @@ def order_table(results: Block, about: About) -> Table | None:
     return Table("How far does it shrink?", columns, tuple(rows), _SHRINK)
 
 
-def parameter_table(results: Block) -> Table | None:
-    """The parameters of the verdict's effects with their intervals."""
-    rows = []
+def parameter_table(results: Block, most: int = 24) -> Table | None:
+    """The parameters of the verdict's effects with their intervals.
+
+    Args:
+        most: so many are shown, those that are largest against their standard deviations.
+    """
+    rows, sizes = [], []
     by_name = {e["name"]: e for e in results["effects"]}
     for effect in results["verdict"]["effects"]:
         for name, block in by_name.get(effect, {}).get("parameters", {}).items():
@@ -113,10 +118,15 @@ def parameter_table(results: Block) -> Table | None:
             interval = "–" if sd is None else _interval(value, sd, scale)
             numbers = (number_text(value / scale, 4), number_text(_over(sd, scale), 2), interval)
             rows.append((f"{effect}: {name}", *numbers, unit))
+            sizes.append(abs(value) / sd if sd else math.inf)
     if not rows:
         return None
     columns = ("parameter", "value", "standard deviation", "95 % interval", "unit")
     note = "Of the effects in the verdict, fitted together; the unit 1 is a number without unit."
+    if (hidden := len(rows) - most) > 0:
+        least = sorted(sizes, reverse=True)[most - 1]
+        rows = [row for row, size in zip(rows, sizes, strict=True) if size >= least]
+        note += f" The {hidden} that differ least from 0 stand in diagnosis.json only."
     return Table("How large is the effect?", columns, tuple(rows), note, ("unit",))
 
 
@@ -139,7 +149,7 @@ def confusable_table(results: Block, about: About) -> Table | None:
                 (
                     f"{effect['name']} or {other}",
                     f"{probability_words(effect['probability'])} or {probability_words(odds.get(other, 0.0))}",
-                    "–" if angle is None else f"{angle * 57.29577951308232:.1f}",
+                    "–" if angle is None else f"{math.degrees(angle):.1f}",
                     "–" if number is None else f"number {number}",
                 )
             )

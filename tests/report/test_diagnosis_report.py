@@ -122,6 +122,8 @@ def test_tables_hold_the_numbers() -> None:
     parameters = parameter_table(results)
     assert parameters is not None
     assert parameters.rows[0] == ("compliance: q1", "4.100e-06", "2.0e-07", "3.71e-06 to 4.49e-06", "rad/(N*m)")
+    fewest = parameter_table(results, 1)
+    assert fewest is not None and [row[0] for row in fewest.rows] == ["compliance: q1"] and "The 1 that" in fewest.note
     regions = region_table(results, about)
     assert regions is not None
     assert regions.rows[0] == ("0 mm to 100 mm", "300 mm to 400 mm", "40.0 [34.0, 46.0]", "50")
@@ -243,6 +245,19 @@ def test_pictures_of_every_case_show_the_numbers(name: str) -> None:
 
 def _texts(figure: Figure) -> list[str]:
     return [label.get_text() for axes in figure.axes for label in axes.get_yticklabels()]
+
+
+def test_a_bar_beyond_its_shrink_has_its_whisker_and_a_few_far_rows_are_cut_off() -> None:
+    results, tensors, labels = one_effect()
+    results["effects"][1] |= {"gap_after": 5e-4, "shrink": 0.0, "shrink_ci95": [0.0, 0.2], "probability": 0.1}
+    plot = gap_plot(results, About())
+    assert plot is not None
+    lines = [c for c in plot.figure.axes[0].collections if len(c.get_segments()) == 1]
+    assert np.array(lines[0].get_segments()[0])[:, 0].max() == pytest.approx(500.0)
+    arrays = _numpy(tensors)
+    arrays["signature.compliance.y"][3] = 1.0
+    drawn = signature_plot(signatures_of(arrays, labels), arrays, ["compliance"])
+    assert drawn is not None and drawn.figure.axes[0].get_ylim()[1] < 1000
 
 
 def test_whiskers_of_the_gap_are_the_shrink_turned_round() -> None:

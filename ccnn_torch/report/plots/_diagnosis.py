@@ -93,9 +93,10 @@ def _draw_bars(axes: Axes, bars: list[Bar], scale: float, unit: str) -> None:
         axes.barh(i, size, height=0.62, color=colour)
         right = size
         if ends is not None:
-            left, right = ends[0] / scale, max(ends[1] / scale, size)
-            axes.hlines(i, left, ends[1] / scale, color="#222222", linewidth=1.3)
-            axes.vlines([left, ends[1] / scale], i - 0.13, i + 0.13, color="#222222", linewidth=1.3)
+            # A shrink is never below 0, but an effect that is not there makes the gap larger on rows it has not seen.
+            left, right = min(ends[0] / scale, size), max(ends[1] / scale, size)
+            axes.hlines(i, left, right, color="#222222", linewidth=1.3)
+            axes.vlines([left, right], i - 0.13, i + 0.13, color="#222222", linewidth=1.3)
         axes.text(right + 0.012 * reach, i, f"{number_text(size, 3)} {unit}", va="center", fontsize=9)
     axes.set_yticks(range(len(bars)), [bar[0] for bar in bars])
     axes.set_ylim(len(bars) - 0.4, -0.6)

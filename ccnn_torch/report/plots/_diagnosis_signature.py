@@ -91,12 +91,22 @@ def _draw(axes: Axes, signature: Signature, held: NDArray[np.bool_], aside: NDAr
             axes.scatter((x + shift)[rows], y[rows], s=size, color=colour, linewidths=0, label=label, rasterized=raster)
     if aside.any():
         _draw_aside(axes, (x + shift)[aside], y[aside], y[~aside])
+    _keep_to_most(axes, np.concatenate([y[~aside], fit[~aside]]))
     _draw_fit(axes, x[~aside], fit[~aside], values if few else None, step, size)
     axes.axhline(0, color=FLOOR, linewidth=0.8)
     axes.set(xlabel=x_label, ylabel=f"{signature.y_axis.name} [{unit}]")
     if few:
         axes.set_xticks(values)
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+
+
+def _keep_to_most(axes: Axes, values: Array) -> None:
+    """Cut the axis where a few rows next to a singularity would press all others onto one line."""
+    low, high = (float(v) for v in np.nanquantile(values, (0.01, 0.99)))
+    whole = (float(np.nanmin(values)), float(np.nanmax(values)))
+    if whole[1] - whole[0] > 2.5 * (high - low) > 0:
+        axes.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
+        axes.annotate("a few rows lie beyond", (0.99, 0.02), xycoords="axes fraction", ha="right", fontsize=8)
 
 
 def _draw_aside(axes: Axes, x: Array, y: Array, others: Array) -> None:
