@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._shrink import held_out
 from ccnn_torch.diagnosis.result import Diagnosis
@@ -60,18 +61,19 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
         name = analysis.library.atoms[i].name
         if name not in shown or not bool((part[keep] != 0).any()):
             continue
-        direction, unit = _direction(part[keep])
-        fit = part @ direction
-        x_name, x_unit, x = _telling(columns, fit, keep, name)
-        arrays |= {
-            f"signature.{name}.x": x,
-            f"signature.{name}.y": fit + left @ direction,
-            f"signature.{name}.fit": fit,
-        }
-        labels[name] = {
-            "x": {"name": x_name, "unit": x_unit},
-            "y": {"name": _direction_words(direction), "unit": unit},
-        }
+        effect = analysis.library.atoms[i].effect
+        drivers = columns
+        if effect is not None and effect.kind == "joints":
+            joint, fit, rest = _in_joints(analysis, part, left)
+            y_axis = {"name": f"deviation of {joint.name}", "unit": joint.unit}
+            drivers = [*columns, *_torques(analysis, joint)]
+        else:
+            direction, unit = _direction(part[keep])
+            fit, rest = part @ direction, left @ direction
+            y_axis = {"name": _direction_words(direction), "unit": unit}
+        x_name, x_unit, x = _telling(drivers, fit, keep, name)
+        arrays |= {f"signature.{name}.x": x, f"signature.{name}.y": fit + rest, f"signature.{name}.fit": fit}
+        labels[name] = {"x": {"name": x_name, "unit": x_unit}, "y": y_axis}
     return {name: value.to(torch.float64) for name, value in arrays.items()}, labels
 
 
@@ -90,6 +92,33 @@ def _remainder(analysis: Analysis, members: tuple[int, ...], seed: int, *, catch
     keep = analysis.whitening.keep()
     out[keep] = _spread(analysis, held_out(analysis, [chosen], seed)[0].left)
     return out
+
+
+def _in_joints(analysis: Analysis, part: Tensor, left: Tensor) -> tuple[Coordinate, Tensor, Tensor]:
+    """What an effect does to the joint that it moves most, and what is left there, `s`; 0 where a row is set aside.
+
+    A deviation of the joints looks the same everywhere in the workspace, what it does to the pose does not.
+    """
+    keep, channels, sigma = analysis.whitening.keep(), analysis.whitening.channels, analysis.whitening.sigma
+    slope = analysis.situation.jacobian[keep][:, channels] / sigma[:, None]
+    both = torch.stack([part, left], -1)[keep][:, channels] / sigma[:, None]
+    found = part.new_zeros(len(part), slope.shape[-1], 2).index_copy(0, keep, torch.linalg.lstsq(slope, both).solution)
+    # Joints of several units are weighed by what a unit of each does to the pose.
+    reach = slope.square().sum(1).mean(0).sqrt()
+    joint = int((found[..., 0].square().mean(0).sqrt() * reach).argmax())
+    return analysis.situation.mechanism.joints[joint], found[:, joint, 0], found[:, joint, 1]
+
+
+def _torques(analysis: Analysis, joint: Coordinate) -> list[tuple[str, str, Tensor]]:
+    """What load and weight ask of a joint, as further things that may give an effect on it away."""
+    situation = analysis.situation
+    i = [c.name for c in situation.mechanism.joints].index(joint.name)
+    turns = joint.unit == "rad"
+    found = [(f"pull of the weight on {joint.name}", "m" if turns else "1", situation.weight_torque[:, i])]
+    if situation.loaded:
+        name = f"{'torque' if turns else 'force'} of the load on {joint.name}"
+        found.append((name, "N*m" if turns else "N", situation.load_torque[:, i]))
+    return found
 
 
 def _direction(part: Tensor) -> tuple[Tensor, str]:
