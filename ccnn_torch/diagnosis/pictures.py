@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,9 +11,12 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._shrink import held_out
 from ccnn_torch.diagnosis.result import Diagnosis
+from ccnn_torch.effects import pose_residual
 
 __all__ = ["picture_arrays"]
 
+Column = tuple[str, str, Tensor]
+"""Name, SI unit and values."""
 # Quantile bins of a driver; the one whose bins hold most of an effect's variance is what gives the effect away.
 _BINS = 12
 _UNITS = {"time": "s", "temperature": "K"}
@@ -41,11 +44,13 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
     held = torch.zeros(len(situation.joints), dtype=torch.float64)
     held[keep] = 1.0
     place = situation.mechanism.frame(analysis.measured)[0]
+    # The analysis' own residual is about the machine with the effects.
+    residual = pose_residual(situation, analysis.measured)
     arrays = {
         "place": torch.nan_to_num(place),
         "joints": situation.joints,
-        "residual": analysis.residual,
-        "remainder": _remainder(analysis, found.members, seed),
+        "residual": residual,
+        "remainder": _remainder(analysis, residual, found.members, seed),
         "noise": _spread(analysis, (analysis.whitening.sigma * analysis.floor**0.5)[None])[0],
         "held_out": held,
         "set_aside": 1 - held,
@@ -56,22 +61,16 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
     columns = _drivers(analysis, place)
     shown = set(diagnosis.verdict["effects"]) | {diagnosis.verdict["driver"]}
     # What the whole set leaves, catch-all and all: the signature of one cause is drawn with all others taken off.
-    left = _remainder(analysis, found.members, seed, catch_alls=True)
+    left = _remainder(analysis, residual, found.members, seed, catch_alls=True)
     for i, part in zip(found.members, parts, strict=True):
         name = analysis.library.atoms[i].name
         if name not in shown or not bool((part[keep] != 0).any()):
             continue
-        effect = analysis.library.atoms[i].effect
-        drivers = columns
-        if effect is not None and effect.kind == "joints":
-            joint, fit, rest = _in_joints(analysis, part, left)
-            y_axis = {"name": f"deviation of {joint.name}", "unit": joint.unit}
-            drivers = [*columns, *_torques(analysis, joint)]
-        else:
-            direction, unit = _direction(part[keep])
-            fit, rest = part @ direction, left @ direction
-            y_axis = {"name": _direction_words(direction), "unit": unit}
-        x_name, x_unit, x = _telling(drivers, fit, keep, name)
+        # In the pose and in the joints; what follows one column best shows the cause best.
+        views = [_along(part, left, keep, columns), _in_joints(analysis, part, left, columns)]
+        told = [_telling(view, keep, name) for view in views]
+        view, (_, (x_name, x_unit, x)) = max(zip(views, told, strict=True), key=lambda pair: pair[1][0])
+        fit, rest, y_axis = view.fit, view.rest, {"name": view.axis.name, "unit": view.axis.unit}
         arrays |= {f"signature.{name}.x": x, f"signature.{name}.y": fit + rest, f"signature.{name}.fit": fit}
         labels[name] = {"x": {"name": x_name, "unit": x_unit}, "y": y_axis}
     return {name: value.to(torch.float64) for name, value in arrays.items()}, labels
@@ -84,32 +83,53 @@ def _spread(analysis: Analysis, values: Tensor) -> Tensor:
     return out
 
 
-def _remainder(analysis: Analysis, members: tuple[int, ...], seed: int, *, catch_alls: bool = False) -> Tensor:
+def _remainder(
+    analysis: Analysis, residual: Tensor, members: tuple[int, ...], seed: int, *, catch_alls: bool = False
+) -> Tensor:
     """What a set's effects leave of each row by a fit to others, `s x c0`; the residual where a row is set aside."""
     atoms = analysis.library.atoms
     chosen = [i for i in members if catch_alls or not atoms[i].catch_all]
-    out = analysis.residual.clone()
+    out = residual.clone()
     keep = analysis.whitening.keep()
     out[keep] = _spread(analysis, held_out(analysis, [chosen], seed)[0].left)
     return out
 
 
-def _in_joints(analysis: Analysis, part: Tensor, left: Tensor) -> tuple[Coordinate, Tensor, Tensor]:
-    """What an effect does to the joint that it moves most, and what is left there, `s`; 0 where a row is set aside.
+class _View(NamedTuple):
+    """One way to look at an effect: its fitted part and what is left, `s` each, on an axis; and what may drive it."""
+
+    axis: Coordinate
+    fit: Tensor
+    rest: Tensor
+    drivers: list[Column]
+
+
+def _along(part: Tensor, left: Tensor, keep: Tensor, columns: list[Column]) -> _View:
+    """Along the direction in which the effect moves the pose most."""
+    direction, unit = _direction(part[keep])
+    return _View(Coordinate(_direction_words(direction), unit), part @ direction, left @ direction, columns)
+
+
+def _in_joints(analysis: Analysis, part: Tensor, left: Tensor, columns: list[Column]) -> _View:
+    """In the joint that the effect moves most; 0 where a row is set aside.
 
     A deviation of the joints looks the same everywhere in the workspace, what it does to the pose does not.
     """
     keep, channels, sigma = analysis.whitening.keep(), analysis.whitening.channels, analysis.whitening.sigma
     slope = analysis.situation.jacobian[keep][:, channels] / sigma[:, None]
     both = torch.stack([part, left], -1)[keep][:, channels] / sigma[:, None]
-    found = part.new_zeros(len(part), slope.shape[-1], 2).index_copy(0, keep, torch.linalg.lstsq(slope, both).solution)
+    # More joints than channels leave a choice, of which the smallest is taken.
+    found = torch.linalg.pinv(slope, rtol=1e-9) @ both
+    found = part.new_zeros(len(part), slope.shape[-1], 2).index_copy(0, keep, found)
     # Joints of several units are weighed by what a unit of each does to the pose.
     reach = slope.square().sum(1).mean(0).sqrt()
     joint = int((found[..., 0].square().mean(0).sqrt() * reach).argmax())
-    return analysis.situation.mechanism.joints[joint], found[:, joint, 0], found[:, joint, 1]
+    axis = analysis.situation.mechanism.joints[joint]
+    drivers = [*columns, *_torques(analysis, axis)]
+    return _View(Coordinate(f"deviation of {axis.name}", axis.unit), found[:, joint, 0], found[:, joint, 1], drivers)
 
 
-def _torques(analysis: Analysis, joint: Coordinate) -> list[tuple[str, str, Tensor]]:
+def _torques(analysis: Analysis, joint: Coordinate) -> list[Column]:
     """What load and weight ask of a joint, as further things that may give an effect on it away."""
     situation = analysis.situation
     i = [c.name for c in situation.mechanism.joints].index(joint.name)
@@ -142,7 +162,7 @@ def _direction_words(direction: Tensor) -> str:
     return f"{kind} along ({', '.join(f'{float(v):.2f}' for v in values)})"
 
 
-def _drivers(analysis: Analysis, place: Tensor) -> list[tuple[str, str, Tensor]]:
+def _drivers(analysis: Analysis, place: Tensor) -> list[Column]:
     """What may give an effect away: covariates, joints, place; name, unit and values of each."""
     situation = analysis.situation
     found = [(name, _unit(name), value) for name, value in situation.covariates.items()]
@@ -156,12 +176,14 @@ def _unit(name: str) -> str:
     return _UNITS.get(name, "1")
 
 
-def _telling(columns: list[tuple[str, str, Tensor]], fit: Tensor, keep: Tensor, cause: str) -> tuple[str, str, Tensor]:
-    """The column that a cause follows: the one that its name says, else whose bins hold most of its variance."""
+def _telling(view: _View, keep: Tensor, cause: str) -> tuple[float, Column]:
+    """The column that a cause follows, and how well: the one that its name says, else the one that it follows best."""
     kind, _, which = cause.partition(" ")
     wanted = {"joint": which, "load": f"load_{which}", "direction": f"direction{which}"}.get(kind, _COLUMN.get(cause))
-    named = [c for c in columns if c[0] == wanted]
-    return named[0] if named else max(columns, key=lambda c: _share(c[2][keep], fit[keep]))
+    named = [c for c in view.drivers if c[0] == wanted] or view.drivers
+    shares = [_share(c[2][keep], view.fit[keep]) for c in named]
+    best = max(range(len(named)), key=lambda i: shares[i])
+    return shares[best], named[best]
 
 
 def _share(x: Tensor, fit: Tensor) -> float:
