@@ -28,7 +28,7 @@ def quantity_text(value: float, unit: str, digits: int = 4) -> str:
         return f"{value - _KELVIN:.1f} °C"
     scale, shown = display_unit(unit, abs(value) or 1.0) if unit == "m" else (1.0, unit)
     number = value / scale
-    text = f"{number:.0f}" if abs(number) >= 10**digits else f"{number:.{digits}g}"
+    text: str = f"{number:.0f}" if abs(number) >= 10**digits else f"{number:.{digits}g}"
     return f"{text} {shown}".removesuffix(" 1")
 
 
