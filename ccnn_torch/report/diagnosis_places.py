@@ -28,7 +28,7 @@ def quantity_text(value: float, unit: str, digits: int = 4) -> str:
         return f"{value - _KELVIN:.1f} °C"
     scale, shown = display_unit(unit, abs(value) or 1.0) if unit == "m" else (1.0, unit)
     number = value / scale
-    text: str = f"{number:.0f}" if abs(number) >= 10**digits else f"{number:.{digits}g}"
+    text = f"{number:.0f}" if abs(number) >= 10**digits else f"{number:.{digits}g}"
     return f"{text} {shown}".removesuffix(" 1")
 
 
@@ -46,7 +46,7 @@ def shares(results: Block, about: About) -> Iterator[tuple[str, str, float, list
 
 
 def _share_note(results: Block) -> str:
-    return _SHARE + " There is no gap above the noise: these are shares of the noise." * results["verdict"]["none"]
+    return _SHARE + " There is no gap above the noise: these are shares of the noise." * bool(results["verdict"]["none"])
 
 
 def _regime(name: str, regime: Block, unit: str) -> str:
