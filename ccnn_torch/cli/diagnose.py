@@ -26,7 +26,7 @@ def diagnose(
 ) -> None:
     """Name the physical effect that makes the gap between a model and measurements, and how far the gap shrinks.
 
-    The folder gets diagnosis.json. Keys: records, mechanism, out, mechanism_keys, covariates, noise, effects, gravity,
+    The folder gets diagnosis.json and report.html. Keys: records, mechanism, out, mechanism_keys, covariates, noise, effects, gravity,
     seed.
 
     Examples:
@@ -37,19 +37,17 @@ def diagnose(
 
     ccnn diagnose --records measured.csv --mechanism stewart --out runs/s --effects backlash,friction,my_effect.py:Mine
     """
-    from ccnn_torch.report.table_form import print_table
-    from ccnn_torch.runs.diagnose import diagnosis_table, run_diagnosis, write_diagnosis
+    from ccnn_torch.report.diagnosis_report import print_diagnosis
+    from ccnn_torch.runs.diagnose import run_diagnosis, write_diagnosis
     from ccnn_torch.runs.screen import stdout
 
     wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)
     if wanted.out is None:
         raise InputError("name the folder to write with --out DIR")
     found = run_diagnosis(wanted)
-    path = write_diagnosis(Path(wanted.out), found)
+    about = {"name": Path(wanted.out).name, "mechanism": str(wanted.mechanism), "records": str(wanted.records)}
+    path = write_diagnosis(Path(wanted.out), found, about, wanted.seed)
     if quiet:
         return
-    print_table(diagnosis_table(found), stdout)
-    for note in found.notes:
-        typer.echo(f"Note: {note}.")
-    typer.echo(found.verdict["text"])
-    typer.echo(f"Written: {path}")
+    print_diagnosis(found.to_json(), stdout)
+    typer.echo(f"Written: {path} and report.html beside it")

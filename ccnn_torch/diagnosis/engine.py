@@ -13,8 +13,8 @@ from ccnn_torch.diagnosis._next import next_measurements
 from ccnn_torch.diagnosis._report import Blocks, blocks
 from ccnn_torch.diagnosis._verdict import judge
 from ccnn_torch.diagnosis._where import where
-from ccnn_torch.diagnosis._words import sentence
 from ccnn_torch.diagnosis.result import Diagnosis
+from ccnn_torch.diagnosis.words import verdict_text
 from ccnn_torch.effects import EFFECTS, Effect, Situation, make_effect, pose_residual
 from ccnn_torch.errors import InputError
 
@@ -80,10 +80,13 @@ def diagnose_rows(
         "none": nothing and not outlier,
         "outside_library": judgement.outside,
         "driver": judgement.driver,
-        "text": sentence(judgement, together, gap["unit"], len(aside) + int((~fine).sum()), outlier),
+        "text": "",
     }
-    notes = [f"{name} cannot be seen without {why}" for name, why in lacking.items()]
     lost = torch.nonzero(~fine).squeeze(-1).tolist()
+    set_aside = sorted([*lost, *(int(chosen[i]) for i in aside)])
+    told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict}
+    verdict["text"] = verdict_text(told | {"rows_set_aside": set_aside})
+    notes = [f"{name} cannot be seen without {why}" for name, why in lacking.items()]
     if len(chosen) < len(fine) - len(lost):
         notes.append(f"{len(chosen)} of {len(fine)} rows, drawn at random, were looked at")
     return Diagnosis(
@@ -93,7 +96,7 @@ def diagnose_rows(
         effects=listed,
         verdict=verdict,
         next_measurements=next_measurements(analysis, judgement, seed),
-        rows_set_aside=sorted([*lost, *(int(chosen[i]) for i in aside)]),
+        rows_set_aside=set_aside,
         notes=notes,
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,

@@ -46,9 +46,9 @@ def shares(results: Block, about: About) -> Iterator[tuple[str, str, float, list
 
 
 def _share_note(results: Block) -> str:
-    return _SHARE + " There is no gap above the noise: these are shares of the noise." * bool(
-        results["verdict"]["none"]
-    )
+    if results["verdict"]["none"]:
+        return _SHARE + " There is no gap above the noise: these are shares of the noise."
+    return _SHARE
 
 
 def _regime(name: str, regime: Block, unit: str) -> str:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of
 from ccnn_torch.diagnosis.check import Check, check_rows
+from ccnn_torch.diagnosis.pictures import picture_arrays
 from ccnn_torch.effects import Effect, make_effect
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import Records, load_records
-from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.diagnosis_report import write_diagnosis_report
+from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.table_form import Table
 from ccnn_torch.runs.diagnose_config import DiagnoseConfig
 
 __all__ = [
     "check_table",
     "check_text",
-    "diagnosis_table",
     "parse_noise",
     "run_check",
     "run_diagnosis",
@@ -60,8 +62,14 @@ def run_check(config: DiagnoseConfig) -> Check:
     return check_rows(situation, records.pose, noise_of(config.noise, situation), effects)
 
 
-def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
-    """Write `diagnosis.json`.
+def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str] | None = None, seed: int = 0) -> Path:
+    """Write `diagnosis.json`, the arrays behind its pictures, and the report.
+
+    Args:
+        folder: is made where it is not there.
+        diagnosis: what to write.
+        about: for the head of the report: `name`, `mechanism`, `records`.
+        seed: of the diagnosis.
 
     Raises:
         InputError: the folder cannot be written.
@@ -71,27 +79,12 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis) -> Path:
     except OSError as reason:
         raise InputError(f"{folder}: cannot be made: {reason.strerror}") from None
     path = folder / "diagnosis.json"
-    write_json(path, diagnosis.to_json())
+    results = plain(diagnosis.to_json())
+    write_json(path, results)
+    arrays, labels = picture_arrays(diagnosis, seed)
+    units = {c.name: c.unit for c in diagnosis.analysis.situation.mechanism.joints}
+    write_diagnosis_report(folder, results, arrays, labels | {"about": {**(about or {}), "units": units}})
     return path
-
-
-def diagnosis_table(diagnosis: Diagnosis, most: int = 8) -> Table:
-    """The most probable candidates."""
-    rows = []
-    for effect in diagnosis.effects[:most]:
-        interval = effect["shrink_ci95"]
-        shrink = ""
-        if interval is not None:
-            shrink = f"{100 * effect['shrink']:.0f} % [{100 * interval[0]:.0f}, {100 * interval[1]:.0f}]"
-        same = ", ".join(effect["indistinguishable_from"])
-        rows.append((effect["name"], f"{effect['probability']:.3f}", shrink, f"{effect['gap_after']:.3g}", same))
-    unit = diagnosis.gap["unit"]
-    return Table(
-        "Candidates",
-        ("effect", "probability", "shrink alone", f"gap after, {unit}", "not told from"),
-        tuple(rows),
-        "Gaps are root mean squares over rows that the fit has not seen; shrink is the share of the reducible gap.",
-    )
 
 
 def check_text(check: Check) -> list[str]:
