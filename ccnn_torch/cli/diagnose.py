@@ -26,8 +26,8 @@ def diagnose(
 ) -> None:
     """Name the physical effect that makes the gap between a model and measurements, and how far the gap shrinks.
 
-    The folder gets diagnosis.json and report.html. Keys: records, mechanism, out, mechanism_keys, covariates, noise, effects, gravity,
-    seed.
+    The folder gets diagnosis.json and report.html. Keys: records, mechanism, out, mechanism_keys, covariates, noise,
+    effects, gravity, seed.
 
     Examples:
 
@@ -37,6 +37,7 @@ def diagnose(
 
     ccnn diagnose --records measured.csv --mechanism stewart --out runs/s --effects backlash,friction,my_effect.py:Mine
     """
+    from ccnn_torch.report.diagnosis_data import about_of, load_labels
     from ccnn_torch.report.diagnosis_report import print_diagnosis
     from ccnn_torch.runs.diagnose import run_diagnosis, write_diagnosis
     from ccnn_torch.runs.screen import stdout
@@ -49,5 +50,5 @@ def diagnose(
     path = write_diagnosis(Path(wanted.out), found, about, wanted.seed)
     if quiet:
         return
-    print_diagnosis(found.to_json(), stdout)
+    print_diagnosis(found.to_json(), stdout, about_of(load_labels(path.parent)))
     typer.echo(f"Written: {path} and report.html beside it")
