@@ -23,6 +23,8 @@ __all__ = ["Analysis", "analyse"]
 LOG_PRIOR = math.log(0.1)
 # Rows are left out where the Jacobian is worse conditioned than this and than ten times the usual.
 _CONDITION = 50.0
+# Or where the joints move the platform so many times as far as usual.
+_GAIN = 3.0
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,8 @@ def _near_singular(situation: Situation, channels: Tensor) -> Tensor:
     values = torch.linalg.svdvals(jacobian)
     condition = values[:, 0] / values[:, -1].clamp_min(1e-300)
     far: Tensor = (condition > _CONDITION) & (condition > 10 * condition.median())
+    # First order does not hold where the joints move the platform much more, and a few such rows have the whole gap.
+    far = far | (values[:, 0] > _GAIN * values[:, 0].median())
     return far
 
 

@@ -48,6 +48,9 @@ def catch_alls(situation: Situation) -> list[Atom]:
         features = [one, d, 0.7 * d * place]
         if not driver.startswith("direction"):
             features.append(_BEND * _bumps(d, few))
+        if driver.startswith("load"):
+            # What a load asks of a joint goes with the slope of the kinematics, which is no plane over the workspace.
+            features.append(_BEND * d * _products(place))
         if driver == "temperature" and "time" in situation.covariates:
             features += [_lagged(value, situation.covariates["time"], k) for k in (0.05, 0.2)]
         found.append(_atom(situation, driver, torch.cat(features, -1)))
@@ -72,6 +75,12 @@ def _unit(values: Tensor) -> Tensor:
     """Each column brought to [-1, 1] over the rows."""
     low, high = values.amin(-2, keepdim=True), values.amax(-2, keepdim=True)
     return (2 * values - low - high) / (high - low).clamp_min(1e-300)
+
+
+def _products(place: Tensor) -> Tensor:
+    """Squares and products of the coordinates, `s x (p + 1) p / 2`."""
+    first, second = torch.triu_indices(place.shape[-1], place.shape[-1])
+    return place[:, first] * place[:, second]
 
 
 def _bumps(points: Tensor, count: int) -> Tensor:

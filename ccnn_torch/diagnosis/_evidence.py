@@ -18,6 +18,7 @@ __all__ = ["Fits", "Grams", "fit_sets", "grams_of"]
 # Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
 _SPREAD = 4.0
 _LIMIT = 25.0
+_DIGITS = 1e-13
 
 
 class Grams(NamedTuple):
@@ -92,7 +93,9 @@ def fit_sets(
     eye = torch.eye(columns.shape[1], dtype=g.dtype, device=g.device)
     for k in range(iterations + 1):
         scale = (member @ (psi / 2).exp()[..., None])[..., 0]
-        a = eye + scale[:, :, None] * g * scale[:, None, :] / noise[:, None, None]
+        a = scale[:, :, None] * g * scale[:, None, :] / noise[:, None, None]
+        # Columns that are nearly the same, under next to no noise, would leave no digit of the 1 on the diagonal.
+        a = a + (1 + _DIGITS * a.diagonal(dim1=-2, dim2=-1).amax(-1))[:, None, None] * eye if a.shape[-1] else a
         factor = torch.linalg.cholesky_ex(a).L
         c = scale * b / noise[:, None]
         u = torch.cholesky_solve(c[..., None], factor)[..., 0]

@@ -11,7 +11,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 from blind.stand_in import Said, StandIn
-from blind.test_machines import planned
+from blind.test_blind_machines import planned
 
 from ccnn_torch.cli import main
 from ccnn_torch.errors import InputError
