@@ -145,7 +145,7 @@ def _diagnose_all(
         began = time.perf_counter()
         answer: dict[str, Any]
         try:
-            records = load_records(folder.records(number), machines[name])
+            records = load_records(folder.records(number), machines[name], learns=False)
             effects = None if without is None else [make_effect(effect) for effect in without[number]]
             answer = dict(diagnose(records, machines[name], noise=case["noise"], effects=effects).to_json())
         except CcnnError as problem:
