@@ -33,11 +33,18 @@ _USABLE = 0.5
 def candidates(
     situation: Situation, effects: Sequence[Effect | str] | None = None
 ) -> tuple[list[Effect], dict[str, str]]:
-    """Effects that these records could show, and for the others what is missing."""
+    """Effects that these records could show, and for the others what is missing.
+
+    Raises:
+        InputError: the records can show none of them.
+    """
     named = list(EFFECTS) if effects is None else effects
     every = [make_effect(e) if isinstance(e, str) else e for e in named]
     names = [*situation.covariates]
     lacking = {e.name: e.missing(situation.mechanism, names) for e in every}
+    if every and all(lacking.values()):
+        need = "; ".join(f"{name} needs {why}" for name, why in lacking.items())
+        raise InputError(f"effects: these records can show none of the candidates: {need}")
     return [e for e in every if not lacking[e.name]], {n: why for n, why in lacking.items() if why}
 
 

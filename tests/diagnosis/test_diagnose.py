@@ -122,3 +122,11 @@ def test_the_check_tells_noise_and_what_looks_alike() -> None:
     assert ("joint_offset", "geometry") in pairs and ("joint_gain", "geometry") in pairs
     assert ("backlash", "geometry") not in pairs
     assert "tool" in found.missing
+
+
+def test_candidates_that_the_records_cannot_show_are_refused() -> None:
+    situation = rows_of("five_bar", 60, 3)
+    pose = measured(situation, {}, 4)
+    blind = replace(situation, covariates={})
+    with pytest.raises(InputError, match=r"none of the candidates: compliance needs a column of the load .*load_x"):
+        diagnose_rows(blind, pose, effects=["compliance"])

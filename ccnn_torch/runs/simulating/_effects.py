@@ -132,9 +132,9 @@ def _values(wanted: Wanted, effect: Effect, units: dict[str, str]) -> dict[str, 
         name = names.get(_plain(written))
         if name is None:
             near = nearest(_plain(written), list(names))
-            hint = f"did you mean '{near}'? " if near else ""
+            hint = f"did you mean '{near}'? It has" if near else "it has"
             raise InputError(
-                f"--effect {wanted.name}: it has no parameter '{written}'; {hint}It has {', '.join(names)} "
+                f"--effect {wanted.name}: it has no parameter '{written}'; {hint} {', '.join(names)} "
                 f"({SIZE} = a factor on what is drawn)"
             )
         match = _VALUE.fullmatch(text)
