@@ -125,7 +125,7 @@ def test_an_own_effect_takes_part(cli: Cli, tmp_path: Path) -> None:
     [
         ("backlsh", "did you mean 'backlash'?"),
         ("outliers", "did you mean 'outlier'?"),
-        ("backlash:q3=1e-4", "it has no parameter 'q3'; It has q1, q1_soft_edge, q1_held"),
+        ("backlash:q3=1e-4", "it has no parameter 'q3'; it has q1, q1_soft_edge, q1_held"),
         ("backlash:q1_soft_edg=1", "did you mean 'q1_soft_edge'?"),
         ("backlash:q1", "write NAME or NAME:parameter=value"),
         ("backlash:q1=much", "q1=much is no number"),
