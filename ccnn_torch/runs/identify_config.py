@@ -76,9 +76,9 @@ class ConstraintConfig(Section):
         description="columns whose values number the placement, anchor or plane; default placement, anchor or plane",
     )
     tolerance: Size | dict[str, Size] = Field(
-        default=0.01,
-        description="prior standard deviation of the links' parameters, in m and rad alike, or by name, pattern or "
-        "unit, e.g. {m: 1 mm, rad: 0.1 deg}",
+        default={"m": 1e-3, "rad": 1e-2},
+        description="prior standard deviation of the links' parameters, by name, pattern or unit, e.g. {m: 1 mm, "
+        "rad: 0.1 deg}, or one number in m and rad alike",
     )
     plate_tolerance: Size | None = Field(
         default=None,
