@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from evolution.test_waves import QUICK, noise_like, uniform_rows
 
 from ccnn_torch.evolution.harmonics import fit_harmonics, harmonic_count
 from ccnn_torch.learners import TrainingData
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
-from tests.evolution.test_waves import QUICK, noise_like, uniform_rows
 
 ROWS = 400
 
