@@ -55,8 +55,9 @@ class CCNNSettings:
             since gears and screws repeat their errors; 0 = none (paper: none). They need refinement.
         wave_searches: how often to look for them, each time followed by a refinement.
         harmonics: harmonics of each turning joint in its own deviation, fitted before anything else (one for every
-            eight rows at most), since gears repeat their errors; 0 = none (paper: none). They need refinement. Inside
-            a UR10's training rows 75 or 100 did better than 30 or 50.
+            eight rows at most, and none with fewer than 50 rows a turning joint), since gears repeat their errors;
+            0 = none (paper: none). They need refinement. Inside a UR10's training rows 75 or 100 did better than 30
+            or 50.
         refinement_iterations: Levenberg-Marquardt iterations of one refinement; 0 = none, as in the paper.
 
     Raises:

@@ -243,7 +243,8 @@ class CCNN:
 
 def _gears(data: TrainingData, settings: CCNNSettings) -> Harmonics | None:
     """Harmonics of the turning joints, where there are such joints, and rows enough."""
-    count = harmonic_count(settings.harmonics, int((data.weights > 0).sum(-1).min()))
+    rows = int((data.weights > 0).sum(-1).min())
+    count = harmonic_count(settings.harmonics, rows, len(data.angle_outputs))
     if data.angle_step is None or not data.angle_outputs or not settings.refinement_iterations or count == 0:
         return None
     first = data.inputs.shape[-1] - data.angles

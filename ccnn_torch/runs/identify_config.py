@@ -39,6 +39,7 @@ PER_LEG = "_per_leg"
 
 Size = float | str
 """A number in SI, or a text of number and unit, such as `0.4 mm` or `0.03 deg`."""
+_LINK_TOLERANCE: dict[str, Size] = {"m": 1e-3, "rad": 1e-2}
 
 
 class ParameterConfig(Section):
@@ -76,7 +77,7 @@ class ConstraintConfig(Section):
         description="columns whose values number the placement, anchor or plane; default placement, anchor or plane",
     )
     tolerance: Size | dict[str, Size] = Field(
-        default={"m": 1e-3, "rad": 1e-2},
+        default=_LINK_TOLERANCE,
         description="prior standard deviation of the links' parameters, by name, pattern or unit, e.g. {m: 1 mm, "
         "rad: 0.1 deg}, or one number in m and rad alike",
     )

@@ -79,7 +79,8 @@ def test_errors_are_judged_in_the_channels_of_the_metric() -> None:
 
 
 def test_few_rows_get_few_harmonics() -> None:
-    assert harmonic_count(96, 2000) == 96 and harmonic_count(96, 200) == 25 and harmonic_count(96, 7) == 0
+    assert harmonic_count(96, 2000, 6) == 96 and harmonic_count(96, 400, 6) == 50
+    assert harmonic_count(96, 299, 6) == 0 and harmonic_count(96, 299, 2) == 37
 
 
 def test_the_network_learns_what_they_leave_and_takes_them_along() -> None:
