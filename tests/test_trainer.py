@@ -83,11 +83,16 @@ class Writer:
 
 
 def test_an_interrupt_waits_until_a_step_is_written() -> None:
+    # Where the tests were started in a shell's background, the signal is ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     writer = Writer()
-    with pytest.raises(KeyboardInterrupt):
-        train(Descent(), linear_data(), callbacks=[writer])
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            train(Descent(), linear_data(), callbacks=[writer])
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert writer.written == ["start", "begin 1", "end 1", "begin 2", "end 2", "closed"]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_the_first_checkpoint_is_written_before_the_first_step(tmp_path: Path) -> None:
