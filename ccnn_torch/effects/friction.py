@@ -18,7 +18,8 @@ __all__ = ["Friction"]
 
 # A joint's friction is some tenths of what it carries, its constant part like that of a tenth of the platform's weight.
 _SHARE = 0.3
-_CONSTANT = {"m": 3e-5, "rad": 5e-5}
+# Small: what does not depend on the load is play, and takes its name unless the rest of friction is there.
+_CONSTANT = {"m": 6e-6, "rad": 1e-5}
 
 
 class Friction:

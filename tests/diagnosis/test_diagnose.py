@@ -22,6 +22,8 @@ from ccnn_torch.report.json_files import load_schema, plain
         ("five_bar", ["transmission"]),
         ("five_bar", ["compliance", "joint_offset"]),
         ("tripod", ["geometry"]),
+        ("tripod", ["backlash"]),
+        ("delta", ["compliance", "backlash"]),
         ("tripod", ["thermal", "friction"]),
         ("delta", ["compliance"]),
     ],
