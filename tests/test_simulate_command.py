@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from ccnn_torch.cli import main
 from ccnn_torch.effects import EFFECTS, Situation, default_gravity, make_effect, pose_residual, signature
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
@@ -21,20 +19,6 @@ from ccnn_torch.runs.simulating import simulate_records
 Cli = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parent.parent
 ARM = Path(__file__).parent / "effects" / "arm.yaml"
-
-
-@pytest.fixture
-def cli(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
-    """Run `ccnn WORDS…` in this process; returns exit code, stdout and stderr."""
-
-    def call(*words: str | Path) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["ccnn", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        captured = capsys.readouterr()
-        return int(ended.value.code or 0), captured.out, captured.err
-
-    return call
 
 
 def words(mechanism: str | Path, *more: str | Path | int) -> tuple[str | Path, ...]:

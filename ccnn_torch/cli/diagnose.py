@@ -40,12 +40,17 @@ def diagnose(
     from ccnn_torch.report.diagnosis_data import about_of, load_labels
     from ccnn_torch.report.diagnosis_report import print_diagnosis
     from ccnn_torch.runs.diagnose import run_diagnosis, write_diagnosis
-    from ccnn_torch.runs.screen import stdout
+    from ccnn_torch.runs.screen import stderr, stdout
 
     wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)
     if wanted.out is None:
         raise InputError("name the folder to write with --out DIR")
-    found = run_diagnosis(wanted)
+    if stderr.is_terminal and not quiet:
+        # Thousands of rows of an arm take half a minute; how much is left nobody knows beforehand.
+        with stderr.status("looking for the effects that make the gap …"):
+            found = run_diagnosis(wanted)
+    else:
+        found = run_diagnosis(wanted)
     about = {"name": Path(wanted.out).name, "mechanism": str(wanted.mechanism), "records": str(wanted.records)}
     path = write_diagnosis(Path(wanted.out), found, about, wanted.seed)
     if quiet:

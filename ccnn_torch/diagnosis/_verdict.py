@@ -24,8 +24,6 @@ _VETO_NOISE = 25.0
 _SMALL, _UNSURE = 0.1, 0.85
 # Odds up to which one name for another is not told apart by the data.
 _ODDS = math.log(20.0)
-# What is claimed grows slower than what the evidence says: its models are not the truth.
-_TEMPER = 1.0
 # Log odds against the most probable set beyond which nobody looks.
 _FAR = 12.0
 
@@ -65,7 +63,7 @@ def judge(analysis: Analysis) -> Judgement:
             essential = _essential(analysis, found, tried)
             groups.setdefault(_named(analysis, essential), []).extend([found, essential])
             tried[essential.members] = essential
-    weights = {key: math.exp(_TEMPER * (max(f.log_posterior for f in fs) - top)) for key, fs in groups.items()}
+    weights = {key: math.exp(max(f.log_posterior for f in fs) - top) for key, fs in groups.items()}
     total = sum(weights.values())
     leading = sorted(((k[0], k[1], w / total, _plainest(groups[k])) for k, w in weights.items()), key=lambda x: -x[2])
     names, driver, probability, found = leading[0]

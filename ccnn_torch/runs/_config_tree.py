@@ -13,7 +13,7 @@ from ccnn_torch.runs._keys import explain
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
 from ccnn_torch.runs._yaml import read_yaml
 
-__all__ = ["Names", "Section", "config_from_file", "config_from_keys", "validated"]
+__all__ = ["Names", "Section", "config_from_file", "config_from_keys", "config_from_options", "validated"]
 
 Config = TypeVar("Config", bound=BaseModel)
 
@@ -44,6 +44,20 @@ def config_from_file(model: type[Config], path: str | Path, overrides: Iterable[
     resolve_paths(tree, path.absolute().parent)
     given = apply_overrides(tree, overrides, Path.cwd())
     return validated(model, tree, str(path), given)
+
+
+def config_from_options(model: type[Config], path: Path | None, overrides: Iterable[str]) -> Config:
+    """As `config_from_file` for commands that need no file: defaults where there is none, and for empty keys.
+
+    Raises:
+        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
+    """
+    tree = {} if path is None else read_yaml(path)
+    if path is not None:
+        resolve_paths(tree, path.absolute().parent)
+    given = apply_overrides(tree, overrides, Path.cwd())
+    filled = {key: value for key, value in tree.items() if value is not None}
+    return validated(model, filled, str(path or "config"), given)
 
 
 def config_from_keys(model: type[Config], keys: Mapping[str, Any]) -> Config:

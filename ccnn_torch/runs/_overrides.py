@@ -15,7 +15,7 @@ __all__ = ["apply_overrides", "resolve_paths"]
 # Keys whose value is text however it looks: a path may hold a colon, a name may be 2024.
 _TEXT = ("name", "out", "records", "transfer", "mechanism")
 
-_METHODS = ("methods", "auto.methods")
+_PLUGINS = ("methods", "auto.methods", "effects")
 
 
 def apply_overrides(tree: dict[str, Any], overrides: Iterable[str], folder: Path) -> dict[str, str]:
@@ -57,7 +57,7 @@ def resolve_paths(tree: dict[str, Any], folder: Path) -> None:
 def _resolve(key: str, value: Any, folder: Path) -> Any:
     if key == "auto" and isinstance(value, dict):
         return {name: _resolve(f"auto.{name}", entry, folder) for name, entry in value.items()}
-    if key in _METHODS and isinstance(value, list):
+    if key in _PLUGINS and isinstance(value, list):
         return [_resolve(key, entry, folder) for entry in value]
     if not isinstance(value, str) or not _is_path(key, value):
         return value
@@ -69,4 +69,4 @@ def _is_path(key: str, value: str) -> bool:
         return value != ""
     if key == "mechanism":
         return ".py:" in value or Path(value).suffix.lower() in (".yaml", ".yml", ".urdf")
-    return key in _METHODS and ".py:" in value
+    return key in _PLUGINS and ".py:" in value

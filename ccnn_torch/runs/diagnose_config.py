@@ -6,28 +6,19 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import Field
 
-from ccnn_torch.errors import InputError
-from ccnn_torch.runs._keys import explain, list_keys
-from ccnn_torch.runs._overrides import apply_overrides
-from ccnn_torch.runs._yaml import read_yaml
+from ccnn_torch.runs._config_tree import Names, Section, config_from_options
+from ccnn_torch.runs._keys import list_keys
 
 __all__ = ["DiagnoseConfig", "describe_diagnose_keys", "load_diagnose_config"]
 
 
-def _listed(value: Any) -> Any:
-    return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
-
-
-Names = Annotated[list[str], BeforeValidator(_listed)]
 Positive = Annotated[float, Field(gt=0)]
 
 
-class DiagnoseConfig(BaseModel):
+class DiagnoseConfig(Section):
     """What `ccnn diagnose` and `ccnn check` may be told."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     records: str | None = Field(default=None, description="CSV of the records; the same as --records")
     mechanism: str | None = Field(default=None, description="the nominal machine; the same as --mechanism")
@@ -55,12 +46,7 @@ def load_diagnose_config(path: Path | None, overrides: Iterable[str] = ()) -> Di
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
-    tree = {} if path is None else read_yaml(path)
-    given = apply_overrides(tree, overrides, Path.cwd())
-    try:
-        return DiagnoseConfig.model_validate({key: value for key, value in tree.items() if value is not None})
-    except ValidationError as error:
-        raise InputError(explain(error, DiagnoseConfig, str(path or "config"), given)) from None
+    return config_from_options(DiagnoseConfig, path, overrides)
 
 
 def describe_diagnose_keys() -> list[tuple[str, str, str]]:

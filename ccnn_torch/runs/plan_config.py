@@ -8,10 +8,8 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from ccnn_torch.runs._config_tree import Names, Section, validated
+from ccnn_torch.runs._config_tree import Names, Section, config_from_options
 from ccnn_torch.runs._keys import list_keys
-from ccnn_torch.runs._overrides import apply_overrides
-from ccnn_torch.runs._yaml import read_yaml
 
 __all__ = ["PlanConfig", "describe_plan_keys", "load_plan_config"]
 
@@ -82,10 +80,7 @@ def load_plan_config(path: Path | None, overrides: Iterable[str] = ()) -> PlanCo
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
-    tree = {} if path is None else read_yaml(path)
-    given = apply_overrides(tree, overrides, Path.cwd())
-    filled = {key: value for key, value in tree.items() if value is not None}
-    return validated(PlanConfig, filled, str(path or "config"), given)
+    return config_from_options(PlanConfig, path, overrides)
 
 
 def describe_plan_keys() -> list[tuple[str, str, str]]:

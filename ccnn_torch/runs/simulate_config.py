@@ -6,23 +6,19 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from ccnn_torch.effects.covariates import SHIFT
-from ccnn_torch.errors import InputError
-from ccnn_torch.runs._keys import explain, list_keys
-from ccnn_torch.runs._overrides import apply_overrides
-from ccnn_torch.runs._yaml import read_yaml
+from ccnn_torch.runs._config_tree import Section, config_from_options
+from ccnn_torch.runs._keys import list_keys
 
 __all__ = ["SimulateConfig", "describe_simulate_keys", "load_simulate_config"]
 
 Positive = Annotated[float, Field(gt=0)]
 
 
-class SimulateConfig(BaseModel):
+class SimulateConfig(Section):
     """What `ccnn simulate` may be told."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
     covariates: list[str] | None = Field(
@@ -57,12 +53,7 @@ def load_simulate_config(path: Path | None, overrides: Iterable[str] = ()) -> Si
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
-    tree = {} if path is None else read_yaml(path)
-    given = apply_overrides(tree, overrides, Path.cwd())
-    try:
-        return SimulateConfig.model_validate({key: value for key, value in tree.items() if value is not None})
-    except ValidationError as error:
-        raise InputError(explain(error, SimulateConfig, str(path or "config"), given)) from None
+    return config_from_options(SimulateConfig, path, overrides)
 
 
 def describe_simulate_keys() -> list[tuple[str, str, str]]:

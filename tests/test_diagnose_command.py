@@ -1,0 +1,64 @@
+"""`ccnn diagnose` and `ccnn check`: what they write and say, and one sentence for everything that is wrong."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from ccnn_torch.report.json_files import load_schema
+
+Cli = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def rows(cli: Cli, tmp_path: Path) -> Path:
+    """Records of a five-bar with play, beside a config that names them by a relative path."""
+    words = ("--mechanism", "five_bar", "--effect", "backlash", "--rows", "80", "--noise", "1e-5", "--seed", "3")
+    code, _, told = cli("simulate", *words, "--out", tmp_path / "rows.csv", "--quiet")
+    assert code == 0, told
+    (tmp_path / "config.yaml").write_text("records: rows.csv\nmechanism: five_bar\nnoise: 1e-5\n", encoding="utf-8")
+    return tmp_path / "rows.csv"
+
+
+def test_a_config_beside_its_records_gives_verdict_and_report(
+    cli: Cli, rows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    code, shown, told = cli("diagnose", "--config", rows.parent / "config.yaml", "--out", "found")
+    assert code == 0 and told == ""
+    results = json.loads(Path("found/diagnosis.json").read_text(encoding="utf-8"))
+    jsonschema.validate(results, load_schema("diagnosis"))
+    assert results["verdict"]["effects"] == ["backlash"]
+    assert "acklash" in shown and " SI " not in shown
+    for name in ("report.html", "diagnosis.md", "diagnosis.safetensors", "next_measurements.csv"):
+        assert Path("found", name).is_file(), name
+
+
+def test_check_says_what_rows_can_show_without_a_verdict(cli: Cli, rows: Path) -> None:
+    code, shown, _ = cli("check", "--records", rows, "--mechanism", "five_bar")
+    assert code == 0
+    assert "80 rows" in shown and "tool cannot be seen without" in shown
+    assert list(rows.parent.glob("*.json")) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "name the folder to write with --out DIR"),
+        (["--out", "x", "--effects", "backlsh"], "did you mean 'backlash'?"),
+        (["--out", "x", "--effects", "tool"], "can show none of the candidates: tool needs"),
+        (["--out", "x", "--noise", "abc"], "'abc' is neither a number nor NAME=S"),
+        (["--out", "x", "--noise", "z=1e-5"], "there is no pose coordinate z"),
+    ],
+)
+def test_what_is_wrong_is_one_sentence(
+    cli: Cli, rows: Path, words: list[str], sentence: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(rows.parent)
+    code, _, told = cli("diagnose", "--records", rows, "--mechanism", "five_bar", *words)
+    assert code == 2 and sentence in told and len(told.strip().splitlines()) == 1
