@@ -75,7 +75,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         noise: standard deviation of each pose channel, `c0` [m, rad], or None.
     """
     residual = pose_residual(situation, measured)
-    channels = moving_channels(torch.nan_to_num(residual), torch.nan_to_num(situation.jacobian))
+    channels = moving_channels(situation)
     near = _near_singular(situation, channels)
     usable = torch.isfinite(residual).all(-1) & torch.isfinite(situation.jacobian).flatten(1).all(-1) & ~near
     residual = torch.where(usable[:, None], residual, 0.0)
@@ -94,10 +94,8 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     ]
     effects = [e for e, s in zip(effects, size, strict=True) if s > 1e-9]
     atoms = [a for a, s in zip(atoms, size, strict=True) if s > 1e-9]
-    everything = torch.cat(
-        [fitted, *(a.columns for a in (*atoms, *(a for a in rest if not a.name.startswith("joint"))))], -1
-    )
-    white = fitted_whitening(residual, everything, channels, noise, usable)
+    everything = [a.columns for a in (*atoms, *rest) if not (a.catch_all and a.name.startswith("joint"))]
+    white = fitted_whitening(residual, [fitted, *everything], channels, noise, usable)
 
     rich = white.sigma
     # Shapes by themselves and with the rest of the library beside them: two ways to start, both stay candidates.

@@ -1,7 +1,8 @@
 """Catch-alls: what no effect of the library describes, one candidate for each driver it may follow.
 
 A catch-all lets the joints deviate by a smooth function of its driver, alone and times the pose: physical causes act
-through the joints, and the Jacobian then carries most of the dependence on the pose.
+through the joints, and the Jacobian then carries most of the dependence on the pose. What follows time, temperature or
+a load may also move the platform as a whole, alike wherever it stands, and faster than a smooth function.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.effects import Situation
 
-__all__ = ["ANY", "catch_alls"]
+__all__ = ["ANY", "SPEED", "catch_alls"]
 
 # A catch-all is that much less probable than no deviation of its kind, before the data are seen.
 LOG_PRIOR = math.log(1e-3)
@@ -22,9 +23,13 @@ LOG_PRIOR = math.log(1e-3)
 _SCALE = {"m": 3e-4, "rad": 5e-4}
 ANY = "*"
 """Stands in a driver's name for all of its kind; a verdict names the one that explains most by itself."""
+SPEED = "speed"
+"""Begins the names of catch-alls that follow a joint's velocity: a verdict knows no such driver."""
 # What bends with a driver against what is proportional to it.
 _BEND = 0.5
-_MOST = 28
+_MOST, _MOST_PLACES = 28, 60
+_PLATFORM = {3: (3e-4, 3e-4, 3e-4), 6: (3e-4, 3e-4, 3e-4, 5e-4, 5e-4, 5e-4)}
+_WAVES = 18
 
 
 def catch_alls(situation: Situation) -> list[Atom]:
@@ -33,7 +38,8 @@ def catch_alls(situation: Situation) -> list[Atom]:
     place = _unit(situation.pose)
     one = torch.ones_like(place[:, :1])
     few = max(4, min(8, rows // 12))
-    found = [_atom(situation, "workspace", torch.cat([one, place, _bumps(place, min(24, max(6, rows // 8)))], -1))]
+    around = torch.cat([one, place, _bumps(place, min(24, max(6, rows // 8)))], -1)
+    found = [_atom(situation, "workspace", around, most=min(_MOST_PLACES, max(_MOST, rows // 4)))]
     for i, joint in enumerate(mechanism.joints):
         q = _unit(situation.joints[..., i : i + 1])
         found.append(_atom(situation, f"joint {joint.name}", torch.cat([one, q, _BEND * _bumps(q, few)], -1)))
@@ -46,8 +52,13 @@ def catch_alls(situation: Situation) -> list[Atom]:
             continue
         d = _unit(value.unsqueeze(-1))
         features = [one, d, 0.7 * d * place]
-        if not driver.startswith("direction"):
+        if driver.startswith(SPEED):
+            pass
+        elif driver.startswith("direction"):
+            features.append(_BEND * d * _carried(situation, int(driver.split()[1]) - 1))
+        else:
             features.append(_BEND * _bumps(d, few))
+            found.append(_whole(situation, driver, _waves(d, max(4, min(_WAVES, rows // 6)))))
         if driver.startswith("load"):
             # What a load asks of a joint goes with the slope of the kinematics, which is no plane over the workspace.
             features.append(_BEND * d * _products(place))
@@ -68,6 +79,8 @@ def _driver(name: str) -> str | None:
         return f"load {name.removeprefix('load_')}"
     if name.startswith("direction"):
         return f"direction {name.removeprefix('direction')}"
+    if name.startswith(SPEED):
+        return f"{SPEED} {name.removeprefix(SPEED)}"
     return name if name in ("temperature", "time") else None
 
 
@@ -110,20 +123,44 @@ def _lagged(value: Tensor, time: Tensor, share: float) -> Tensor:
     return _unit(((weight @ value) / weight.sum(-1)).unsqueeze(-1))
 
 
-def _atom(situation: Situation, driver: str, features: Tensor, only: int | None = None) -> Atom:
+def _carried(situation: Situation, joint: int) -> Tensor:
+    """What load and weight ask of a joint, by size, `s x 2 or less`: what holds it where it came from."""
+    asked = torch.stack([t[:, joint].abs() for t in (situation.load_torque, situation.own_weight_torque)], -1)
+    return _unit(asked[:, (asked.amax(0) - asked.amin(0)) > 1e-9 * asked.amax().clamp_min(1e-300)])
+
+
+def _waves(values: Tensor, count: int) -> Tensor:
+    """Half waves over the range of values `s x 1` in [-1, 1], the faster the smaller, `s x count`."""
+    k = torch.arange(1, count + 1, dtype=values.dtype)
+    waves = torch.cos(0.5 * math.pi * k * (values + 1)) / k.sqrt()
+    return waves - waves.mean(-2, keepdim=True)
+
+
+def _whole(situation: Situation, driver: str, features: Tensor) -> Atom:
+    """features: `s x f`; columns = shifts and turns of the platform, alike in all poses, times the features."""
+    visible = situation.visible
+    sizes = torch.tensor(_PLATFORM[visible.shape[-1]], dtype=features.dtype)
+    columns = ((visible * sizes).unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
+    shown = columns.abs().amax((0, 1)) > 0
+    return Atom(driver, None, features.new_zeros(0), columns[..., shown], LOG_PRIOR)
+
+
+def _atom(
+    situation: Situation, driver: str, features: Tensor, only: int | None = None, most: int = _MOST
+) -> Atom:
     """features: `s x f`; columns = joints' Jacobian times the features, reduced to the directions that matter."""
     sizes = torch.tensor([_SCALE.get(j.unit, 5e-4) for j in situation.mechanism.joints], dtype=features.dtype)
     jacobian = situation.jacobian * sizes
     if only is not None:
         jacobian = jacobian[..., only : only + 1]
     columns = (jacobian.unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
-    return Atom(driver, None, features.new_zeros(0), _reduced(columns), LOG_PRIOR)
+    return Atom(driver, None, features.new_zeros(0), _reduced(columns, most), LOG_PRIOR)
 
 
-def _reduced(columns: Tensor) -> Tensor:
+def _reduced(columns: Tensor, most: int) -> Tensor:
     """The leading principal columns: with one prior scale for all, the rest is the least of what the prior allows."""
     weight = columns.square().mean((0, 2), keepdim=True).sqrt().clamp_min(1e-300)
     flat = (columns / weight).flatten(0, 1)
     _, vectors = torch.linalg.eigh(flat.mT @ flat)
-    reduced: Tensor = columns @ vectors[:, -_MOST:]
+    reduced: Tensor = columns @ vectors[:, -most:]
     return reduced

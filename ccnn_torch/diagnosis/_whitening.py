@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
+from ccnn_torch.diagnosis._evidence import Grams, fit_sets, grams_of
+from ccnn_torch.effects import Situation
 
 __all__ = ["Whitening", "fitted_whitening", "moving_channels", "reweighted"]
 
 # Degrees of freedom of the row weights (Student t), and beyond how many times its noise a row is set aside.
 _DEGREES = 4.0
+# The richest fit: at most so many candidates, the log evidence from which one is taken in, the spread of its log size.
+_RICH, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
 _GROSS = 6.0
 
 
@@ -44,23 +48,28 @@ class Whitening:
         return torch.nonzero(self.weight > 0).squeeze(-1)
 
 
-def moving_channels(residual: Tensor, jacobian: Tensor) -> Tensor:
-    """Channels in which the joints move the platform or something was measured, `c`."""
-    moved = jacobian.abs().amax((0, 2))
-    scale = moved.clone()
-    scale[:3] /= moved[:3].max().clamp_min(1e-300)
-    scale[3:] /= moved[3:].max().clamp_min(1e-300) if len(moved) > 3 else 1.0
-    return torch.nonzero((scale > 1e-6) | (residual.abs().amax(0) > 1e-12)).squeeze(-1)
+def moving_channels(situation: Situation) -> Tensor:
+    """As many channels as pose coordinates were measured, those that show most of them, `c`.
+
+    A machine that is measured in two angles turns a little about a third axis, too; what is seen there is no more
+    measurement, and has no noise of its own.
+    """
+    slope = torch.nan_to_num(situation.frame_slope).square().mean((0, 2))
+    units = [c.unit for c in situation.mechanism.pose]
+    kinds = [(slope[:3], units.count("m"), 0), (slope[3:], units.count("rad"), 3)]
+    chosen = [kind.argsort(descending=True, stable=True)[:count] + first for kind, count, first in kinds]
+    return torch.cat(chosen).sort().values
 
 
 def fitted_whitening(
-    residual: Tensor, columns: Tensor, channels: Tensor, noise: Tensor | None, usable: Tensor
+    residual: Tensor, columns: Sequence[Tensor], channels: Tensor, noise: Tensor | None, usable: Tensor
 ) -> Whitening:
-    """Noise and row weights from the richest fit: all columns with one common prior scale, reweighted four times.
+    """Noise and row weights from the richest fit: of everything that may be there, one by one what explains most of
+    what is left, as long as the evidence for it is more than slight.
 
     Args:
         residual: `s x c0` [m, rad].
-        columns: of everything that may be there, `s x c0 x P`.
+        columns: of everything that may be there, `s x c0 x P` each.
         channels: `c`.
         noise: known standard deviation of each of the c0 channels, or None.
         usable: `s`, False where a row is left out from the start.
@@ -68,20 +77,65 @@ def fitted_whitening(
     rms = residual[usable][:, channels].abs().median(0).values.clamp_min(1e-15) * 1.4826
     sigma = rms if noise is None else noise[channels]
     white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0)
-    unit = columns / (columns[usable][:, channels] / sigma[:, None]).square().mean((0, 1)).sqrt().clamp_min(1e-300)
-    everything = [[torch.arange(unit.shape[-1])]]
-    for _ in range(4):
+    shown = [c / _size(c[usable][:, channels] / sigma[:, None]) for c in columns if c.shape[-1]]
+    unit = torch.cat(shown, -1)
+    ends = torch.tensor([c.shape[-1] for c in shown]).cumsum(0).tolist()
+    groups = [torch.arange(e - c.shape[-1], e) for c, e in zip(shown, ends, strict=True)]
+    if noise is None:
+        white = replace(white, sigma=sigma * _noise_share(white(unit), white(residual), groups).sqrt())
+    chosen: list[Tensor] = []
+    left, free = residual, 1.0
+    for _ in range(_RICH):
         x, y = white(unit), white(residual)
-        fit = fit_sets(grams_of(x, y), everything, 0.0, spread=6.0)
-        left = residual - (unit @ fit.mean[0])
-        weight = white.weight > 0
-        free = 1 - float(fit.effective[0]) / max(float(weight.sum()) * len(channels), 1.0)
-        if noise is None:
-            spread = left[weight][:, channels].abs().median(0).values * 1.4826 / max(free, 0.1) ** 0.5
-            # No channel's noise is below a thousandth of what it shows: a perfect fit knows nothing of the noise.
-            white = replace(white, sigma=torch.maximum(spread, 1e-4 * rms))
-        white = reweighted(white, left, usable, free)
+        whole = grams_of(x, y)
+        if chosen:
+            fit = fit_sets(whole, [chosen], 0.0, spread=_ANY_SIZE)
+            index = fit.columns[0]
+            left = residual - unit[..., index] @ fit.mean[0]
+            free = max(1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), 0.1)
+            white = _settled(white, left, usable, free, None if noise is not None else 1e-4 * rms)
+            x, y = white(unit), white(residual)
+            whole = grams_of(x, y)
+        y = white(left)
+        rest = [g for g in groups if not any(g is c for c in chosen)]
+        alone = Grams(whole.xx, x.flatten(0, 1).mT @ y.flatten(), y.square().sum(), whole.values)
+        evidence = fit_sets(alone, [[], *([g] for g in rest)], 0.0, spread=_ANY_SIZE).log_evidence
+        best = int(evidence[1:].argmax())
+        if float(evidence[best + 1] - evidence[0]) < _SLIGHT:
+            break
+        chosen.append(rest[best])
+    white = _settled(white, left, usable, free, None if noise is not None else 1e-4 * rms)
     return replace(white, known=0.0 if noise is None else 50.0)
+
+
+def _noise_share(x: Tensor, y: Tensor, groups: Sequence[Tensor]) -> Tensor:
+    """Of the squares of each channel what the candidate that explains it best by itself leaves, `c`.
+
+    Channel by channel: one that is almost all gap would else be lost in the noise of the others.
+    """
+    share = []
+    for c in range(y.shape[-1]):
+        fits = fit_sets(grams_of(x[:, c : c + 1], y[:, c : c + 1]), [[], *([g] for g in groups)], 0.0, spread=_ANY_SIZE)
+        best = int(fits.log_evidence.argmax())
+        clear = float(fits.log_evidence[best] - fits.log_evidence[0]) > _SLIGHT
+        share.append(fits.noise[best] / fits.noise[0] if clear else torch.ones_like(fits.noise[0]))
+    return torch.stack(share).clamp(1e-6, 1.0)
+
+
+def _size(values: Tensor) -> Tensor:
+    return values.square().mean().sqrt().clamp_min(1e-300)
+
+
+def _settled(white: Whitening, left: Tensor, usable: Tensor, free: float, least: Tensor | None) -> Whitening:
+    """Noise (unless it is known: `least` None) and weights from what a fit leaves.
+
+    No channel's noise is below `least`: a perfect fit knows nothing of the noise.
+    """
+    if least is not None:
+        rows = white.weight > 0
+        spread = left[rows][:, white.channels].abs().median(0).values * 1.4826 / free**0.5
+        white = replace(white, sigma=torch.maximum(spread, least))
+    return reweighted(white, left, usable, free)
 
 
 def reweighted(white: Whitening, left: Tensor, usable: Tensor, free: float) -> Whitening:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis, analyse
+from ccnn_torch.diagnosis._catch_all import SPEED
 from ccnn_torch.diagnosis._next import next_measurements
 from ccnn_torch.diagnosis._report import Blocks, blocks
 from ccnn_torch.diagnosis._verdict import judge
@@ -86,7 +87,7 @@ def diagnose_rows(
         "shrink_ci95": None if together.interval is None else list(together.interval),
         "none": nothing and not outlier,
         "outside_library": judgement.outside,
-        "driver": judgement.driver,
+        "driver": None if (judgement.driver or "").startswith(SPEED) else judgement.driver,
         "text": "",
     }
     lost = torch.nonzero(~fine).squeeze(-1).tolist()

@@ -14,10 +14,12 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.mechanisms._pose import frame_jacobian
 from ccnn_torch.rotations import rotation_vector_to_matrix
 
-__all__ = ["PLATFORM_WEIGHT", "Situation", "default_gravity"]
+__all__ = ["PLATFORM_WEIGHT", "WEIGHTS", "Situation", "default_gravity"]
 
 PLATFORM_WEIGHT = 100.0
 """Weight of a platform of which nothing is known [N]."""
+WEIGHTS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
+"""Weights that a machine may have [N], for what asks of the joints together with a load that was recorded."""
 _STANDARD = 9.80665
 _SAMPLES = 128
 # What 1 N asks of a joint at least [N], [N·m], where gravity does not.
@@ -184,16 +186,19 @@ class Situation:
         size: Tensor = torch.linalg.vector_norm(self.gravity)
         return self.gravity / size.clamp_min(1e-300)
 
-    @cached_property
-    def push(self) -> Tensor:
+    def push(self, weight: Tensor) -> Tensor:
         """How hard weight and load push each joint along its coordinate, `... x s x n` [1].
 
-        In units of what a weight of `PLATFORM_WEIGHT` typically asks of the joint in the workspace; of a joint that
-        carries little of it, of a tenth of what the others carry.
+        In units of what `PLATFORM_WEIGHT` typically asks of the joints of the same unit in the workspace.
+
+        Args:
+            weight: of the machine, `...` [N].
         """
-        typical = self.samples.own_weight_torque.square().mean(0).sqrt()
-        typical = torch.maximum(typical, 0.1 * typical.amax()).clamp_min(_LEAST)
-        return self.own_weight_torque / typical + self.load_torque / (typical * PLATFORM_WEIGHT)
+        asked = self.samples.own_weight_torque.square().mean(0)
+        units = [j.unit for j in self.mechanism.joints]
+        alike = torch.tensor([[a == b for b in units] for a in units], dtype=asked.dtype)
+        typical = (alike @ asked / alike.sum(-1)).sqrt().clamp_min(_LEAST) * PLATFORM_WEIGHT
+        return (self.own_weight_torque * weight[..., None, None] + self.load_torque) / typical
 
     @cached_property
     def directed(self) -> list[int]:

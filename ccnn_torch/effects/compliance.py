@@ -23,9 +23,10 @@ _TYPICAL = {"m": 100.0, "rad": 30.0}
 
 
 class Compliance:
-    """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0, τ = what the load asks of the joint; and members that give, e_k.
+    """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0 + h_i τ_i³ / τ_0², τ = what the load asks of the joint; and members that
+    give, e_k.
 
-    τ_0 = 100 N or 30 N·m: d is the change of compliance there. Secondary as well, the members: a leg stretches in all
+    τ_0 = 100 N or 30 N·m: d and h are changes of compliance there. Secondary as well, the members: a leg stretches in all
     its lengths p in proportion to what the load asks of them, Δp = e (∂x/∂p) · load (virtual work); a link of an arm
     tilts at its joint under the part of the moment that the joint does not carry. All to first order about the nominal
     pose, so that the effect is one on the pose.
@@ -43,18 +44,18 @@ class Compliance:
         return "" if there else f"a column of the load on the platform: {along}"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """One a joint, then one a joint for what is not proportional, then the members."""
+        """One a joint, then two a joint for what is not proportional, then the members."""
         mechanism = situation.mechanism
         found = [
             Coefficient(
-                f"{j.name}{' stiffening' if secondary else ''}",
+                f"{j.name}{part}",
                 per_force(j.unit),
-                SCALE[j.unit] * (_SECONDARY if secondary else 1.0),
+                SCALE[j.unit] * (_SECONDARY if part else 1.0),
                 joint=j.name,
-                secondary=secondary,
-                positive=not secondary,
+                secondary=bool(part),
+                positive=not part,
             )
-            for secondary in (False, True)
+            for part in ("", " stiffening", " hardening")
             for j in mechanism.joints
         ]
         if isinstance(mechanism, SerialArm):
@@ -74,7 +75,8 @@ class Compliance:
         """`... x s x c x m`."""
         jacobian, torque = torch.nan_to_num(situation.jacobian), situation.load_torque
         typical = torch.tensor([_TYPICAL[j.unit] for j in situation.mechanism.joints], dtype=torch.float64)
-        parts = [jacobian * torque.unsqueeze(-2), jacobian * (torque * torque.abs() / typical).unsqueeze(-2)]
+        ratio = torque.abs() / typical
+        parts = [jacobian * (torque * ratio**k).unsqueeze(-2) for k in range(3)]
         arm = isinstance(situation.mechanism, SerialArm)
         return torch.cat([*parts, _tilting(situation) if arm else _stretching(situation)], -1)
 

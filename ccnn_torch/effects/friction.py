@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ccnn_torch.effects._columns import by_joint, per_force
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
-from ccnn_torch.effects._situation import PLATFORM_WEIGHT, Situation
+from ccnn_torch.effects._situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.effects.backlash import Backlash
 from ccnn_torch.effects.compliance import SCALE
 from ccnn_torch.mechanisms import Mechanism
@@ -27,7 +27,7 @@ class Friction:
 
     Coulomb's friction is in proportion to what presses the surfaces together; a drive of compliance C and friction
     coefficient μ stops C μ |τ| short. The weight is that of a platform of 100 N: of another one d is as much larger.
-    Secondary: load and weight together, |τ_load + τ_weight|, where they pull apart; and the part e that does not depend
+    Secondary: load and weight together, |τ_load + τ_weight|, where they pull apart, the weight a shape; and the part e that does not depend
     on them, which by itself is what play does.
     """
 
@@ -57,13 +57,17 @@ class Friction:
         return tuple(found)
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
+        """The machine's weight beside a load that was recorded."""
+        if not situation.loaded:
+            return ()
+        together = tuple(k for k, c in enumerate(self.coefficients(situation)) if c.name.endswith("together"))
+        return (Shape("weight", "N", WEIGHTS, together),)
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x m`, joint by joint."""
-        load, weight = situation.load_torque, situation.own_weight_torque * PLATFORM_WEIGHT
-        carried = [load.abs(), weight.abs(), (load + weight).abs()] if situation.loaded else [weight.abs()]
-        carried.append(torch.ones_like(situation.joints))
-        against = -situation.direction.unsqueeze(-1) * torch.stack(carried, -1)
-        return by_joint(against, situation.directed)
+        load, weight = situation.load_torque, situation.own_weight_torque
+        carried = [(weight * PLATFORM_WEIGHT).abs(), torch.ones_like(weight)]
+        if situation.loaded:
+            carried[:1] = [load.abs(), carried[0], (load + weight * shape[..., 0, None, None]).abs()]
+        columns = torch.stack(torch.broadcast_tensors(*carried), -1)  # type: ignore[no-untyped-call]
+        return by_joint(-situation.direction.unsqueeze(-1) * columns, situation.directed)

@@ -35,7 +35,8 @@ class Thermal:
     θ is the temperature less 20 degC, as a body of one heat capacity follows it with a lag: θ' = (T - θ) / lag, settled
     at the first row. Without a column of times there is no lag. Secondary: mounts that move a joint by γ_i θ; a
     reference that was not 20 degC (a constant growth); beams that bend by what the surroundings are ahead of the body,
-    T - θ, and a part of the growth that follows at once; and the drives' own warmth, which no thermometer in the hall
+    T - θ; parts of the growth that follow at once, or with a lag of their own (a core in its skin); and the drives' own
+    warmth, which no thermometer in the hall
     sees: growth of all and of the sliding drives by 1 - exp(-t / 2000 s).
 
     Lengths are parameters and drives are joints. Both move the measured frame, to first order by the mechanism's
@@ -73,6 +74,7 @@ class Thermal:
         if "time" in situation.covariates:
             own = _STEEL * _OWN_WARMTH
             found.append(Coefficient("at once", "1/K", uneven, secondary=True))
+            found.append(Coefficient("late", "1/K", uneven, secondary=True))
             found += [
                 Coefficient(f"{j.name} bend", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
                 for j in mechanism.joints
@@ -92,7 +94,12 @@ class Thermal:
         whole = max(float(elapsed(situation.covariates["time"]).max()), 1e-6)
         low, high = (math.log(share * whole) for share in _SHARES)
         lags = [math.exp(low + (high - low) * k / (_LAGS - 1)) for k in range(_LAGS)]
-        return (Shape("lag", "s", (0.0, *lags)),)
+        late = [c.name for c in self.coefficients(situation)].index("late")
+        every = range(len(self.coefficients(situation)))
+        return (
+            Shape("lag", "s", (0.0, *lags), tuple(k for k in every if k != late)),
+            Shape("late lag", "s", tuple(lags), (late,)),
+        )
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
@@ -112,7 +119,8 @@ class Thermal:
         others = [whole]
         if time is not None:
             ahead, own = warm - body, -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
-            others += [whole * warm[..., None, None], jacobian * ahead[..., None, None]]
+            core = lagged(time, warm, shape[..., 1])
+            others += [whole * warm[..., None, None], whole * core[..., None, None], jacobian * ahead[..., None, None]]
             others += [whole * own[..., None, None], travel * own[..., None, None]]
         return torch.cat([following, *(c.expand(*following.shape[:-1], c.shape[-1]) for c in others)], -1)
 

@@ -17,7 +17,11 @@ __all__ = ["Transmission"]
 
 _SCALE = {"m": 5e-5, "rad": 1e-4}
 # Waves: harmonics of the period, and how large they are likely to be.
-_HARMONICS = (("sin", 1.0), ("cos", 1.0), ("sin 2", 0.5), ("cos 2", 0.5))
+_HARMONICS = tuple(
+    (f"{wave}{'' if k == 1 else f' {k}'}", size)
+    for k, size in ((1, 1.0), (2, 0.5), (3, 0.05), (4, 0.05))
+    for wave in ("sin", "cos")
+)
 # Harmonics of a turn; those of a harmonic drive's ball cage and teeth lie near the hundredth.
 _MOST_PER_TURN = 130
 # Periods over the travel of a sliding joint; fewer than the first cannot be told from a bend.
@@ -27,7 +31,10 @@ _PERIOD_STEP = 1 / 3
 
 
 class Transmission:
-    """Δq_i = a_i sin(f_i q_i) + b_i cos(f_i q_i) and their second harmonic; f_i unknown."""
+    """Δq_i = a_i sin(f_i q_i) + b_i cos(f_i q_i) and their harmonics up to the fourth; f_i unknown.
+
+    The second may be as large as the first (a gear's two teeth in mesh), the third and the fourth are small.
+    """
 
     name = "transmission"
     kind: Kind = "joints"
@@ -39,7 +46,7 @@ class Transmission:
         return ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """Sine and cosine of a joint's period, then of half of it, joint by joint."""
+        """Sine and cosine of a joint's period, then of its harmonics, joint by joint."""
         return tuple(
             Coefficient(f"{j.name} {wave}", j.unit, _SCALE[j.unit] * size, joint=j.name, secondary=size < 1)
             for j in situation.mechanism.joints
@@ -61,9 +68,9 @@ class Transmission:
         )
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
-        """`... x s x n x 4n`."""
+        """`... x s x n x 8n`."""
         angle = situation.joints * shape.unsqueeze(-2)
-        waves = [torch.sin(angle), torch.cos(angle), torch.sin(2 * angle), torch.cos(2 * angle)]
+        waves = [wave(k * angle) for k in range(1, len(_HARMONICS) // 2 + 1) for wave in (torch.sin, torch.cos)]
         return by_joint(torch.stack(waves, -1))
 
 

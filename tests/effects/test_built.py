@@ -7,6 +7,8 @@ an effect leaves at its best bounds what a diagnosis can make of it.
 
 from __future__ import annotations
 
+from itertools import product
+
 import pytest
 import torch
 from torch import Tensor
@@ -19,12 +21,12 @@ LEFT = [
     ("tripod", "transmission", ["transmission"], 1e-3, 0.3),
     ("arm", "transmission", ["transmission"], 1e-3, 0.3),
     ("tripod", "backlash", ["backlash"], 0.35, 0.9),
-    ("arm", "backlash", ["backlash"], 0.2, 0.4),
-    ("tripod", "compliance", ["compliance", "gravity"], 0.05, 0.06),
-    ("machine_tool", "compliance", ["compliance", "gravity"], 0.07, 0.15),
-    ("arm", "compliance", ["compliance", "gravity"], 0.05, 0.055),
-    ("tripod", "thermal", ["thermal"], 0.2, 0.25),
-    ("machine_tool", "thermal", ["thermal"], 0.12, 0.4),
+    ("arm", "backlash", ["backlash"], 0.15, 0.4),
+    ("tripod", "compliance", ["compliance", "gravity"], 0.045, 0.06),
+    ("machine_tool", "compliance", ["compliance", "gravity"], 0.055, 0.15),
+    ("arm", "compliance", ["compliance", "gravity"], 0.045, 0.055),
+    ("tripod", "thermal", ["thermal"], 0.15, 0.25),
+    ("machine_tool", "thermal", ["thermal"], 0.06, 0.4),
     ("arm", "geometry", ["geometry"], 0.25, 0.0),
 ]
 
@@ -58,8 +60,9 @@ def left(built: RealisticMachine, repeat: int, effects: list[str], secondary: bo
     shapes: list[list[float]] = [[]]
     if effects == ["transmission"]:
         shapes = [built.built.causes.frequency[repeat][:, 0].tolist()]
-    elif effects == ["thermal"]:
-        shapes = [[lag] for lag in make_effect("thermal").shapes(rows)[0].grid]
+    elif len(effects) == 1:
+        grids = [shape.grid[::2] for shape in make_effect(effects[0]).shapes(rows)]
+        shapes = [list(values) for values in product(*grids)]
     shares = []
     for shape in shapes:
         matrix = torch.cat([columns(effect, shape) for effect in effects], -1)
