@@ -8,6 +8,7 @@ a load may also move the platform as a whole, alike wherever it stands, and fast
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -39,7 +40,9 @@ def catch_alls(situation: Situation) -> list[Atom]:
     one = torch.ones_like(place[:, :1])
     few = max(4, min(8, rows // 12))
     around = torch.cat([one, place, _bumps(place, min(24, max(6, rows // 8)))], -1)
-    found = [_atom(situation, "workspace", around, most=min(_MOST_PLACES, max(_MOST, rows // 4)))]
+    most = min(_MOST_PLACES, max(_MOST, rows // 4))
+    found = [_atom(situation, "workspace", around, most=most)]
+    found.append(_atom(situation, "workspace", torch.cat([one, *_configuration(situation)], -1), most=most))
     for i, joint in enumerate(mechanism.joints):
         q = _unit(situation.joints[..., i : i + 1])
         found.append(_atom(situation, f"joint {joint.name}", torch.cat([one, q, _BEND * _bumps(q, few)], -1)))
@@ -58,10 +61,11 @@ def catch_alls(situation: Situation) -> list[Atom]:
             features.append(_BEND * d * _carried(situation, int(driver.split()[1]) - 1))
         else:
             features.append(_BEND * _bumps(d, few))
-            found.append(_whole(situation, driver, _waves(d, max(4, min(_WAVES, rows // 6)))))
+            found.append(_whole(situation, driver, _waves(d, max(4, min(_WAVES, 2 * rows // 5)))))
         if driver.startswith("load"):
             # What a load asks of a joint goes with the slope of the kinematics, which is no plane over the workspace.
             features.append(_BEND * d * _products(place))
+            found.append(_atom(situation, driver, _asked(_under(situation, name)), most=most))
         if driver == "temperature" and "time" in situation.covariates:
             features += [_lagged(value, situation.covariates["time"], k) for k in (0.05, 0.2)]
         found.append(_atom(situation, driver, torch.cat(features, -1)))
@@ -71,6 +75,8 @@ def catch_alls(situation: Situation) -> list[Atom]:
         # One cause may follow all loads, or all directions, at once.
         if sum(a.name.startswith(kind) for a in found) > 1:
             found.append(_atom(situation, f"{kind} {ANY}", torch.cat([one, *features], -1)))
+            if kind == "load":
+                found.append(_atom(situation, f"{kind} {ANY}", _asked(situation), most=most))
     return found
 
 
@@ -121,6 +127,28 @@ def _lagged(value: Tensor, time: Tensor, share: float) -> Tensor:
     span = (time.max() - time.min()).clamp_min(1e-300) * share
     weight = torch.exp(-(time[:, None] - time[None, :]) / span) * (time[:, None] >= time[None, :])
     return _unit(((weight @ value) / weight.sum(-1)).unsqueeze(-1))
+
+
+def _configuration(situation: Situation) -> list[Tensor]:
+    """What repeats with the turns of the joints, and what the machine's weight asks of them, `s x …` each."""
+    turning = [i for i, j in enumerate(situation.mechanism.joints) if j.unit == "rad"]
+    angles = situation.joints[:, turning]
+    return [torch.sin(angles), torch.cos(angles), _over_largest(situation.own_weight_torque)]
+
+
+def _under(situation: Situation, load: str) -> Situation:
+    """The rows with one load alone."""
+    return replace(situation, covariates={load: situation.covariates[load]})
+
+
+def _asked(situation: Situation) -> Tensor:
+    """What the load asks of the joints, and its square with the sign, `s x 2n`, the largest 1."""
+    torque = _over_largest(situation.load_torque)
+    return torch.cat([torque, _BEND * torque * torque.abs()], -1)
+
+
+def _over_largest(values: Tensor) -> Tensor:
+    return values / values.abs().amax().clamp_min(1e-300)
 
 
 def _carried(situation: Situation, joint: int) -> Tensor:

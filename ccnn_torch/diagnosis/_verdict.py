@@ -114,11 +114,11 @@ def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fo
             i: _FORM_CATCH_ALL if atoms[i].catch_all else _BESIDE_CATCH_ALL if beside else _FORM for i in found.members
         }
         shares = _net(analysis, found, tried)
-        net = {i: share / limits[i] for i, (share, _) in shares.items()}
-        # A catch-all can stand in for much of the library, so it is the first to go.
-        least = min(net, key=lambda i: (not (atoms[i].catch_all and net[i] < 1), net[i]))
-        if net[least] >= 1:
+        idle = [i for i, (share, _) in shares.items() if share < limits[i]]
+        if not idle:
             break
+        # A catch-all can stand in for much of the library, so it is the first to go; else what is missed least.
+        least = max(idle, key=lambda i: (atoms[i].catch_all, tried[shares[i][1]].log_posterior))
         found = tried[shares[least][1]]
     return found
 

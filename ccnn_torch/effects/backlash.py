@@ -15,19 +15,19 @@ from ccnn_torch.mechanisms import Mechanism
 __all__ = ["Backlash"]
 
 _SCALE = {"m": 1.5e-4, "rad": 2e-4}
-# Pushes at which a joint leaves its flank, in units of the usual one, and how soft the change is.
-_HOLDS = (0.1, 0.2, 0.4, 0.7, 1.2, 2.0, 3.5, 6.0)
-_SOFT = 0.35
+# Pushes at which a joint leaves its flank, in units of the usual one; and how soft the change is.
+_HOLDS = (0.1, 0.2, 0.4, 0.7, 1.2, 2.0, 3.5, 6.0, 60.0)
+_SOFT = 0.3
+_EDGES = ((" softer", 2 * _SOFT), (" harder", 0.5 * _SOFT))
 
 
 class Backlash:
-    """Δq_i = -b_i s_i / 2 + e_i D(w_i) / 2 + h_i s_i (1 - B(w_i)) / 2: s the direction of approach, w the push.
+    """Δq_i = b_i / 2 tanh((w_i - s_i h) / (e h)): s the direction of approach, w the push of weight and load.
 
     A joint rests on the flank that drove it, half the play b behind the motor's middle, unless weight and load push it
-    onto the other flank whichever way it came. Friction f holds it with its motion, so that it rests at
-    b/2 tanh((w - f s) / edge): the part that does not depend on s is odd in w (e, the soft edge), D = (t₊ + t₋) / 2, and
-    the part with s is even and fades where w is large (h, held), B = (t₊ - t₋) / 2, with
-    t± = tanh((w ± hold) / (0.35 hold)). Weight and hold, the push at which friction gives, are shapes.
+    onto the other flank whichever way it came; friction holds it there up to the push h. The machine's weight and h are
+    shapes, h for all joints alike; without a push that reaches h this is -b s / 2. Secondary: the same with an edge
+    twice and half as soft as e = 0.3, less the part with e, so that b stays the play.
     """
 
     name = "backlash"
@@ -42,8 +42,8 @@ class Backlash:
         return "" if there else f"the sign of each joint's last motion before it stopped: direction1[1]…direction{n}[1]"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """Play, soft edge and what is held, of each joint whose direction is known."""
-        parts = (("", 1.0), (" soft edge", 0.5), (" held", 0.5))
+        """Play, and what a softer and a harder edge change, of each joint whose direction is known."""
+        parts = (("", 1.0), *((edge, 0.5) for edge, _ in _EDGES))
         return tuple(
             Coefficient(
                 f"{j.name}{part}", j.unit, _SCALE[j.unit] * size, joint=j.name, secondary=size < 1, positive=size == 1
@@ -54,16 +54,14 @@ class Backlash:
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """The machine's weight beside a load that was recorded, and the push that friction holds."""
-        secondary = tuple(k for k, c in enumerate(self.coefficients(situation)) if c.secondary)
-        hold = Shape("hold", "1", _HOLDS, secondary)
-        return (Shape("weight", "N", WEIGHTS, secondary), hold) if situation.loaded else (hold,)
+        hold = Shape("hold", "1", _HOLDS)
+        return (Shape("weight", "N", WEIGHTS), hold) if situation.loaded else (hold,)
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x 3 · (joints whose direction is known)`."""
         weight = shape[..., 0] if situation.loaded else shape.new_tensor(PLATFORM_WEIGHT)
-        push, side = situation.push(weight), situation.direction
         hold = shape[..., -1, None, None]
-        up, down = (torch.tanh((push + sign * hold) / (_SOFT * hold)) for sign in (1.0, -1.0))
-        held = 1 - (up - down) / 2
-        columns = torch.broadcast_tensors(-side / 2, (up + down) / 4, side * held / 2)  # type: ignore[no-untyped-call]
-        return by_joint(torch.stack(columns, -1), situation.directed)
+        left = situation.push(weight) / hold - situation.direction
+        rest = torch.tanh(left / _SOFT) / 2
+        edges = [torch.tanh(left / soft) / 2 - rest for _, soft in _EDGES]
+        return by_joint(torch.stack([rest, *edges], -1), situation.directed)
