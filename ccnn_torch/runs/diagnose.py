@@ -114,5 +114,5 @@ def _loaded(config: DiagnoseConfig) -> tuple[Records, Mechanism, list[Effect] | 
             raise InputError(f"{key}: is missing; give --{key}, or the key in a config")
     mechanism = load_mechanism(str(config.mechanism), **config.mechanism_keys)
     records = load_records(str(config.records), mechanism, config.covariates, learns=False)
-    effects = None if config.effects is None else [make_effect(name) for name in config.effects]
+    effects = None if config.effects is None else [make_effect(name, mechanism) for name in config.effects]
     return records, mechanism, effects
