@@ -14,6 +14,8 @@ from ccnn_torch.mechanisms.five_bar import FiveBar as FiveBar
 from ccnn_torch.mechanisms.framed import Framed as Framed
 from ccnn_torch.mechanisms.frames import fit_frames as fit_frames
 from ccnn_torch.mechanisms.machine_tool import MachineTool as MachineTool
+from ccnn_torch.mechanisms.mujoco_model import ModelParameter as ModelParameter
+from ccnn_torch.mechanisms.mujoco_model import mujoco_simulator as mujoco_simulator
 from ccnn_torch.mechanisms.overconstrained import Overconstrained2Dof as Overconstrained2Dof
 from ccnn_torch.mechanisms.serial import SerialArm as SerialArm
 from ccnn_torch.mechanisms.simulator import Joint as Joint
