@@ -7,7 +7,6 @@ import hashlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,11 @@ def class_hint(file: str) -> str:
     names = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
     for node in tree.body:
         # NAME = Simulator(…) and what makes one.
-        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call) and "imulator" in ast.unparse(node.value.func):
+        if (
+            isinstance(node, ast.Assign)
+            and isinstance(node.value, ast.Call)
+            and "imulator" in ast.unparse(node.value.func)
+        ):
             names += [target.id for target in node.targets if isinstance(target, ast.Name)]
     if not names:
         return f"{file}: names no class, and has none; write path/to/file.py:Name"

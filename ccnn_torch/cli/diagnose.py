@@ -49,7 +49,7 @@ def diagnose(
     if wanted.out is None:
         raise InputError("name the folder to write with --out DIR")
     if stderr.is_terminal and not quiet:
-        # Thousands of rows of an arm take half a minute, a slow simulator many; how much is left nobody knows beforehand.
+        # Thousands of rows of an arm take half a minute, a slow simulator more; how much is left nobody knows.
         doing = "looking for the effects that make the gap …"
         with stderr.status(doing) as shown, simulated_rows(lambda n: shown.update(f"{doing} {n:,} rows simulated")):
             found = run_diagnosis(wanted)

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis._told import refuse_lost_rows, told
 from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.result import Diagnosis
-from ccnn_torch.diagnosis._told import refuse_lost_rows, told
 from ccnn_torch.effects import Effect, Situation, default_gravity
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm

@@ -56,7 +56,7 @@ def make_effect(name: str, mechanism: Mechanism | None = None) -> Effect:
     """An effect by name, or from a user's `path/to/file.py:Name` (a class that is called without arguments).
 
     Args:
-        name: of the library, of a file, or `parameter NAME` where the mechanism has parameters with causes of their own.
+        name: of the library, of a file, or `parameter NAME` for a cause that the mechanism's parameters name.
         mechanism: the one that the effect is for.
 
     Raises:

@@ -109,7 +109,7 @@ def _maker(spec: str) -> Callable[..., Any]:
         return REGISTRY[spec]
     if is_plugin(spec):
         found = load_plugin(spec, (Simulator,))
-        return (lambda: found) if isinstance(found, Simulator) else found  # type: ignore[no-any-return]
+        return (lambda: found) if isinstance(found, Simulator) else found
     reader = _READERS.get(Path(spec).suffix.lower())
     if reader is not None:
         return functools.partial(reader, spec)

@@ -49,9 +49,9 @@ def try_simulator(simulator: Simulator, calls: Calls, home: Tensor, joints: Tens
     apart = np.nan_to_num(np.abs(again - first[: len(again)]), nan=0.0).max(-1)
     worst = int(apart.argmax())
     if apart[worst] > _REPEATS * typical:
+        at = described(simulator, some[worst], {})
         raise InputError(
-            f"simulator '{simulator.name}' is not deterministic: asked twice about {described(simulator, some[worst], {})} "
-            f"it gave poses that differ by {apart[worst]:.2g} m or rad, and a step of a joint changes them by "
-            f"{typical:.2g}; seed its random numbers, let no row depend on others or on earlier calls, or give a "
-            "larger step"
+            f"simulator '{simulator.name}' is not deterministic: asked twice about {at} it gave poses that differ by "
+            f"{apart[worst]:.2g} m or rad, and a step of a joint changes them by {typical:.2g}; seed its random numbers, "
+            "let no row depend on others or on earlier calls, or give a larger step"
         )

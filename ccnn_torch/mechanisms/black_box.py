@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.batching import leading_shape
-from ccnn_torch.coordinates import Condition, Coordinate, Parameter, plausible_error
+from ccnn_torch.coordinates import Condition, Coordinate, plausible_error
 from ccnn_torch.errors import InputError
 from ccnn_torch.least_squares import levenberg_marquardt
+from ccnn_torch.mechanisms._differences import central_slope, differentiable_pose
 from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms._numeric import carry_derivative
-from ccnn_torch.mechanisms._pose import Frame, frame_from_coordinates, frame_jacobian
+from ccnn_torch.mechanisms._pose import Frame, frame_from_coordinates
 from ccnn_torch.mechanisms._simulator_calls import Calls, described
 from ccnn_torch.mechanisms._simulator_trial import try_simulator
 from ccnn_torch.mechanisms.simulator import Simulator
@@ -43,6 +44,8 @@ class BlackBox(Mechanism):
         conditions: covariates that its rows are simulated under, by name; what is not there has its usual value.
     """
 
+    joint_low: Tensor
+    joint_high: Tensor
     starts: Tensor
     start_poses: Tensor
 
@@ -64,8 +67,8 @@ class BlackBox(Mechanism):
         home_pose = self._calls.pose(home, nominal, {})
         if not bool(torch.isfinite(home_pose).all()):
             raise InputError(
-                f"simulator '{simulator.name}' returns NaN at {described(simulator, home, {})}, its home configuration; "
-                "set home to commands at which it has a pose"
+                f"simulator '{simulator.name}' returns NaN at its home configuration, "
+                f"{described(simulator, home, {})}; set home to commands at which it has a pose"
             )
         super().__init__(
             name=simulator.name,
@@ -122,8 +125,11 @@ class BlackBox(Mechanism):
     ) -> Tensor:
         """What the simulator gives under the conditions, `... x p` [SI]; NaN in rows where it has no pose."""
         values = self.resolve(parameters)
-        found: Tensor = _Simulated.apply(joints, values, self)  # type: ignore[no-untyped-call]
-        return found
+        return differentiable_pose(self, joints, values)
+
+    def simulated(self, joints: Tensor, values: Tensor) -> Tensor:
+        """The same without derivatives."""
+        return self._calls.pose(joints, values, self.conditions)
 
     def frame(self, pose: Tensor) -> Frame:
         """By the declared frame; else x, y, z and rx, ry, rz by name, and phi about the axis that has no length."""
@@ -143,7 +149,8 @@ class BlackBox(Mechanism):
         values = self.resolve(parameters)
         step = self.simulator.step * (self.joint_high - self.joint_low) / 2
         places = [j.name for j in self.joints]
-        return self._slope(lambda q: self._calls.pose(q, values, self.conditions), joints, values, step, places)
+        point = joints.detach().expand(*leading_shape(joints, values), -1)
+        return central_slope(self, lambda q: self._calls.pose(q, values, self.conditions), point, step, places)
 
     def parameter_jacobian(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
@@ -152,68 +159,9 @@ class BlackBox(Mechanism):
         values = self.resolve(parameters)
         step = _SHARE * torch.tensor([plausible_error(p) for p in self.geometry], dtype=torch.float64)
         places = [p.name for p in self.geometry]
-        lead = leading_shape(joints, values)
         bounds = self._calls.low, self._calls.high
-        return self._slope(
-            lambda v: self._calls.pose(joints, v, self.conditions),
-            values.expand(*lead, -1),
-            joints,
-            step,
-            places,
-            bounds,
-        )
-
-    def _slope(
-        self,
-        pose: Callable[[Tensor], Tensor],
-        point: Tensor,
-        other: Tensor,
-        step: Tensor,
-        places: Sequence[str],
-        bounds: tuple[Tensor, Tensor] | None = None,
-    ) -> Tensor:
-        """Derivative of position and rotation vector by `point` `... x d`, `... x c x d`."""
-        point = point.detach().expand(*leading_shape(point, other), -1)
-        if bounds is not None:
-            point = torch.minimum(torch.maximum(point, bounds[0]), bounds[1])
-        ahead = torch.diag(step).reshape(-1, *[1] * (point.dim() - 1), len(step))
-        ends = torch.stack([point + ahead, point - ahead])
-        if bounds is not None:
-            ends = torch.minimum(torch.maximum(ends, bounds[0]), bounds[1])
-        found = pose(ends)
-        lost = ~torch.isfinite(found).all(-1)
-        if bool(lost.any()):
-            ends, found = self._one_sided(pose, point, ends, found, lost, places)
-        way = (ends[0] - ends[1]).sum(-1, keepdim=True)
-        first, second = self.frame(found[0]), self.frame(found[1])
-        change = first[0] - second[0]
-        if first[1] is not None and second[1] is not None:
-            change = torch.cat([change, matrix_to_rotation_vector(first[1] @ second[1].mT)], -1)
-        # A value between two bounds that are one has no way to go.
-        return (change / torch.where(way == 0, 1.0, way)).movedim(0, -1)
-
-    def _one_sided(
-        self,
-        pose: Callable[[Tensor], Tensor],
-        point: Tensor,
-        ends: Tensor,
-        found: Tensor,
-        lost: Tensor,
-        places: Sequence[str],
-    ) -> tuple[Tensor, Tensor]:
-        """The point itself in place of an end without a pose; refuses a point whose both neighbours have none."""
-        here = pose(point)
-        nowhere = lost.all(0) & torch.isfinite(here).all(-1)
-        if bool(nowhere.any()):
-            k, *row = torch.nonzero(nowhere)[0].tolist()
-            at = ends[:, k, *row, k].tolist()
-            raise InputError(
-                f"simulator '{self.name}' returns NaN with {places[k]} = {at[0]:.6g} and {at[1]:.6g}, and a pose "
-                f"between them (row {row[-1] if row else 0}): let it take these values, or give the parameter "
-                "another scale, or low and high"
-            )
-        ends = torch.where(lost[..., None], point, ends)
-        return ends, torch.where(lost[..., None], here, found)
+        point = values.detach().expand(*leading_shape(joints, values), -1)
+        return central_slope(self, lambda v: self._calls.pose(joints, v, self.conditions), point, step, places, bounds)
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x 3` or `6`."""
@@ -308,47 +256,3 @@ class BlackBox(Mechanism):
             f"simulator '{self.name}' was made in Python and stands under no name; write it to a file and use "
             "load_mechanism('file.py:NAME')"
         )
-
-
-class _Simulated(torch.autograd.Function):
-    """The simulator's pose, with its differences as the derivative."""
-
-    @staticmethod
-    def forward(joints: Tensor, values: Tensor, machine: BlackBox) -> Tensor:  # type: ignore[override]
-        return machine._calls.pose(joints, values, machine.conditions)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        joints, values, ctx.machine = inputs
-        ctx.save_for_backward(joints, values, output)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:  # type: ignore[override]
-        joints, values, pose = ctx.saved_tensors
-        parts: list[Tensor | None] = []
-        for which, point in enumerate((joints, values)):
-            if not ctx.needs_input_grad[which] or point.shape[-1] == 0:
-                parts.append(None if point.shape[-1] else torch.zeros_like(point))
-                continue
-            slope = _Slope.apply(joints, values, pose, ctx.machine, which)  # type: ignore[no-untyped-call]
-            whole = (gradient.unsqueeze(-2) @ slope).squeeze(-2)
-            parts.append(whole.sum_to_size(point.shape))
-        return parts[0], parts[1], None
-
-
-class _Slope(torch.autograd.Function):
-    """Derivative of the pose coordinates, `... x p x d`: of the frame by differences, and back to the coordinates."""
-
-    @staticmethod
-    def forward(joints: Tensor, values: Tensor, pose: Tensor, machine: BlackBox, which: int) -> Tensor:  # type: ignore[override]
-        slope = (machine.parameter_jacobian if which else machine.jacobian)(joints, values)
-        rows = frame_jacobian(machine.frame, torch.nan_to_num(pose)).detach()
-        return torch.linalg.pinv(rows) @ slope
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.mark_non_differentiable(output)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, ...]:
-        return None, None, None, None, None
