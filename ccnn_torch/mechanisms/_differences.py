@@ -113,7 +113,7 @@ class _Pose(torch.autograd.Function):
             if not ctx.needs_input_grad[which] or point.shape[-1] == 0:
                 parts.append(None)
                 continue
-            # Through a function of its own: here a transform may have wrapped the tensors; a simulator wants plain ones.
+            # By a function of its own: a transform may have wrapped the tensors here, and a simulator wants plain ones.
             slope = _Slope.apply(joints, values, pose, ctx.machine, which)  # type: ignore[no-untyped-call]
             parts.append((gradient.unsqueeze(-2) @ slope).squeeze(-2).sum_to_size(point.shape))
         return parts[0], parts[1], None

@@ -118,7 +118,7 @@ class Calls:
                 answer = simulator.simulate(torch.from_numpy(commands), tensors, torch.from_numpy(parameters))
             else:
                 answer = simulator.simulate(commands, covariates, parameters)
-            plain = answer.detach() if isinstance(answer, Tensor) else answer
+            plain = answer.detach().numpy() if isinstance(answer, Tensor) else answer
             pose = np.array(plain, dtype=np.float64)
         except InputError:
             raise

@@ -52,6 +52,6 @@ def try_simulator(simulator: Simulator, calls: Calls, home: Tensor, joints: Tens
         at = described(simulator, some[worst], {})
         raise InputError(
             f"simulator '{simulator.name}' is not deterministic: asked twice about {at} it gave poses that differ by "
-            f"{apart[worst]:.2g} m or rad, and a step of a joint changes them by {typical:.2g}; seed its random numbers, "
-            "let no row depend on others or on earlier calls, or give a larger step"
+            f"{apart[worst]:.2g} m or rad, and a step of a joint changes them by {typical:.2g}; seed its random "
+            "numbers, let no row depend on others or on earlier calls, or give a larger step"
         )
