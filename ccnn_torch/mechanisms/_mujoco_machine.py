@@ -42,6 +42,11 @@ class MujocoMachine:
         self.mujoco, self.rollout = _imported(path)
         self.path, self.pose = path, pose
         self.planar = "".join(axis for axis in _AXES if axis not in pose) if "phi" in pose else ""
+        strange = [c for c in pose if c not in _WRENCH and (c != "phi" or len(self.planar) != 1)]
+        if strange:
+            raise InputError(
+                f"{path}: pose: '{strange[0]}' is none of x, y, z, rx, ry, rz, or phi beside two of x, y, z"
+            )
         wrench = [_WRENCH["r" + self.planar if c == "phi" else c] for c in pose]
         self.loads = [f"load_{c}" for c in pose]
         self.model = self._compiled(measured, wrench)
@@ -98,7 +103,7 @@ class MujocoMachine:
             share = (share * share * (3 - 2 * share))[:, None]
             control = self._control(begin[:, None] + share * (commands - begin)[:, None], loads[:, None])
             state = self._moved(models, state, control)
-        look = max(round(_LOOK / time_step), 1)
+        look = max(round(min(_LOOK, self.settle) / time_step), 1)
         hold = self._control(commands[:, None], loads[:, None])
         moving = np.arange(len(commands))
         for _ in range(max(round(self.settle / _LOOK), 1)):

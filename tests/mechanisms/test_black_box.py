@@ -177,7 +177,10 @@ def _islands(commands: np.ndarray, covariates: object, parameters: np.ndarray) -
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"simulate": lambda c, *o: c * np.nan}, "returns NaN at its home configuration, q1 = 0.5 m, q2 = 0 m; set home"),
+        (
+            {"simulate": lambda c, *o: c * np.nan},
+            "returns NaN at its home configuration, q1 = 0.5 m, q2 = 0 m; set home",
+        ),
         ({"simulate": lambda c, *o: c[:, :1]}, r"returned shape \(1, 1\) for 1 rows, expected \(1, 2\).*of x, y; wrap"),
         ({"simulate": lambda c, *o: None}, r"returned shape \(\) for 1 rows"),
         ({"simulate": lambda c, *o: c * 0}, "no joint changes the pose"),
