@@ -1,4 +1,4 @@
-"""Diagnosis with a black-box simulator as the nominal machine; causes are put in by its own formulas, not by effects."""
+"""Diagnosis with a simulator as the nominal machine; causes are put in by its own formulas, not by effects."""
 
 from __future__ import annotations
 

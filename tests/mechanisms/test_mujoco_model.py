@@ -128,7 +128,8 @@ def test_a_closed_loop_goes_to_its_command_from_where_it_is_closed(tmp_path: Pat
 
 def test_dry_friction_stops_on_the_side_that_it_comes_from(tmp_path: Path) -> None:
     file = tmp_path / "stiff.xml"
-    servo = '<joint name="shoulder" axis="0 1 0" frictionloss="2" solreffriction="0.004 1" solimpfriction="0.9999 0.9999 0.001 0.5 2"/>'
+    stiff = 'solreffriction="0.004 1" solimpfriction="0.9999 0.9999 0.001 0.5 2"'
+    servo = f'<joint name="shoulder" axis="0 1 0" frictionloss="2" {stiff}/>'
     text = MODEL.read_text(encoding="utf-8").replace('<joint name="shoulder" axis="0 1 0"/>', servo)
     file.write_text(text.replace("0 0 -9.81", "0 0 0"), encoding="utf-8")
     simulator = mujoco_simulator(file, SERVOS, "tool", ("x", "z"), approach=5e-3, settle=0.5)
