@@ -73,7 +73,7 @@ def test_play_is_told_from_the_simulators_own_parameters(tmp_path: Path) -> None
     said = _diagnosed(_measured(tmp_path / "r.csv", play=(2e-4, 1e-4)))
     assert said.verdict["effects"] == ["backlash"] and not said.verdict["outside_library"]
     found = {name: said.effects[0]["parameters"][name]["value"] for name in ("q1", "q2")}
-    assert found == pytest.approx({"q1": 2e-4, "q2": 1e-4}, rel=0.1)
+    assert found == pytest.approx({"q1": 2e-4, "q2": 1e-4}, rel=0.25)
 
 
 def test_wrong_lengths_are_geometry(tmp_path: Path) -> None:
