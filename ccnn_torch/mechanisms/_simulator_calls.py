@@ -20,8 +20,9 @@ from ccnn_torch.mechanisms.simulator import Simulator
 
 __all__ = ["Calls", "described", "simulated_rows"]
 
-# Of a simulator that remembers: rows in one call, so that its user sees it move on, and rows that are kept.
-_AT_ONCE = 512
+# Rows in one call, so that memory suffices; of a simulator that remembers, so that its user sees it move on.
+_AT_MOST, _AT_ONCE = 50_000, 512
+# Rows that are kept.
 _MOST_KEPT = 500_000
 _PACKAGE = str(Path(__file__).parents[1])
 _WATCHER: ContextVar[Callable[[int], None] | None] = ContextVar("watcher", default=None)
@@ -79,12 +80,15 @@ class Calls:
         found = np.full((len(rows), len(self.simulator.pose)), np.nan)
         asked = np.flatnonzero(np.isfinite(rows).all(-1))
         if len(asked):
-            found[asked] = self._remembered(rows[asked]) if self.simulator.remember else self.ask(rows[asked])
+            found[asked] = self._remembered(rows[asked]) if self.simulator.remember else self._in_parts(rows[asked])
         return torch.from_numpy(found).reshape(*lead, found.shape[-1])
 
     @property
     def _conditions(self) -> list[Condition]:
         return [c for c in self.simulator.covariates if isinstance(c, Condition)]
+
+    def _in_parts(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.concatenate([self.ask(rows[i : i + _AT_MOST]) for i in range(0, len(rows), _AT_MOST)])
 
     def _remembered(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         keys = [row.tobytes() for row in rows]

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 import torch
 
-from ccnn_torch.diagnosis import Diagnosis, diagnose
+from ccnn_torch.diagnosis import Diagnosis, diagnose, situation_of
+from ccnn_torch.diagnosis.check import check_rows
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records, write_table
+from ccnn_torch.runs.diagnose import check_text
 
 Cli = Callable[..., tuple[int, str, str]]
 FILE = Path(__file__).parents[2] / "experiments" / "my_simulator.py"
@@ -94,6 +96,9 @@ def test_what_the_simulator_says_of_its_conditions_is_no_gap(tmp_path: Path, pay
     blind = _diagnosed(path)
     assert any("press takes payload, which the records do not have" in note for note in blind.notes)
     assert not blind.verdict["none"] and blind.gap["before"] > 5 * NOISE
+    mechanism = load_mechanism(PRESS)
+    looked = check_rows(situation_of(load_records(path, mechanism, learns=False), mechanism), blind.analysis.measured)
+    assert "press takes payload" in " ".join(check_text(looked))
 
 
 def test_the_commands_take_it_and_simulate_its_parameters(cli: Cli, tmp_path: Path) -> None:

@@ -12,7 +12,16 @@ import torch
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.least_squares import jacobian_of
-from ccnn_torch.mechanisms import BlackBox, FiveBar, Joint, Simulator, load_mechanism, rowwise, simulated_rows
+from ccnn_torch.mechanisms import (
+    BlackBox,
+    FiveBar,
+    Joint,
+    Simulator,
+    load_mechanism,
+    mechanism_from_description,
+    rowwise,
+    simulated_rows,
+)
 from ccnn_torch.testing import check_mechanism
 
 EXAMPLES = Path(__file__).parents[2] / "experiments"
@@ -234,6 +243,18 @@ def test_what_a_file_calls_by_another_name_is_told(tmp_path: Path) -> None:
         load_mechanism(f"{file}:PRES")
     with pytest.raises(InputError, match=r"write .*mine.py:PRESS"):
         load_mechanism(str(file))
+    factory = """
+def soft(spring):
+    import dataclasses
+    weak = dataclasses.replace(PRESS.parameters[3], nominal=spring)
+    return dataclasses.replace(PRESS, parameters=[*PRESS.parameters[:3], weak, PRESS.parameters[4]])
+"""
+    file.write_text(file.read_text(encoding="utf-8") + factory, encoding="utf-8")
+    soft = load_mechanism(f"{file}:soft", spring=2e4)
+    assert soft.nominal.tolist()[3:] == [2e4, 4e4]
+    assert mechanism_from_description(soft.describe()).nominal.tolist() == soft.nominal.tolist()
+    with pytest.raises(InputError, match="it takes spring"):
+        load_mechanism(f"{file}:soft", sprung=1.0)
     file.write_text("def make(stiff=1.0):\n    return stiff\n", encoding="utf-8")
     with pytest.raises(InputError, match="make a Simulator"):
         load_mechanism(f"{file}:make")

@@ -87,6 +87,15 @@ def test_a_heavier_forearm_is_found(arm: BlackBox) -> None:
     assert abs(found["value"] - 0.15) < 4 * found["sd"] < 0.03
 
 
+def test_a_moment_turns_it() -> None:
+    """phi, about +y, and its load: the servos' compliance under 4 N·m, without weight on the scales."""
+    simulator = mujoco_simulator(MODEL, SERVOS, "tool", ("x", "z", "phi"))
+    told = {"load_x": np.zeros(2), "load_z": np.zeros(2), "load_phi": np.array([0.0, 4.0])}
+    still, turned = simulator.simulate(np.tile([-0.8, 1.0], (2, 1)), told, np.zeros((2, 0)))
+    assert turned[2] - still[2] == pytest.approx(4 / 2000 + 4 / 1500, rel=2e-3)
+    assert still[2] == pytest.approx(0.2, abs=5e-3)
+
+
 _STIFF = 'solref="0.001 1" solimp="0.9999 0.9999 0.001 0.5 2"'
 _LEG = """
   <body pos="{x} 0 0" euler="0 0 {turn}"><joint name="q{i}" axis="0 0 1" ref="{turn}"/>
