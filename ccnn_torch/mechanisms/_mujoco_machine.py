@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import torch
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._mujoco_numbers import Array, ModelNumbers, ModelParameter
+from ccnn_torch.rotations import matrix_to_rotation_vector
 
 __all__ = ["MujocoMachine"]
 
@@ -163,7 +164,7 @@ class MujocoMachine:
             self.mujoco.mj_kinematics(model, data)
             place[row] = data.site_xpos[self.site]
             turn[row] = data.site_xmat[self.site].reshape(3, 3)
-        vector = Rotation.from_matrix(turn).as_rotvec()
+        vector = matrix_to_rotation_vector(torch.from_numpy(turn)).numpy()
         columns = dict(zip(_WRENCH, [*place.T, *vector.T], strict=True))
         if self.planar:
             i, j = ((k + _AXES.index(self.planar)) % 3 for k in (1, 2))
