@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["Coordinate", "Parameter", "plausible_error"]
+__all__ = ["Condition", "Coordinate", "Parameter", "plausible_error"]
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,21 @@ class Coordinate:
 
 
 @dataclass(frozen=True)
+class Condition(Coordinate):
+    """A covariate that a simulator takes, with the SI value that it has where the records do not tell.
+
+    Attributes:
+        usual: that value.
+        spread: standard deviation about it in simulated records.
+    """
+
+    usual: float = 0.0
+    spread: float = 0.0
+
+
+@dataclass(frozen=True)
 class Parameter:
-    """A geometric parameter of a mechanism.
+    """A parameter of a mechanism: a length, an angle, a gain; of a simulator also a stiffness, a mass, a friction.
 
     Attributes:
         name: as configs and results name it.
@@ -33,6 +46,9 @@ class Parameter:
         leg: number of the leg that it belongs to, and no other; joint i drives leg i. None = common to all.
         scale: plausible error of a machine as built [SI], one standard deviation; None = `plausible_error` goes by the
             unit.
+        low, high: values that it cannot pass [SI]; a simulator is never asked beyond them. None = no bound.
+        cause: what a diagnosis calls the cause when it is wrong; parameters of one cause go wrong together. None =
+            ``geometry``, the lengths and angles of the machine as built.
     """
 
     name: str
@@ -40,6 +56,9 @@ class Parameter:
     nominal: float
     leg: int | None = None
     scale: float | None = None
+    low: float | None = None
+    high: float | None = None
+    cause: str | None = None
 
 
 _PLAUSIBLE = {"m": 1e-3, "rad": 2e-3, "1": 2e-3}

@@ -7,7 +7,6 @@ import hashlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +29,21 @@ def class_hint(file: str) -> str:
     except SyntaxError as error:
         return f"{file} line {error.lineno} is no valid Python: {error.msg}"
     names = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    for node in tree.body:
+        # NAME = Simulator(…) and what makes one.
+        if (
+            isinstance(node, ast.Assign)
+            and isinstance(node.value, ast.Call)
+            and "imulator" in ast.unparse(node.value.func)
+        ):
+            names += [target.id for target in node.targets if isinstance(target, ast.Name)]
     if not names:
         return f"{file}: names no class, and has none; write path/to/file.py:Name"
     return f"{file}: names no class; write {' or '.join(f'{file}:{name}' for name in names)}"
 
 
-def load_plugin(spec: str) -> Callable[..., Any]:
-    """Run the file and return what it calls `Name`.
+def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
+    """Run the file and return what it calls `Name`: something that can be called, or an object of a class of `also`.
 
     Raises:
         InputError: there is no such file or name in it, or the file cannot be run.
@@ -59,7 +66,8 @@ def load_plugin(spec: str) -> Callable[..., Any]:
     except ImportError as error:
         raise InputError(f"{spec}: {file} imports something that is not installed: {error}") from error
     found = getattr(module, name, None)
-    if not callable(found):
+    if not callable(found) and not isinstance(found, also):
         classes = [n for n, o in vars(module).items() if inspect.isclass(o) and o.__module__ == module.__name__]
+        classes += [n for n, o in vars(module).items() if isinstance(o, also)]
         raise InputError(f"{spec}: {file} has no class '{name}'; it has {', '.join(classes) or 'none'}")
-    return found  # type: ignore[no-any-return]
+    return found

@@ -28,6 +28,8 @@ def check(
     Examples:
 
     ccnn check --records measured.csv --mechanism five_bar
+
+    ccnn check --records measured.csv --mechanism my_simulator.py:PRESS
     """
     from dataclasses import asdict
 

@@ -36,7 +36,10 @@ def diagnose(
     ccnn diagnose --records measured.csv --mechanism arm.yaml --out runs/arm --noise x=1e-5,y=1e-5,z=2e-5
 
     ccnn diagnose --records measured.csv --mechanism stewart --out runs/s --effects backlash,friction,my_effect.py:Mine
+
+    ccnn diagnose --records measured.csv --mechanism my_simulator.py:PRESS --out runs/press
     """
+    from ccnn_torch.mechanisms import simulated_rows
     from ccnn_torch.report.diagnosis_data import about_of, load_labels
     from ccnn_torch.report.diagnosis_report import print_diagnosis
     from ccnn_torch.runs.diagnose import run_diagnosis, write_diagnosis
@@ -46,8 +49,9 @@ def diagnose(
     if wanted.out is None:
         raise InputError("name the folder to write with --out DIR")
     if stderr.is_terminal and not quiet:
-        # Thousands of rows of an arm take half a minute; how much is left nobody knows beforehand.
-        with stderr.status("looking for the effects that make the gap …"):
+        # Thousands of rows of an arm take half a minute, a slow simulator more; how much is left nobody knows.
+        doing = "looking for the effects that make the gap …"
+        with stderr.status(doing) as shown, simulated_rows(lambda n: shown.update(f"{doing} {n:,} rows simulated")):
             found = run_diagnosis(wanted)
     else:
         found = run_diagnosis(wanted)

@@ -45,6 +45,9 @@ def simulate(
     ccnn simulate --mechanism tripod --effect outlier:share=0.05 --rows 100 --noise y=1e-5,z=1e-5,phi=3e-5 --out r.csv
 
     ccnn simulate --mechanism my_arm.yaml --effect my_effect.py:CableForce --rows 300 --noise 2e-5 --out r.csv
+
+    ccnn simulate --mechanism my_simulator.py:PRESS --effect "parameter spring:spring=-60" --rows 200 --noise 1e-5
+    --out r.csv
     """
     from ccnn_torch.report.table_form import print_table
     from ccnn_torch.runs.screen import stdout

@@ -63,8 +63,12 @@ def _candidates(analysis: Analysis, seed: int) -> Situation:
     """Poses of the workspace under conditions as they were measured, one drawn row's conditions for each pose."""
     here = analysis.situation
     generator = torch.Generator().manual_seed(seed)
-    pose = here.mechanism.sample_workspace(_CANDIDATES, generator)
-    joints = here.mechanism.solve_inverse(pose, here.parameters if _common(here) else None)
+    pose: Tensor | None = None
+    if _common(here):
+        pose = here.mechanism.sample_workspace(_CANDIDATES, generator)
+        joints = here.mechanism.solve_inverse(pose, here.parameters)
+    else:
+        joints = here.mechanism.sample_joints(_CANDIDATES, generator)
     row = torch.randint(len(here.joints), (_CANDIDATES,), generator=generator)
     covariates = {n: v[row] for n, v in here.covariates.items()}
     if "time" in covariates:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -31,6 +31,7 @@ class Check:
         weak: by effect, its plausible size in units of the noise where that is below 1: it could hide.
         confusable: pairs of effects with the share of the first that the second can take over (cosine), largest first.
         condition: largest condition number of the Jacobian over the rows that count.
+        remarks: what else to know, such as covariates that a simulator takes and the records lack, one sentence each.
     """
 
     rows: int
@@ -41,6 +42,7 @@ class Check:
     weak: dict[str, float]
     confusable: list[tuple[str, str, float]]
     condition: float
+    remarks: list[str] = field(default_factory=list)
 
 
 def check_rows(
@@ -75,6 +77,7 @@ def check_rows(
         weak=weak,
         confusable=_confusable(spans),
         condition=float(condition.max()),
+        remarks=situation.mechanism.remarks([*situation.covariates]),
     )
 
 

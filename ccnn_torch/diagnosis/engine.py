@@ -16,7 +16,7 @@ from ccnn_torch.diagnosis._verdict import judge
 from ccnn_torch.diagnosis._where import where
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.words import verdict_text
-from ccnn_torch.effects import EFFECTS, Effect, Situation, make_effect, pose_residual
+from ccnn_torch.effects import Effect, Situation, effect_names, make_effect, pose_residual
 from ccnn_torch.errors import InputError
 
 __all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows"]
@@ -39,8 +39,8 @@ def candidates(
     Raises:
         InputError: the records can show none of them.
     """
-    named = list(EFFECTS) if effects is None else effects
-    every = [make_effect(e) if isinstance(e, str) else e for e in named]
+    named = effect_names(situation.mechanism) if effects is None else effects
+    every = [make_effect(e, situation.mechanism) if isinstance(e, str) else e for e in named]
     names = [*situation.covariates]
     lacking = {e.name: e.missing(situation.mechanism, names) for e in every}
     if every and all(lacking.values()):
@@ -95,6 +95,7 @@ def diagnose_rows(
     told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict}
     verdict["text"] = verdict_text(told | {"rows_set_aside": set_aside})
     notes = [f"{name} cannot be seen without {why}" for name, why in lacking.items()]
+    notes += situation.mechanism.remarks([*situation.covariates])
     if len(chosen) < len(fine) - len(lost):
         notes.append(f"{len(chosen)} of {len(fine)} rows, drawn at random, were looked at")
     return Diagnosis(

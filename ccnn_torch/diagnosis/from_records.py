@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis._told import refuse_lost_rows, told
 from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Effect, Situation, default_gravity
@@ -59,8 +60,12 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
     if down.shape != (3,):
         raise InputError(f"gravity: needs three numbers (x, y, z in m/s²), not {len(down)}")
     covariates = {c.name: records.covariates[:, i] for i, c in enumerate(records.covariate_coordinates)}
+    mechanism, more = told(records, mechanism, covariates)
+    covariates |= more
     guess = records.pose if records.pose.shape[-1] == len(mechanism.pose) else None
-    return Situation(mechanism, records.joints, covariates, down, parameters, guess)
+    situation = Situation(mechanism, records.joints, covariates, down, parameters, guess)
+    refuse_lost_rows(records, situation)
+    return situation
 
 
 def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) -> Tensor | None:

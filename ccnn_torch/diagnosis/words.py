@@ -37,6 +37,9 @@ _DRIVERS = {"workspace": "the place in the workspace", "temperature": "the tempe
 
 def effect_words(name: str) -> str:
     """What an effect of the library is called in a sentence; a user's own effect goes by its name."""
+    kind, _, parameter = name.partition(" ")
+    if kind == "parameter" and parameter:
+        return f"a wrong value of the parameter {parameter}"
     return _EFFECTS.get(name, f"the effect {name}")
 
 

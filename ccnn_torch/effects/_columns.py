@@ -11,7 +11,7 @@ from ccnn_torch.effects._situation import Situation
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
 from ccnn_torch.rotations import skew
 
-__all__ = ["TWIST", "by_joint", "own_parameters", "per_force", "shown_columns", "twist_columns"]
+__all__ = ["TWIST", "by_joint", "caused_by", "own_parameters", "per_force", "shown_columns", "twist_columns"]
 
 _SHOWN = 1e-9
 
@@ -50,6 +50,11 @@ def own_parameters(mechanism: Mechanism) -> list[int]:
     if isinstance(mechanism, Framed):
         first, last = (6 if mechanism.base else 0), last - (6 if mechanism.tool else 0)
     return list(range(first, last))
+
+
+def caused_by(mechanism: Mechanism, cause: str) -> list[int]:
+    """Numbers of the mechanism's own parameters that are wrong by this cause, ``geometry`` where they name none."""
+    return [k for k in own_parameters(mechanism) if (mechanism.geometry[k].cause or "geometry") == cause]
 
 
 def twist_columns(situation: Situation, arm: Tensor, axes: Tensor) -> Tensor:

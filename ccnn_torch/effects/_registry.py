@@ -19,13 +19,15 @@ from ccnn_torch.effects.instrument import Instrument
 from ccnn_torch.effects.joint_gain import JointGain
 from ccnn_torch.effects.joint_offset import JointOffset
 from ccnn_torch.effects.latency import Latency
+from ccnn_torch.effects.parameter import parameter_causes
 from ccnn_torch.effects.thermal import Thermal
 from ccnn_torch.effects.tool import Tool
 from ccnn_torch.effects.transmission import Transmission
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.plugins import is_plugin, load_plugin
 
-__all__ = ["EFFECTS", "OUTLIER", "make_effect"]
+__all__ = ["EFFECTS", "OUTLIER", "effect_names", "make_effect"]
 
 EFFECTS: dict[str, Callable[[], Effect]] = {
     "geometry": Geometry,
@@ -50,8 +52,12 @@ OUTLIER = "outlier"
 """What verdicts and simulations call bad rows. No effect: no other column foretells them."""
 
 
-def make_effect(name: str) -> Effect:
+def make_effect(name: str, mechanism: Mechanism | None = None) -> Effect:
     """An effect by name, or from a user's `path/to/file.py:Name` (a class that is called without arguments).
+
+    Args:
+        name: of the library, of a file, or `parameter NAME` for a cause that the mechanism's parameters name.
+        mechanism: the one that the effect is for.
 
     Raises:
         InputError: no effect has this name, or what the file has is no effect.
@@ -66,7 +72,21 @@ def make_effect(name: str) -> Effect:
             )
         return cast(Effect, effect)
     if name not in EFFECTS:
-        near = difflib.get_close_matches(name, EFFECTS, 1)
+        own = {} if mechanism is None else {e.name: e for e in parameter_causes(mechanism)}
+        plain = {_plain(n): e for n, e in own.items()}
+        if _plain(name) in plain:
+            return plain[_plain(name)]
+        near = difflib.get_close_matches(name, [*EFFECTS, *own], 1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise InputError(f"effects: {name!r} is no effect of this version, which has {', '.join(EFFECTS)}{hint}")
+        known = ", ".join([*EFFECTS, *own])
+        raise InputError(f"effects: {name!r} is no effect of this version, which has {known}{hint}")
     return EFFECTS[name]()
+
+
+def effect_names(mechanism: Mechanism) -> list[str]:
+    """Of the library's effects, and of the causes that the mechanism's own parameters name."""
+    return [*EFFECTS, *(e.name for e in parameter_causes(mechanism))]
+
+
+def _plain(name: str) -> str:
+    return "_".join(name.lower().split())

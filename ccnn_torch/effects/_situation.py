@@ -56,24 +56,24 @@ class Situation:
     guess: Tensor | None = None
 
     @cached_property
+    def machine(self) -> Mechanism:
+        """The nominal one under the rows' covariates: a simulator may itself say what a load does."""
+        return self.mechanism.under(self.covariates)
+
+    @cached_property
     def pose(self) -> Tensor:
         """Nominal pose at the commanded joints, `... x s x p` [SI]."""
-        return self.mechanism.forward_kinematics(self.joints, self.parameters, self.guess).detach()
+        return self.machine.forward_kinematics(self.joints, self.parameters, self.guess).detach()
 
     @cached_property
     def jacobian(self) -> Tensor:
         """Derivative of position and rotation vector by the joints, `... x s x c x n`, c = 3 or 6; NaN without pose."""
-        return self.mechanism.jacobian(self.joints, self.parameters, self.pose).detach()
+        return self.machine.jacobian(self.joints, self.parameters, self.pose).detach()
 
     @cached_property
     def parameter_jacobian(self) -> Tensor:
         """The same by the mechanism's parameters, `... x s x c x k`."""
-        values = self.mechanism.resolve(self.parameters).expand(*self.joints.shape[:-1], -1)
-
-        def frame(theta: Tensor) -> tuple[Tensor, Tensor | None]:
-            return self.mechanism.frame(self.mechanism.forward_kinematics(self.joints, theta, self.pose))
-
-        return frame_jacobian(frame, values).detach()
+        return self.machine.parameter_jacobian(self.joints, self.parameters, self.pose).detach()
 
     @cached_property
     def frame_slope(self) -> Tensor:

@@ -55,7 +55,8 @@ def reached(situation: Situation, acting: Sequence[Acting]) -> Tensor:
             joints = joints + one.change(situation)
         elif one.effect.kind == "parameters":
             parameters = parameters + one.change(situation)
-    position, rotation = mechanism.frame(mechanism.forward_kinematics(joints, parameters, situation.pose))
+    pose = situation.machine.forward_kinematics(joints, parameters, situation.pose)
+    position, rotation = mechanism.frame(pose)
     moved = [one.change(situation) for one in acting if one.effect.kind == "pose"]
     for change in moved:
         position = position + change[..., :3]

@@ -39,7 +39,7 @@ def draw_covariates(
         load: standard deviation of the load by unit of the pose coordinate [N], [N·m]; None = 60 N and 6 N·m.
 
     Returns:
-        `time`, `temperature`, `load_NAME`, `direction1`…, each `s` [SI].
+        `time`, `temperature`, `load_NAME`, `direction1`…, and what a simulator takes besides, each `s` [SI].
     """
     rows, n = joints.shape
 
@@ -58,12 +58,17 @@ def draw_covariates(
         found[f"load_{coordinate.name}"] = sizes[coordinate.unit] * draw
     before = torch.where(torch.rand(1, n, generator=generator, dtype=torch.float64) < 0.5, -1.0, 1.0)
     way = torch.where(joints.diff(dim=0) < 0, -1.0, 1.0)
-    return found | {f"direction{i + 1}": d for i, d in enumerate(torch.cat([before, way])[:rows].unbind(-1))}
+    found |= {f"direction{i + 1}": d for i, d in enumerate(torch.cat([before, way])[:rows].unbind(-1))}
+    for condition in mechanism.takes:
+        if condition.name not in found and condition.spread > 0:
+            draw = torch.randn(rows, generator=generator, dtype=torch.float64)
+            found[condition.name] = condition.usual + condition.spread * draw
+    return found
 
 
 def covariate_units(mechanism: Mechanism) -> dict[str, str]:
-    """SI unit of every column that the library's effects know, by name."""
-    units = {"time": "s", "temperature": "K"}
+    """SI unit of every column that the library's effects know, or the machine itself takes, by name."""
+    units = {c.name: c.unit for c in mechanism.takes} | {"time": "s", "temperature": "K"}
     units |= {f"load_{c.name}": "N" if c.unit == "m" else "N*m" for c in mechanism.pose}
     units |= {f"direction{i + 1}": "1" for i in range(len(mechanism.joints))}
     return units | {f"speed{i + 1}": f"{j.unit}/s" for i, j in enumerate(mechanism.joints)}

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import plausible_error
-from ccnn_torch.effects._columns import own_parameters
+from ccnn_torch.effects._columns import caused_by
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
@@ -17,7 +17,10 @@ __all__ = ["Geometry"]
 
 
 class Geometry:
-    """Δp_k = c_k, p = the mechanism's own parameters; base and tool frames are effects of their own."""
+    """Δp_k = c_k, p = the mechanism's own lengths, angles and gains; base and tool frames are effects of their own.
+
+    A parameter that names another cause (a simulator's stiffness) is a candidate of its own: `ParameterCause`.
+    """
 
     name = "geometry"
     kind: Kind = "parameters"
@@ -26,12 +29,12 @@ class Geometry:
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """Parameters."""
-        return "" if own_parameters(mechanism) else f"geometric parameters: mechanism '{mechanism.name}' has none"
+        return "" if caused_by(mechanism, self.name) else f"geometric parameters: mechanism '{mechanism.name}' has none"
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """One a parameter."""
         mechanism = situation.mechanism
-        chosen = own_parameters(mechanism)
+        chosen = caused_by(mechanism, self.name)
         # The parameters of an arm's link i stand behind its joint i.
         links = len(chosen) // len(mechanism.joints) if isinstance(mechanism, SerialArm) else 0
         return tuple(
@@ -53,5 +56,5 @@ class Geometry:
         """Columns of the identity at every row, `... x s x k x m`."""
         count = len(situation.mechanism.geometry)
         eye = torch.eye(count, dtype=situation.joints.dtype, device=situation.joints.device)
-        chosen = eye[:, own_parameters(situation.mechanism)]
+        chosen = eye[:, caused_by(situation.mechanism, self.name)]
         return chosen.expand(*situation.joints.shape[:-1], *chosen.shape)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ccnn_torch.batching import expand_leading
-from ccnn_torch.coordinates import Coordinate, Parameter
+from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import _numeric
 from ccnn_torch.mechanisms._pose import PoseError, frame_from_coordinates, frame_jacobian, pose_error
@@ -59,6 +59,7 @@ class Mechanism(nn.Module):
         low, high: box of poses that `sample_workspace` draws from, `p` [SI], buffers.
         home_pose, home_joints: a configuration on the nominal branch, `p` and `n` [SI], buffers; where Newton starts.
         inverse_kinematics: child module around `solve_inverse`, the place for forward hooks.
+        takes: covariates that the nominal machine itself depends on: a simulator's; () for all others.
     """
 
     nominal: Tensor
@@ -67,6 +68,7 @@ class Mechanism(nn.Module):
     home_pose: Tensor
     home_joints: Tensor
     orientations: tuple[str, ...] = ()
+    takes: tuple[Condition, ...] = ()
 
     def __init__(
         self,
@@ -224,6 +226,24 @@ class Mechanism(nn.Module):
         return frame_jacobian(
             lambda q: self.frame(self.forward_kinematics(q, parameters, guess)), expand_leading(joints, *others)
         )
+
+    def parameter_jacobian(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """The same by the parameters, at joints `... x n`; `... x 6 x k` or `... x 3 x k`, per parameter's unit."""
+        values = self.resolve(parameters).expand(*joints.shape[:-1], -1)
+        return frame_jacobian(lambda theta: self.frame(self.forward_kinematics(joints, theta, guess)), values)
+
+    def under(self, conditions: Mapping[str, Tensor]) -> Mechanism:
+        """The machine under conditions of the rows that it is then asked about, `...` each [SI], by covariate.
+
+        Itself, unless it `takes` some of them: closed forms know neither loads nor temperatures.
+        """
+        return self
+
+    def remarks(self, conditions: Sequence[str]) -> list[str]:
+        """What somebody who reads results under these conditions should know, one sentence each."""
+        return []
 
     def condition_number(
         self,

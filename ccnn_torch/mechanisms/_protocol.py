@@ -11,6 +11,8 @@ import torch
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._branch import jump_sentence, settle_home
 from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.mechanisms.black_box import BlackBox
+from ccnn_torch.mechanisms.simulator import Simulator
 
 __all__ = ["checked_plugin"]
 
@@ -35,8 +37,12 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
     """
     try:
         mechanism = make()
+        if isinstance(mechanism, Simulator):
+            mechanism = BlackBox(mechanism)
         if not isinstance(mechanism, Mechanism):
-            raise InputError(f"{spec}: is no mechanism; derive the class from ccnn_torch.mechanisms.Mechanism")
+            raise InputError(
+                f"{spec}: is no mechanism; derive the class from ccnn_torch.mechanisms.Mechanism, or make a Simulator"
+            )
         wrong = _wrong_names(mechanism) or _wrong_shape_of_closure(mechanism)
         if not wrong:
             settle_home(mechanism)

@@ -20,6 +20,7 @@ from ccnn_torch.mechanisms.machine_tool import MachineTool
 from ccnn_torch.mechanisms.mechanism_file import MechanismFile, read_mechanism_file
 from ccnn_torch.mechanisms.overconstrained import Overconstrained2Dof
 from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.mechanisms.simulator import Simulator
 from ccnn_torch.mechanisms.stewart import Stewart
 from ccnn_torch.mechanisms.tripod import Tripod
 from ccnn_torch.mechanisms.urdf import read_urdf
@@ -51,7 +52,7 @@ REGISTRY: dict[str, Callable[..., Mechanism]] = {
 _READERS: dict[str, Callable[..., Mechanism]] = {".yaml": read_dh_file, ".yml": read_dh_file, ".urdf": read_urdf}
 _YAML = (".yaml", ".yml")
 
-_FORMS = "a serial arm's geometry file (.yaml, .urdf), or your own class as path/to/file.py:Name"
+_FORMS = "a serial arm's geometry file (.yaml, .urdf), or your own class or simulator as path/to/file.py:Name"
 
 
 def load_mechanism(spec: str, **keys: Any) -> Mechanism:
@@ -59,7 +60,8 @@ def load_mechanism(spec: str, **keys: Any) -> Mechanism:
 
     Args:
         spec: a name in the registry (`tripod`, `five_bar`, `stewart`, …), a DH file (.yaml), a URDF (.urdf), an
-            identified machine's mechanism file (.yaml, as `ccnn identify` writes it), or `path/to/file.py:Name`.
+            identified machine's mechanism file (.yaml, as `ccnn identify` writes it), or `path/to/file.py:Name`: a
+            class, a `Simulator`, or a function that makes one.
         keys: keys of its constructor (tripod: L, r, per_leg; DH file: orientation; URDF: base, tip, orientation;
             framed: mechanism, base, tool; …).
 
@@ -106,7 +108,8 @@ def _maker(spec: str) -> Callable[..., Any]:
     if spec in REGISTRY:
         return REGISTRY[spec]
     if is_plugin(spec):
-        return load_plugin(spec)
+        found = load_plugin(spec, (Simulator,))
+        return (lambda: found) if isinstance(found, Simulator) else found
     reader = _READERS.get(Path(spec).suffix.lower())
     if reader is not None:
         return functools.partial(reader, spec)

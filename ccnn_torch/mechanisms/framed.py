@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -69,6 +71,7 @@ class Framed(Mechanism):
             home_joints=inner.home_joints.tolist(),
         )
         self.mechanism = inner
+        self.takes = inner.takes
         self.base, self.tool, self.rotation_weight = base, tool, rotation_weight
         # Where the coordinates of the mechanism's pose are those of its frame there is nothing to search.
         plain = type(inner).frame is Mechanism.frame and type(inner).pose_near is Mechanism.pose_near
@@ -142,6 +145,19 @@ class Framed(Mechanism):
         values = self.resolve(parameters)
         closest = self._closest(pose, values, self.rotation_weight)
         return self.mechanism.reachable(closest, self._split(values)[1])
+
+    def under(self, conditions: Mapping[str, Tensor]) -> Framed:
+        """The mechanism inside under them."""
+        inner = self.mechanism.under(conditions)
+        if inner is self.mechanism:
+            return self
+        twin = copy.copy(self)
+        twin._modules = {**self._modules, "mechanism": inner}
+        return twin
+
+    def remarks(self, conditions: Sequence[str]) -> list[str]:
+        """Those of the mechanism inside."""
+        return self.mechanism.remarks(conditions)
 
     def fitted_frames(self, joints: Tensor, measured: Frame) -> Tensor:
         """Closed-form frames between the nominal mechanism's poses of the joints and measured ones.

@@ -96,6 +96,7 @@ def check_text(check: Check) -> list[str]:
         f"Noise (m, rad): {noise}.",
         f"Covariates: {', '.join(check.covariates) or 'none'}.",
     ]
+    lines += [f"{remark}." for remark in check.remarks]
     lines += [f"{name} cannot be seen without {why}." for name, why in check.missing.items()]
     lines += [f"{name} could hide: its plausible size is {size:.2g} of the noise." for name, size in check.weak.items()]
     return lines
@@ -114,5 +115,5 @@ def _loaded(config: DiagnoseConfig) -> tuple[Records, Mechanism, list[Effect] | 
             raise InputError(f"{key}: is missing; give --{key}, or the key in a config")
     mechanism = load_mechanism(str(config.mechanism), **config.mechanism_keys)
     records = load_records(str(config.records), mechanism, config.covariates, learns=False)
-    effects = None if config.effects is None else [make_effect(name) for name in config.effects]
+    effects = None if config.effects is None else [make_effect(name, mechanism) for name in config.effects]
     return records, mechanism, effects

@@ -92,7 +92,7 @@ def act(wanted: Wanted, situation: Situation, generator: torch.Generator) -> Act
     """
     if wanted.name not in EFFECTS and nearest(wanted.name, [OUTLIER], 0.8):
         raise InputError(f"effects: '{wanted.name}' is no effect; did you mean '{OUTLIER}'?")
-    effect = make_effect(wanted.name)
+    effect = make_effect(wanted.name, situation.mechanism)
     missing = effect.missing(situation.mechanism, list(situation.covariates))
     if missing:
         raise InputError(f"--effect {wanted.name}: it needs {missing}")
