@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import Atom, default_shape
 from ccnn_torch.diagnosis._catch_all import catch_alls
-from ccnn_torch.diagnosis._evidence import grams_of
-from ccnn_torch.diagnosis._linear import signature_at, tangent
+from ccnn_torch.diagnosis._evidence import alone, grams_of
+from ccnn_torch.diagnosis._linear import remainder, signature_at, tangent
 from ccnn_torch.diagnosis._search import Found, Library, search
 from ccnn_torch.diagnosis._shapes import Scan, Shaped
 from ccnn_torch.diagnosis._whitening import Whitening, fitted_whitening, moving_channels, reweighted
@@ -23,6 +23,8 @@ __all__ = ["Analysis", "analyse"]
 LOG_PRIOR = math.log(0.1)
 # Rows are left out where the Jacobian is worse conditioned than this and than ten times the usual.
 _CONDITION = 50.0
+# Effects with so many coefficients are looked for in one joint or leg, too; spread of their log size there.
+_MANY, _SIZE_SPREAD = 8, 4.0
 # Or where the joints move the platform so many times as far as usual.
 _GAIN = 3.0
 
@@ -100,6 +102,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     rich = white.sigma
     # Shapes by themselves and with the rest of the library beside them: two ways to start, both stay candidates.
     fixed = [a for a in atoms if a.shape.numel() == 0]
+    fixed += [part for a in fixed if (part := _best_part(situation, a, white, residual)) is not None]
     shaped = [a for a in atoms if a.shape.numel()]
     alone = white(fitted)
     beside = torch.cat([alone, *(white(a.columns) for a in fixed)], -1)
@@ -113,9 +116,12 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest], near, rich, fitted)
 
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
+    before: tuple[str, ...] | None = None
     for _ in range(2):
         best = next(f for f in result.found if not any(result.library.atoms[i].catch_all for i in f.members))
         acting = result.acting(best)
+        if before == (before := tuple(a.effect.name for a in acting)) and noise is not None:
+            break
         there, target = tangent(situation, measured, acting)
         ok = usable & torch.isfinite(target).all(-1) & torch.isfinite(there.jacobian).flatten(1).all(-1)
         if int(ok.sum()) < 0.9 * int(usable.sum()):
@@ -129,6 +135,10 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
             if not effect.shapes(situation):
                 none = Shaped(default_shape(situation, effect), None, 0.0)
                 atoms.append(_cleaned(_atom(situation, there, effect, none), ok))
+                beside = [a for a in acting if a.effect is not effect]
+                left = torch.where(ok[:, None], torch.nan_to_num(remainder(situation, measured, beside)), 0.0)
+                part = _best_part(situation, atoms[-1], white, left)
+                atoms += [part] if part is not None else []
                 continue
             others = [
                 white(_cleaned(_atom(situation, there, a.effect, Shaped(a.shape, None, 0.0)), ok).columns)
@@ -171,6 +181,21 @@ def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped
     if shaped.used is not None:
         columns = columns[..., list(shaped.used)]
     return Atom(effect.name, effect, shaped.value, columns, LOG_PRIOR - shaped.charge, shaped.used)
+
+
+def _best_part(situation: Situation, atom: Atom, white: Whitening, y: Tensor) -> Atom | None:
+    """Of an effect with many coefficients those of the one joint or leg that explains most of `y` by itself."""
+    assert atom.effect is not None
+    coefficients = atom.effect.coefficients(situation)
+    owners = [c.joint if c.leg is None else c.leg for c in coefficients]
+    parts = [[k for k, o in enumerate(owners) if o == owner] for owner in dict.fromkeys(owners) if owner is not None]
+    if len(coefficients) < _MANY or len(parts) < 2:
+        return None
+    evidence, _ = alone(grams_of(white(atom.columns), white(y)), [torch.tensor(p) for p in parts], _SIZE_SPREAD)
+    part = parts[int(evidence[1:].argmax())]
+    return replace(
+        atom, columns=atom.columns[..., part], log_prior=atom.log_prior - math.log(len(parts)), used=tuple(part)
+    )
 
 
 def _only(white: Whitening, usable: Tensor) -> Whitening:

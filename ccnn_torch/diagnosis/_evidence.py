@@ -13,8 +13,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Fits", "Grams", "fit_sets", "grams_of"]
+__all__ = ["Fits", "Grams", "alone", "fit_sets", "grams_of", "of_like_width"]
 
+_BUCKET = 16
 # Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
 _SPREAD = 4.0
 _LIMIT = 25.0
@@ -119,6 +120,24 @@ def fit_sets(
     energy = (part * (g @ part)).sum(1)
     covariance = scale[:, :, None] * inverse * scale[:, None, :]
     return Fits(log_evidence, noise, columns, slot, mean, covariance, energy, rss, gamma.sum(-1), psi)
+
+
+def of_like_width(sets: Sequence[Sequence[Tensor]]) -> list[list[int]]:
+    """Numbers of the sets in lots of about as many columns: those are fitted side by side."""
+    lots: dict[int, list[int]] = {}
+    for k, groups in enumerate(sets):
+        lots.setdefault(-(-sum(map(len, groups)) // _BUCKET), []).append(k)
+    return list(lots.values())
+
+
+def alone(grams: Grams, groups: Sequence[Tensor], spread: float) -> tuple[Tensor, Tensor]:
+    """Log evidence of no group and of each by itself, and the noise that they leave; `1 + groups` each."""
+    sets: list[list[Tensor]] = [[], *([g] for g in groups)]
+    evidence, noise = grams.xy.new_empty(len(sets)), grams.xy.new_empty(len(sets))
+    for lot in of_like_width(sets):
+        fits = fit_sets(grams, [sets[k] for k in lot], 0.0, spread=spread)
+        evidence[lot], noise[lot] = fits.log_evidence, fits.noise
+    return evidence, noise
 
 
 def _padded(sets: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:

@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import Atom
-from ccnn_torch.diagnosis._evidence import Grams, fit_sets
+from ccnn_torch.diagnosis._evidence import Grams, fit_sets, of_like_width
 
 __all__ = ["Found", "Library", "scored", "search"]
 
 _MOST = 4
-_BUCKET = 16
 # A third cause at once is rarer still than a second one.
 _CROWD = math.log(0.1)
 
@@ -51,15 +50,10 @@ class Found:
 
 def scored(library: Library, sets: Sequence[tuple[int, ...]], iterations: int = 8) -> list[Found]:
     """Fit the sets, those of like width side by side."""
-    width = [sum(len(library.groups[i]) for i in s) for s in sets]
-    buckets: dict[int, list[int]] = {}
-    for k, w in enumerate(width):
-        buckets.setdefault(-(-w // _BUCKET), []).append(k)
+    groups = [[library.groups[i] for i in s] for s in sets]
     found: dict[int, Found] = {}
-    for members in buckets.values():
-        fits = fit_sets(
-            library.grams, [[library.groups[i] for i in sets[k]] for k in members], library.noise_dof, iterations
-        )
+    for members in of_like_width(groups):
+        fits = fit_sets(library.grams, [groups[k] for k in members], library.noise_dof, iterations)
         for row, k in enumerate(members):
             prior = sum(library.atoms[i].log_prior for i in sets[k]) + _CROWD * max(len(sets[k]) - 2, 0)
             evidence = float(fits.log_evidence[row])

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._evidence import Grams, fit_sets, grams_of
+from ccnn_torch.diagnosis._evidence import Grams, alone, fit_sets, grams_of
 from ccnn_torch.effects import Situation
 
 __all__ = ["Whitening", "fitted_whitening", "moving_channels", "reweighted"]
@@ -98,8 +98,8 @@ def fitted_whitening(
             whole = grams_of(x, y)
         y = white(left)
         rest = [g for g in groups if not any(g is c for c in chosen)]
-        alone = Grams(whole.xx, x.flatten(0, 1).mT @ y.flatten(), y.square().sum(), whole.values)
-        evidence = fit_sets(alone, [[], *([g] for g in rest)], 0.0, spread=_ANY_SIZE).log_evidence
+        beside = Grams(whole.xx, x.flatten(0, 1).mT @ y.flatten(), y.square().sum(), whole.values)
+        evidence, _ = alone(beside, rest, _ANY_SIZE)
         best = int(evidence[1:].argmax())
         if float(evidence[best + 1] - evidence[0]) < _SLIGHT:
             break
@@ -115,10 +115,10 @@ def _noise_share(x: Tensor, y: Tensor, groups: Sequence[Tensor]) -> Tensor:
     """
     share = []
     for c in range(y.shape[-1]):
-        fits = fit_sets(grams_of(x[:, c : c + 1], y[:, c : c + 1]), [[], *([g] for g in groups)], 0.0, spread=_ANY_SIZE)
-        best = int(fits.log_evidence.argmax())
-        clear = float(fits.log_evidence[best] - fits.log_evidence[0]) > _SLIGHT
-        share.append(fits.noise[best] / fits.noise[0] if clear else torch.ones_like(fits.noise[0]))
+        evidence, left = alone(grams_of(x[:, c : c + 1], y[:, c : c + 1]), groups, _ANY_SIZE)
+        best = int(evidence.argmax())
+        clear = float(evidence[best] - evidence[0]) > _SLIGHT
+        share.append(left[best] / left[0] if clear else torch.ones_like(left[0]))
     return torch.stack(share).clamp(1e-6, 1.0)
 
 
