@@ -112,7 +112,8 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         scan = Scan(situation, situation, atom.effect, _only(white, usable))
         for nuisance in (alone, beside):
             shaped_so = scan.best(white(residual), nuisance)
-            starts.append(_cleaned(_atom(situation, situation, atom.effect, shaped_so), usable))
+            if not any(a.effect is atom.effect and _same_shape(a, shaped_so) for a in starts):
+                starts.append(_cleaned(_atom(situation, situation, atom.effect, shaped_so), usable))
     result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest], near, rich, fitted)
 
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
@@ -148,8 +149,8 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
             beside = torch.cat([white(fitted), *others], -1)
             shaped_so = Scan(situation, there, effect, _only(white, ok)).best(white(target), beside, start)
             atoms.append(_cleaned(_atom(situation, there, effect, shaped_so), ok))
-            if not inside:
-                old = next(a for a in result.library.atoms if a.effect is effect)
+            # What was found at first stays a candidate: what acts now may have hidden the better shape.
+            for old in (a for a in starts if a.effect is effect and not _same_shape(a, shaped_so)):
                 so = Shaped(old.shape, old.used, LOG_PRIOR - old.log_prior)
                 atoms.append(_cleaned(_atom(situation, there, effect, so), ok))
         result = _searched(situation, measured, target, white, [*atoms, *rest], near, rich, fitted)
@@ -181,6 +182,10 @@ def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped
     if shaped.used is not None:
         columns = columns[..., list(shaped.used)]
     return Atom(effect.name, effect, shaped.value, columns, LOG_PRIOR - shaped.charge, shaped.used)
+
+
+def _same_shape(atom: Atom, shaped: Shaped) -> bool:
+    return atom.used == shaped.used and torch.allclose(atom.shape, shaped.value, rtol=1e-3)
 
 
 def _best_part(situation: Situation, atom: Atom, white: Whitening, y: Tensor) -> Atom | None:

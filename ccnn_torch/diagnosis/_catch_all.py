@@ -173,9 +173,7 @@ def _whole(situation: Situation, driver: str, features: Tensor) -> Atom:
     return Atom(driver, None, features.new_zeros(0), columns[..., shown], LOG_PRIOR)
 
 
-def _atom(
-    situation: Situation, driver: str, features: Tensor, only: int | None = None, most: int = _MOST
-) -> Atom:
+def _atom(situation: Situation, driver: str, features: Tensor, only: int | None = None, most: int = _MOST) -> Atom:
     """features: `s x f`; columns = joints' Jacobian times the features, reduced to the directions that matter."""
     sizes = torch.tensor([_SCALE.get(j.unit, 5e-4) for j in situation.mechanism.joints], dtype=features.dtype)
     jacobian = situation.jacobian * sizes

@@ -16,11 +16,15 @@ __all__ = ["Scan", "Shaped"]
 
 # The grid, then twice this many values between the neighbours of the best.
 _FINE, _ROUNDS = 9, 2
+# Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
+_LOOSE = 10.0
+# Shapes that share coefficients are looked for together where that are no more values.
+_TOGETHER = 150
 
 
 class Shaped(NamedTuple):
     """Shapes found: `value` `h`; `used`, the coefficients whose shape is worth its charge (None = all); and `charge`,
-    what looking for them costs in log odds, the logarithm of how many values were looked at."""
+    what looking for them costs in log odds: the logarithm of the share of the values looked at that do as well."""
 
     value: Tensor
     used: tuple[int, ...] | None
@@ -32,6 +36,14 @@ class _Part(NamedTuple):
 
     shapes: list[int]
     columns: list[int]
+
+
+class _Turn(NamedTuple):
+    """Candidates `g x h`, the columns of each part there, and how many of them a part looks at: 0 = none this time."""
+
+    candidates: Tensor
+    columns: list[Tensor]
+    sizes: list[int]
 
 
 class Scan:
@@ -51,7 +63,7 @@ class Scan:
         self.lead = whiten(torch.nan_to_num(kind())) if kind is not None else None
         free = [c for c in range(len(coefficients)) if not any(c in p.columns for p in self.parts)]
         self.unshaped = self._whitened(effect.basis(situation, self.start)[None], free)[0]
-        self.coarse: list[tuple[Tensor, list[Tensor]]] | None = None
+        self.coarse: list[_Turn] | None = None
 
     def columns(self, candidates: Tensor) -> list[Tensor]:
         """Of each part, whitened, in plausible sizes, `g x N x m`; candidates: `g x h`."""
@@ -73,42 +85,64 @@ class Scan:
                 other.
         """
         value = self.start if start is None else start
-        target, fixed = y.flatten(), torch.cat([others.flatten(0, 1), self.unshaped], -1)
+        target, fixed = y.flatten(), _LOOSE * torch.cat([others.flatten(0, 1), self.unshaped], -1)
         gains = [0.0] * len(self.parts)
+        charges = [0.0] * len(self.parts)
         plain = _Left(target, fixed)
         for level in range(_ROUNDS + 1):
-            for candidates, pieces in self._level(value, level):
+            for candidates, pieces, sizes in self._level(value, level):
                 chosen = [self._nearest(candidates, value, part) for part in self.parts]
+                spent = [0.0] * len(self.parts)
                 for sweep in range(2 if start is not None and len(self.parts) > 1 else 1):
                     for i, z in enumerate(pieces):
+                        if not sizes[i]:
+                            continue
                         left = plain
                         if sweep:
-                            own = [p[chosen[j]] for j, p in enumerate(pieces) if j != i]
+                            own = [_LOOSE * p[chosen[j]] for j, p in enumerate(pieces) if j != i]
                             left = _Left(target, torch.cat([fixed, *own], -1))
-                        score = left.gain(z)
+                        score = left.gain(z[: sizes[i]])
                         chosen[i] = int(score.argmax())
                         gains[i] = float(score[chosen[i]])
+                        spent[i] = _charge(score) if level == 0 else 0.0
+                charges = [c + s for c, s in zip(charges, spent, strict=True)]
                 value = value.clone()
                 for i, part in enumerate(self.parts):
                     value[part.shapes] = candidates[chosen[i]][part.shapes]
-        return self._worth(value, gains)
+        return self._worth(value, gains, charges)
 
-    def _level(self, value: Tensor, level: int) -> list[tuple[Tensor, list[Tensor]]]:
-        """Candidates `g x h` with their columns; every first shape of a part at once, then every second one."""
+    def _level(self, value: Tensor, level: int) -> list[_Turn]:
+        """Candidates with their columns: of every part all its shapes at once where that are few, else one by one."""
         if level == 0 and self.coarse is not None:
             return self.coarse
+        tables = [self._tables(value, part, level) for part in self.parts]
         found = []
-        for turn in range(max((len(p.shapes) for p in self.parts), default=0)):
-            moving = [p.shapes[turn] for p in self.parts if turn < len(p.shapes)]
-            grids = {h: self._grid(h, float(value[h]), level) for h in moving}
-            longest = max(len(g) for g in grids.values())
-            candidates = value.expand(longest, -1).clone()
-            for h, grid in grids.items():
-                candidates[: len(grid), h] = grid
-                candidates[len(grid) :, h] = grid[-1]
-            found.append((candidates, self.columns(candidates)))
+        for turn in range(max(map(len, tables), default=0)):
+            mine = [
+                table[turn] if turn < len(table) else value[part.shapes][None, :0]
+                for part, table in zip(self.parts, tables, strict=True)
+            ]
+            candidates = value.expand(max(map(len, mine)), -1).clone()
+            for part, table in zip(self.parts, mine, strict=True):
+                if table.shape[-1]:
+                    candidates[: len(table), part.shapes] = table
+                    candidates[len(table) :, part.shapes] = table[-1]
+            sizes = [len(table) if table.shape[-1] else 0 for table in mine]
+            found.append(_Turn(candidates, self.columns(candidates), sizes))
         if level == 0:
             self.coarse = found
+        return found
+
+    def _tables(self, value: Tensor, part: _Part, level: int) -> list[Tensor]:
+        """Values to look at, one table a turn, `g x (shapes of the part)`."""
+        grids = [self._grid(h, float(value[h]), level) for h in part.shapes]
+        if len(grids) > 1 and level == 0 and math.prod(map(len, grids)) <= _TOGETHER:
+            return [torch.cartesian_prod(*grids)]
+        found = []
+        for k, grid in enumerate(grids):
+            table = value[part.shapes].expand(len(grid), -1).clone()
+            table[:, k] = grid
+            found.append(table)
         return found
 
     def _grid(self, h: int, value: float, level: int) -> Tensor:
@@ -124,9 +158,8 @@ class Scan:
     def _nearest(self, candidates: Tensor, value: Tensor, part: _Part) -> int:
         return int((candidates[:, part.shapes] - value[part.shapes]).abs().sum(-1).argmin())
 
-    def _worth(self, value: Tensor, gains: Sequence[float]) -> Shaped:
+    def _worth(self, value: Tensor, gains: Sequence[float], charges: Sequence[float]) -> Shaped:
         """Only the parts that pay for their search and half a unit of log evidence a coefficient; at least the best."""
-        charges = [sum(math.log(max(len(self.shapes[h].grid), 1)) for h in p.shapes) for p in self.parts]
         net = [g / 2 - c for g, c in zip(gains, charges, strict=True)]
         best = max(range(len(net)), key=lambda i: net[i])
         kept = [i for i, p in enumerate(self.parts) if i == best or net[i] > 1.5 * len(p.columns)]
@@ -135,6 +168,11 @@ class Scan:
             return Shaped(value, None, charge)
         unshaped = set(range(len(self.size))) - {c for p in self.parts for c in p.columns}
         return Shaped(value, tuple(sorted(unshaped | {c for i in kept for c in self.parts[i].columns})), charge)
+
+
+def _charge(gain: Tensor) -> float:
+    """Log odds that a search over a grid costs, `g` squares explained at each value: nothing where all do as well."""
+    return math.log(len(gain)) - float(torch.logsumexp((gain - gain.max()) / 2, 0))
 
 
 class _Left:

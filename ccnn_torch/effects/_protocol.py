@@ -50,12 +50,14 @@ class Shape:
         grid: values to look at, ascending; the search refines between neighbours and never leaves the grid's ends.
         columns: which coefficients depend on it, or None where all do; shapes without a common coefficient are
             searched one by one.
+        usual: what a simulation takes unless told otherwise; drawn from the lower half of the grid where None.
     """
 
     name: str
     unit: str
     grid: tuple[float, ...]
     columns: tuple[int, ...] | None = None
+    usual: float | None = None
 
 
 @runtime_checkable

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -22,7 +23,7 @@ _EDGES = ((" softer", 2 * _SOFT), (" harder", 0.5 * _SOFT))
 
 
 class Backlash:
-    """Δq_i = b_i / 2 tanh((w_i - s_i h) / (e h)): s the direction of approach, w the push of weight and load.
+    """Δq_i = b_i / 2 tanh((w_i / h - s_i) / e) / tanh(1 / e): s the direction of approach, w the push on the joint.
 
     A joint rests on the flank that drove it, half the play b behind the motor's middle, unless weight and load push it
     onto the other flank whichever way it came; friction holds it there up to the push h. The machine's weight and h are
@@ -54,14 +55,19 @@ class Backlash:
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """The machine's weight beside a load that was recorded, and the push that friction holds."""
-        hold = Shape("hold", "1", _HOLDS)
-        return (Shape("weight", "N", WEIGHTS), hold) if situation.loaded else (hold,)
+        hold = Shape("hold", "1", _HOLDS, usual=_HOLDS[-1])
+        return (Shape("weight", "N", WEIGHTS, usual=PLATFORM_WEIGHT), hold) if situation.loaded else (hold,)
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x 3 · (joints whose direction is known)`."""
         weight = shape[..., 0] if situation.loaded else shape.new_tensor(PLATFORM_WEIGHT)
         hold = shape[..., -1, None, None]
         left = situation.push(weight) / hold - situation.direction
-        rest = torch.tanh(left / _SOFT) / 2
-        edges = [torch.tanh(left / soft) / 2 - rest for _, soft in _EDGES]
+        rest = _rest(left, _SOFT)
+        edges = [_rest(left, soft) - rest for _, soft in _EDGES]
         return by_joint(torch.stack([rest, *edges], -1), situation.directed)
+
+
+def _rest(left: Tensor, soft: float) -> Tensor:
+    """Where a joint rests within its play, ±1/2 where nothing pushes it off its flank."""
+    return torch.tanh(left / soft) / (2 * math.tanh(1 / soft))

@@ -26,10 +26,10 @@ class Compliance:
     """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0 + h_i τ_i³ / τ_0², τ = what the load asks of the joint; and members that
     give, e_k.
 
-    τ_0 = 100 N or 30 N·m: d and h are changes of compliance there. Secondary as well, the members: a leg stretches in all
-    its lengths p in proportion to what the load asks of them, Δp = e (∂x/∂p) · load (virtual work); a link of an arm
-    tilts at its joint under the part of the moment that the joint does not carry. All to first order about the nominal
-    pose, so that the effect is one on the pose.
+    τ_0 = 100 N or 30 N·m: d and h are changes of compliance there. Secondary as well, the members: a leg stretches in
+    all its lengths p in proportion to what the load asks of them, Δp = e (∂x/∂p) · load (virtual work); a link of an
+    arm tilts at its joint under the part of the moment that the joint does not carry. All to first order about the
+    nominal pose, so that the effect is one on the pose.
     """
 
     name = "compliance"

@@ -27,8 +27,8 @@ class Friction:
 
     Coulomb's friction is in proportion to what presses the surfaces together; a drive of compliance C and friction
     coefficient μ stops C μ |τ| short. The weight is that of a platform of 100 N: of another one d is as much larger.
-    Secondary: load and weight together, |τ_load + τ_weight|, where they pull apart, the weight a shape; and the part e that does not depend
-    on them, which by itself is what play does.
+    Secondary: load and weight together, |τ_load + τ_weight|, where they pull apart, the weight a shape; and the part e
+    that does not depend on them, which by itself is what play does.
     """
 
     name = "friction"
@@ -61,7 +61,7 @@ class Friction:
         if not situation.loaded:
             return ()
         together = tuple(k for k, c in enumerate(self.coefficients(situation)) if c.name.endswith("together"))
-        return (Shape("weight", "N", WEIGHTS, together),)
+        return (Shape("weight", "N", WEIGHTS, together, usual=PLATFORM_WEIGHT),)
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x m`, joint by joint."""

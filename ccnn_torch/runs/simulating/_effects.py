@@ -105,7 +105,8 @@ def act(wanted: Wanted, situation: Situation, generator: torch.Generator) -> Act
     at = []
     for shape in shapes:
         pick = int(torch.randint(max(len(shape.grid) // 2, 1), (), generator=generator))
-        at.append(values.get(shape.name, shape.grid[pick]))
+        usual = shape.grid[pick] if shape.usual is None else shape.usual
+        at.append(values.get(shape.name, usual))
     return Acting(effect, torch.tensor(at, dtype=torch.float64), drawn)
 
 
