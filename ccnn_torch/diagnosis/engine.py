@@ -93,6 +93,7 @@ def diagnose_rows(
     lost = torch.nonzero(~fine).squeeze(-1).tolist()
     set_aside = sorted([*lost, *(int(chosen[i]) for i in aside)])
     told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict}
+    places, intervals = where(analysis, residual, seed)
     verdict["text"] = verdict_text(told | {"rows_set_aside": set_aside})
     notes = [f"{name} cannot be seen without {why}" for name, why in lacking.items()]
     notes += situation.mechanism.remarks([*situation.covariates])
@@ -101,7 +102,8 @@ def diagnose_rows(
     return Diagnosis(
         gap=gap,
         gap_rotation=gap_rotation,
-        where=where(analysis, residual),
+        where=places,
+        where_ci95=intervals,
         effects=listed,
         verdict=verdict,
         next_measurements=next_measurements(analysis, judgement, seed),

@@ -33,6 +33,7 @@ class Diagnosis:
     gap: dict[str, Any]
     gap_rotation: dict[str, Any] | None
     where: dict[str, Any]
+    where_ci95: dict[str, Any]
     effects: list[dict[str, Any]]
     verdict: dict[str, Any]
     next_measurements: list[dict[str, Any]]
@@ -48,6 +49,7 @@ class Diagnosis:
             "gap": self.gap,
             "gap_rotation": self.gap_rotation,
             "where": self.where,
+            "where_ci95": self.where_ci95,
             "effects": self.effects,
             "verdict": self.verdict,
             "next_measurements": self.next_measurements,
