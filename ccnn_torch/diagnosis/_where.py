@@ -75,9 +75,7 @@ def where(analysis: Analysis, residual: Tensor, seed: int = 0) -> tuple[dict[str
     places, inside = _regions(analysis, keep)
     regions = draws.shares(_split(rows, inside))
     edges = {
-        name: _bins(value[keep])
-        for name, value in situation.covariates.items()
-        if float(value.max() - value.min()) > 0
+        name: _bins(value[keep]) for name, value in situation.covariates.items() if float(value.max() - value.min()) > 0
     }
     covariates = {name: draws.shares(_split(rows, member)) for name, (_, member) in edges.items()}
     told = {

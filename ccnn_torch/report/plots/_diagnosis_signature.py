@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ccnn_torch._display import display_unit
+from ccnn_torch._display import display_unit, unit_text
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.report.diagnosis_data import Signature, used_rows
 from ccnn_torch.report.plots._style import AFTER, BEFORE, FLOOR, GREY, RASTER_ABOVE, Plot, styled
@@ -70,7 +70,7 @@ def axis_values(values: Array, axis: Coordinate) -> tuple[Array, str]:
     """Values for an axis and its label: lengths in mm, temperatures in °C."""
     if axis.unit == "K":
         return values - _KELVIN, f"{axis.name} [°C]"
-    scale, unit = (1e-3, "mm") if axis.unit == "m" else (1.0, axis.unit)
+    scale, unit = (1e-3, "mm") if axis.unit == "m" else (1.0, unit_text(axis.unit))
     return values / scale, f"{axis.name} [{unit}]"
 
 

@@ -1,0 +1,82 @@
+"""What was not recorded: columns that would bring further effects into sight, and how large those may be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis._analysis import Analysis
+from ccnn_torch.diagnosis._atoms import default_shape, scaled_signature
+from ccnn_torch.effects import Effect, Situation
+from ccnn_torch.effects.covariates import covariate_units, draw_covariates
+
+__all__ = ["missing_covariates"]
+
+_KINDS = ("time", "temperature", "load", "direction", "speed")
+# Of a joint on its way past the measuring device, in its ranges a second.
+_SPEED = 0.2
+
+
+def missing_covariates(
+    analysis: Analysis, effects: Sequence[Effect], lacking: Mapping[str, str], driver: str | None, seed: int
+) -> list[dict[str, Any]]:
+    """The block `missing_covariates` of diagnosis.json: what to record beside the pose, most promising first.
+
+    The plausible size of an effect is what its coefficients, each of its plausible size, do to the median row under
+    conditions drawn for them (`draw_covariates`: a shift in a hall, loads of 60 N and 6 N·m). Where something
+    that no effect describes follows the time, the temperature comes first.
+
+    Args:
+        analysis: of the rows.
+        effects: all candidates.
+        lacking: what is missing for those of them that the rows cannot show, by name.
+        driver: of what no effect describes.
+        seed: of the conditions drawn.
+    """
+    situation = analysis.situation
+    mechanism, units = situation.mechanism, covariate_units(situation.mechanism) | {"temperature": "degC"}
+    generator = torch.Generator().manual_seed(seed)
+    drawn = draw_covariates(mechanism, situation.joints, generator)
+    low, high = situation.workspace
+    speed = _SPEED * (high - low) * torch.randn(situation.joints.shape, generator=generator, dtype=torch.float64)
+    drawn |= {f"speed{i + 1}": v for i, v in enumerate(speed.unbind(-1))}
+    names = [*situation.covariates]
+    kinds = {k: [n for n in drawn if n.startswith(k) and n not in names] for k in _KINDS}
+    position = bool((analysis.whitening.channels < 3).any())
+    found: dict[tuple[str, ...], dict[str, float]] = {}
+    for effect in (e for e in effects if lacking.get(e.name)):
+        for added in _additions(kinds):
+            if effect.missing(mechanism, [*names, *added]):
+                continue
+            with_them = dict(situation.covariates) | {n: drawn[n] for n in added}
+            size = _plausible(replace(situation, covariates=with_them), effect, position)
+            if size > 0:
+                found.setdefault(added, {})[effect.name] = size
+                break
+    told: list[dict[str, Any]] = [
+        {"columns": [f"{n}[{units[n]}]" for n in added], "effects": sizes, "unit": "m" if position else "rad"}
+        for added, sizes in found.items()
+    ]
+    first = "temperature" if driver == "time" else ""
+    return sorted(told, key=lambda e: (not first or not e["columns"][0].startswith(first), -max(e["effects"].values())))
+
+
+def _additions(kinds: Mapping[str, list[str]]) -> Iterator[tuple[str, ...]]:
+    """Columns that might be added: those of one kind, then of two."""
+    there = [k for k in kinds if kinds[k]]
+    for count in (1, 2):
+        for some in combinations(there, count):
+            yield tuple(n for k in some for n in kinds[k])
+
+
+def _plausible(situation: Situation, effect: Effect, position: bool) -> float:
+    """What an effect of plausible size does to the usual row [m] or [rad]."""
+    main = [i for i, c in enumerate(effect.coefficients(situation)) if not c.secondary]
+    columns = scaled_signature(situation, effect, default_shape(situation, effect))[..., main]
+    block: Tensor = columns[:, :3] if position else columns[:, 3:]
+    return float(torch.nan_to_num(block).square().sum((1, 2)).median().sqrt())
