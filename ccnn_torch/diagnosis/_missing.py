@@ -17,9 +17,8 @@ from ccnn_torch.effects.covariates import covariate_units, draw_covariates
 
 __all__ = ["missing_covariates"]
 
-_KINDS = ("time", "temperature", "load", "direction", "speed")
-# Of a joint on its way past the measuring device, in its ranges a second.
-_SPEED = 0.2
+# Speeds are not among them: rows at rest, as most are, have none.
+_KINDS = ("time", "temperature", "load", "direction")
 
 
 def missing_covariates(
@@ -42,9 +41,6 @@ def missing_covariates(
     mechanism, units = situation.mechanism, covariate_units(situation.mechanism) | {"temperature": "degC"}
     generator = torch.Generator().manual_seed(seed)
     drawn = draw_covariates(mechanism, situation.joints, generator)
-    low, high = situation.workspace
-    speed = _SPEED * (high - low) * torch.randn(situation.joints.shape, generator=generator, dtype=torch.float64)
-    drawn |= {f"speed{i + 1}": v for i, v in enumerate(speed.unbind(-1))}
     names = [*situation.covariates]
     kinds = {k: [n for n in drawn if n.startswith(k) and n not in names] for k in _KINDS}
     position = bool((analysis.whitening.channels < 3).any())

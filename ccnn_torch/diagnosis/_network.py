@@ -26,8 +26,8 @@ Progress = Callable[[float], None]
 """Told the share that is done, 0 to 1."""
 
 _FOLDS = 5
-# More rows than this make the answer no surer and the training slow: so many are drawn.
-_ROWS = 600
+# More rows than this, and more outputs (rows times joints), make the training slow: so many are drawn.
+_ROWS, _VALUES = 600, 2400
 # One coevolution of one structure: on five-bars and a Stewart platform what six of two left was within the interval,
 # at ten times the time.
 _SETTINGS = CCNNSettings(members=1, kept=1, rival_hidden=(), refinement_iterations=25, harmonics=0)
@@ -70,9 +70,10 @@ def remaining_gain(
     channels = position if bool(position.any()) else ~position
     fold = folds(len(white.keep()), seed)
     rows = torch.arange(len(fold))
-    if len(rows) > _ROWS:
+    most = min(_ROWS, _VALUES // len(analysis.situation.mechanism.joints))
+    if len(rows) > most:
         drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
-        rows = drawn[:_ROWS].sort().values
+        rows = drawn[:most].sort().values
     left = _left(analysis, judgement, fold)[:, rows]
     here = (fold[rows], torch.arange(len(rows)))
     before = _squares(left[here], white.sigma, channels)

@@ -51,7 +51,7 @@ def next_measurements(analysis: Analysis, judgement: Judgement, seed: int) -> li
     Rows are chosen one after the other, each for what it adds to those before it; `gain` is that of the row by itself.
     """
     rivals = _rivals(analysis, judgement)
-    if not rivals:
+    if not any(found.members for _, found in rivals):
         return []
     situation = _candidates(analysis, seed)
     first, x = rivals[0][1], _columns(analysis, rivals[0][1], situation)
@@ -68,12 +68,12 @@ def next_measurements(analysis: Analysis, judgement: Judgement, seed: int) -> li
 
 
 def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Found]]:
-    """The most probable sets with other library names, no catch-all among them, and their probabilities."""
+    """The most probable sets with other library names, or none, no catch-all among them, and their probabilities."""
     atoms = analysis.library.atoms
     plain = [
         (probability, one)
         for _, driver, probability, one in judgement.leading
-        if driver is None and one.members and not any(atoms[i].catch_all for i in one.members)
+        if driver is None and not any(atoms[i].catch_all for i in one.members)
     ]
     return plain[:_RIVALS]
 
@@ -113,7 +113,7 @@ def _common(situation: Situation) -> bool:
 
 def _columns(analysis: Analysis, found: Found, there: Situation) -> Tensor:
     """Deviation at the candidates per plausible size of each coefficient of a set, in units of the noise."""
-    columns = []
+    columns = [there.jacobian[..., :0]]
     for i in found.members:
         atom = analysis.library.atoms[i]
         assert atom.effect is not None
