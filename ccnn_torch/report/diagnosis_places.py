@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from ccnn_torch._display import display_unit, number_text, unit_text
 from ccnn_torch.report.diagnosis_data import About, used_rows
-from ccnn_torch.report.diagnosis_tables import percent
+from ccnn_torch.report.diagnosis_tables import percent, percent_interval
 from ccnn_torch.report.table_form import Table
 
 __all__ = ["aside_table", "next_table", "quantity_text", "region_table", "shares", "where_table", "write_next_csv"]
 
 Block = Mapping[str, Any]
 _KELVIN = 273.15
-_SHARE = "Share: of the gap's mean square that lies there, [95 % interval] where it is known."
+_SHARES = ("share of the gap [%]", "95 % interval [%]")
+_SHARE = "Share: of the gap's mean square that lies there."
 
 
 def quantity_text(value: float, unit: str, digits: int = 4) -> str:
@@ -70,13 +71,17 @@ def where_table(results: Block, about: About, *, telling: bool = False) -> Table
         intervals = [interval for group, _, _, interval in found if group == name]
         even = all(i is not None and i[0] <= 1 / len(regimes) <= i[1] for i in intervals)
         hidden += [name] if telling and even else []
-    rows = [(part, percent(share, interval)) for group, part, share, interval in found if group not in hidden]
+    rows = [
+        (part, percent(share), percent_interval(interval))
+        for group, part, share, interval in found
+        if group not in hidden
+    ]
     if not rows:
         return None
     note = _share_note(results)
     if hidden:
         note += f" Not shown: {', '.join(hidden)}, over which the gap is even as far as these rows tell."
-    return Table("Where does the gap lie?", ("part", "share of the gap [%]"), tuple(rows), note)
+    return Table("Where does the gap lie?", ("part", *_SHARES), tuple(rows), note)
 
 
 def region_table(results: Block, about: About) -> Table | None:
@@ -93,8 +98,8 @@ def region_table(results: Block, about: About) -> Table | None:
             middle, half = region["center"][name], region["half_width"][name]
             low, high = (quantity_text(middle + side * half, about.unit(name)) for side in (-1, 1))
             cells.append(f"{low} to {high}")
-        rows.append((cells[0], *cells[1:], percent(region["share"], interval), str(region["rows"])))
-    columns = (*names, "share of the gap [%]", "rows")
+        rows.append((*cells, percent(region["share"]), percent_interval(interval), str(region["rows"])))
+    columns = (*names, *_SHARES, "rows")
     return Table("In which region?", columns, tuple(rows), "Largest share first. " + _share_note(results))
 
 

@@ -18,15 +18,16 @@ __all__ = [
     "order_table",
     "parameter_table",
     "percent",
+    "percent_interval",
     "record_table",
     "unseen_table",
 ]
 
 Block = Mapping[str, Any]
 _Z95 = 1.96
-_SHRINK = (
-    "Removed: share of the mean square above the noise that goes on rows not used for fitting, [95 % interval]; "
-    "it is unknown (–) where the gap is not above the noise."
+_REMOVED = (
+    "Removed: share of the mean square above the noise that goes on rows not used for fitting; it is unknown (–) where "
+    "the gap is not above the noise."
 )
 
 
@@ -38,6 +39,11 @@ def percent(value: float | None, interval: Sequence[float] | None = None) -> str
     if interval is not None:
         text += f" [{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]"
     return text
+
+
+def percent_interval(interval: Sequence[float] | None) -> str:
+    """`91.0 to 95.0`, without its unit."""
+    return "–" if interval is None else f"{100 * interval[0]:.1f} to {100 * interval[1]:.1f}"
 
 
 def gap_table(results: Block, about: About) -> Table:
@@ -81,7 +87,7 @@ def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
     ]
     columns = ("effect", "what it is", "probability", f"gap with it alone [{unit}]", "removed [%]", "not told from")
     before = number_text(_over(results["gap"]["before"], scale), 4)
-    note = f"● in the verdict. The gap without any of them is {before} {unit}. {_SHRINK}"
+    note = f"● in the verdict. The gap without any of them is {before} {unit}. {_REMOVED} In brackets: 95 % interval."
     if hidden := len(results["effects"]) - len(shown):
         note += f" Not shown: {hidden} with a probability below {least:g}."
     return Table("Which effect?", columns, tuple(rows), note, ("what it is", "not told from"))
@@ -94,18 +100,15 @@ def order_table(results: Block) -> Table | None:
         return None
     gap = results["gap"]
     scale, unit = display_unit(gap["unit"], gap["before"] or 1.0)
-    rows = [("the model as it is", number_text(_over(gap["before"], scale), 4), "–")]
+    rows = [("the model as it is", number_text(_over(gap["before"], scale), 4), "–", "–")]
     for entry in added:
-        removed = percent(entry["shrink"], entry["shrink_ci95"])
-        rows.append((f"+ {entry['name']}", number_text(_over(entry["gap_after"], scale), 4), removed))
+        size = number_text(_over(entry["gap_after"], scale), 4)
+        rows.append((f"+ {entry['name']}", size, percent(entry["shrink"]), percent_interval(entry["shrink_ci95"])))
     if network.get("gap_after") is not None:
-        low, high = (number_text(v / scale, 4) for v in network["gap_after_ci95"])
-        rows.append(
-            ("+ a network on the remainder", f"{number_text(network['gap_after'] / scale, 4)} [{low}, {high}]", "–")
-        )
-    rows.append(("noise floor", number_text(_over(gap["noise_floor"], scale), 4), "–"))
-    columns = ("added to the model", f"gap on held-out rows [{unit}]", "removed in all [%]")
-    return Table("How far does it shrink?", columns, tuple(rows), f"{_SHRINK} {network_text(results)}".rstrip())
+        rows.append(("+ a network on the remainder", number_text(network["gap_after"] / scale, 4), "–", "–"))
+    rows.append(("noise floor", number_text(_over(gap["noise_floor"], scale), 4), "–", "–"))
+    columns = ("added to the model", f"gap on held-out rows [{unit}]", "removed in all [%]", "95 % interval [%]")
+    return Table("How far does it shrink?", columns, tuple(rows), f"{_REMOVED} {network_text(results)}".rstrip())
 
 
 def parameter_table(results: Block, most: int = 24) -> Table | None:
