@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +27,7 @@ CAUSE = {"L1": 5e-4}
 CANDIDATES = ["geometry", "joint_offset", "joint_gain", "gravity", "frame", "instrument"]
 
 
-def _more(rows: Situation, joints: Tensor, covariates: dict[str, Tensor]) -> Situation:
+def _more(rows: Situation, joints: Tensor, covariates: Mapping[str, Tensor]) -> Situation:
     """Rows measured after the others, a minute each."""
     late = rows.covariates["time"][-1] + 60 * torch.arange(1, len(joints) + 1, dtype=torch.float64)
     added = {**covariates, "time": late}
@@ -42,7 +43,7 @@ def _proposed(said: Diagnosis) -> tuple[Tensor, dict[str, Tensor]]:
     return joints, {n: torch.tensor([m["covariates"][n] for m in wanted], dtype=torch.float64) for n in names}
 
 
-def _belief(rows: Situation, joints: Tensor, covariates: dict[str, Tensor], seed: int) -> float:
+def _belief(rows: Situation, joints: Tensor, covariates: Mapping[str, Tensor], seed: int) -> float:
     """Probability of the cause once further rows are measured."""
     more = _more(rows, joints, covariates)
     said = diagnose_rows(more, reached_with(more, [acting(more, "geometry", **CAUSE)], seed), EXACT, CANDIDATES)
@@ -76,7 +77,7 @@ def test_chosen_rows_say_more_together_than_any_drawn_at_random_would() -> None:
     there = _candidates(analysis, 0)
     x = torch.cat([_columns(analysis, first, there), -_columns(analysis, second, there)], -1)
     mean = torch.cat([*first.mean, *second.mean])
-    covariance = torch.block_diag(first.covariance, second.covariance)
+    covariance = torch.block_diag(first.covariance, second.covariance)  # type: ignore[no-untyped-call]
 
     def said_by(chosen: Tensor) -> float:
         """Half the square of the difference in units of what is open, of all rows at once."""

@@ -264,6 +264,8 @@ def test_the_same_files_give_the_same_page_and_text_is_escaped(folder: Path, tmp
 def test_tensorboard_gets_the_same_figures_once(folder: Path) -> None:
     events = EventAccumulator(str(folder / "tensorboard")).Reload()
     stems = ("gap", "probabilities", "signatures", "map", "where")
+    assert [e.value for e in events.Scalars("gap/in_order")] == pytest.approx([1.13e-4])
+    assert events.Scalars("gap/after_network")[0].value == pytest.approx(6e-5)
     assert set(events.Tags()["images"]) == {f"diagnosis/{stem}" for stem in stems}
     assert events.Scalars("gap/before")[0].value == pytest.approx(4.2e-4)
     assert events.Scalars("probability/geometry")[0].value == pytest.approx(0.31)
