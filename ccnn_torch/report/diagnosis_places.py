@@ -27,7 +27,8 @@ def quantity_text(value: float, unit: str, digits: int = 4) -> str:
     """A joint, a coordinate or a covariate with its unit: lengths in mm, temperatures in °C."""
     if unit == "K":
         return f"{value - _KELVIN:.1f} °C"
-    scale, shown = display_unit(unit, abs(value) or 1.0) if unit == "m" else (1.0, unit_text(unit))
+    # Always mm, so that the ends of a range have one unit.
+    scale, shown = (1e-3, "mm") if unit == "m" else (1.0, unit_text(unit))
     number = value / scale
     text = f"{number:.0f}" if abs(number) >= 10**digits else f"{number:.{digits}g}"
     return f"{text} {shown}".removesuffix(" 1")
