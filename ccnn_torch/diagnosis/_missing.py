@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._atoms import default_shape, scaled_signature
+from ccnn_torch.diagnosis._rows import picked
 from ccnn_torch.effects import Effect, Situation
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
 
@@ -19,6 +20,8 @@ __all__ = ["missing_covariates"]
 
 # Speeds are not among them: rows at rest, as most are, have none.
 _KINDS = ("time", "temperature", "load", "direction")
+# A usual row is found among so many.
+_ROWS = 60
 
 
 def missing_covariates(
@@ -37,23 +40,21 @@ def missing_covariates(
         driver: of what no effect describes.
         seed: of the conditions drawn.
     """
-    situation = analysis.situation
-    mechanism, units = situation.mechanism, covariate_units(situation.mechanism) | {"temperature": "degC"}
-    generator = torch.Generator().manual_seed(seed)
-    drawn = draw_covariates(mechanism, situation.joints, generator)
-    names = [*situation.covariates]
+    rows = torch.unique(torch.linspace(0, len(analysis.situation.joints) - 1, _ROWS).round().long())
+    here = picked(analysis.situation, rows)
+    mechanism, units = here.mechanism, covariate_units(here.mechanism) | {"temperature": "degC"}
+    drawn = draw_covariates(mechanism, here.joints, torch.Generator().manual_seed(seed))
+    names = [*here.covariates]
     kinds = {k: [n for n in drawn if n.startswith(k) and n not in names] for k in _KINDS}
+    # One machine for all of them: its derivatives may be dear.
+    there = replace(here, covariates=drawn | dict(here.covariates))
     position = bool((analysis.whitening.channels < 3).any())
     found: dict[tuple[str, ...], dict[str, float]] = {}
     for effect in (e for e in effects if lacking.get(e.name)):
-        for added in _additions(kinds):
-            if effect.missing(mechanism, [*names, *added]):
-                continue
-            with_them = dict(situation.covariates) | {n: drawn[n] for n in added}
-            size = _plausible(replace(situation, covariates=with_them), effect, position)
-            if size > 0:
-                found.setdefault(added, {})[effect.name] = size
-                break
+        added = next((a for a in _additions(kinds) if not effect.missing(mechanism, [*names, *a])), None)
+        size = 0.0 if added is None else _plausible(there, effect, position)
+        if added is not None and size > 0:
+            found.setdefault(added, {})[effect.name] = size
     told: list[dict[str, Any]] = [
         {"columns": [f"{n}[{units[n]}]" for n in added], "effects": sizes, "unit": "m" if position else "rad"}
         for added, sizes in found.items()

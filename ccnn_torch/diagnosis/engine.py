@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from ccnn_torch.diagnosis._catch_all import SPEED
 from ccnn_torch.diagnosis._missing import missing_covariates
 from ccnn_torch.diagnosis._next import next_measurements
 from ccnn_torch.diagnosis._report import Blocks, blocks, in_order
+from ccnn_torch.diagnosis._rows import picked
 from ccnn_torch.diagnosis._verdict import judge
 from ccnn_torch.diagnosis._where import where
 from ccnn_torch.diagnosis.result import Diagnosis
@@ -161,20 +161,8 @@ def usable_rows(situation: Situation, measured: Tensor) -> Tensor:
 
 def thinned(situation: Situation, measured: Tensor, fine: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:
     """At most `_MOST_ROWS` of the fine rows, in order, and which they are."""
-    rows = len(fine)
     chosen = torch.nonzero(fine).squeeze(-1)
     if len(chosen) > _MOST_ROWS:
         drawn = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]
         chosen = chosen[drawn.sort().values]
-
-    def pick(value: Tensor | None) -> Tensor | None:
-        return value[chosen] if value is not None and value.dim() > 1 and len(value) == rows else value
-
-    fewer = replace(
-        situation,
-        joints=situation.joints[chosen],
-        covariates={n: v[chosen] for n, v in situation.covariates.items()},
-        parameters=pick(situation.parameters),
-        guess=pick(situation.guess),
-    )
-    return fewer, measured[chosen], chosen
+    return picked(situation, chosen), measured[chosen], chosen

@@ -13,7 +13,7 @@ from _machines import NOISE, acting, cramped, measured, reached_with, rows_of
 from torch import Tensor
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
-from ccnn_torch.diagnosis._next import _candidates, _columns
+from ccnn_torch.diagnosis._next import _candidates, _columns, _possible
 from ccnn_torch.diagnosis._search import Found
 from ccnn_torch.effects import Situation
 from ccnn_torch.effects.covariates import covariate_units
@@ -96,16 +96,36 @@ def test_chosen_rows_say_more_together_than_any_drawn_at_random_would() -> None:
     assert said_by(chosen) > 1.2 * max(drawn)
 
 
-def test_a_cause_without_rival_is_made_sharper_and_noise_asks_for_nothing_odd() -> None:
+def test_a_cause_without_rival_is_made_sharper() -> None:
     rows = rows_of("five_bar", 60, 3)
     poses = reached_with(rows, [acting(rows, "compliance", q1=8e-6, q2=5e-6)], 4)
     said = diagnose_rows(rows, poses, EXACT, ["compliance"])
     assert said.verdict["effects"] == ["compliance"]
     wanted = said.next_measurements
-    assert wanted and all(m["separates"] in ([], ["compliance"]) for m in wanted)
-    loads = torch.tensor([[m["covariates"]["load_x"], m["covariates"]["load_y"]] for m in wanted], dtype=torch.float64)
-    usual = torch.stack([rows.covariates["load_x"], rows.covariates["load_y"]], -1).norm(dim=-1).median()
-    assert bool((loads.norm(dim=-1) > usual).double().mean() > 0.7)
+    assert [m["separates"] for m in wanted] == [[]] * 8
+    there, found = _candidates(said.analysis, 0), said.judgement.found
+    x = _columns(said.analysis, found, there)
+
+    def information(chosen: Tensor) -> float:
+        """Half the log determinant, of all rows at once."""
+        flat = x[chosen].flatten(0, 1)
+        return float(0.5 * torch.linalg.slogdet(torch.eye(len(flat)) + flat @ found.covariance @ flat.mT).logabsdet)
+
+    chosen = torch.cdist(_proposed(said)[0], there.joints).argmin(-1)
+    assert wanted[0]["gain"] == pytest.approx(information(chosen[:1]))
+    generator = torch.Generator().manual_seed(1)
+    # Next to a singularity every row says much, to first order.
+    others = torch.nonzero(_possible(there)).flatten()
+    drawn = [information(others[torch.randperm(len(others), generator=generator)[:8]]) for _ in range(40)]
+    assert information(chosen) > 1.2 * max(drawn)
+
+
+def test_where_there_is_only_noise_rows_tell_it_from_the_most_probable_effect() -> None:
+    rows = rows_of("five_bar", 60, 3)
+    said = diagnose_rows(rows, reached_with(rows, [], 4), EXACT, ["compliance", "joint_offset"])
+    assert said.verdict["none"]
+    assert {name for m in said.next_measurements for name in m["separates"]} <= {"compliance", "joint_offset"}
+    assert all(len(m["separates"]) == 1 and m["gain"] < 3 for m in said.next_measurements)
 
 
 def test_conditions_that_always_came_together_come_apart() -> None:
