@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._atoms import scaled_signature
-from ccnn_torch.diagnosis._search import Found
+from ccnn_torch.diagnosis._search import Found, scored
 from ccnn_torch.diagnosis._verdict import Judgement
 from ccnn_torch.effects import Situation
 
@@ -68,14 +69,31 @@ def next_measurements(analysis: Analysis, judgement: Judgement, seed: int) -> li
 
 
 def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Found]]:
-    """The most probable sets with other library names, or none, no catch-all among them, and their probabilities."""
-    atoms = analysis.library.atoms
+    """The most probable sets with other library names, or none, no catch-all among them, and their probabilities.
+
+    What cannot be told from the verdict is among them, even where the search did not come across it.
+    """
+    atoms, own = analysis.library.atoms, judgement.found
     plain = [
         (probability, one)
         for _, driver, probability, one in judgement.leading
         if driver is None and not any(atoms[i].catch_all for i in one.members)
     ]
-    return plain[:_RIVALS]
+    if not plain:
+        return []
+    like = {
+        tuple(sorted(j if m == i else m for m in own.members))
+        for i in own.members
+        for name in judgement.classes.get(atoms[i].name, ())
+        for j, a in enumerate(atoms)
+        if a.name == name
+    }
+    known = [_names(analysis, one) for _, one in plain]
+    for one in sorted(scored(analysis.library, sorted(like)), key=lambda f: -f.log_posterior):
+        if _names(analysis, one) not in known:
+            known.append(_names(analysis, one))
+            plain.append((plain[0][0] * math.exp(min(one.log_posterior - own.log_posterior, 0.0)), one))
+    return sorted(plain, key=lambda pair: -pair[0])[:_RIVALS]
 
 
 def _names(analysis: Analysis, found: Found) -> set[str]:

@@ -46,6 +46,9 @@ def test_why_one_effect_is_not_told_from_another_is_their_angle() -> None:
     # The gain of a joint has a zero of its own, so that it can do all that an offset does.
     assert effect["signatures"]["joint_gain"]["angle"] < 1e-6
     assert "on these poses their signatures are" in said.verdict["text"]
+    # What to measure next is what tells such names apart.
+    pairs = [{"joint_offset", other} for other in effect["signatures"]]
+    assert all(set(m["separates"]) in pairs for m in said.next_measurements[:3])
     analysis, found = said.analysis, said.judgement.found
     keep, library = analysis.whitening.keep(), analysis.library
 
