@@ -105,6 +105,13 @@ def diagnose_rows(
     notes += situation.mechanism.remarks([*situation.covariates])
     if len(chosen) < len(fine) - lost:
         notes.append(f"{len(chosen)} of {len(fine)} rows, drawn at random, were looked at")
+    missing = missing_covariates(analysis, every, lacking, judgement.driver, seed)
+    if nothing and analysis.whitening.known == 0 and missing:
+        columns = ", ".join(column for entry in missing for column in entry["columns"])
+        notes.append(
+            "the noise was not given, so that a cause that follows nothing recorded counts as noise: compare the noise "
+            f"with that of the measuring device, and record what may be missing ({columns})"
+        )
     return Diagnosis(
         gap=gap,
         gap_rotation=gap_rotation,
@@ -115,7 +122,7 @@ def diagnose_rows(
         network=None,
         verdict=verdict,
         next_measurements=next_measurements(analysis, judgement, seed),
-        missing_covariates=missing_covariates(analysis, every, lacking, judgement.driver, seed),
+        missing_covariates=missing,
         not_seen=lacking,
         rows_set_aside=sorted(why),
         why_set_aside=[why[row] for row in sorted(why)],
