@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["count_text", "display_unit", "number_text"]
+__all__ = ["count_text", "display_unit", "number_text", "unit_text"]
 
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
@@ -11,7 +11,7 @@ def display_unit(unit: str, magnitude: float) -> tuple[float, str]:
     """The prefixed unit for numbers of about this magnitude.
 
     Args:
-        unit: `m` or `rad`; any other SI unit stays as it is.
+        unit: `m` or `rad`; any other SI unit stays, written as in print.
         magnitude: a typical number [unit]; 1e-3 and more is shown in mm or mrad, less in µm or µrad, less than 1e-7 in
             nm or nrad.
 
@@ -19,12 +19,18 @@ def display_unit(unit: str, magnitude: float) -> tuple[float, str]:
         Divide a number by the first to have it in the second.
     """
     if unit not in ("m", "rad"):
-        return 1.0, unit
+        return 1.0, unit_text(unit)
     wanted = (10.0, 1e-3, 1e-7, 0.0)
     scale, prefix = next(
         entry for entry, least in zip(_PREFIXES, wanted, strict=True) if abs(magnitude) >= least or entry[1] == "n"
     )
     return scale, prefix + unit
+
+
+def unit_text(unit: str) -> str:
+    """A unit as in print: `rad/N/m` and `rad/(N*m)` are both `rad/(N·m)`."""
+    over, *under = unit.replace("(", "").replace(")", "").replace("*", "·").split("/")
+    return f"{over}/{f'({below})' if '·' in (below := '·'.join(under)) else below}" if under else over
 
 
 def number_text(value: float | None, digits: int = 4) -> str:

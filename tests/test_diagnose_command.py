@@ -35,8 +35,32 @@ def test_a_config_beside_its_records_gives_verdict_and_report(
     jsonschema.validate(results, load_schema("diagnosis"))
     assert results["verdict"]["effects"] == ["backlash"]
     assert "acklash" in shown and " SI " not in shown
+    assert results["network"]["reason"] == "what the effects leave is no more than the noise"
+    assert [step["name"] for step in results["in_order"]] == ["backlash"] and results["where_ci95"][
+        "joints"
+    ].keys() == {
+        "q1",
+        "q2",
+    }
+    assert set(results["not_seen"]) == {"tool"} and "needs a platform that turns" in shown
+    # The verdict comes before all that takes longer.
+    assert shown.index("acklash") < shown.index("How large is the gap?") and shown.count("would remove") == 1
     for name in ("report.html", "diagnosis.md", "diagnosis.safetensors", "next_measurements.csv"):
         assert Path("found", name).is_file(), name
+
+
+def test_without_a_network_the_rest_is_the_same(cli: Cli, rows: Path, tmp_path: Path) -> None:
+    words = ("diagnose", "--records", rows, "--mechanism", "five_bar", "--effects", "geometry,compliance", "--quiet")
+    assert cli(*words, "--out", tmp_path / "with")[0] == 0
+    assert cli(*words, "--no-network", "--out", tmp_path / "without")[0] == 0
+    told, bare = (
+        json.loads((tmp_path / name / "diagnosis.json").read_text(encoding="utf-8")) for name in ("with", "without")
+    )
+    network = told.pop("network")
+    assert bare.pop("network") is None and told == bare
+    # Play that the library was not given is what the network finds.
+    assert network["gain_ci95"][0] > 0 and network["gap_after"] < 0.7 * network["gap_before"]
+    assert "network on what is left would gain" in (tmp_path / "with" / "diagnosis.md").read_text(encoding="utf-8")
 
 
 def test_check_says_what_rows_can_show_without_a_verdict(cli: Cli, rows: Path) -> None:

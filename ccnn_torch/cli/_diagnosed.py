@@ -20,6 +20,7 @@ def configured(
     config: Path | None,
     seed: int | None,
     out: Path | None = None,
+    network: bool | None = None,
 ) -> DiagnoseConfig:
     """The config file with what the command line says over it."""
     from ccnn_torch.runs.diagnose import parse_noise
@@ -32,6 +33,7 @@ def configured(
         "mechanism": mechanism,
         "effects": names,
         "seed": seed,
+        "network": network,
         "out": None if out is None else str(out),
     }
     return wanted.model_copy(update={k: v for k, v in given.items() if v is not None})

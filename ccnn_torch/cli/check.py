@@ -17,7 +17,9 @@ def check(
     records: Annotated[Path | None, typer.Option(help="CSV of joints, measured poses and covariates.")] = None,
     mechanism: Annotated[str | None, typer.Option(help="A mechanism's name, file, or path/to/file.py:Name.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write check.json to; nothing when left out.")] = None,
-    noise: Annotated[str | None, typer.Option(help="Standard deviation of the pose in SI: S, or NAME=S,….")] = None,
+    noise: Annotated[
+        str | None, typer.Option(help="Standard deviation of the pose: S in m and rad alike, or NAME=S,….")
+    ] = None,
     effects: Annotated[str | None, typer.Option(help="Candidates, a,b,…; all when left out.")] = None,
     config: Annotated[Path | None, typer.Option(help="A YAML file with keys as for ccnn diagnose.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,

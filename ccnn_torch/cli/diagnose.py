@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -18,16 +19,23 @@ def diagnose(
     records: Annotated[Path | None, typer.Option(help="CSV of joints, measured poses and covariates.")] = None,
     mechanism: Annotated[str | None, typer.Option(help="A mechanism's name, file, or path/to/file.py:Name.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write diagnosis.json to.")] = None,
-    noise: Annotated[str | None, typer.Option(help="Standard deviation of the pose in SI: S, or NAME=S,….")] = None,
+    noise: Annotated[
+        str | None, typer.Option(help="Standard deviation of the pose: S in m and rad alike, or NAME=S,….")
+    ] = None,
     effects: Annotated[str | None, typer.Option(help="Candidates, a,b,…; all when left out.")] = None,
     config: Annotated[Path | None, typer.Option(help="A YAML file with keys as below.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
+    network: Annotated[
+        bool | None, typer.Option(help="What a network would still gain; the same as network=….")
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No verdict, no table.")] = False,
 ) -> None:
     """Name the physical effect that makes the gap between a model and measurements, and how far the gap shrinks.
 
-    The folder gets diagnosis.json and report.html. Keys: records, mechanism, out, mechanism_keys, covariates, noise,
-    effects, gravity, seed.
+    The verdict comes first; then a network is trained on what the effects leave, to say what it would still gain
+    (seconds; --no-network leaves that out). The folder gets diagnosis.json, report.html and next_measurements.csv, the
+    rows that would tell most. Keys: records, mechanism, out, mechanism_keys, covariates, noise, effects, gravity,
+    network, seed.
 
     Examples:
 
@@ -39,25 +47,41 @@ def diagnose(
 
     ccnn diagnose --records measured.csv --mechanism my_simulator.py:PRESS --out runs/press
     """
+    from ccnn_torch.diagnosis import Diagnosis, with_network
     from ccnn_torch.mechanisms import simulated_rows
     from ccnn_torch.report.diagnosis_data import about_of, load_labels
     from ccnn_torch.report.diagnosis_report import print_diagnosis
-    from ccnn_torch.runs.diagnose import run_diagnosis, write_diagnosis
+    from ccnn_torch.runs.diagnose import run_diagnosis, write_diagnosis, write_result
     from ccnn_torch.runs.screen import stderr, stdout
 
-    wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)
+    wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out, network)
     if wanted.out is None:
         raise InputError("name the folder to write with --out DIR")
-    if stderr.is_terminal and not quiet:
-        # Thousands of rows of an arm take half a minute, a slow simulator more; how much is left nobody knows.
-        doing = "looking for the effects that make the gap …"
-        with stderr.status(doing) as shown, simulated_rows(lambda n: shown.update(f"{doing} {n:,} rows simulated")):
-            found = run_diagnosis(wanted)
-    else:
-        found = run_diagnosis(wanted)
-    about = {"name": Path(wanted.out).name, "mechanism": str(wanted.mechanism), "records": str(wanted.records)}
-    path = write_diagnosis(Path(wanted.out), found, about, wanted.seed)
+    shown = stderr.is_terminal and not quiet
+
+    def watched(text: str, work: Callable[[Callable[[str], None]], Diagnosis]) -> Diagnosis:
+        if not shown:
+            return work(lambda how_far: None)
+        with stderr.status(text) as status:
+            return work(lambda how_far: status.update(f"{text} {how_far}"))
+
+    def search(tell: Callable[[str], None]) -> Diagnosis:
+        with simulated_rows(lambda n: tell(f"{n:,} rows simulated")):
+            return run_diagnosis(wanted)
+
+    # Thousands of rows of an arm take half a minute, a slow simulator more; how much is left nobody knows.
+    found = watched("looking for the effects that make the gap …", search)
+    folder = Path(wanted.out)
+    # What was found is kept, whatever becomes of the rest.
+    write_result(folder, found)
+    if not quiet:
+        stdout.print(found.verdict["text"], style="bold", markup=False)
+    if wanted.network:
+        text = "training a network on what the effects leave …"
+        found = watched(text, lambda tell: with_network(found, wanted.seed, lambda share: tell(f"{100 * share:.0f} %")))
+    about = {"name": folder.name, "mechanism": str(wanted.mechanism), "records": str(wanted.records)}
+    path = write_diagnosis(folder, found, about, wanted.seed)
     if quiet:
         return
-    print_diagnosis(found.to_json(), stdout, about_of(load_labels(path.parent)))
+    print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False)
     typer.echo(f"Written: {path} and report.html beside it")

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis
+from ccnn_torch.diagnosis._apart import signatures_apart
 from ccnn_torch.diagnosis._shrink import Gap, HeldOut, held_out, shrink_of
 from ccnn_torch.diagnosis._verdict import Judgement
 
-__all__ = ["Blocks", "blocks"]
+__all__ = ["Blocks", "blocks", "in_order", "noise_floor"]
 
 
 class Blocks:
@@ -22,15 +22,19 @@ class Blocks:
         white = analysis.whitening
         self.analysis, self.judgement, self.seed = analysis, judgement, seed
         self.before = residual[white.keep()][:, white.channels]
-        self.floor = _floor(analysis)
+        self.floor = noise_floor(analysis)
         self.position = white.channels < 3
         atoms = analysis.library.atoms
         self.candidates = _best_alone(analysis)
-        chosen = [i for i in judgement.found.members if not atoms[i].catch_all]
+        members = judgement.found.members
         alone = [[i] for i in self.candidates.values()]
-        held = held_out(analysis, [chosen, *alone], seed)
-        self.together = held[0]
-        self.alone: dict[str, HeldOut] = dict(zip(self.candidates, held[1:], strict=True))
+        # The verdict's effects one after the other, the largest first; the last has them all.
+        place = {atoms[i].name: i for i in members if not atoms[i].catch_all}
+        steps = [[place[n] for n in judgement.names[:k]] for k in range(len(judgement.names) + 1)]
+        held = held_out(analysis, [*steps, *alone], seed)
+        self.steps, self.together = held[1 : len(steps)], held[len(steps) - 1]
+        self.alone: dict[str, HeldOut] = dict(zip(self.candidates, held[len(steps) :], strict=True))
+        self.apart = signatures_apart(analysis, judgement)
 
     def gap(self, held: HeldOut, position: bool) -> Gap:
         """In position [m] or rotation [rad]."""
@@ -53,7 +57,17 @@ def blocks(made: Blocks) -> tuple[dict[str, Any], dict[str, Any] | None, list[di
     return gap, turned, [_effect(made, name) for name in _ordered(made)]
 
 
-def _floor(analysis: Analysis) -> Tensor:
+def in_order(made: Blocks) -> list[dict[str, Any]]:
+    """`in_order` of diagnosis.json: the verdict's effects added one after the other, each step refitted."""
+    found = []
+    for name, held in zip(made.judgement.names, made.steps, strict=True):
+        gap = made.main(held)
+        interval = None if gap.interval is None else list(gap.interval)
+        found.append({"name": name, "gap_after": gap.after, "shrink": gap.shrink, "shrink_ci95": interval})
+    return found
+
+
+def noise_floor(analysis: Analysis) -> Tensor:
     """Variance of the noise, `c`: given, or the mean square that the most probable set of all leaves, tails and all."""
     white, best = analysis.whitening, analysis.found[0]
     if white.known > 0 or not analysis.library.grams.values:
@@ -88,6 +102,7 @@ def _effect(made: Blocks, name: str) -> dict[str, Any]:
         "shrink": alone.shrink,
         "shrink_ci95": None if alone.interval is None else list(alone.interval),
         "indistinguishable_from": list(made.judgement.classes.get(name, ())),
+        "signatures": made.apart.get(name, {}),
     }
 
 
@@ -130,11 +145,3 @@ def _ordered(made: Blocks) -> list[str]:
     marginal = made.judgement.marginal
     tie = {n: made.alone[n].left.square().sum() for n in made.alone}
     return sorted(made.alone, key=lambda n: (-marginal.get(n, 0.0), float(tie[n]), n))
-
-
-def amount(value: float, unit: str) -> str:
-    """A length or an angle as people say it."""
-    steps = [(1.0, "m"), (1e-3, "mm"), (1e-6, "µm")] if unit == "m" else [(1.0, "rad"), (1e-3, "mrad"), (1e-6, "µrad")]
-    size, name = next((s for s in steps if abs(value) >= s[0]), steps[-1])
-    digits = max(0, 2 - math.floor(math.log10(max(abs(value / size), 1e-12))))
-    return f"{value / size:.{min(digits, 3)}f} {name}"

@@ -12,7 +12,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._evidence import Grams, fit_sets, grams_of
 
-__all__ = ["Gap", "HeldOut", "held_out", "shrink_of"]
+__all__ = ["Gap", "HeldOut", "folds", "held_out", "resampled", "shrink_of"]
 
 _FOLDS = 5
 _REPEATS = 400
@@ -53,7 +53,7 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     """
     keep = analysis.whitening.keep()
     x, y = analysis.columns[keep], analysis.y[keep]
-    fold = _folds(len(keep), seed)
+    fold = folds(len(keep), seed)
     weight = analysis.whitening.weight[keep].sqrt()[:, None]
     sigma = analysis.whitening.sigma
     left = [y.clone() for _ in sets]
@@ -102,7 +102,7 @@ def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, fl
         return Gap(math.sqrt(b2), math.sqrt(a2), math.sqrt(noise), None, None)
     plain = min(max(1 - (a2 - noise) / (b2 - noise), 0.0), 1.0)
     generator = torch.Generator().manual_seed(seed)
-    rows = _resampled(len(old), generator)
+    rows = resampled(len(old), generator)
     drawn = torch.full((_REPEATS,), noise, dtype=old.dtype)
     if floor_dof > 0:
         drawn = noise * (1 + math.sqrt(2 / floor_dof) * torch.randn(_REPEATS, generator=generator, dtype=old.dtype))
@@ -115,7 +115,7 @@ def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, fl
     return Gap(math.sqrt(b2), math.sqrt(a2), math.sqrt(noise), plain, (min(low, plain), max(high, plain)))
 
 
-def _folds(rows: int, seed: int) -> Tensor:
+def folds(rows: int, seed: int) -> Tensor:
     """Fold of each row."""
     generator = torch.Generator().manual_seed(seed)
     run = max(1, rows // 50)
@@ -124,7 +124,7 @@ def _folds(rows: int, seed: int) -> Tensor:
     return deal.repeat_interleave(run)[:rows]
 
 
-def _resampled(rows: int, generator: torch.Generator) -> Tensor:
+def resampled(rows: int, generator: torch.Generator) -> Tensor:
     """Rows drawn in runs with replacement, `repeats x rows`."""
     run = max(1, rows // 50)
     starts = torch.randint(rows, (_REPEATS, -(-rows // run)), generator=generator)

@@ -2,102 +2,158 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis
+from ccnn_torch.diagnosis._shrink import resampled
 
 __all__ = ["where"]
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
+# Rows from which on each of two coordinates is cut in three and not in two.
+_MANY = 300
 
 
-def where(analysis: Analysis, residual: Tensor) -> dict[str, Any]:
-    """The block `where` of diagnosis.json; residual: nominal, `s x c0` [m, rad]. Every list of shares sums to 1."""
+class _Parts(NamedTuple):
+    """Squares of every row in each part, and those that noise of variance 1 makes there on average, `s x k` each."""
+
+    squares: Tensor
+    noise: Tensor
+
+
+class _Shares(NamedTuple):
+    """Share of each part, `k`, and its 95 % interval, `k x 2`; shares sum to 1."""
+
+    plain: list[float]
+    interval: list[list[float]]
+
+
+class _Draws:
+    """Rows drawn in runs with replacement, and the noise within what is known of it."""
+
+    def __init__(self, analysis: Analysis, seed: int) -> None:
+        generator = torch.Generator().manual_seed(seed)
+        rows = resampled(len(analysis.whitening.keep()), generator)
+        self.counts = torch.zeros(rows.shape, dtype=analysis.y.dtype)
+        self.counts.scatter_add_(1, rows, torch.ones_like(self.counts))
+        values, effective = analysis.library.grams.values, analysis.found[0].effective
+        spread = 0.0 if analysis.whitening.known > 0 else math.sqrt(2 / max(values - effective, 1.0))
+        drawn = torch.randn(len(rows), 1, generator=generator, dtype=self.counts.dtype)
+        self.floor, self.floors = analysis.floor, (analysis.floor * (1 + spread * drawn)).clamp_min(0.0)
+
+    def shares(self, parts: _Parts) -> _Shares:
+        """Of the energy above the noise."""
+        plain = _normalised(parts.squares.sum(0) - self.floor * parts.noise.sum(0))
+        drawn = _normalised(self.counts @ parts.squares - self.floors * (self.counts @ parts.noise))
+        low, high = torch.quantile(drawn, torch.tensor([0.025, 0.975], dtype=drawn.dtype), 0)
+        return _Shares(plain.tolist(), torch.stack([low.minimum(plain), high.maximum(plain)], -1).tolist())
+
+
+def where(analysis: Analysis, residual: Tensor, seed: int = 0) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The blocks `where` and `where_ci95` of diagnosis.json: shares, each list of which sums to 1, and intervals.
+
+    Args:
+        analysis: of the rows.
+        residual: nominal, `s x c0` [m, rad].
+        seed: of the draws.
+    """
     white, situation = analysis.whitening, analysis.situation
     keep = white.keep()
     y = (residual[:, white.channels] / white.sigma)[keep]
-    energy = (y.square() - analysis.floor).sum(-1)
-    outputs = dict(zip((_AXES[int(c)] for c in white.channels), (y.square() - analysis.floor).sum(0), strict=True))
-    joints = _joints(analysis, y, keep)
-    names = [j.name for j in situation.mechanism.joints]
-    legs = {str(g.leg) for g in situation.mechanism.geometry if g.leg is not None}
-    return {
-        "outputs": _shares(outputs),
-        "joints": _shares(dict(zip(names, joints, strict=True))),
-        "legs": _shares({f"leg {i + 1}": e for i, e in enumerate(joints)}) if legs else {},
-        "regions": _regions(analysis, energy, keep),
+    rows = _Parts(y.square().sum(-1, keepdim=True), torch.full_like(y[:, :1], y.shape[-1]))
+    draws = _Draws(analysis, seed)
+    outputs = draws.shares(_Parts(y.square(), torch.ones_like(y)))
+    joints = draws.shares(_joints(analysis, y, keep))
+    axes, names = [_AXES[int(c)] for c in white.channels], [j.name for j in situation.mechanism.joints]
+    legged = any(g.leg is not None for g in situation.mechanism.geometry)
+    legs = [f"leg {i + 1}" for i in range(len(names))] if legged else []
+    places, inside = _regions(analysis, keep)
+    regions = draws.shares(_split(rows, inside))
+    edges = {
+        name: _bins(value[keep]) for name, value in situation.covariates.items() if float(value.max() - value.min()) > 0
+    }
+    covariates = {name: draws.shares(_split(rows, member)) for name, (_, member) in edges.items()}
+    told = {
+        "outputs": dict(zip(axes, outputs.plain, strict=True)),
+        "joints": dict(zip(names, joints.plain, strict=True)),
+        "legs": dict(zip(legs, joints.plain, strict=False)),
+        "regions": [
+            {**place, "share": share, "rows": int(n)}
+            for place, share, n in zip(places, regions.plain, inside.sum(0), strict=True)
+        ],
         "covariates": {
-            name: _bins(value[keep], energy)
-            for name, value in situation.covariates.items()
-            if float(value.max() - value.min()) > 0
+            name: [
+                {"from": low, "to": high, "share": share}
+                for (low, high), share in zip(edges[name][0], found.plain, strict=True)
+            ]
+            for name, found in covariates.items()
         },
     }
+    intervals = {
+        "outputs": dict(zip(axes, outputs.interval, strict=True)),
+        "joints": dict(zip(names, joints.interval, strict=True)),
+        "legs": dict(zip(legs, joints.interval, strict=False)),
+        "regions": regions.interval,
+        "covariates": {name: found.interval for name, found in covariates.items()},
+    }
+    return told, intervals
 
 
-def _joints(analysis: Analysis, y: Tensor, keep: Tensor) -> Tensor:
-    """Energy of the joint deviations that make the residual, each by what it alone moves, `n`."""
+def _normalised(energy: Tensor) -> Tensor:
+    """`... x k` to shares; alike where there is no energy."""
+    energy = energy.clamp_min(0.0)
+    total = energy.sum(-1, keepdim=True)
+    return torch.where(total > 0, energy / total.clamp_min(1e-300), 1 / energy.shape[-1])
+
+
+def _joints(analysis: Analysis, y: Tensor, keep: Tensor) -> _Parts:
+    """Squares of the joint deviations that make the residual, each by what it alone moves, `s x n`."""
     white = analysis.whitening
     jacobian = (analysis.situation.jacobian[:, white.channels] / white.sigma[:, None])[keep]
     inverse = torch.linalg.pinv(jacobian)
-    deviation = (inverse @ y[..., None])[..., 0]
-    noise = analysis.floor * inverse.square().sum(-1)
-    energy: Tensor = ((deviation.square() - noise) * jacobian.square().sum(-2)).sum(0)
-    return energy
+    reach = jacobian.square().sum(-2)
+    return _Parts((inverse @ y[..., None])[..., 0].square() * reach, inverse.square().sum(-1) * reach)
 
 
-def _shares(parts: dict[str, Tensor]) -> dict[str, float]:
-    values = {k: max(float(v), 0.0) for k, v in parts.items()}
-    total = sum(values.values())
-    return {k: v / total if total > 0 else 1 / len(values) for k, v in values.items()}
+def _split(rows: _Parts, member: Tensor) -> _Parts:
+    """The rows' squares by the part that each is in; member: `s x k`, bool."""
+    return _Parts(rows.squares * member, rows.noise * member)
 
 
-def _regions(analysis: Analysis, energy: Tensor, keep: Tensor) -> list[dict[str, Any]]:
-    """Boxes of the workspace: the two position coordinates that vary most, each cut at its median."""
+def _regions(analysis: Analysis, keep: Tensor) -> tuple[list[dict[str, Any]], Tensor]:
+    """Boxes of the workspace and which rows are in them, `s x k`: the two lengths that vary most, cut at quantiles."""
     coordinates = analysis.situation.mechanism.pose
     lengths = [i for i, c in enumerate(coordinates) if c.unit == "m"] or list(range(len(coordinates)))
     pose = analysis.situation.pose[keep]
     varying = sorted(lengths, key=lambda i: -float(pose[:, i].std()))[:2]
-    cell = sum((pose[:, i] > pose[:, i].median()).long() * 2**k for k, i in enumerate(varying))
-    found: list[dict[str, Any]] = []
-    total = 0.0
-    for k in range(2 ** len(varying)):
-        inside = cell == k
-        if not bool(torch.as_tensor(inside).any()):
-            continue
-        low, high = pose[inside].amin(0), pose[inside].amax(0)
-        share = max(float(energy[inside].sum()), 0.0)
-        total += share
-        found.append(
-            {
-                "center": {coordinates[i].name: float((low + high)[i] / 2) for i in lengths},
-                "half_width": {coordinates[i].name: float((high - low)[i] / 2) for i in lengths},
-                "share": share,
-                "rows": int(torch.as_tensor(inside).sum()),
-            }
-        )
-    for region in found:
-        region["share"] = region["share"] / total if total > 0 else 1 / len(found)
-    return found
+    cuts = 3 if len(keep) >= _MANY and len(varying) == 2 else 2
+    cell = torch.zeros(len(keep), dtype=torch.int64)
+    for k, i in enumerate(varying):
+        edges = torch.quantile(pose[:, i], torch.arange(1, cuts, dtype=pose.dtype) / cuts)
+        cell += cuts**k * torch.bucketize(pose[:, i].contiguous(), edges)
+    inside = cell[:, None] == torch.unique(cell)
+    alone = inside[..., None]
+    low = torch.where(alone, pose[:, None], math.inf).amin(0)[:, lengths]
+    high = torch.where(alone, pose[:, None], -math.inf).amax(0)[:, lengths]
+    names = [coordinates[i].name for i in lengths]
+    places = [
+        {"center": dict(zip(names, centre, strict=True)), "half_width": dict(zip(names, half, strict=True))}
+        for centre, half in zip(((low + high) / 2).tolist(), ((high - low) / 2).tolist(), strict=True)
+    ]
+    return places, inside
 
 
-def _bins(value: Tensor, energy: Tensor) -> list[dict[str, float]]:
-    """Thirds of a covariate, or its values where it has no more than three."""
+def _bins(value: Tensor) -> tuple[list[tuple[float, float]], Tensor]:
+    """Thirds of a covariate, or its values where it has no more than three, and which rows are in them, `s x k`."""
     levels = torch.unique(value)
     if len(levels) <= 3:
-        edges = [(float(v), float(v)) for v in levels]
-    else:
-        cuts = torch.quantile(value, torch.tensor([0, 1 / 3, 2 / 3, 1], dtype=value.dtype)).tolist()
-        edges = list(pairwise(cuts))
-    sums = []
-    for k, (low, high) in enumerate(edges):
-        inside = (value >= low) & ((value <= high) if k == len(edges) - 1 or low == high else (value < high))
-        sums.append(max(float(energy[inside].sum()), 0.0))
-    total = sum(sums)
-    return [
-        {"from": low, "to": high, "share": s / total if total > 0 else 1 / len(edges)}
-        for (low, high), s in zip(edges, sums, strict=True)
-    ]
+        return [(float(v), float(v)) for v in levels], value[:, None] == levels
+    cuts = torch.quantile(value, torch.tensor([0, 1 / 3, 2 / 3, 1], dtype=value.dtype))
+    part = torch.bucketize(value.contiguous(), cuts[1:-1].contiguous(), right=True)
+    edges = list(pairwise(cuts.tolist()))
+    return edges, part[:, None] == torch.arange(len(edges))

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis, analyse
 from ccnn_torch.diagnosis._catch_all import SPEED
+from ccnn_torch.diagnosis._missing import missing_covariates
 from ccnn_torch.diagnosis._next import next_measurements
-from ccnn_torch.diagnosis._report import Blocks, blocks
+from ccnn_torch.diagnosis._report import Blocks, blocks, in_order
+from ccnn_torch.diagnosis._rows import picked
 from ccnn_torch.diagnosis._verdict import judge
 from ccnn_torch.diagnosis._where import where
 from ccnn_torch.diagnosis.result import Diagnosis
-from ccnn_torch.diagnosis.words import verdict_text
+from ccnn_torch.diagnosis.words import unseen_text, verdict_text
 from ccnn_torch.effects import Effect, Situation, effect_names, make_effect, pose_residual
 from ccnn_torch.errors import InputError
 
@@ -39,14 +40,19 @@ def candidates(
     Raises:
         InputError: the records can show none of them.
     """
-    named = effect_names(situation.mechanism) if effects is None else effects
-    every = [make_effect(e, situation.mechanism) if isinstance(e, str) else e for e in named]
+    every = _made(situation, effects)
     names = [*situation.covariates]
     lacking = {e.name: e.missing(situation.mechanism, names) for e in every}
     if every and all(lacking.values()):
         need = "; ".join(f"{name} needs {why}" for name, why in lacking.items())
         raise InputError(f"effects: these records can show none of the candidates: {need}")
     return [e for e in every if not lacking[e.name]], {n: why for n, why in lacking.items() if why}
+
+
+def _made(situation: Situation, effects: Sequence[Effect | str] | None) -> list[Effect]:
+    """Candidates, those of the library and of the mechanism when None."""
+    named = effect_names(situation.mechanism) if effects is None else effects
+    return [make_effect(e, situation.mechanism) if isinstance(e, str) else e for e in named]
 
 
 def diagnose_rows(
@@ -71,13 +77,13 @@ def diagnose_rows(
     fine = usable_rows(situation, measured)
     situation, measured, chosen = thinned(situation, measured, fine, seed)
     residual = pose_residual(situation, measured)
-    usable, lacking = candidates(situation, effects)
+    every = _made(situation, effects)
+    usable, lacking = candidates(situation, every)
     analysis = analyse(situation, measured, usable, noise)
     judgement = judge(analysis)
     made = Blocks(analysis, judgement, residual, seed)
     gap, gap_rotation, listed = blocks(made)
     together = made.main(made.together)
-    aside = torch.nonzero(analysis.whitening.weight <= 0).squeeze(-1)
     nothing = not judgement.names and not judgement.outside
     outlier = nothing and bool(gross_rows(analysis).any())
     verdict = {
@@ -90,27 +96,49 @@ def diagnose_rows(
         "driver": None if (judgement.driver or "").startswith(SPEED) else judgement.driver,
         "text": "",
     }
-    lost = torch.nonzero(~fine).squeeze(-1).tolist()
-    set_aside = sorted([*lost, *(int(chosen[i]) for i in aside)])
+    why = _why_set_aside(analysis, fine, chosen)
     told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict}
-    verdict["text"] = verdict_text(told | {"rows_set_aside": set_aside})
-    notes = [f"{name} cannot be seen without {why}" for name, why in lacking.items()]
+    verdict["text"] = verdict_text(told | {"rows_set_aside": sorted(why)})
+    places, intervals = where(analysis, residual, seed)
+    lost = int((~fine).sum())
+    notes = [unseen_text(name, reason) for name, reason in lacking.items()]
     notes += situation.mechanism.remarks([*situation.covariates])
-    if len(chosen) < len(fine) - len(lost):
+    if len(chosen) < len(fine) - lost:
         notes.append(f"{len(chosen)} of {len(fine)} rows, drawn at random, were looked at")
+    missing = missing_covariates(analysis, every, lacking, judgement.driver, seed)
+    if nothing and analysis.whitening.known == 0 and missing:
+        columns = ", ".join(column for entry in missing for column in entry["columns"])
+        notes.append(
+            "the noise was not given, so that a cause that follows nothing recorded counts as noise: compare the noise "
+            f"with that of the measuring device, and record what may be missing ({columns})"
+        )
     return Diagnosis(
         gap=gap,
         gap_rotation=gap_rotation,
-        where=where(analysis, residual),
+        where=places,
+        where_ci95=intervals,
         effects=listed,
+        in_order=in_order(made),
+        network=None,
         verdict=verdict,
         next_measurements=next_measurements(analysis, judgement, seed),
-        rows_set_aside=set_aside,
+        missing_covariates=missing,
+        not_seen=lacking,
+        rows_set_aside=sorted(why),
+        why_set_aside=[why[row] for row in sorted(why)],
         notes=notes,
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,
         judgement=judgement,
     )
+
+
+def _why_set_aside(analysis: Analysis, fine: Tensor, chosen: Tensor) -> dict[int, str]:
+    """Reason by row, counted from 0 in the file; fine: `s` bool; chosen: the rows looked at."""
+    why = dict.fromkeys(torch.nonzero(~fine).squeeze(-1).tolist(), "the machine does not reach it")
+    aside, near = analysis.whitening.weight <= 0, analysis.near_singular
+    why |= dict.fromkeys(chosen[aside & ~near].tolist(), "far from what any fit to the other rows says")
+    return why | dict.fromkeys(chosen[aside & near].tolist(), "next to a singularity")
 
 
 def gross_rows(analysis: Analysis) -> Tensor:
@@ -140,20 +168,8 @@ def usable_rows(situation: Situation, measured: Tensor) -> Tensor:
 
 def thinned(situation: Situation, measured: Tensor, fine: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:
     """At most `_MOST_ROWS` of the fine rows, in order, and which they are."""
-    rows = len(fine)
     chosen = torch.nonzero(fine).squeeze(-1)
     if len(chosen) > _MOST_ROWS:
         drawn = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]
         chosen = chosen[drawn.sort().values]
-
-    def pick(value: Tensor | None) -> Tensor | None:
-        return value[chosen] if value is not None and value.dim() > 1 and len(value) == rows else value
-
-    fewer = replace(
-        situation,
-        joints=situation.joints[chosen],
-        covariates={n: v[chosen] for n, v in situation.covariates.items()},
-        parameters=pick(situation.parameters),
-        guess=pick(situation.guess),
-    )
-    return fewer, measured[chosen], chosen
+    return picked(situation, chosen), measured[chosen], chosen

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis._network import with_network
 from ccnn_torch.diagnosis._told import refuse_lost_rows, told
 from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.result import Diagnosis
@@ -30,6 +31,7 @@ def diagnose(
     effects: Sequence[Effect | str] | None = None,
     gravity: Sequence[float] | None = None,
     seed: int = 0,
+    network: bool = False,
 ) -> Diagnosis:
     """Which effect makes the gap between a model and measured records, where it lies, how far it shrinks.
 
@@ -41,12 +43,14 @@ def diagnose(
         effects: candidates, or their names; the whole library when None.
         gravity: `3` [m/s²] in the base frame; down along -z (planar machines: -y) when None.
         seed: of folds and resampling.
+        network: whether to train networks on what the verdict's effects leave, which takes seconds.
 
     Raises:
         InputError: too few rows, most of them out of reach, or noise of a coordinate that there is not.
     """
     situation = situation_of(records, mechanism, gravity)
-    return diagnose_rows(situation, records.pose, noise_of(noise, situation), effects, seed)
+    said = diagnose_rows(situation, records.pose, noise_of(noise, situation), effects, seed)
+    return with_network(said, seed) if network else said
 
 
 def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float] | None = None) -> Situation:

@@ -111,12 +111,14 @@ def _along(part: Tensor, left: Tensor, keep: Tensor, columns: list[Column]) -> _
 
 
 def _in_joints(analysis: Analysis, part: Tensor, left: Tensor, columns: list[Column]) -> _View:
-    """In the joint that the effect moves most; 0 where a row is set aside.
+    """In the joint that the effect moves most; 0 where a row was set aside for a singularity.
 
     A deviation of the joints looks the same everywhere in the workspace, what it does to the pose does not.
     """
-    keep, channels, sigma = analysis.whitening.keep(), analysis.whitening.channels, analysis.whitening.sigma
-    slope = analysis.situation.jacobian[keep][:, channels] / sigma[:, None]
+    channels, sigma = analysis.whitening.channels, analysis.whitening.sigma
+    jacobian = analysis.situation.jacobian
+    keep = torch.nonzero(~analysis.near_singular & jacobian.isfinite().flatten(1).all(-1)).flatten()
+    slope = jacobian[keep][:, channels] / sigma[:, None]
     both = torch.stack([part, left], -1)[keep][:, channels] / sigma[:, None]
     # More joints than channels leave a choice, of which the smallest is taken.
     found = torch.linalg.pinv(slope, rtol=1e-9) @ both

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from ccnn_torch.diagnosis._analysis import Analysis
@@ -21,10 +21,16 @@ class Diagnosis:
         gap, gap_rotation: `{"unit", "before", "after", "noise_floor", "reducible_share"}`, held-out RMS; the rotation's
             is None without orientation.
         where: shares of the gap by `outputs`, `joints`, `legs`, `regions`, `covariates`.
-        effects: every candidate, most probable first.
+        where_ci95: the same with `[low, high]` in the place of each share, regions and regimes as lists of them.
+        effects: every candidate, most probable first; `signatures` says why one cannot be told from another.
+        in_order: the verdict's effects added one after the other, the largest first.
+        network: what a network on the remainder would still gain; None where nobody asked.
         verdict: what is stood by.
         next_measurements: rows that would tell the leading explanations apart.
+        missing_covariates: columns that would bring more effects into sight, most promising first.
+        not_seen: effects that these records cannot show, with what is missing for each.
         rows_set_aside: rows (0-based) that no fit saw: outliers, near-singular ones, rows outside the reach.
+        why_set_aside: the reason for each of them.
         notes: what was left out and why, one sentence each.
         acting: the verdict's effects with their numbers, to be simulated or compensated.
         analysis, judgement: everything that was looked at.
@@ -33,10 +39,16 @@ class Diagnosis:
     gap: dict[str, Any]
     gap_rotation: dict[str, Any] | None
     where: dict[str, Any]
+    where_ci95: dict[str, Any]
     effects: list[dict[str, Any]]
+    in_order: list[dict[str, Any]]
+    network: dict[str, Any] | None
     verdict: dict[str, Any]
     next_measurements: list[dict[str, Any]]
+    missing_covariates: list[dict[str, Any]]
+    not_seen: dict[str, str]
     rows_set_aside: list[int]
+    why_set_aside: list[str]
     notes: list[str]
     acting: tuple[Acting, ...] = field(repr=False)
     analysis: Analysis = field(repr=False)
@@ -44,13 +56,5 @@ class Diagnosis:
 
     def to_json(self) -> Mapping[str, Any]:
         """The form of `diagnosis.json` (schema `diagnosis`)."""
-        return {
-            "gap": self.gap,
-            "gap_rotation": self.gap_rotation,
-            "where": self.where,
-            "effects": self.effects,
-            "verdict": self.verdict,
-            "next_measurements": self.next_measurements,
-            "rows_set_aside": self.rows_set_aside,
-            "notes": self.notes,
-        }
+        told = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: value for name, value in told.items() if name not in ("acting", "analysis", "judgement")}

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccnn_torch._display import count_text, display_unit, number_text
 
-__all__ = ["SURE", "driver_words", "effect_words", "gap_words", "listed", "probability_words", "verdict_text"]
+__all__ = [
+    "SURE",
+    "driver_words",
+    "effect_words",
+    "gap_words",
+    "listed",
+    "network_text",
+    "probability_words",
+    "unseen_text",
+    "verdict_text",
+]
 
 Block = Mapping[str, Any]
 
@@ -87,6 +98,30 @@ def verdict_text(results: Block) -> str:
     return f"{gap_words(results)} {_cause(results)}"
 
 
+def unseen_text(name: str, why: str) -> str:
+    """That the records cannot show an effect, without a full stop."""
+    return f"{name} cannot be seen without {why}"
+
+
+def network_text(results: Block) -> str:
+    """What a network on the remainder would still gain, in one sentence; empty where nobody asked."""
+    network = results.get("network")
+    if network is None:
+        return ""
+    if network["gap_after"] is None:
+        return f"A network has nothing left to learn: {network['reason']}."
+    before, after = (_size(network[key], network) for key in ("gap_before", "gap_after"))
+    low, high = (_size(v, network) for v in network["gain_ci95"])
+    if network["gain_ci95"][0] <= 0:
+        return f"A network on what is left gains nothing on rows not used for training ({before} → {after})."
+    text = f"A network on what is left would gain {_size(network['gain'], network)} [{low}, {high}] more on rows not "
+    text += f"used for training ({before} → {after})"
+    floor = results["gap"]["noise_floor"]
+    if floor and network["gap_after_ci95"][1] < floor:
+        text += ", less than the noise was taken for: part of that is no noise but repeats"
+    return f"{text}."
+
+
 def _cause(results: Block) -> str:
     verdict = results["verdict"]
     names = list(verdict["effects"])
@@ -101,9 +136,11 @@ def _cause(results: Block) -> str:
         text = f"{_capital(listed([effect_words(n) for n in names]))} {verb} part of it, but the rest {follows} in a "
         text += f"way that no effect of the library describes ({_probability(verdict)})"
         return f"{text}{_removed(results, ', and that part is ')}."
+    by_name = {e["name"]: e for e in results["effects"]}
     classes = {e["name"]: [n for n in e["indistinguishable_from"] if n not in names] for e in results["effects"]}
     likes = [classes.get(name, []) for name in names]
-    subject = listed([_with_class(n, like) for n, like in zip(names, likes, strict=True)])
+    angles = [by_name.get(name, {}).get("signatures", {}) for name in names]
+    subject = listed([_with_class(n, like, a) for n, like, a in zip(names, likes, angles, strict=True)])
     sure = verdict["probability"] >= SURE
     if len(names) == 1:
         verb = "explains it" if sure else "is the likeliest explanation"
@@ -113,10 +150,18 @@ def _cause(results: Block) -> str:
     return f"{_capital(subject)}{comma} {verb} ({_probability(verdict)}){_removed(results, ' and would remove ')}."
 
 
-def _with_class(name: str, like: Sequence[str]) -> str:
+def _with_class(name: str, like: Sequence[str], signatures: Block) -> str:
+    """An effect with those that may stand in its place, and why these rows cannot tell: the angles."""
     if not like:
         return effect_words(name)
-    return f"{effect_words(name)}, or {listed([effect_words(n) for n in like], 'or')} (these rows cannot tell which)"
+    angles = [signatures[n]["angle"] for n in like if n in signatures]
+    reason = ""
+    if angles:
+        widest = math.degrees(max(angles))
+        size = "less than 0.1°" if widest < 0.1 else f"{'up to ' if len(angles) > 1 else ''}{widest:.1f}°"
+        reason = f": on these poses their signatures are {size} apart"
+    others = listed([effect_words(n) for n in like], "or")
+    return f"{effect_words(name)}, or {others} (these rows cannot tell which{reason})"
 
 
 def _removed(results: Block, joint: str) -> str:

@@ -70,12 +70,6 @@ class About:
         records: the file of records.
         noise: where the noise floor is from, as a sentence.
         units: SI units of joints, covariates and place coordinates by name.
-        in_order: the verdict's effects added one after the other: `{"name", "gap_after", "shrink", "shrink_ci95"}`.
-        network: what a network on the remainder would still gain: `{"gap_after", "gap_after_ci95"}`.
-        not_seen: effects that these records cannot show, with the reason as a sentence.
-        where_ci95: 95 % intervals in the form of `where`, with `[low, high]` in the place of each share.
-        angles: `[name, name, angle]`, the angle between two effects' signatures on these rows [rad].
-        why_set_aside: one reason for each of `rows_set_aside`.
         notes: further sentences.
     """
 
@@ -84,12 +78,6 @@ class About:
     records: str = ""
     noise: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
-    in_order: tuple[Mapping[str, Any], ...] = ()
-    network: Mapping[str, Any] | None = None
-    not_seen: Mapping[str, str] = field(default_factory=dict)
-    where_ci95: Mapping[str, Any] = field(default_factory=dict)
-    angles: tuple[tuple[str, str, float], ...] = ()
-    why_set_aside: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def unit(self, name: str) -> str:
@@ -115,8 +103,7 @@ def about_of(labels: Mapping[str, Any]) -> About:
         )
     axes = [block["x"] for name, block in labels.items() if name != "about"]
     given["units"] = {axis["name"]: axis["unit"] for axis in axes} | dict(given.get("units", {}))
-    for name in ("in_order", "angles", "why_set_aside", "notes"):
-        given[name] = tuple(given.get(name, ()))
+    given["notes"] = tuple(given.get("notes", ()))
     return About(**given)
 
 

@@ -10,23 +10,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ccnn_torch._display import display_unit, number_text
+from ccnn_torch._display import display_unit, number_text, unit_text
 from ccnn_torch.report.diagnosis_data import About, used_rows
-from ccnn_torch.report.diagnosis_tables import percent
+from ccnn_torch.report.diagnosis_tables import percent, percent_interval
 from ccnn_torch.report.table_form import Table
 
 __all__ = ["aside_table", "next_table", "quantity_text", "region_table", "shares", "where_table", "write_next_csv"]
 
 Block = Mapping[str, Any]
 _KELVIN = 273.15
-_SHARE = "Share: of the gap's mean square that lies there, [95 % interval] where it is known."
+_SHARES = ("share of the gap [%]", "95 % interval [%]")
+_SHARE = "Share: of the gap's mean square that lies there."
 
 
 def quantity_text(value: float, unit: str, digits: int = 4) -> str:
     """A joint, a coordinate or a covariate with its unit: lengths in mm, temperatures in °C."""
     if unit == "K":
         return f"{value - _KELVIN:.1f} °C"
-    scale, shown = display_unit(unit, abs(value) or 1.0) if unit == "m" else (1.0, unit)
+    # Always mm, so that the ends of a range have one unit.
+    scale, shown = (1e-3, "mm") if unit == "m" else (1.0, unit_text(unit))
     number = value / scale
     text = f"{number:.0f}" if abs(number) >= 10**digits else f"{number:.{digits}g}"
     return f"{text} {shown}".removesuffix(" 1")
@@ -34,7 +36,7 @@ def quantity_text(value: float, unit: str, digits: int = 4) -> str:
 
 def shares(results: Block, about: About) -> Iterator[tuple[str, str, float, list[float] | None]]:
     """Every share of `where` but the regions': group, part, share, and its interval or None."""
-    where, known = results["where"], about.where_ci95
+    where, known = results["where"], results.get("where_ci95", {})
     for group, single in (("outputs", "output"), ("joints", "joint"), ("legs", "leg")):
         for name, share in where[group].items():
             part = name if name.startswith(single) else f"{single} {name}"
@@ -58,12 +60,29 @@ def _regime(name: str, regime: Block, unit: str) -> str:
     return f"{name} {low} to {high}"
 
 
-def where_table(results: Block, about: About) -> Table | None:
-    """Shares of the gap by output, joint, leg and covariate regime."""
-    rows = [(part, percent(share, interval)) for _, part, share, interval in shares(results, about)]
+def where_table(results: Block, about: About, *, telling: bool = False) -> Table | None:
+    """Shares of the gap by output, joint, leg and covariate regime.
+
+    Args:
+        telling: leave covariates out none of whose regimes differs from an even share.
+    """
+    found = list(shares(results, about))
+    hidden = []
+    for name, regimes in results["where"]["covariates"].items():
+        intervals = [interval for group, _, _, interval in found if group == name]
+        even = all(i is not None and i[0] <= 1 / len(regimes) <= i[1] for i in intervals)
+        hidden += [name] if telling and even else []
+    rows = [
+        (part, percent(share), percent_interval(interval))
+        for group, part, share, interval in found
+        if group not in hidden
+    ]
     if not rows:
         return None
-    return Table("Where does the gap lie?", ("part", "share of the gap [%]"), tuple(rows), _share_note(results))
+    note = _share_note(results)
+    if hidden:
+        note += f" Not shown: {', '.join(hidden)}, over which the gap is even as far as these rows tell."
+    return Table("Where does the gap lie?", ("part", *_SHARES), tuple(rows), note)
 
 
 def region_table(results: Block, about: About) -> Table | None:
@@ -72,7 +91,7 @@ def region_table(results: Block, about: About) -> Table | None:
     if not regions:
         return None
     names = list(regions[0]["center"])
-    intervals = about.where_ci95.get("regions") or [None] * len(regions)
+    intervals = results.get("where_ci95", {}).get("regions") or [None] * len(regions)
     rows = []
     for region, interval in sorted(zip(regions, intervals, strict=True), key=lambda pair: -pair[0]["share"]):
         cells = []
@@ -80,8 +99,8 @@ def region_table(results: Block, about: About) -> Table | None:
             middle, half = region["center"][name], region["half_width"][name]
             low, high = (quantity_text(middle + side * half, about.unit(name)) for side in (-1, 1))
             cells.append(f"{low} to {high}")
-        rows.append((cells[0], *cells[1:], percent(region["share"], interval), str(region["rows"])))
-    columns = (*names, "share of the gap [%]", "rows")
+        rows.append((*cells, percent(region["share"]), percent_interval(interval), str(region["rows"])))
+    columns = (*names, *_SHARES, "rows")
     return Table("In which region?", columns, tuple(rows), "Largest share first. " + _share_note(results))
 
 
@@ -128,7 +147,7 @@ def _columns(results: Block) -> tuple[list[str], list[str]]:
     return joints, covariates
 
 
-def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]], about: About) -> Table | None:
+def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]]) -> Table | None:
     """Rows that were set aside, how far they are off, and why where that is known."""
     numbers = results["rows_set_aside"]
     if not numbers:
@@ -143,9 +162,10 @@ def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]], about
             columns.append(f"residual [{unit}]")
             for row, value in zip(cells, size, strict=True):
                 row.append(number_text(float(value) / scale, 4) if np.isfinite(value) else "not within reach")
-    if len(about.why_set_aside) == len(numbers):
+    reasons = results.get("why_set_aside", [])
+    if len(reasons) == len(numbers):
         columns.append("why")
-        for row, reason in zip(cells, about.why_set_aside, strict=True):
+        for row, reason in zip(cells, reasons, strict=True):
             row.append(reason)
     note = "Counted from 0. They speak neither for nor against any effect and count in no figure above."
     return Table("Which rows were set aside?", tuple(columns), tuple(map(tuple, cells)), note, ("why",))

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from torch import Tensor
 
-from ccnn_torch.diagnosis.words import verdict_text
+from ccnn_torch.diagnosis.words import network_text, unseen_text, verdict_text
 from ccnn_torch.report.diagnosis_data import (
     ARRAYS,
     LABELS,
@@ -31,6 +31,7 @@ from ccnn_torch.report.diagnosis_tables import (
     gap_table,
     order_table,
     parameter_table,
+    record_table,
     unseen_table,
 )
 from ccnn_torch.report.diagnosis_tensorboard import write_diagnosis_events
@@ -136,8 +137,8 @@ def diagnosis_markdown(results: Block, about: About | None = None) -> str:
     )
 
 
-def print_diagnosis(results: Block, console: Console, about: About | None = None) -> None:
-    """Show what matters of the tables, and the verdict, on a terminal."""
+def print_diagnosis(results: Block, console: Console, about: About | None = None, *, verdict: bool = True) -> None:
+    """Show what matters of the tables, and the verdict where it was not shown before, on a terminal."""
     about = about or About()
     effects = effect_table(results, least=_LEAST)
     if effects is not None:
@@ -148,24 +149,28 @@ def print_diagnosis(results: Block, console: Console, about: About | None = None
     shown = (
         gap_table(results, about),
         effects,
-        order_table(results, about),
+        order_table(results),
         parameter_table(results, 12),
-        where_table(results, about),
+        where_table(results, about, telling=True),
         next_table(results, about),
-        unseen_table(about),
+        unseen_table(results),
+        record_table(results),
     )
     for table in shown:
         if table is not None:
             print_table(table, console)
     for sentence in _notes(results, about):
         console.print(escape(sentence), style="yellow")
-    console.print(escape(verdict_text(results)), style="bold")
+    if text := network_text(results):
+        console.print(escape(text))
+    if verdict:
+        console.print(escape(verdict_text(results)), style="bold")
 
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
     effects = list(results["verdict"]["effects"])
     plots = (
-        gap_plot(results, about),
+        gap_plot(results),
         probability_plot(results),
         signature_plot(signatures_of(arrays, labels, effects), arrays, effects),
         remainder_map(arrays, about),
@@ -177,7 +182,7 @@ def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[
 def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str, InlineFigure]) -> list[Section]:
     """The page in reading order; a section with nothing to show is left out."""
     planned: list[tuple[str, tuple[str, ...], tuple[Table | None, ...]]] = [
-        ("How large is the gap?", ("gap",), (gap_table(results, about), order_table(results, about))),
+        ("How large is the gap?", ("gap",), (gap_table(results, about), order_table(results))),
         ("Which effect?", ("probabilities",), (effect_table(results), parameter_table(results))),
         ("What gives it away?", ("signatures",), ()),
         (
@@ -185,10 +190,10 @@ def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str
             ("map", "where"),
             (where_table(results, about), region_table(results, about)),
         ),
-        ("What can these rows not tell apart?", (), (confusable_table(results, about),)),
-        ("What can these records not show?", (), (unseen_table(about),)),
+        ("What can these rows not tell apart?", (), (confusable_table(results),)),
+        ("What can these records not show?", (), (unseen_table(results), record_table(results))),
         ("What should be measured next?", (), (next_table(results, about),)),
-        ("Which rows were set aside?", (), (aside_table(results, arrays, about),)),
+        ("Which rows were set aside?", (), (aside_table(results, arrays),)),
     ]
     sections = []
     for title, names, tables in planned:
@@ -201,7 +206,10 @@ def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str
 
 def _notes(results: Block, about: About) -> list[str]:
     """Notes of the diagnosis and of the report, as sentences."""
-    return [note if note.endswith(".") else f"{note}." for note in (*results["notes"], *about.notes)]
+    # What has a table of its own needs no sentence.
+    told = {unseen_text(name, why) for name, why in results.get("not_seen", {}).items()}
+    notes = (note for note in (*results["notes"], *about.notes) if note not in told)
+    return [note if note.endswith(".") else f"{note}." for note in notes]
 
 
 def _facts(results: Block, arrays: Arrays, about: About) -> str:

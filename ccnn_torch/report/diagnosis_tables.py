@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccnn_torch._display import display_unit, number_text
-from ccnn_torch.diagnosis.words import effect_words, listed, probability_words
+from ccnn_torch.diagnosis.words import effect_words, listed, network_text, probability_words
 from ccnn_torch.report.diagnosis_data import About, gaps_of
 from ccnn_torch.report.table_form import Table
 
@@ -18,14 +18,16 @@ __all__ = [
     "order_table",
     "parameter_table",
     "percent",
+    "percent_interval",
+    "record_table",
     "unseen_table",
 ]
 
 Block = Mapping[str, Any]
 _Z95 = 1.96
-_SHRINK = (
-    "Removed: share of the mean square above the noise that goes on rows not used for fitting, [95 % interval]; "
-    "it is unknown (–) where the gap is not above the noise."
+_REMOVED = (
+    "Removed: share of the mean square above the noise that goes on rows not used for fitting; it is unknown (–) where "
+    "the gap is not above the noise."
 )
 
 
@@ -37,6 +39,11 @@ def percent(value: float | None, interval: Sequence[float] | None = None) -> str
     if interval is not None:
         text += f" [{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]"
     return text
+
+
+def percent_interval(interval: Sequence[float] | None) -> str:
+    """`91.0 to 95.0`, without its unit."""
+    return "–" if interval is None else f"{100 * interval[0]:.1f} to {100 * interval[1]:.1f}"
 
 
 def gap_table(results: Block, about: About) -> Table:
@@ -80,27 +87,28 @@ def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
     ]
     columns = ("effect", "what it is", "probability", f"gap with it alone [{unit}]", "removed [%]", "not told from")
     before = number_text(_over(results["gap"]["before"], scale), 4)
-    note = f"● in the verdict. The gap without any of them is {before} {unit}. {_SHRINK}"
+    note = f"● in the verdict. The gap without any of them is {before} {unit}. {_REMOVED} In brackets: 95 % interval."
     if hidden := len(results["effects"]) - len(shown):
         note += f" Not shown: {hidden} with a probability below {least:g}."
     return Table("Which effect?", columns, tuple(rows), note, ("what it is", "not told from"))
 
 
-def order_table(results: Block, about: About) -> Table | None:
+def order_table(results: Block) -> Table | None:
     """The verdict's effects added to the model one after the other, and what a network would still gain."""
-    if not about.in_order and about.network is None:
+    added, network = results.get("in_order") or [], results.get("network") or {}
+    if not added and network.get("gap_after") is None:
         return None
     gap = results["gap"]
     scale, unit = display_unit(gap["unit"], gap["before"] or 1.0)
-    rows = [("the model as it is", number_text(_over(gap["before"], scale), 4), "–")]
-    for entry in about.in_order:
-        removed = percent(entry.get("shrink"), entry.get("shrink_ci95"))
-        rows.append((f"+ {entry['name']}", number_text(_over(entry["gap_after"], scale), 4), removed))
-    if about.network is not None:
-        rows.append(("+ a network on the remainder", number_text(_over(about.network["gap_after"], scale), 4), "–"))
-    rows.append(("noise floor", number_text(_over(gap["noise_floor"], scale), 4), "–"))
-    columns = ("added to the model", f"gap on held-out rows [{unit}]", "removed in all [%]")
-    return Table("How far does it shrink?", columns, tuple(rows), _SHRINK)
+    rows = [("the model as it is", number_text(_over(gap["before"], scale), 4), "–", "–")]
+    for entry in added:
+        size = number_text(_over(entry["gap_after"], scale), 4)
+        rows.append((f"+ {entry['name']}", size, percent(entry["shrink"]), percent_interval(entry["shrink_ci95"])))
+    if network.get("gap_after") is not None:
+        rows.append(("+ a network on the remainder", number_text(network["gap_after"] / scale, 4), "–", "–"))
+    rows.append(("noise floor", number_text(_over(gap["noise_floor"], scale), 4), "–", "–"))
+    columns = ("added to the model", f"gap on held-out rows [{unit}]", "removed in all [%]", "95 % interval [%]")
+    return Table("How far does it shrink?", columns, tuple(rows), f"{_REMOVED} {network_text(results)}".rstrip())
 
 
 def parameter_table(results: Block, most: int = 24) -> Table | None:
@@ -130,9 +138,8 @@ def parameter_table(results: Block, most: int = 24) -> Table | None:
     return Table("How large is the effect?", columns, tuple(rows), note, ("unit",))
 
 
-def confusable_table(results: Block, about: About) -> Table | None:
-    """Pairs of effects that these rows do not tell apart, and which measurement would."""
-    angles = {frozenset(entry[:2]): float(entry[2]) for entry in about.angles}
+def confusable_table(results: Block) -> Table | None:
+    """Pairs of effects that these rows do not tell apart, why, and which measurement would."""
     odds = {e["name"]: e["probability"] for e in results["effects"]}
     rows, told = [], set()
     for effect in results["effects"]:
@@ -141,7 +148,7 @@ def confusable_table(results: Block, about: About) -> Table | None:
             if pair in told:
                 continue
             told.add(pair)
-            angle = angles.get(pair)
+            apart = effect.get("signatures", {}).get(other)
             number = next(
                 (i for i, m in enumerate(results["next_measurements"], 1) if pair <= set(m["separates"])), None
             )
@@ -149,25 +156,54 @@ def confusable_table(results: Block, about: About) -> Table | None:
                 (
                     f"{effect['name']} or {other}",
                     f"{probability_words(effect['probability'])} or {probability_words(odds.get(other, 0.0))}",
-                    "–" if angle is None else f"{math.degrees(angle):.1f}",
+                    "–" if apart is None else f"{math.degrees(apart['angle']):.1f}",
+                    "–" if apart is None else number_text(apart["separation"], 2),
                     "–" if number is None else f"number {number}",
                 )
             )
     if not rows:
         return None
     note = (
-        "On these rows the two leave nearly the same trace, so the numbers cannot say which it is. Angle: between "
-        "their traces, 0 = the same, 90 = unlike. Told apart by: the first of the next measurements that does."
+        "On these rows the second can leave nearly the same trace as the first, so the numbers cannot say which it is. "
+        "Angle: between what the first does to these rows and all that the second can do, 0 = the same, 90 = unlike; "
+        "difference: what the second cannot copy over all rows together, in units of the noise: below about 3 it is "
+        "hidden. Told apart by: the first of the next measurements that does."
     )
-    columns = ("pair", "probability", "angle [°]", "told apart by")
+    columns = ("pair", "probability", "angle [°]", "difference / noise [1]", "told apart by")
     return Table("What can these rows not tell apart?", columns, tuple(rows), note, ("told apart by",))
 
 
-def unseen_table(about: About) -> Table | None:
+def unseen_table(results: Block) -> Table | None:
     """Effects that these records cannot show, and why."""
-    if not about.not_seen:
+    unseen = results.get("not_seen")
+    if not unseen:
         return None
-    return Table("What can these records not show?", ("effect", "why"), tuple(about.not_seen.items()), "", ("why",))
+    rows = tuple((name, f"needs {why}") for name, why in unseen.items())
+    return Table("What can these records not show?", ("effect", "why"), rows, "", ("why",))
+
+
+def record_table(results: Block) -> Table | None:
+    """Which columns to add to the records, most promising first."""
+    missing = results.get("missing_covariates")
+    if not missing:
+        return None
+    typical = max(size for entry in missing for size in entry["effects"].values())
+    scale, unit = display_unit(missing[0]["unit"], typical)
+    rows = tuple(
+        (_columns_text(entry["columns"]), name, number_text(size / scale, 3))
+        for entry in missing
+        for name, size in entry["effects"].items()
+    )
+    note = (
+        "Size: what an effect of plausible size does to the usual of these poses in a workshop; so much of the gap it "
+        "may make, and cannot be named, until the column is recorded."
+    )
+    return Table("What should be recorded as well?", ("column", "would show", f"size [{unit}]"), rows, note)
+
+
+def _columns_text(columns: Sequence[str]) -> str:
+    """`direction1[1] … direction6[1]` for many of a kind."""
+    return ", ".join(columns) if len(columns) < 4 else f"{columns[0]} … {columns[-1]}"
 
 
 def _over(value: float | None, scale: float) -> float | None:

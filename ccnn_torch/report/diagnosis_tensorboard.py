@@ -15,7 +15,8 @@ __all__ = ["write_diagnosis_events"]
 def write_diagnosis_events(
     folder: Path, results: Mapping[str, Any], verdict: str, pictures: Mapping[str, Path]
 ) -> None:
-    """Write the verdict as text, the gap and the probabilities as scalars, and the pictures as images.
+    """Write the verdict as text, gaps (`gap/in_order`: step k has the first k effects) and probabilities as scalars,
+    and the pictures as images.
 
     Event files of an earlier diagnosis in the same folder are removed, for TensorBoard would mix the two.
 
@@ -37,6 +38,11 @@ def write_diagnosis_events(
                 value = (results.get(key) or {}).get(part)
                 if value is not None:
                     writer.add_scalar(f"{key}/{part}", value, 0)
+        for step, entry in enumerate(results.get("in_order", []), 1):
+            writer.add_scalar("gap/in_order", entry["gap_after"], step)
+        network = results.get("network") or {}
+        if network.get("gap_after") is not None:
+            writer.add_scalar("gap/after_network", network["gap_after"], 0)
         for effect in results["effects"]:
             writer.add_scalar(f"probability/{effect['name']}", effect["probability"], 0)
         for name, path in pictures.items():

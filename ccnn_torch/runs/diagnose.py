@@ -9,6 +9,7 @@ from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of
 from ccnn_torch.diagnosis.check import Check, check_rows
 from ccnn_torch.diagnosis.pictures import picture_arrays
 from ccnn_torch.effects import Effect, make_effect
+from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import Records, load_records
@@ -24,6 +25,7 @@ __all__ = [
     "run_check",
     "run_diagnosis",
     "write_diagnosis",
+    "write_result",
 ]
 
 
@@ -62,6 +64,21 @@ def run_check(config: DiagnoseConfig) -> Check:
     return check_rows(situation, records.pose, noise_of(config.noise, situation), effects)
 
 
+def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
+    """Write `diagnosis.json` alone.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as reason:
+        raise InputError(f"{folder}: cannot be made: {reason.strerror}") from None
+    path = folder / "diagnosis.json"
+    write_json(path, plain(diagnosis.to_json()))
+    return path
+
+
 def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str] | None = None, seed: int = 0) -> Path:
     """Write `diagnosis.json`, the arrays behind its pictures, and the report.
 
@@ -74,17 +91,19 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str]
     Raises:
         InputError: the folder cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as reason:
-        raise InputError(f"{folder}: cannot be made: {reason.strerror}") from None
-    path = folder / "diagnosis.json"
-    results = plain(diagnosis.to_json())
-    write_json(path, results)
+    path = write_result(folder, diagnosis)
     arrays, labels = picture_arrays(diagnosis, seed)
-    units = {c.name: c.unit for c in diagnosis.analysis.situation.mechanism.joints}
-    write_diagnosis_report(folder, results, arrays, labels | {"about": {**(about or {}), "units": units}})
+    mechanism = diagnosis.analysis.situation.mechanism
+    units = covariate_units(mechanism) | {c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)}
+    told = {"noise": _noise_text(diagnosis), **(about or {}), "units": units}
+    write_diagnosis_report(folder, plain(diagnosis.to_json()), arrays, labels | {"about": told})
     return path
+
+
+def _noise_text(diagnosis: Diagnosis) -> str:
+    if diagnosis.analysis.whitening.known > 0:
+        return "The noise was given."
+    return "The noise was not given: its floor is what the most probable of all explanations leaves."
 
 
 def check_text(check: Check) -> list[str]:

@@ -31,11 +31,14 @@ class DiagnoseConfig(Section):
     noise: Positive | dict[str, Positive] | None = Field(
         default=None,
         description="standard deviation of the measured pose in SI, one number for every coordinate or by coordinate; "
-        "null = estimated from the records",
+        "null = estimated from the records; one number is metres for lengths and radians for angles alike",
     )
     effects: Names | None = Field(default=None, description="candidates, by name or path/to/file.py:Name; null = all")
     gravity: tuple[float, float, float] | None = Field(
         default=None, description="gravity in the base frame in m/s²; null = down along -z (planar machines: -y)"
+    )
+    network: bool = Field(
+        default=True, description="whether to say what a network on the remainder would still gain; takes seconds"
     )
     seed: int = Field(default=0, ge=0, description="seed of folds and resampling")
 

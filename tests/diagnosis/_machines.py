@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -27,6 +29,30 @@ def rows_of(name: str, rows: int, seed: int) -> Situation:
     covariates |= {f"load_{c}": (draw(rows) - 0.3) * 100 for c in lengths}
     covariates |= {f"direction{i + 1}": torch.sign(draw(rows) - 0.5) for i in range(len(mechanism.joints))}
     return Situation(mechanism, joints, covariates, default_gravity(mechanism), None, pose)
+
+
+def cramped(name: str, rows: int, seed: int, share: float = 0.15) -> Situation:
+    """The same in a small part of the workspace, where one cause looks like another."""
+    here = rows_of(name, rows, seed)
+    middle = (here.mechanism.low + here.mechanism.high) / 2
+    pose = middle + share * (here.pose - middle)
+    return replace(here, joints=here.mechanism.solve_inverse(pose), guess=pose)
+
+
+def acting(situation: Situation, name: str, **values: float) -> Acting:
+    """An effect without shapes, with the named coefficients [SI] and no others."""
+    effect = make_effect(name)
+    names = [c.name.replace(" ", "_") for c in effect.coefficients(situation)]
+    assert set(values) <= set(names), names
+    coefficients = [values.get(n, 0.0) for n in names]
+    return Acting(effect, torch.zeros(0, dtype=torch.float64), torch.tensor(coefficients, dtype=torch.float64))
+
+
+def reached_with(situation: Situation, causes: list[Acting], seed: int, noise: float = NOISE) -> Tensor:
+    """Poses of a machine with causes, measured with noise, `s x p`."""
+    there = reached(situation, causes)
+    drawn = torch.randn(there.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return pose_of(situation.mechanism, there + noise * drawn)
 
 
 def measured(situation: Situation, causes: dict[str, float], seed: int, noise: float = NOISE) -> Tensor:

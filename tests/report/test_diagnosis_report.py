@@ -18,12 +18,26 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_run_report import Page
 
-from ccnn_torch.diagnosis.words import driver_words, effect_words, probability_words, verdict_text
+from ccnn_torch._display import unit_text
+from ccnn_torch.diagnosis.words import driver_words, effect_words, network_text, probability_words, verdict_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.diagnosis_data import About, about_of, load_diagnosis_arrays, signatures_of
-from ccnn_torch.report.diagnosis_places import aside_table, next_table, region_table, shares
+from ccnn_torch.report.diagnosis_places import (
+    aside_table,
+    next_table,
+    quantity_text,
+    region_table,
+    shares,
+    where_table,
+)
 from ccnn_torch.report.diagnosis_report import diagnosis_markdown, print_diagnosis, write_diagnosis_report
-from ccnn_torch.report.diagnosis_tables import confusable_table, effect_table, gap_table, parameter_table
+from ccnn_torch.report.diagnosis_tables import (
+    confusable_table,
+    effect_table,
+    gap_table,
+    order_table,
+    parameter_table,
+)
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.plots._diagnosis import gap_plot, probability_plot
 from ccnn_torch.report.plots._diagnosis_places import remainder_map, where_plot
@@ -69,9 +83,10 @@ def test_the_verdict_of_each_kind() -> None:
     )
     assert verdict_text(none()[0]).endswith("No cause beyond the noise is to be seen (probability above 0.99).")
     assert "It comes from 2 bad rows, set aside" in verdict_text(outlier()[0])
-    assert "or an error of the geometry or a shifted or tilted base frame (these rows cannot tell which), explains" in (
-        verdict_text(indistinguishable()[0])
-    )
+    assert (
+        "or an error of the geometry or a shifted or tilted base frame (these rows cannot tell which: on these poses "
+        "their signatures are up to 11.5° apart), explains"
+    ) in verdict_text(indistinguishable()[0])
     assert "420 µm and 900 µrad is 20 and 8.2 times" in verdict_text(with_rotation()[0])
     results = outside()[0]
     assert "explains part of it, but the rest follows the temperature" in verdict_text(results)
@@ -98,7 +113,7 @@ def test_gaps_that_cannot_be_put_against_a_floor() -> None:
     turning["gap_rotation"] = None
     assert [row[0] for row in gap_table(turning, About()).rows] == ["rotation [µrad]"]
     turning["gap"]["before"] = 0.0
-    assert gap_plot(turning, About()) is None
+    assert gap_plot(turning) is None
     assert verdict_text(turning).startswith("There is no gap between model and machine")
 
 
@@ -121,29 +136,79 @@ def test_tables_hold_the_numbers() -> None:
     assert effects.rows[0][:5] == ("compliance ●", "joint compliance under load", "0.98", "113.0", "93.0 [91.0, 95.0]")
     parameters = parameter_table(results)
     assert parameters is not None
-    assert parameters.rows[0] == ("compliance: q1", "4.100e-06", "2.0e-07", "3.71e-06 to 4.49e-06", "rad/(N*m)")
+    assert parameters.rows[0] == ("compliance: q1", "4.100e-06", "2.0e-07", "3.71e-06 to 4.49e-06", "rad/(N·m)")
     fewest = parameter_table(results, 1)
     assert fewest is not None and [row[0] for row in fewest.rows] == ["compliance: q1"] and "The 1 that" in fewest.note
     regions = region_table(results, about)
     assert regions is not None
-    assert regions.rows[0] == ("0 mm to 100 mm", "300 mm to 400 mm", "40.0 [34.0, 46.0]", "50")
+    assert regions.rows[0] == ("0 mm to 100 mm", "300 mm to 400 mm", "40.0", "34.0 to 46.0", "50")
     told = {part: (share, interval) for _, part, share, interval in shares(results, about)}
     assert told["output x"] == (0.7, [0.66, 0.74]) and told["load_z 60 N to 120 N"] == (0.85, [0.8, 0.9])
-    aside = aside_table(results, _numpy(arrays), about)
+    aside = aside_table(results, _numpy(arrays))
     assert aside is not None and aside.columns == ("row", "residual [mm]", "why")
     expected = [1e3 * float(arrays["residual"][i, :3].norm()) for i in (17, 90)]
     assert [float(row[1]) for row in aside.rows] == pytest.approx(expected, rel=1e-3)
 
 
 def test_pairs_are_told_once_with_their_angle_and_what_separates_them() -> None:
-    results, _, labels = indistinguishable()
-    table = confusable_table(results, about_of(labels))
+    results = indistinguishable()[0]
+    table = confusable_table(results)
     assert table is not None
     assert table.rows == (
-        ("joint_offset or geometry", "0.52 or 0.31", f"{math.degrees(0.03):.1f}", "number 1"),
-        ("joint_offset or frame", "0.52 or 0.13", f"{math.degrees(0.2):.1f}", "–"),
+        ("joint_offset or geometry", "0.52 or 0.31", f"{math.degrees(0.03):.1f}", "1.2", "number 1"),
+        ("joint_offset or frame", "0.52 or 0.13", f"{math.degrees(0.2):.1f}", "2.5", "–"),
     )
-    assert confusable_table(one_effect()[0], About()) is None
+    assert confusable_table(one_effect()[0]) is None
+    del results["effects"][0]["signatures"]
+    without = confusable_table(results)
+    assert without is not None and [row[2:4] for row in without.rows] == [("–", "–")] * 2
+    assert "(these rows cannot tell which)" in verdict_text(results)
+
+
+def test_what_a_network_would_still_gain_is_one_sentence() -> None:
+    results = one_effect()[0]
+    assert network_text(results) == (
+        "A network on what is left would gain 53.0 µm [30.0 µm, 70.0 µm] more on rows not used for training "
+        "(113 µm → 60.0 µm)."
+    )
+    order = order_table(results)
+    assert order is not None and order.rows[-2] == ("+ a network on the remainder", "60.00", "–", "–")
+    results["gap"]["noise_floor"] = 9e-5
+    assert network_text(results).endswith("less than the noise was taken for: part of that is no noise but repeats.")
+    results["network"]["gain_ci95"] = [-1e-6, 3e-6]
+    assert network_text(results).startswith("A network on what is left gains nothing on rows not used for training")
+    results["network"] |= dict.fromkeys(("gap_after", "gap_after_ci95", "gain", "gain_ci95"))
+    results["network"]["reason"] = "what the effects leave is no more than the noise"
+    assert network_text(results) == (
+        "A network has nothing left to learn: what the effects leave is no more than the noise."
+    )
+    results["in_order"] = []
+    assert order_table(results) is None
+    assert network_text(two_effects()[0]) == ""
+
+
+def test_what_is_not_seen_is_a_table_and_no_note_as_well() -> None:
+    results = one_effect()[0]
+    text = diagnosis_markdown(results)
+    assert "latency cannot be seen" not in text and "a note of its own." in text
+    assert "| latency | needs time[s] |" in text and "| speed1[rad/s] | latency | 42.0 |" in text
+
+
+def test_units_are_written_as_in_print() -> None:
+    written = ("rad/N/m", "rad/(N*m)", "m/N", "N*m", "1", "rad/N/m/K")
+    assert [unit_text(u) for u in written] == ["rad/(N·m)", "rad/(N·m)", "m/N", "N·m", "1", "rad/(N·m·K)"]
+    about = About()
+    assert quantity_text(2.0, about.unit("load_rx")) == "2 N·m"
+
+
+def test_a_terminal_shows_only_regimes_that_tell_something() -> None:
+    results, _, labels = one_effect()
+    about = about_of(labels)
+    assert where_table(results, about, telling=True) == where_table(results, about)
+    results["where_ci95"]["covariates"]["load_z"] = [[0.1, 0.6], [0.4, 0.9]]
+    told = where_table(results, about, telling=True)
+    assert told is not None and not any("load_z" in row[0] for row in told.rows)
+    assert told.note.endswith("Not shown: load_z, over which the gap is even as far as these rows tell.")
 
 
 def test_next_measurements_as_table_and_as_records_for_the_machine(folder: Path) -> None:
@@ -163,7 +228,7 @@ def test_the_page_is_whole_and_fetches_nothing(folder: Path) -> None:
     page.feed(text)
     page.close()
     assert page.open == [] and "script" not in page.count and "link" not in page.count
-    assert page.count["svg"] == 5 == page.count["figcaption"] and page.count["table"] == 9
+    assert page.count["svg"] == 5 == page.count["figcaption"] and page.count["table"] == 10
     outside = {a for a in page.addresses if not a.startswith(("#", "data:"))}
     assert all((folder / address).is_file() for address in outside) and "diagnosis.json" in outside
     assert text.index('class="verdict"') < text.index("<svg") < text.index("What should be measured next?")
@@ -179,7 +244,7 @@ def test_a_browser_shows_all_of_the_page(folder: Path, tmp_path: Path) -> None:
         assert seen["page"] <= seen["window"], "the page is wider than the window"
         assert seen["fetched"] == 0
         assert 0 < seen["verdict"]["top"] < 200 and seen["verdict"]["height"] > 20
-        assert len(seen["figures"]) == 5 and len(seen["tables"]) == 9
+        assert len(seen["figures"]) == 5 and len(seen["tables"]) == 10
         assert all(0.5 * min(width, 600) < f["width"] <= width and f["height"] > 60 for f in seen["figures"])
         assert "these rows cannot tell which" in seen["text"] and "&amp;" not in seen["text"]
 
@@ -199,6 +264,8 @@ def test_the_same_files_give_the_same_page_and_text_is_escaped(folder: Path, tmp
 def test_tensorboard_gets_the_same_figures_once(folder: Path) -> None:
     events = EventAccumulator(str(folder / "tensorboard")).Reload()
     stems = ("gap", "probabilities", "signatures", "map", "where")
+    assert [e.value for e in events.Scalars("gap/in_order")] == pytest.approx([1.13e-4])
+    assert events.Scalars("gap/after_network")[0].value == pytest.approx(6e-5)
     assert set(events.Tags()["images"]) == {f"diagnosis/{stem}" for stem in stems}
     assert events.Scalars("gap/before")[0].value == pytest.approx(4.2e-4)
     assert events.Scalars("probability/geometry")[0].value == pytest.approx(0.31)
@@ -213,7 +280,7 @@ def test_terminal_and_markdown_of_every_case(name: str) -> None:
     told = " ".join(screen.getvalue().split())
     assert verdict_text(results) in told and "How large is the gap?" in told
     text = diagnosis_markdown(results, about_of(labels))
-    assert all(f"{note}." in text for note in results["notes"])
+    assert all(f"{note}." in text for note in results["notes"] if "cannot be seen" not in note)
     blocks = text.split("## ")[1:]
     for block in blocks:
         assert len({line.replace("\\|", "").count("|") for line in block.splitlines() if line.startswith("|")}) == 1
@@ -223,7 +290,7 @@ def test_terminal_and_markdown_of_every_case(name: str) -> None:
 def test_pictures_of_every_case_show_the_numbers(name: str) -> None:
     results, tensors, labels = CASES[name]()
     arrays, about = _numpy(tensors), about_of(labels)
-    gap = gap_plot(results, about)
+    gap = gap_plot(results)
     assert gap is not None
     bars = [bar.get_width() for bar in gap.figure.axes[0].patches]
     assert bars[0] == pytest.approx(results["gap"]["before"] / (1e-3 if results["gap"]["before"] > 1e-3 else 1e-6))
@@ -250,7 +317,7 @@ def _texts(figure: Figure) -> list[str]:
 def test_a_bar_beyond_its_shrink_has_its_whisker_and_a_few_far_rows_are_cut_off() -> None:
     results, tensors, labels = one_effect()
     results["effects"][1] |= {"gap_after": 5e-4, "shrink": 0.0, "shrink_ci95": [0.0, 0.2], "probability": 0.1}
-    plot = gap_plot(results, About())
+    plot = gap_plot(results)
     assert plot is not None
     lines = [c for c in plot.figure.axes[0].collections if len(c.get_segments()) == 1]
     assert np.array(lines[0].get_segments()[0])[:, 0].max() == pytest.approx(500.0)
@@ -262,7 +329,7 @@ def test_a_bar_beyond_its_shrink_has_its_whisker_and_a_few_far_rows_are_cut_off(
 
 def test_whiskers_of_the_gap_are_the_shrink_turned_round() -> None:
     results = two_effects()[0]
-    plot = gap_plot(results, About())
+    plot = gap_plot(results)
     assert plot is not None
     gap, floor = results["gap"]["before"], results["gap"]["noise_floor"]
     # Lines across, in pairs with their ends: the last is that of the verdict.

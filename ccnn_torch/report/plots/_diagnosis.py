@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from ccnn_torch._display import display_unit, number_text
 from ccnn_torch.diagnosis.words import driver_words, probability_words
-from ccnn_torch.report.diagnosis_data import About, gaps_of
+from ccnn_torch.report.diagnosis_data import gaps_of
 from ccnn_torch.report.plots._style import AFTER, BEFORE, FLOOR, GREY, SERIES, Plot, styled
 
 __all__ = ["gap_plot", "probability_plot"]
@@ -24,12 +24,12 @@ _DRAWN = 12
 
 
 @styled
-def gap_plot(results: Block, about: About) -> Plot | None:
+def gap_plot(results: Block) -> Plot | None:
     """The gap before, with each effect alone, and with all of the verdict, as bars against the noise floor."""
     shown = [(name, block) for name, block in gaps_of(results) if block["before"]]
     if not shown:
         return None
-    bars = {name: _bars(results, block, about, alone=name == shown[0][0]) for name, block in shown}
+    bars = {name: _bars(results, block, alone=name == shown[0][0]) for name, block in shown}
     heights = [len(bars[name]) + 1.6 for name, _ in shown]
     figure = Figure(figsize=(8.4, 0.34 * sum(heights) + 0.5 * len(shown)), layout="constrained")
     grid = figure.subplots(len(shown), 1, squeeze=False, height_ratios=heights)[:, 0]
@@ -54,7 +54,7 @@ def gap_plot(results: Block, about: About) -> Plot | None:
 Bar = tuple[str, float, tuple[float, float] | None, str]
 
 
-def _bars(results: Block, block: Block, about: About, *, alone: bool) -> list[Bar]:
+def _bars(results: Block, block: Block, *, alone: bool) -> list[Bar]:
     verdict, floor = results["verdict"], block["noise_floor"] or 0.0
     bars: list[Bar] = [("model as it is", block["before"], None, BEFORE)]
     if alone:
@@ -68,10 +68,10 @@ def _bars(results: Block, block: Block, about: About, *, alone: bool) -> list[Ba
     if verdict["effects"]:
         ends = _ends(block["before"], floor, verdict["shrink_ci95"]) if alone else None
         bars.append((_all_words(verdict["effects"]), block["after"], ends, AFTER))
-    if alone and about.network is not None:
-        interval = about.network.get("gap_after_ci95")
-        label = "with a network on the remainder"
-        bars.append((label, about.network["gap_after"], None if interval is None else tuple(interval), SERIES[2]))
+    network = results.get("network") or {}
+    if alone and network.get("gap_after") is not None:
+        low, high = network["gap_after_ci95"]
+        bars.append(("and a network on the remainder", network["gap_after"], (low, high), SERIES[2]))
     # One effect alone is all of the verdict then: one bar tells it.
     if len(verdict["effects"]) == 1:
         bars = [bar for bar in bars if bar[0] != f"with {verdict['effects'][0]} alone"]

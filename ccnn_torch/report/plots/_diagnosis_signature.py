@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ccnn_torch._display import display_unit
+from ccnn_torch._display import display_unit, unit_text
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.report.diagnosis_data import Signature, used_rows
 from ccnn_torch.report.plots._style import AFTER, BEFORE, FLOOR, GREY, RASTER_ABOVE, Plot, styled
@@ -53,13 +53,17 @@ def signature_plot(
             told.append(f"{name} {100 * share:.3g} %")
     for axes in panels[len(signatures) :]:
         axes.set_axis_off()
-    handles = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
+    handles = {
+        label: handle
+        for axes in panels[: len(signatures)]
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
     figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=len(handles))
     caption = (
         "What gives each effect away: the residual along the effect's own direction, the other effects taken off, "
         "against what drives it."
     )
-    if any(used_rows(arrays, len(signature.x))[1].any() for signature in signatures):
+    if "set aside" in handles:
         caption += " Crosses: rows set aside, at the edge where they lie beyond it."
     if told:
         caption += f" Share of the drawn variance on rows not used for fitting that the fit takes: {', '.join(told)}."
@@ -70,7 +74,7 @@ def axis_values(values: Array, axis: Coordinate) -> tuple[Array, str]:
     """Values for an axis and its label: lengths in mm, temperatures in °C."""
     if axis.unit == "K":
         return values - _KELVIN, f"{axis.name} [°C]"
-    scale, unit = (1e-3, "mm") if axis.unit == "m" else (1.0, axis.unit)
+    scale, unit = (1e-3, "mm") if axis.unit == "m" else (1.0, unit_text(axis.unit))
     return values / scale, f"{axis.name} [{unit}]"
 
 
@@ -89,8 +93,10 @@ def _draw(axes: Axes, signature: Signature, held: NDArray[np.bool_], aside: NDAr
     for rows, colour, label in ((~held & ~aside, GREY, "rows fitted on"), (held & ~aside, AFTER, "rows held out")):
         if rows.any():
             axes.scatter((x + shift)[rows], y[rows], s=size, color=colour, linewidths=0, label=label, rasterized=raster)
-    if aside.any():
-        _draw_aside(axes, (x + shift)[aside], y[aside], y[~aside])
+    # Of a row next to a singularity there is nothing to draw.
+    shown = aside & (np.abs(y) + np.abs(fit) > 0)
+    if shown.any():
+        _draw_aside(axes, (x + shift)[shown], y[shown], y[~aside])
     _keep_to_most(axes, np.concatenate([y[~aside], fit[~aside]]))
     _draw_fit(axes, x[~aside], fit[~aside], values if few else None, step, size)
     axes.axhline(0, color=FLOOR, linewidth=0.8)
