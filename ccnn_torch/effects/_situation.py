@@ -136,9 +136,16 @@ class Situation:
         force = torch.stack([zero if q is None else q.expand_as(zero) for q in along], -1)
         if self.mechanism.orientations:
             return force
-        rows = self.frame_slope
-        held: Tensor = rows @ torch.linalg.solve(rows.mT @ rows, force.unsqueeze(-1))
+        held: Tensor = self.holding @ force.unsqueeze(-1)
         return held.squeeze(-1)
+
+    @cached_property
+    def holding(self) -> Tensor:
+        """Force and moment per unit of load along each pose coordinate, `... x s x c x p`."""
+        rows = self.frame_slope
+        inner = rows.mT @ rows
+        eye = torch.eye(inner.shape[-1], dtype=inner.dtype, device=inner.device)
+        return rows @ torch.linalg.solve(inner, eye.expand_as(inner))
 
     @cached_property
     def load_torque(self) -> Tensor:
@@ -178,7 +185,7 @@ class Situation:
 
         return jacobian_of(along, self.joints)[1].squeeze(-2).detach()
 
-    @property
+    @cached_property
     def down(self) -> Tensor:
         """Unit vector along gravity, `3`; 0 where there is none."""
         size: Tensor = torch.linalg.vector_norm(self.gravity)
@@ -191,9 +198,14 @@ class Situation:
         In units of what a weight of `PLATFORM_WEIGHT` typically asks of the joint in the workspace; of a joint that
         carries little of it, of a tenth of what the others carry.
         """
-        typical = self.samples.own_weight_torque.square().mean(0).sqrt()
-        typical = torch.maximum(typical, 0.1 * typical.amax()).clamp_min(_LEAST)
+        typical = self.typical_torque
         return self.own_weight_torque / typical + self.load_torque / (typical * PLATFORM_WEIGHT)
+
+    @cached_property
+    def typical_torque(self) -> Tensor:
+        """What 1 N of its own weight typically asks of each joint in the workspace, `n` [N or N·m per N]."""
+        typical = self.samples.own_weight_torque.square().mean(0).sqrt()
+        return torch.maximum(typical, 0.1 * typical.amax()).clamp_min(_LEAST)
 
     @cached_property
     def directed(self) -> list[int]:
