@@ -44,13 +44,14 @@ class ClosedKinematics(nn.Module):
         mechanism = self._mechanism[0]
         joints, pose, stands = self._standing(joints)
         found = {"pose": pose}
-        seen = _frame_slope(mechanism.frame, pose)
+        needed = self.start is not None or names & {"frame_slope", "holding", "visible"}
+        seen = _frame_slope(mechanism.frame, pose) if needed else pose
         if self.start is None:
             found["jacobian"] = _frame_slope(lambda q: mechanism.frame(mechanism.forward_kinematics(q)), joints)
         else:
             found["jacobian"] = seen @ _pseudo_inverse(_slope(mechanism.solve_inverse, pose))
         if "parameter_jacobian" in names:
-            values = mechanism.nominal.expand(len(joints), -1)
+            values = mechanism.nominal.expand(joints.shape[0], -1)
             if self.start is None:
                 found["parameter_jacobian"] = _frame_slope(
                     lambda p: mechanism.frame(mechanism.forward_kinematics(joints, p)), values
@@ -92,11 +93,11 @@ class ClosedKinematics(nn.Module):
 
 def _slope(function: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
     """Derivative of `s x k` -> `s x o` by central differences, `s x o x k`; 0 where a neighbour is no number."""
-    step = torch.tensor(_STEP, dtype=point.dtype)
-    away = (torch.eye(point.shape[-1], dtype=point.dtype) * step).unsqueeze(-2)
-    near = function(point + away) - function(point - away)
-    far = function(point + 2 * away) - function(point - 2 * away)
-    slope = (8 * near - far) / (12 * step)
+    step, unit = torch.tensor(_STEP, dtype=point.dtype), torch.eye(point.shape[-1], dtype=point.dtype)
+    away = torch.stack([unit, -unit, 2 * unit, -2 * unit]).unsqueeze(-2) * step
+    # All neighbours in one call: a graph is as long as its calls are many.
+    near, before, far, behind = function(point + away).unbind(0)
+    slope = (8 * (near - before) - (far - behind)) / (12 * step)
     return torch.nan_to_num(slope, posinf=0.0, neginf=0.0).permute(1, 2, 0)
 
 

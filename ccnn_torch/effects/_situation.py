@@ -161,8 +161,9 @@ class Situation:
     @cached_property
     def weight_torque(self) -> Tensor:
         """What 1 N of weight on the platform asks of each joint, `... x s x n` [N or N·m per N]."""
-        torque: Tensor = _known(self.jacobian)[..., :3, :].mT @ self.down
-        return torque
+        # As a matrix product: the ONNX exporter gets that of a stack of matrices with one vector wrong.
+        torque: Tensor = _known(self.jacobian)[..., :3, :].mT @ self.down.unsqueeze(-1)
+        return torque.squeeze(-1)
 
     @cached_property
     def own_weight_torque(self) -> Tensor:
