@@ -5,6 +5,7 @@ from ccnn_torch.compensation._compensator import Solution as Solution
 from ccnn_torch.compensation._compensator import default_limit as default_limit
 from ccnn_torch.compensation._compensator import fit_compensator as fit_compensator
 from ccnn_torch.compensation._domain import Domain as Domain
+from ccnn_torch.compensation._effects import Care as Care
 from ccnn_torch.compensation._effects import PhysicalEffects as PhysicalEffects
 from ccnn_torch.compensation._effects import effect_deviation as effect_deviation
 from ccnn_torch.compensation._effects import expand_effects as expand_effects

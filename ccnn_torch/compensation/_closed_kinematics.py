@@ -92,13 +92,14 @@ class ClosedKinematics(nn.Module):
 
 
 def _slope(function: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
-    """Derivative of `s x k` -> `s x o` by central differences, `s x o x k`; 0 where a neighbour is no number."""
+    """Derivative of `s x k` -> `s x o` by central differences, `s x o x k`; `_LOST` where a neighbour is no number."""
     step, unit = torch.tensor(_STEP, dtype=point.dtype), torch.eye(point.shape[-1], dtype=point.dtype)
     away = torch.stack([unit, -unit, 2 * unit, -2 * unit]).unsqueeze(-2) * step
     # All neighbours in one call: a graph is as long as its calls are many.
     near, before, far, behind = function(point + away).unbind(0)
     slope = (8 * (near - before) - (far - behind)) / (12 * step)
-    return torch.nan_to_num(slope, posinf=0.0, neginf=0.0).permute(1, 2, 0)
+    # An edge of the workspace is as near as that, and there the Jacobian is out of all proportion.
+    return torch.nan_to_num(slope, nan=_LOST, posinf=_LOST, neginf=-_LOST).permute(1, 2, 0)
 
 
 def _frame_slope(function: Callable[[Tensor], tuple[Tensor, Tensor | None]], point: Tensor) -> Tensor:

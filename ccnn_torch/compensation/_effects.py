@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from ccnn_torch.compensation._serial_geometry import _inverse
 from ccnn_torch.effects import Acting, Situation, make_effect
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 
-__all__ = ["PhysicalEffects", "effect_deviation", "expand_effects", "gains"]
+__all__ = ["Care", "PhysicalEffects", "effect_deviation", "expand_effects", "gains"]
 
 # Joints that move the platform less than this are held back [m per joint unit]: a thousandth of what is usual.
 _LEAST_DAMPING = 1e-3
@@ -23,13 +23,27 @@ _LEAST_DAMPING = 1e-3
 _LOST = 1e6
 
 
+class Care(NamedTuple):
+    """How effects are brought to the joints, and where they are not, since near a singular pose they are out of hand.
+
+    Attributes:
+        rotation_weight: of rotation against position [m/rad].
+        damping: directions in which a joint moves the platform less than this are held back [m per joint unit].
+        gain: where the joints move the platform by more than this (Frobenius norm of the weighted Jacobian), what the
+            effects take from the kinematics fades out over another 40 % [m per joint unit].
+        inverse_gain: the same of the Jacobian's damped inverse, for effects on the pose [joint unit per m].
+        free: names of effects that look at nothing of the kinematics, and never fade.
+    """
+
+    rotation_weight: float
+    damping: float
+    gain: float = math.inf
+    inverse_gain: float = math.inf
+    free: tuple[str, ...] = ()
+
+
 def effect_deviation(
-    here: Situation,
-    acting: Sequence[Acting],
-    jacobian: Callable[[Tensor], Tensor],
-    rotation_weight: float,
-    damping: float,
-    gain: float = math.inf,
+    here: Situation, acting: Sequence[Acting], jacobian: Callable[[Tensor], Tensor], care: Care
 ) -> Tensor:
     """Joint deviation with which the nominal machine stands where the machine with the effects stands.
 
@@ -40,31 +54,33 @@ def effect_deviation(
         here: the rows as commanded.
         acting: effects with their numbers.
         jacobian: of position and rotation vector, at joints `... x s x n` -> `... x s x c x n`.
-        rotation_weight: of rotation against position [m/rad].
-        damping: directions in which a joint moves the platform less than this are held back [m per joint unit].
-        gain: where the joints move the platform by more than this (Frobenius norm of the weighted Jacobian), near a
-            singular pose, the deviation fades out, over another 40 % [m per joint unit].
+        care: what is done near singular poses.
 
     Returns:
         `... x s x n` [joint's unit], finite.
     """
-    fade = None if math.isinf(gain) else _fading(here.jacobian, rotation_weight, gain)
-    moved, shift = torch.zeros_like(here.joints), None
+    free, moved, shift = torch.zeros_like(here.joints), torch.zeros_like(here.joints), None
     for one in acting:
         change = one.change(here)
         if one.effect.kind == "joints":
-            moved = moved + change
+            free, moved = (free + change, moved) if one.effect.name in care.free else (free, moved + change)
             continue
         if one.effect.kind == "parameters":
             change = (here.parameter_jacobian @ change.unsqueeze(-1)).squeeze(-1)
         shift = change if shift is None else shift + change
-    moved = torch.nan_to_num(moved, posinf=0.0, neginf=0.0)
+    if all(one.effect.name in care.free for one in acting):
+        return free
+    slope, lost = _weighted(here.jacobian, care.rotation_weight)
+    fade = _fading(slope.square().sum((-2, -1)) + lost, care.gain).unsqueeze(-1)
+    moved = fade * torch.nan_to_num(moved, posinf=0.0, neginf=0.0)
     if shift is None:
-        return moved if fade is None else fade * moved
-    shift = torch.nan_to_num(shift, posinf=0.0, neginf=0.0)
-    first = _lifted(here.jacobian, shift, rotation_weight, damping)
-    found = moved + _lifted(jacobian(here.joints + moved + 0.5 * first), shift, rotation_weight, damping)
-    return found if fade is None else fade * found
+        return free + moved
+    shift = _weights(here.jacobian, care.rotation_weight) * torch.nan_to_num(shift, posinf=0.0, neginf=0.0)
+    inverse = _lifting(slope, care.damping)
+    fade = fade * _fading(inverse.square().sum((-2, -1)), care.inverse_gain).unsqueeze(-1)
+    first = (inverse @ shift.unsqueeze(-1)).squeeze(-1)
+    half_way = _weighted(jacobian(here.joints + free + moved + 0.5 * first), care.rotation_weight)[0]
+    return free + moved + fade * (_lifting(half_way, care.damping) @ shift.unsqueeze(-1)).squeeze(-1)
 
 
 class PhysicalEffects(nn.Module):
@@ -77,6 +93,7 @@ class PhysicalEffects(nn.Module):
         covariates: names of the columns that come with the joints.
         acting: effects with their numbers; their own code runs on the fields.
         fields: what the effects see of the nominal machine.
+        care: what is done near singular poses.
         gravity: `3` [m/s²].
         numbers: of every effect by name and coefficient, for the model's card.
         export_tolerance: share of the limit to which exports agree.
@@ -92,9 +109,7 @@ class PhysicalEffects(nn.Module):
         covariates: Sequence[str],
         acting: Sequence[Acting],
         fields: Fields,
-        rotation_weight: float,
-        damping: float,
-        gain: float,
+        care: Care,
         numbers: Mapping[str, Mapping[str, float]],
     ) -> None:
         super().__init__()
@@ -102,7 +117,7 @@ class PhysicalEffects(nn.Module):
         self._mechanism = (mechanism,)
         self.covariates = list(covariates)
         self.fields = fields
-        self.rotation_weight, self.damping, self.gain = rotation_weight, damping, gain
+        self.care = care
         self.numbers = {name: dict(values) for name, values in numbers.items()}
         self.register_buffer("gravity", gravity.detach().clone())
         self._names = [one.effect.name for one in acting]
@@ -126,8 +141,7 @@ class PhysicalEffects(nn.Module):
         given = {name: columns[:, i] for i, name in enumerate(self.covariates) if name != "time"}
         with exact_numbers():
             here = self.fields.fill(Situation(self._mechanism[0], rows, given, self.gravity))
-            settings = self.rotation_weight, self.damping, self.gain
-            found = effect_deviation(here, self.acting, self.fields.jacobian, *settings)
+            found = effect_deviation(here, self.acting, self.fields.jacobian, self.care)
         return found.reshape(joints.shape)
 
     def describe(self) -> dict[str, Any]:
@@ -138,9 +152,7 @@ class PhysicalEffects(nn.Module):
             "covariates": self.covariates,
             "acting": [[one.effect.name, len(one.shape), len(one.coefficients)] for one in self.acting],
             "fields": self.fields.describe(),
-            "rotation_weight": self.rotation_weight,
-            "damping": self.damping,
-            "gain": None if math.isinf(self.gain) else self.gain,
+            "care": [None if value == math.inf else value for value in self.care],
             "numbers": self.numbers,
         }
 
@@ -148,6 +160,7 @@ class PhysicalEffects(nn.Module):
     def from_description(cls, description: dict[str, Any]) -> PhysicalEffects:
         """The module as it was described, its tensors 0."""
         mechanism = mechanism_from_description(description["mechanism"])
+        weight, damping, *gains, free = description["care"]
         acting = [
             Acting(make_effect(name), *(torch.zeros(size, dtype=torch.float64) for size in sizes))
             for name, *sizes in description["acting"]
@@ -158,9 +171,7 @@ class PhysicalEffects(nn.Module):
             description["covariates"],
             acting,
             Fields.from_description(description["fields"], mechanism),
-            description["rotation_weight"],
-            description["damping"],
-            math.inf if description["gain"] is None else description["gain"],
+            Care(weight, damping, *(math.inf if g is None else g for g in gains), tuple(free)),
             description["numbers"],
         )
 
@@ -169,10 +180,8 @@ def expand_effects(
     situation: Situation,
     acting: Sequence[Acting],
     covariates: Sequence[str],
-    margin: float = 0.1,
-    rotation_weight: float = 0.04,
-    damping: float = 0.0,
-    gain: float = math.inf,
+    margin: float,
+    care: Care,
 ) -> PhysicalEffects:
     """Effects with their numbers as a module that a model file can hold.
 
@@ -181,23 +190,21 @@ def expand_effects(
         acting: effects of the library, without time.
         covariates: names of the compensator's covariates, in order.
         margin: of the compensator's domain.
-        rotation_weight, damping, gain: as in `effect_deviation`.
+        care: what is done near singular poses; its `free` is found here.
 
     Raises:
         InputError, MethodFailedError: what the effects see of the machine cannot be expanded over these joints.
     """
     mechanism, few = situation.mechanism, slice(0, 8)
     given = {name: value[few] for name, value in situation.covariates.items()}
-    names = {"jacobian"} if any(one.effect.kind != "joints" for one in acting) else set()
+    names: set[str] = set()
+    free = []
     for one in acting:
-        names |= looked_at(Situation(mechanism, situation.joints[few], given, situation.gravity), one.change)
-        if one.effect.kind == "parameters":
-            names.add("parameter_jacobian")
-    if not names:
-        # Nothing of the kinematics is looked at, so nothing goes wrong near a singular pose.
-        gain = math.inf
-    elif not math.isinf(gain):
-        names.add("jacobian")
+        own = looked_at(Situation(mechanism, situation.joints[few], given, situation.gravity), one.change)
+        if one.effect.kind == "joints" and not own:
+            free.append(one.effect.name)
+            continue
+        names |= own | {"jacobian"} | ({"parameter_jacobian"} if one.effect.kind == "parameters" else set())
     fields = make_fields(mechanism, situation.gravity, names, situation.joints, margin)
     numbers = {
         one.effect.name: dict(
@@ -209,39 +216,40 @@ def expand_effects(
         )
         for one in acting
     }
-    return PhysicalEffects(
-        mechanism, situation.gravity, covariates, acting, fields, rotation_weight, damping, gain, numbers
-    ).requires_grad_(False)
+    care = care._replace(free=tuple(free))
+    module = PhysicalEffects(mechanism, situation.gravity, covariates, acting, fields, care, numbers)
+    return module.requires_grad_(False)
 
 
-def gains(jacobian: Tensor, rotation_weight: float) -> Tensor:
-    """How far the joints move the platform: Frobenius norm of the Jacobian, `... x c x n` -> `...` [m per unit]."""
-    return _squares(jacobian, rotation_weight).sqrt()
+def gains(jacobian: Tensor, care: Care) -> tuple[Tensor, Tensor]:
+    """What `Care` bounds as `gain` and `inverse_gain`, of `... x c x n`, `...` each."""
+    slope, lost = _weighted(jacobian, care.rotation_weight)
+    inverse = _lifting(slope, care.damping)
+    return (slope.square().sum((-2, -1)) + lost).sqrt(), inverse.square().sum((-2, -1)).sqrt()
 
 
-def _squares(jacobian: Tensor, rotation_weight: float) -> Tensor:
-    return (jacobian * _weights(jacobian, rotation_weight).unsqueeze(-1)).square().sum((-2, -1))
-
-
-def _fading(jacobian: Tensor, rotation_weight: float, gain: float) -> Tensor:
-    """1 where the Jacobian is as usual, 0 where it is 1.4 times the most, `... x s x 1`."""
-    known = torch.nan_to_num(jacobian, nan=_LOST, posinf=_LOST, neginf=-_LOST)
-    excess = torch.relu(_squares(known, rotation_weight) / gain**2 - 1)
-    fade = torch.relu(1 - excess)
-    return (fade * fade).unsqueeze(-1)
+def _weighted(jacobian: Tensor, rotation_weight: float) -> tuple[Tensor, Tensor]:
+    """Jacobian with its rotation weighted, `... x c x n`, 0 where there is none, and there a large number, `...`."""
+    # A comparison with NaN is false.
+    there = jacobian.abs() < _LOST
+    slope = torch.where(there, jacobian, torch.zeros_like(jacobian))
+    lost = torch.where(there, torch.zeros_like(jacobian), torch.full_like(jacobian, _LOST**2)).sum((-2, -1))
+    return slope * _weights(jacobian, rotation_weight).unsqueeze(-1), lost
 
 
 def _weights(jacobian: Tensor, rotation_weight: float) -> Tensor:
     return torch.tensor([1.0] * 3 + [rotation_weight] * (jacobian.shape[-2] - 3), dtype=jacobian.dtype)
 
 
-def _lifted(jacobian: Tensor, shift: Tensor, rotation_weight: float, damping: float) -> Tensor:
-    """Change of the joints that comes closest to a change of the pose, `... x s x n`."""
-    # A comparison with NaN is false.
-    slope = torch.where(jacobian.abs() < _LOST, jacobian, torch.zeros_like(jacobian))
-    weight = _weights(slope, rotation_weight)
-    slope = slope * weight.unsqueeze(-1)
+def _fading(square: Tensor, most: float) -> Tensor:
+    """1 up to `most` squared, 0 from twice that on, `...`."""
+    if math.isinf(most):
+        return torch.ones_like(square)
+    fade = torch.relu(1 - torch.relu(square / most**2 - 1))
+    return fade * fade
+
+
+def _lifting(slope: Tensor, damping: float) -> Tensor:
+    """Damped inverse of a weighted Jacobian, `... x n x c`."""
     unit = torch.eye(slope.shape[-1], dtype=slope.dtype)
-    inverse = _inverse(slope.mT @ slope + max(damping, _LEAST_DAMPING) ** 2 * unit, unit)
-    found: Tensor = inverse @ (slope.mT @ (weight * shift).unsqueeze(-1))
-    return found.squeeze(-1)
+    return _inverse(slope.mT @ slope + max(damping, _LEAST_DAMPING) ** 2 * unit, unit) @ slope.mT

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation._contraction import STEEPEST_DEVIATION, steepest
 from ccnn_torch.compensation._domain import Domain
-from ccnn_torch.compensation._effects import PhysicalEffects, expand_effects, gains
+from ccnn_torch.compensation._effects import Care, PhysicalEffects, expand_effects, gains
 from ccnn_torch.effects import Acting, Situation
 from ccnn_torch.mechanisms import SerialArm
 
@@ -36,7 +36,7 @@ def settled_effects(
     """The module of `expand_effects`, held back near singular poses no more than it must.
 
     There a load or a weight moves joints and platform out of all proportion, and fast: an arm's deviation is damped
-    more, that of another machine fades out where its Jacobian is larger than at most of the rows.
+    more, that of another machine fades out where its Jacobian, or the inverse, is larger than at most of the rows.
 
     Args:
         situation: the training rows, `s x n`.
@@ -54,22 +54,24 @@ def settled_effects(
     columns = [situation.covariates.get(name, torch.zeros_like(rows[:, 0])) for name in names]
     inputs = torch.cat([rows, *(column.unsqueeze(-1) for column in columns)], -1)
     domain = Domain.fit(inputs, torch.cat([limit, limit.new_zeros(len(names))]), margin)
+    care = Care(rotation_weight, damping)
     if isinstance(situation.mechanism, SerialArm):
-        module = expand_effects(situation, acting, names, margin, rotation_weight, damping)
+        module = expand_effects(situation, acting, names, margin, care)
 
         def hold_back(step: int) -> None:
-            module.damping = max(damping, _DAMPINGS[step])
+            module.care = module.care._replace(damping=max(damping, _DAMPINGS[step]))
     else:
-        sizes = gains(situation.jacobian, rotation_weight)
-        sizes = sizes[torch.isfinite(sizes)]
-        most = [float(torch.quantile(sizes, share)) * (_ABOVE if share == 1 else 1.0) for share in _SHARES]
-        module = expand_effects(situation, acting, names, margin, rotation_weight, damping, most[0])
-        if not module.fields.layout:
-            return module
+        sizes = torch.stack(gains(situation.jacobian, care))
+        most = torch.quantile(sizes, torch.tensor(_SHARES, dtype=sizes.dtype), dim=-1)
+        most[0] *= _ABOVE
+        module = expand_effects(situation, acting, names, margin, care)
 
         def hold_back(step: int) -> None:
-            module.gain = most[step]
+            gain, inverse_gain = most[step].tolist()
+            module.care = module.care._replace(gain=gain, inverse_gain=inverse_gain)
 
+    if not module.fields.layout:
+        return module
     _settle(hold_back, lambda: _steepness(module, inputs, domain, limit))
     return module
 

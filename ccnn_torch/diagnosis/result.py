@@ -44,7 +44,13 @@ class Diagnosis:
 
     def to_json(self) -> Mapping[str, Any]:
         """The form of `diagnosis.json` (schema `diagnosis`)."""
+        situation = self.analysis.situation
         return {
+            "mechanism": {
+                "name": situation.mechanism.name,
+                "joints": [joint.name for joint in situation.mechanism.joints],
+                "gravity": situation.gravity.tolist(),
+            },
             "gap": self.gap,
             "gap_rotation": self.gap_rotation,
             "where": self.where,
