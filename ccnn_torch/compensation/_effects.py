@@ -30,9 +30,9 @@ class Care(NamedTuple):
         rotation_weight: of rotation against position [m/rad].
         damping: directions in which a joint moves the platform less than this are held back [m per joint unit].
         gain: where the joints move the platform by more than this (Frobenius norm of the weighted Jacobian), what the
-            effects take from the kinematics fades out over another 40 % [m per joint unit].
+            effects take from the kinematics grows no further with it [m per joint unit].
         inverse_gain: the same of the Jacobian's damped inverse, for effects on the pose [joint unit per m].
-        free: names of effects that look at nothing of the kinematics, and never fade.
+        free: names of effects that look at nothing of the kinematics, and are never held back.
     """
 
     rotation_weight: float
@@ -71,16 +71,16 @@ def effect_deviation(
     if all(one.effect.name in care.free for one in acting):
         return free
     slope, lost = _weighted(here.jacobian, care.rotation_weight)
-    fade = _fading(slope.square().sum((-2, -1)) + lost, care.gain).unsqueeze(-1)
-    moved = fade * torch.nan_to_num(moved, posinf=0.0, neginf=0.0)
+    share = _held(slope.square().sum((-2, -1)) + lost, care.gain).unsqueeze(-1)
+    moved = share * torch.nan_to_num(moved, posinf=0.0, neginf=0.0)
     if shift is None:
         return free + moved
     shift = _weights(here.jacobian, care.rotation_weight) * torch.nan_to_num(shift, posinf=0.0, neginf=0.0)
     inverse = _lifting(slope, care.damping)
-    fade = fade * _fading(inverse.square().sum((-2, -1)), care.inverse_gain).unsqueeze(-1)
+    share = share * _held(inverse.square().sum((-2, -1)), care.inverse_gain).unsqueeze(-1)
     first = (inverse @ shift.unsqueeze(-1)).squeeze(-1)
-    half_way = _weighted(jacobian(here.joints + free + moved + 0.5 * first), care.rotation_weight)[0]
-    return free + moved + fade * (_lifting(half_way, care.damping) @ shift.unsqueeze(-1)).squeeze(-1)
+    half_way = _weighted(jacobian(here.joints + free + moved + 0.5 * share * first), care.rotation_weight)[0]
+    return free + moved + share * (_lifting(half_way, care.damping) @ shift.unsqueeze(-1)).squeeze(-1)
 
 
 class PhysicalEffects(nn.Module):
@@ -241,12 +241,11 @@ def _weights(jacobian: Tensor, rotation_weight: float) -> Tensor:
     return torch.tensor([1.0] * 3 + [rotation_weight] * (jacobian.shape[-2] - 3), dtype=jacobian.dtype)
 
 
-def _fading(square: Tensor, most: float) -> Tensor:
-    """1 up to `most` squared, 0 from twice that on, `...`."""
+def _held(square: Tensor, most: float) -> Tensor:
+    """1 up to `most` squared, and what keeps the product with its root there beyond, `...`."""
     if math.isinf(most):
         return torch.ones_like(square)
-    fade = torch.relu(1 - torch.relu(square / most**2 - 1))
-    return fade * fade
+    return torch.rsqrt((square / most**2).clamp_min(1.0))
 
 
 def _lifting(slope: Tensor, damping: float) -> Tensor:

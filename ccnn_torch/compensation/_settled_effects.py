@@ -36,7 +36,7 @@ def settled_effects(
     """The module of `expand_effects`, held back near singular poses no more than it must.
 
     There a load or a weight moves joints and platform out of all proportion, and fast: an arm's deviation is damped
-    more, that of another machine fades out where its Jacobian, or the inverse, is larger than at most of the rows.
+    more, that of another machine grows no further where its Jacobian, or the inverse, is larger than at most of the rows.
 
     Args:
         situation: the training rows, `s x n`.
