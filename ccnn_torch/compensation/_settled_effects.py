@@ -19,9 +19,10 @@ __all__ = ["settled_effects"]
 _SHARES = (1.0, 0.99, 0.98, 0.97, 0.96, 0.94, 0.92, 0.9, 0.87, 0.84, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)
 _ABOVE = 1.1
 _DAMPINGS = tuple(0.01 * 1.3**k for k in range(16))
-# Of the steepest slope that a compensator may have: the rest is for network and geometry.
-_SHARE = 0.6
-_ROWS = 400
+# Of the steepest slope that a compensator may have: the rest is for network and geometry, and a gentle slope takes
+# fewer steps to the command.
+_SHARE = 0.25
+_ROWS = 512
 
 
 def settled_effects(
