@@ -75,7 +75,7 @@ class ClosedKinematics(nn.Module):
             pose = mechanism.forward_kinematics(joints)
             stands = torch.isfinite(pose).all(-1, keepdim=True)
             joints = torch.where(stands, joints, mechanism.home_joints)
-            return joints, mechanism.forward_kinematics(joints), stands
+            return joints, torch.where(stands, pose, mechanism.home_pose), stands
         pose = self.start(joints).detach()
         for _ in range(_NEWTON_STEPS):
             pose = self._newton(pose, joints).detach()

@@ -30,7 +30,7 @@ class Care(NamedTuple):
         rotation_weight: of rotation against position [m/rad].
         damping: directions in which a joint moves the platform less than this are held back [m per joint unit].
         gain: where the joints move the platform by more than this (Frobenius norm of the weighted Jacobian), what the
-            effects take from the kinematics grows no further with it [m per joint unit].
+            effects take from the kinematics is held, and falls beyond with its square [m per joint unit].
         inverse_gain: the same of the Jacobian's damped inverse, for effects on the pose [joint unit per m].
         free: names of effects that look at nothing of the kinematics, and are never held back.
     """
@@ -242,10 +242,10 @@ def _weights(jacobian: Tensor, rotation_weight: float) -> Tensor:
 
 
 def _held(square: Tensor, most: float) -> Tensor:
-    """1 up to `most` squared, and what keeps the product with its root there beyond, `...`."""
+    """1 up to `most` squared, and falling in proportion beyond, `...`: what grows with the square is held there."""
     if math.isinf(most):
         return torch.ones_like(square)
-    return torch.rsqrt((square / most**2).clamp_min(1.0))
+    return 1 / (square / most**2).clamp_min(1.0)
 
 
 def _lifting(slope: Tensor, damping: float) -> Tensor:

@@ -21,7 +21,7 @@ _ABOVE = 1.1
 _DAMPINGS = tuple(0.01 * 1.3**k for k in range(16))
 # Of the steepest slope that a compensator may have: the rest is for network and geometry, and a gentle slope takes
 # fewer steps to the command.
-_SHARE = 0.25
+_SHARE = 0.5
 _ROWS = 512
 
 
