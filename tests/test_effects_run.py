@@ -12,14 +12,20 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
+from ccnn_torch.cli._main import app
 from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
+from ccnn_torch.compensation._export import quiet_exporter, to_onnx
+from ccnn_torch.compensation._networks import describe_network, network_from_description
+from ccnn_torch.compensation._session import open_onnx
+from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, measured_pose, reached
 from ccnn_torch.effects.covariates import draw_covariates
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.records import read_table
+from ccnn_torch.records import read_table, write_table
 from ccnn_torch.report.json_files import load_schema
 from ccnn_torch.runs.config import load_config, make_config
 from ccnn_torch.runs.prepare import prepare
@@ -31,16 +37,26 @@ NOISE = 5e-6
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A five-bar with wrong gains and compliance: its records, their diagnosis, and a config."""
-    from ccnn_torch.cli._main import app
-    from typer.testing import CliRunner
-
+    """A five-bar with wrong gains and compliance away from singular poses: records, diagnosis and a config."""
     folder = tmp_path_factory.mktemp("then")
     runner = CliRunner()
-    words = ["--mechanism", "five_bar", "--effect", "compliance", "--effect", "joint_gain", "--rows", "120"]
+    words = ["--mechanism", "five_bar", "--effect", "compliance", "--effect", "joint_gain", "--rows", "160"]
     words += ["--noise", str(NOISE), "--seed", "3", "--out", str(folder / "rows.csv"), "--quiet"]
     assert runner.invoke(app, ["simulate", *words]).exit_code == 0
-    words = ["--records", str(folder / "rows.csv"), "--mechanism", "five_bar", "--out", str(folder / "found"), "--quiet"]
+    table, bar = read_table(folder / "rows.csv"), load_mechanism("five_bar")
+    joints = torch.as_tensor(np.stack([table.column(q, "rad") for q in ("q1", "q2")], -1))
+    fine = (bar.condition_number(joints, 0.04) < 4).numpy()
+    assert fine.sum() > 100
+    write_table(folder / "rows.csv", {f"{n}[{table.units[n]}]": table.raw(n)[fine] for n in table.names})
+    words = [
+        "--records",
+        str(folder / "rows.csv"),
+        "--mechanism",
+        "five_bar",
+        "--out",
+        str(folder / "found"),
+        "--quiet",
+    ]
     words += ["--effects", "compliance,joint_gain,backlash,gravity,drift"]
     assert runner.invoke(app, ["diagnose", *words]).exit_code == 0
     text = "records: rows.csv\nmechanism: five_bar\nmethods: [gp]\neffects: from:found/diagnosis.json\n"
@@ -50,7 +66,12 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def keys(played: Path, **more: Any) -> dict[str, Any]:
     found = f"from:{played / 'found' / 'diagnosis.json'}"
-    return {"records": str(played / "rows.csv"), "mechanism": "five_bar", "methods": ["constant"], "effects": found} | more
+    return {
+        "records": str(played / "rows.csv"),
+        "mechanism": "five_bar",
+        "methods": ["constant"],
+        "effects": found,
+    } | more
 
 
 def test_held_out_rows_come_near_the_noise(played: Path) -> None:
@@ -66,19 +87,20 @@ def test_held_out_rows_come_near_the_noise(played: Path) -> None:
     block = found.results["effects"]
     assert block["test"]["q1"]["mse"]["median"] < 0.01 * before**2
     # Of each repeat's own training rows, near the file's, which saw all rows.
-    gain, file = block["coefficients"]["joint_gain"]["q1"]["values"], told["effects"]
-    given = next(e for e in file if e["name"] == "joint_gain")["parameters"]["q1"]["value"]
+    gain = block["coefficients"]["joint_gain"]["q1"]["values"]
+    given = next(e for e in told["effects"] if e["name"] == "joint_gain")["parameters"]["q1"]["value"]
     assert gain[0] != gain[1] and gain == pytest.approx([given] * 2, rel=0.02)
     assert any("fitted anew to the training rows" in note for note in found.results["notes"])
     jsonschema.validate(json.loads(json.dumps(found.results)), load_schema("results"))
-    # The compensator, effects and network in it, does on held-out rows what the results say.
+    # The compensator, effects and network in it, does so on held-out rows inside its domain.
     prepared, made = found.prepared, found.compensator()
     k = found.repeat()
     test = prepared.dataset.splits[k].test
     joints, covariates = prepared.joints[k, test], prepared.covariates[k, test]
-    arm = found.mechanism()
-    left = arm.pose_error(prepared.pose[k, test], arm.forward_kinematics(joints + made.deviation(joints, covariates)))
-    assert float(left.position.square().mean().sqrt()) == pytest.approx(after, rel=0.3)
+    bar, told_of = found.mechanism(), made.solve(joints, covariates)
+    left = bar.pose_error(prepared.pose[k, test], bar.forward_kinematics(told_of.ideal)).position
+    inside = told_of.ideal_inside_domain
+    assert int(inside.sum()) > 15 and float(left[inside].square().mean().sqrt()) < 1.6 * floor
 
 
 def test_held_out_rows_do_not_change_the_coefficients(played: Path, tmp_path: Path) -> None:
@@ -192,6 +214,31 @@ def test_the_module_does_what_the_effects_do(name: str, effects: tuple[str, ...]
     assert bool(torch.isfinite(module(odd, given.repeat(2, 1) * 100)).all())
 
 
+def test_an_exported_graph_has_the_numbers_of_the_effects() -> None:
+    # 293.15 K and other numbers in their code are none that single precision could hold.
+    bar, generator = load_mechanism("five_bar"), torch.Generator().manual_seed(4)
+    joints = bar.sample_joints(60, generator)
+    covariates = draw_covariates(bar, joints, generator)
+    del covariates["time"]
+    situation = Situation(bar, joints, covariates, default_gravity(bar))
+    acting = []
+    for effect in map(make_effect, ("thermal", "backlash")):
+        sizes = [c.scale for c in effect.coefficients(situation)]
+        acting.append(Acting(effect, torch.zeros(0, dtype=torch.float64), torch.tensor(sizes, dtype=torch.float64)))
+    module = expand_effects(situation, acting, [*covariates], 0.1, Care(0.04, 0.0, 2.0, 4.0))
+    given = torch.stack([*covariates.values()], -1)
+    batch = torch.export.Dim("batch")
+    shapes = {"joints": {0: batch}, "covariates": {0: batch}}
+    with quiet_exporter():
+        program = torch.export.export(module, (joints[:3], given[:3]), dynamic_shapes=shapes)
+    session = open_onnx(to_onnx(program, None, ["deviation"], 20, "{}", False).SerializeToString())
+    found = session.run(None, {"joints": joints.numpy(), "covariates": given.numpy()})[0]
+    np.testing.assert_allclose(found, module(joints, given).numpy(), rtol=0, atol=1e-13)
+    again = network_from_description(json.loads(json.dumps(describe_network(module))))
+    again.load_state_dict(module.state_dict())
+    assert torch.equal(again(joints, given), module(joints, given))
+
+
 def edited(played: Path, tmp_path: Path, change: Callable[[dict[str, Any]], None]) -> str:
     told = json.loads((played / "found" / "diagnosis.json").read_text(encoding="utf-8"))
     change(told)
@@ -244,8 +291,6 @@ def test_paths_start_where_the_key_stands(played: Path, tmp_path: Path, monkeypa
 
 
 def test_a_lag_is_left_out_and_said(played: Path) -> None:
-    from ccnn_torch.diagnosis.from_file import Verdict
-
     config = make_config(**keys(played, effects="none"))
     rows = prepare(config)
     names = [c.name for c in rows.covariate_coordinates]
@@ -253,7 +298,7 @@ def test_a_lag_is_left_out_and_said(played: Path) -> None:
     situation = Situation(rows.mechanism, rows.joints[0], covariates, default_gravity(rows.mechanism))
     verdict = Verdict("d.json", None, {"thermal": {"growth": 1.1e-5, "lag": 900.0, "at once": 1e-6}})
     known, notes = verdict.on(situation)
-    assert len(notes) == 1 and "Of thermal, lag, at once need" in notes[0]
+    assert len(notes) == 1 and "What thermal has of lag, at once comes from before" in notes[0]
     assert known[0].shape.shape == (0,) and float(known[0].coefficients[0]) == 1.1e-5
     bare = replace(situation, covariates={n: v for n, v in covariates.items() if n != "time"})
     assert len(known[0].coefficients) == len(known[0].effect.coefficients(bare))

@@ -59,7 +59,9 @@ class ClosedKinematics(nn.Module):
             else:
                 rates = _slope(lambda p: mechanism.solve_inverse(pose, p), values)
                 found["parameter_jacobian"] = -found["jacobian"] @ rates
-        found["jacobian"] = torch.where(stands.unsqueeze(-1), found["jacobian"], torch.full_like(pose[:1, :1, None], _LOST))
+        found["jacobian"] = torch.where(
+            stands.unsqueeze(-1), found["jacobian"], torch.full_like(pose[:1, :1, None], _LOST)
+        )
         if "frame_slope" in names:
             found["frame_slope"] = seen
         if "holding" in names:

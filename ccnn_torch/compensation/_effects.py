@@ -120,7 +120,6 @@ class PhysicalEffects(nn.Module):
         self.care = care
         self.numbers = {name: dict(values) for name, values in numbers.items()}
         self.register_buffer("gravity", gravity.detach().clone())
-        self._names = [one.effect.name for one in acting]
         self._effects = [one.effect for one in acting]
         for i, one in enumerate(acting):
             self.register_buffer(f"shape{i}", one.shape.detach().clone())
@@ -160,7 +159,7 @@ class PhysicalEffects(nn.Module):
     def from_description(cls, description: dict[str, Any]) -> PhysicalEffects:
         """The module as it was described, its tensors 0."""
         mechanism = mechanism_from_description(description["mechanism"])
-        weight, damping, *gains, free = description["care"]
+        weight, damping, gain, inverse_gain, free = (math.inf if c is None else c for c in description["care"])
         acting = [
             Acting(make_effect(name), *(torch.zeros(size, dtype=torch.float64) for size in sizes))
             for name, *sizes in description["acting"]
@@ -171,7 +170,7 @@ class PhysicalEffects(nn.Module):
             description["covariates"],
             acting,
             Fields.from_description(description["fields"], mechanism),
-            Care(weight, damping, *(math.inf if g is None else g for g in gains), tuple(free)),
+            Care(weight, damping, gain, inverse_gain, tuple(free)),
             description["numbers"],
         )
 
@@ -206,16 +205,11 @@ def expand_effects(
             continue
         names |= own | {"jacobian"} | ({"parameter_jacobian"} if one.effect.kind == "parameters" else set())
     fields = make_fields(mechanism, situation.gravity, names, situation.joints, margin)
-    numbers = {
-        one.effect.name: dict(
-            zip(
-                [c.name for c in (*one.effect.coefficients(situation), *one.effect.shapes(situation))],
-                [*one.coefficients.tolist(), *one.shape.tolist()],
-                strict=True,
-            )
-        )
-        for one in acting
-    }
+    numbers: dict[str, dict[str, float]] = {}
+    for one in acting:
+        named = [c.name for c in one.effect.coefficients(situation)] + [s.name for s in one.effect.shapes(situation)]
+        values = [*one.coefficients.tolist(), *one.shape.tolist()]
+        numbers[one.effect.name] = dict(zip(named, values, strict=True))
     care = care._replace(free=tuple(free))
     module = PhysicalEffects(mechanism, situation.gravity, covariates, acting, fields, care, numbers)
     return module.requires_grad_(False)

@@ -19,7 +19,16 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.training import tensor_digest
 
-__all__ = ["FORMAT", "FORMAT_EFFECTS", "FORMAT_GEOMETRY", "check_keys", "check_tensors", "coordinates", "facts_of", "to_json"]
+__all__ = [
+    "FORMAT",
+    "FORMAT_EFFECTS",
+    "FORMAT_GEOMETRY",
+    "check_keys",
+    "check_tensors",
+    "coordinates",
+    "facts_of",
+    "to_json",
+]
 
 FORMAT = "ccnn_torch compensator 2"
 # A reader that does not know of geometry must refuse such a file, not leave the geometry out.

@@ -21,7 +21,7 @@ _ABOVE = 1.1
 _DAMPINGS = tuple(0.01 * 1.3**k for k in range(16))
 # Of the steepest slope that a compensator may have: the rest is for network and geometry, and a gentle slope takes
 # fewer steps to the command.
-_SHARE = 0.5
+_SHARE = 0.6
 _ROWS = 512
 
 
@@ -37,7 +37,7 @@ def settled_effects(
     """The module of `expand_effects`, held back near singular poses no more than it must.
 
     There a load or a weight moves joints and platform out of all proportion, and fast: an arm's deviation is damped
-    more, that of another machine grows no further where its Jacobian, or the inverse, is larger than at most of the rows.
+    more, that of another machine grows no further where its Jacobian, or the inverse, is larger than at most rows.
 
     Args:
         situation: the training rows, `s x n`.

@@ -87,8 +87,8 @@ class Verdict:
             left = [n for n in values if n not in _named([*effect.coefficients(alone), *effect.shapes(alone)])]
             if left:
                 notes.append(
-                    f"Of {name}, {', '.join(left)} {'needs' if len(left) == 1 else 'need'} what was before a row, which "
-                    "a controller's command does not know: the machine is taken as settled under its covariates."
+                    f"What {name} has of {', '.join(left)} comes from before a row, which a command does not know: the "
+                    "machine is taken as settled under its covariates."
                 )
             found.append(known)
         return found, notes
@@ -123,7 +123,9 @@ def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Ver
     try:
         verdict = told["verdict"]
         names, outside, nothing = list(verdict["effects"]), bool(verdict["outside_library"]), bool(verdict["none"])
-        listed = {str(e["name"]): {str(n): _number(p["value"]) for n, p in e["parameters"].items()} for e in told["effects"]}
+        listed = {
+            str(e["name"]): {str(n): _number(p["value"]) for n, p in e["parameters"].items()} for e in told["effects"]
+        }
         machine = told.get("mechanism") or {}
         gravity = None if machine.get("gravity") is None else [_number(g) for g in machine["gravity"]]
         theirs = [str(j) for j in machine.get("joints") or joints]

@@ -44,10 +44,7 @@ def refit(
     white: Whitening | None = None
     for _ in range(_ROUNDS):
         there, target = tangent(situation, measured, acting)
-        columns = [
-            signature_at(situation, there, k.effect, k.shape)[..., list(k.used)]
-            for k in known
-        ]
+        columns = [signature_at(situation, there, k.effect, k.shape)[..., list(k.used)] for k in known]
         columns += [] if beside is None else [beside]
         every = torch.cat(columns, -1)
         fine = usable & torch.isfinite(target).all(-1) & torch.isfinite(every).flatten(1).all(-1)

@@ -145,7 +145,8 @@ class Situation:
         rows = self.frame_slope
         inner = rows.mT @ rows
         eye = torch.eye(inner.shape[-1], dtype=inner.dtype, device=inner.device)
-        return rows @ torch.linalg.solve(inner, eye.expand_as(inner))
+        inverse: Tensor = torch.linalg.solve(inner, eye.expand_as(inner))
+        return rows @ inverse
 
     @cached_property
     def load_torque(self) -> Tensor:

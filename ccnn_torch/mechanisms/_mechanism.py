@@ -58,8 +58,8 @@ class Mechanism(nn.Module):
         nominal: nominal parameters, `k` [SI], buffer.
         low, high: box of poses that `sample_workspace` draws from, `p` [SI], buffers.
         home_pose, home_joints: a configuration on the nominal branch, `p` and `n` [SI], buffers; where Newton starts.
-        closed_form: which direction is a closed form of sums, products, roots, sines and cosines, so that it can stand in
-            an exported graph: ``forward``, ``inverse``, or None.
+        closed_form: which direction is a closed form of sums, products, roots, sines and cosines, so that it can stand
+            in an exported graph: ``forward``, ``inverse``, or None.
         inverse_kinematics: child module around `solve_inverse`, the place for forward hooks.
     """
 

@@ -58,9 +58,8 @@ def evaluate(prepared: Prepared, fitted: Fitted) -> Outcome:
     """Predict on every row, and find the pose error that is left.
 
     Simulated: the machine is commanded q with q + δ(q) = q*, and the pose that it then reaches is solved.
-    Recorded: FK(q + δ(q)) predicts the measured pose, δ with identified geometry and known effects where there are any.
+    Recorded: FK(q + δ(q)) predicts the measured pose, δ with identified geometry and known effects where there are.
     """
-    mechanism = prepared.mechanism
     joints = prepared.joints
     deviation = _deviation(prepared, fitted, joints)
     if prepared.simulation is None:
