@@ -159,7 +159,8 @@ class PhysicalEffects(nn.Module):
     def from_description(cls, description: dict[str, Any]) -> PhysicalEffects:
         """The module as it was described, its tensors 0."""
         mechanism = mechanism_from_description(description["mechanism"])
-        weight, damping, gain, inverse_gain, free = (math.inf if c is None else c for c in description["care"])
+        weight, damping, *most, free = description["care"]
+        gain, inverse_gain = (math.inf if m is None else float(m) for m in most)
         acting = [
             Acting(make_effect(name), *(torch.zeros(size, dtype=torch.float64) for size in sizes))
             for name, *sizes in description["acting"]
