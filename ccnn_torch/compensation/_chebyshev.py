@@ -74,7 +74,12 @@ class ChebyshevExpansion(nn.Module):
 
 
 def expand(
-    function: Callable[[Tensor], Tensor], joints: Tensor, margin: float, what: str, groups: list[int] | None = None
+    function: Callable[[Tensor], Tensor],
+    joints: Tensor,
+    margin: float,
+    what: str,
+    groups: list[int] | None = None,
+    worst: float = _WORST,
 ) -> ChebyshevExpansion:
     """Expand functions of the joints over the domain of the training rows, by least squares, checked at other points.
 
@@ -85,10 +90,11 @@ def expand(
         what: is expanded, for messages.
         groups: widths of neighbouring outputs that share a unit and are judged by their own largest value; all
             together when None.
+        worst: error at other points up to which an expansion is taken, as a share of the largest value.
 
     Raises:
         InputError: the mechanism has more joints than an expansion can have terms for.
-        MethodFailedError: no expansion of up to 600 terms is right to 1e-2 of the largest value.
+        MethodFailedError: no expansion of up to 600 terms is right to `worst`.
     """
     n = joints.shape[-1]
     degrees = [degree for degree in _DEGREES if math.comb(n + degree, n) <= _MOST_TERMS]
@@ -127,11 +133,11 @@ def expand(
             best = error, found
         if error <= _AIM:
             break
-    if best is None or not best[0] <= _WORST:
+    if best is None or not best[0] <= worst:
         share = "no number" if best is None else f"{best[0]:.1e}"
         raise MethodFailedError(
             f"the {what} is no polynomial of the joints: the best of degree {degrees[-1]} is off by "
-            f"{share} of its largest value, where {_WORST:g} is allowed; measure a smaller part of the workspace, away "
+            f"{share} of its largest value, where {worst:g} is allowed; measure a smaller part of the workspace, away "
             "from singular poses"
         )
     best[1].coefficients.mul_(size)

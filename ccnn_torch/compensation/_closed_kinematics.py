@@ -15,8 +15,8 @@ __all__ = ["ClosedKinematics"]
 
 # Of central differences of the fourth order [SI]: machines are about 1 m, and their kinematics are curved by about 1/m.
 _STEP = 5e-4
-# From a polynomial that is off by up to a hundredth.
-_NEWTON_STEPS = 3
+# From a polynomial that is off by some hundredths at most, and by 1e-4 mostly.
+_NEWTON_STEPS = 4
 # What is left of the inverse kinematics where a pose was found [SI].
 _FOUND = 1e-9
 # A Jacobian that no machine has [m or rad per joint unit].

@@ -213,7 +213,11 @@ def expand_effects(
         numbers[one.effect.name] = dict(zip(named, values, strict=True))
     care = care._replace(free=tuple(free))
     module = PhysicalEffects(mechanism, situation.gravity, covariates, acting, fields, care, numbers)
-    return module.requires_grad_(False)
+    module.requires_grad_(False)
+    # Effects that ask which of their columns the workspace shows keep the answer; a traced graph could not ask.
+    columns = [given.get(name, torch.zeros_like(situation.joints[few, 0])) for name in module.covariates]
+    module(situation.joints[few], torch.stack(columns, -1) if columns else situation.joints[few, :0])
+    return module
 
 
 def gains(jacobian: Tensor, care: Care) -> tuple[Tensor, Tensor]:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
+from onnxruntime.capi.onnxruntime_pybind11_state import NotImplemented as NoKernel
 from torch import Tensor, nn
 
 from ccnn_torch.compensation._compensator import Compensator
@@ -98,11 +99,17 @@ def export_onnx(compensator: Compensator, program: torch.export.ExportedProgram,
         metadata: JSON to carry in the file.
 
     Raises:
-        MethodFailedError: the file does not give the eager model's numbers; see `verify`.
+        MethodFailedError: the file does not give the eager model's numbers, see `verify`, or cannot be run.
     """
     model = to_onnx(program, None, OUTPUTS, _OPSET, metadata, _plain(compensator))
     content: bytes = model.SerializeToString(deterministic=True)
-    session = open_onnx(content)
+    try:
+        session = open_onnx(content)
+    except NoKernel as reason:
+        raise MethodFailedError(
+            f"an operator of this model has no kernel in ONNX Runtime in double ({str(reason).rpartition(' : ')[2]}); "
+            "leave out the learner or the effect (instrument on a machine that turns) that brings it"
+        ) from None
     verify(compensator, lambda joints, covariates: run_onnx(session, joints, covariates), "ONNX")
     return content
 

@@ -37,6 +37,8 @@ _NAMES = (
     "pose",
     "platform",
 )
+# Error of a pose from which Newton's method comes to the right one, as a share of the largest.
+_START = 0.1
 # Parts of `platform`.
 _POSITION, _ROTATION = "platform position", "platform rotation"
 
@@ -207,7 +209,7 @@ def make_fields(mechanism: Mechanism, gravity: Tensor, names: set[str], joints: 
     elif layout and mechanism.closed_form is not None:
         start = None
         if mechanism.closed_form == "inverse":
-            start = expand(lambda q: Situation(mechanism, q, {}, gravity).pose, joints, margin, _WHAT)
+            start = expand(lambda q: Situation(mechanism, q, {}, gravity).pose, joints, margin, _WHAT, worst=_START)
         source = ClosedKinematics(mechanism, start)
     elif layout:
         source = expand(flat, joints, margin, _WHAT, [math.prod(shape) for _, shape in layout])
