@@ -5,6 +5,10 @@ from ccnn_torch.compensation._compensator import Solution as Solution
 from ccnn_torch.compensation._compensator import default_limit as default_limit
 from ccnn_torch.compensation._compensator import fit_compensator as fit_compensator
 from ccnn_torch.compensation._domain import Domain as Domain
+from ccnn_torch.compensation._effects import Care as Care
+from ccnn_torch.compensation._effects import PhysicalEffects as PhysicalEffects
+from ccnn_torch.compensation._effects import effect_deviation as effect_deviation
+from ccnn_torch.compensation._effects import expand_effects as expand_effects
 from ccnn_torch.compensation._geometry import Geometry as Geometry
 from ccnn_torch.compensation._geometry import fit_geometry_module as fit_geometry_module
 from ccnn_torch.compensation._geometry import geometric_deviation as geometric_deviation
@@ -19,3 +23,4 @@ from ccnn_torch.compensation._model_file import save_model as save_model
 from ccnn_torch.compensation._networks import UncertainNetwork as UncertainNetwork
 from ccnn_torch.compensation._networks import network_from_description as network_from_description
 from ccnn_torch.compensation._networks import register_network as register_network
+from ccnn_torch.compensation._settled_effects import settled_effects as settled_effects

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.compensation._contraction import STEEPEST_DEVIATION, iterations_needed, steepest
 from ccnn_torch.compensation._domain import Domain
+from ccnn_torch.compensation._effects import PhysicalEffects
 from ccnn_torch.compensation._geometry import Geometry
 from ccnn_torch.compensation._networks import UncertainNetwork
 from ccnn_torch.coordinates import Coordinate
@@ -87,6 +88,7 @@ class Compensator(nn.Module):
         lipschitz: bound of |∂δ/∂q| with joints in units of their limits (maximum row sum), 1.
         iterations: smallest k with lipschitzᵏ · max|δ| below 1e-12 of the limit.
         geometry: commanded joints `... x n` -> γ `... x n` [SI], bounded for finite joints; None without one.
+        effects: commanded joints and covariates -> ε `... x n` [SI]; None without one.
     """
 
     limit: Tensor
@@ -108,10 +110,12 @@ class Compensator(nn.Module):
         sd_scale: Tensor | None = None,
         safe_sd: Tensor | None = None,
         geometry: Geometry | None = None,
+        effects: PhysicalEffects | None = None,
     ) -> None:
         super().__init__()
         self.network = network
         self.geometry = geometry
+        self.effects = effects
         self.scaling = scaling
         self.domain = domain
         self.register_buffer("limit", limit)
@@ -243,6 +247,9 @@ class Compensator(nn.Module):
         weight = fade * fade
         # Two products instead of safe + weight · (limited - safe): each end is then exact.
         value = self._limited(weight * self._limited(raw) + (1 - weight) * self.safe)
+        if self.effects is not None:
+            moved = self.effects(caged[..., : len(self.joints)] + value, caged[..., len(self.joints) :])
+            value = self._limited(value + weight * moved)
         if self.geometry is not None:
             moved = self.geometry(caged[..., : len(self.joints)] + value)
             value = self._limited(value + (moved if self.geometry.extrapolates else weight * moved))
@@ -279,15 +286,16 @@ def fit_compensator(
     transition: float = 0.5,
     sd_scale: Tensor | None = None,
     geometry: Geometry | None = None,
+    effects: PhysicalEffects | None = None,
 ) -> Compensator:
-    """Put guard, limit and fixed point around a trained network, and identified geometry beside it.
+    """Put guard, limit and fixed point around a trained network, and identified geometry and effects beside it.
 
     Args:
         network: features -> standardised deviation, of one repeat.
         scaling: of that repeat, without the leading dimension.
         inputs: training inputs, commanded joints and then covariates, `s x (n + m)` [SI].
-        deviations: training deviations of what the network learned, `s x n` [SI]; with `geometry` what that leaves. The
-            mean of the deviations that fade out is the safe correction outside the domain.
+        deviations: training deviations of what the network learned, `s x n` [SI]; with `geometry` or `effects` what
+            these leave. The mean of the deviations that fade out is the safe correction outside the domain.
         joints, covariates: coordinates in the order of the inputs.
         limit: hard limit of |δ|, `n` [SI]; 1.5 times the largest training deviation of each joint, geometry included,
             when None.
@@ -295,6 +303,7 @@ def fit_compensator(
         transition: width over which it then fades into the safe correction, as a share of the half range.
         sd_scale: what the network's standard deviation is multiplied by, `n` [1]; 1 when None.
         geometry: deviation of the identified geometry, of one repeat.
+        effects: deviation of known effects, of one repeat.
 
     Raises:
         InputError: shapes do not fit together, or a limit or a scale is out of its range.
@@ -307,18 +316,21 @@ def fit_compensator(
             f"{n} joints and {len(covariates)} covariates"
         )
     inputs, deviations = inputs.detach(), deviations.detach()
-    total = deviations
-    if geometry is not None:
-        geometry = copy.deepcopy(geometry)
-        with torch.no_grad():
-            total = deviations + geometry(inputs[:, :n] + deviations)
+    total = fading = deviations
+    with torch.no_grad():
+        if effects is not None:
+            effects = copy.deepcopy(effects)
+            total = fading = deviations + effects(inputs[:, :n] + deviations, inputs[:, n:])
+        if geometry is not None:
+            geometry = copy.deepcopy(geometry)
+            total = fading + geometry(inputs[:, :n] + fading)
+            fading = fading if geometry.extrapolates else total
     limit = default_limit(total) if limit is None else limit.detach()
     if limit.shape != (n,) or not bool((limit >= 0).all() & torch.isfinite(limit).all()):
         raise InputError(f"limit must be one finite number of at least 0 for each of the {n} joints")
     sd_scale = torch.ones_like(limit) if sd_scale is None else sd_scale.detach().clone()
     if sd_scale.shape != (n,) or not bool((sd_scale > 0).all() & torch.isfinite(sd_scale).all()):
         raise InputError(f"sd_scale must be one finite number above 0 for each of the {n} joints")
-    fading = deviations if geometry is None or geometry.extrapolates else total
     safe = torch.minimum(torch.maximum(fading.mean(0), -limit), limit)
     safe_sd = (fading - safe).square().mean(0).sqrt()
     reach = torch.cat([limit, limit.new_zeros(len(covariates))])
@@ -326,9 +338,9 @@ def fit_compensator(
     # A copy: what is compensated with does not change when the learner trains on.
     frozen = copy.deepcopy(network).requires_grad_(False)
     compensator = Compensator(
-        frozen, scaling, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale, safe_sd, geometry
+        frozen, scaling, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale, safe_sd, geometry, effects
     )
-    size = {} if geometry is None else {"count": 512, "at_once": 1024}
+    size = {} if geometry is None and effects is None else {"count": 512, "at_once": 1024}
     found = steepest(compensator.deviation, inputs, domain, limit, **size)
     if not math.isfinite(found.lipschitz):
         raise MethodFailedError("the trained network gives values that are not finite within its domain")

@@ -2,77 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from ccnn_torch.compensation._contraction import spread_points
-from ccnn_torch.compensation._domain import Domain
-from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.compensation._chebyshev import ChebyshevExpansion, expand
 
 __all__ = ["ExpandedGeometry", "expand_geometry"]
 
-_DEGREES = (2, 4, 6, 8, 10, 12, 16)
-_MOST_TERMS = 600
-# Error of the expansion at points it was not fitted to, as a share of the largest deviation: what is aimed at, and what
-# is still written. Geometric errors are known to no more than a few per cent themselves.
-_AIM, _WORST = 1e-6, 1e-2
-# Rows taken, twice, with six times as many points between and around them: three times the most terms.
-_SPREAD = 250
-# Keeps coefficients that the points do not determine (corners that no pose reaches) small.
-_RIDGE = 1e-12
 
-
-class ExpandedGeometry(nn.Module):
-    """δ(q) = Σ c_α Π T_αj(z_j), |α| ≤ degree, with z the joints scaled to [-1, 1] and clamped there.
-
-    Only sums, products and a matrix product, so that it runs wherever a network does.
+class ExpandedGeometry(ChebyshevExpansion):
+    """δ(q), commanded joints `... x n` -> `... x n` [SI], as a polynomial.
 
     Attributes:
-        centre, half_range: of the joints, `n` [SI].
-        coefficients: `terms x n` [SI].
         extrapolates: a polynomial says nothing outside the points it was fitted to.
         export_tolerance: share of the limit to which exports agree; sums of many terms are rounded.
     """
 
     extrapolates = False
     export_tolerance = 1e-10
-    centre: Tensor
-    half_range: Tensor
-    coefficients: Tensor
-    _pick: Tensor
-
-    def __init__(self, centre: Tensor, half_range: Tensor, degree: int, coefficients: Tensor | None = None) -> None:
-        super().__init__()
-        exponents = _exponents(len(centre), degree)
-        empty = centre.new_zeros(len(exponents), len(centre))
-        self.degree = degree
-        self.register_buffer("centre", centre)
-        self.register_buffer("half_range", half_range)
-        self.register_buffer("coefficients", empty if coefficients is None else coefficients)
-        pick = torch.nn.functional.one_hot(exponents.mT, degree + 1).mT.to(centre.dtype)
-        # `n x (degree + 1) x terms`
-        self.register_buffer("_pick", pick.contiguous(), persistent=False)
-
-    def forward(self, joints: Tensor) -> Tensor:
-        """joints: `... x n` [SI]; returns δ, `... x n` [SI]."""
-        return self.basis(joints) @ self.coefficients
-
-    def basis(self, joints: Tensor) -> Tensor:
-        """Products of Chebyshev polynomials, `... x terms` [1]."""
-        z = torch.clamp((joints - self.centre) / self.half_range, -1.0, 1.0)
-        powers = [torch.ones_like(z), z]
-        for _ in range(self.degree - 1):
-            powers.append(2.0 * z * powers[-1] - powers[-2])
-        table = torch.stack(powers, -1)
-        # One matrix product a joint takes its polynomial into every term: narrow engines have no gather.
-        product = table[..., 0, :] @ self._pick[0]
-        for j in range(1, len(self.centre)):
-            product = product * (table[..., j, :] @ self._pick[j])
-        return product
 
     def describe(self) -> dict[str, Any]:
         """Everything `from_description` needs; the tensors stand beside it."""
@@ -86,7 +36,7 @@ class ExpandedGeometry(nn.Module):
 
 
 def expand_geometry(deviation: Callable[[Tensor], Tensor], joints: Tensor, margin: float = 0.1) -> ExpandedGeometry:
-    """Expand a geometric deviation over the domain of the training rows, by least squares, checked at other points.
+    """Expand a geometric deviation over the domain of the training rows.
 
     Args:
         deviation: commanded joints `s x n` -> δ `s x n` [SI]; NaN where the mechanism cannot stand.
@@ -94,56 +44,7 @@ def expand_geometry(deviation: Callable[[Tensor], Tensor], joints: Tensor, margi
         margin: as in `fit_compensator`.
 
     Raises:
-        InputError: the mechanism has more joints than an expansion can have terms for.
-        MethodFailedError: no expansion of up to 600 terms is right to 1e-2 of the largest deviation.
+        InputError, MethodFailedError: as `expand`.
     """
-    n = joints.shape[-1]
-    degrees = [degree for degree in _DEGREES if math.comb(n + degree, n) <= _MOST_TERMS]
-    if degrees[-1:] < [4]:
-        raise InputError(f"geometry: a mechanism of {n} joints without closed forms cannot be expanded; up to 8 can")
-    domain = Domain.fit(joints, torch.zeros_like(joints[0]), margin)
-    generator = torch.Generator().manual_seed(2)
-    points = torch.cat([spread_points(joints, domain, generator, _SPREAD) for _ in range(2)])
-    value = deviation(points)
-    known = torch.isfinite(value).all(-1)
-    inside = (domain.excess(domain.cage(points)).squeeze(-1) == 0) & known
-    check = torch.arange(len(points)) % 5 == 0
-    low, high = points[known].amin(0), points[known].amax(0)
-    centre, half = (low + high) / 2, ((high - low) / 2).clamp_min(1e-9)
-    size = float(value[inside].abs().max()) if bool(inside.any()) else 0.0
-    if size == 0:
-        return ExpandedGeometry(centre, half, 2)
-    best: tuple[float, ExpandedGeometry] | None = None
-    for degree in degrees:
-        found = ExpandedGeometry(centre, half, degree)
-        fitted = known & ~check
-        # What is beyond the margin only keeps the polynomial tame there.
-        root = torch.where(inside[fitted], 1.0, 1e-2).to(value.dtype).unsqueeze(-1)
-        basis = found.basis(points[fitted]) * root
-        if len(basis) < 2 * basis.shape[-1]:
-            break
-        normal = basis.mT @ basis
-        normal = normal + _RIDGE * normal.diagonal().max() * torch.eye(len(normal), dtype=normal.dtype)
-        found.coefficients.copy_(torch.linalg.solve(normal, basis.mT @ (value[fitted] * root)))
-        other = inside & check
-        error = float((found(points[other]) - value[other]).abs().max()) / size
-        if best is None or error < best[0]:
-            best = error, found
-        if error <= _AIM:
-            break
-    if best is None or not best[0] <= _WORST:
-        share = "no number" if best is None else f"{best[0]:.1e}"
-        raise MethodFailedError(
-            f"the geometric deviation is no polynomial of the joints: the best of degree {degrees[-1]} is off by "
-            f"{share} of its largest value, where {_WORST:g} is allowed; measure a smaller part of the workspace, away "
-            "from singular poses"
-        )
-    return best[1]
-
-
-def _exponents(joints: int, degree: int) -> Tensor:
-    """All exponents of total degree up to `degree`, `terms x joints` int64."""
-    rows: list[tuple[int, ...]] = [()]
-    for _ in range(joints):
-        rows = [(*row, k) for row in rows for k in range(degree + 1 - sum(row))]
-    return torch.tensor(rows, dtype=torch.int64)
+    found = expand(deviation, joints, margin, "geometric deviation")
+    return ExpandedGeometry(found.centre, found.half_range, found.degree, found.coefficients)

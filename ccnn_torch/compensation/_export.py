@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
+from onnxruntime.capi.onnxruntime_pybind11_state import NotImplemented as NoKernel
 from torch import Tensor, nn
 
 from ccnn_torch.compensation._compensator import Compensator
@@ -98,11 +99,17 @@ def export_onnx(compensator: Compensator, program: torch.export.ExportedProgram,
         metadata: JSON to carry in the file.
 
     Raises:
-        MethodFailedError: the file does not give the eager model's numbers; see `verify`.
+        MethodFailedError: the file does not give the eager model's numbers, see `verify`, or cannot be run.
     """
-    model = to_onnx(program, None, OUTPUTS, _OPSET, metadata, compensator.geometry is None)
+    model = to_onnx(program, None, OUTPUTS, _OPSET, metadata, _plain(compensator))
     content: bytes = model.SerializeToString(deterministic=True)
-    session = open_onnx(content)
+    try:
+        session = open_onnx(content)
+    except NoKernel as reason:
+        raise MethodFailedError(
+            f"an operator of this model has no kernel in ONNX Runtime in double ({str(reason).rpartition(' : ')[2]}); "
+            "leave out the learner or the effect (instrument on a machine that turns) that brings it"
+        ) from None
     verify(compensator, lambda joints, covariates: run_onnx(session, joints, covariates), "ONNX")
     return content
 
@@ -131,16 +138,18 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     back is ideal = joints + `back_deviation`. `guard` and `back_guard` are 1 inside the domain and fall to 0 outside.
 
     Raises:
-        MethodFailedError: the file is not right to 1e-5 of the limit.
+        MethodFailedError: the file is not right to 1e-5 of the limit, or the model holds physical effects, whose code
+            computes in double.
     """
+    if compensator.effects is not None:
+        raise MethodFailedError("the physical effects are worked out in double precision; use the float64 file")
     twin = copy.deepcopy(compensator)
     twin.iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), _TOLERANCE_FLOAT32 / 10)
     twin = twin.float()
     joints, covariates = probe_points(compensator)
     given = [v.float() for v in (joints, covariates) if v is not None]
     example = tuple(v[:1] for v in given)
-    plain = compensator.geometry is None
-    model = to_onnx(_Single(twin), example, _OUTPUTS_FLOAT32, _OPSET_FLOAT32, metadata, plain)
+    model = to_onnx(_Single(twin), example, _OUTPUTS_FLOAT32, _OPSET_FLOAT32, metadata, _plain(compensator))
     content: bytes = model.SerializeToString(deterministic=True)
     session = open_onnx(content)
     with torch.no_grad():
@@ -169,14 +178,14 @@ def verify(compensator: Compensator, run: Any, form: str) -> None:
     Raises:
         MethodFailedError: it differs by more than 1e-12 of the limit (commands: and the rounding of a joint; standard
             deviations: and 1e-12 of themselves). A network may ask for more than 1e-12, up to 1e-9, by its attribute
-            `export_tolerance`; so may a geometry.
+            `export_tolerance`; so may geometry and effects.
     """
     joints, covariates = probe_points(compensator)
     with torch.no_grad():
         expected = {k: v.numpy() for k, v in compensator.solve(joints, covariates)._asdict().items()}
     given = joints.numpy(), None if covariates is None else covariates.numpy()
     single = joints.numpy()[:1], None if covariates is None else covariates.numpy()[:1]
-    parts = (compensator.network, compensator.geometry)
+    parts = (compensator.network, compensator.geometry, compensator.effects)
     share = min(max(TOLERANCE, *(getattr(part, "export_tolerance", TOLERANCE) for part in parts)), _LOOSEST)
     tolerance = share * compensator.limit.numpy()
     for found, wanted in ((run(*given), expected), (run(*single), {k: v[:1] for k, v in expected.items()})):
@@ -213,6 +222,11 @@ def probe_points(compensator: Compensator, count: int = 256) -> tuple[Tensor, Te
     points = torch.cat([spread, *rows])
     n = len(compensator.joints)
     return points[:, :n].contiguous(), points[:, n:].contiguous() if compensator.covariates else None
+
+
+def _plain(compensator: Compensator) -> bool:
+    """Whether the graph is small enough for the exporter to look for patterns in it."""
+    return compensator.geometry is None and compensator.effects is None
 
 
 def to_onnx(

@@ -19,11 +19,23 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.training import tensor_digest
 
-__all__ = ["FORMAT", "FORMAT_GEOMETRY", "check_keys", "check_tensors", "coordinates", "facts_of", "to_json"]
+__all__ = [
+    "FORMAT",
+    "FORMAT_EFFECTS",
+    "FORMAT_GEOMETRY",
+    "check_keys",
+    "check_tensors",
+    "coordinates",
+    "facts_of",
+    "to_json",
+]
 
 FORMAT = "ccnn_torch compensator 2"
 # A reader that does not know of geometry must refuse such a file, not leave the geometry out.
 FORMAT_GEOMETRY = "ccnn_torch compensator 3"
+# The same of effects.
+FORMAT_EFFECTS = "ccnn_torch compensator 4"
+_KNOWN = (FORMAT, FORMAT_GEOMETRY, FORMAT_EFFECTS)
 _FORMATS = "ccnn_torch compensator "
 
 _REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
@@ -46,7 +58,7 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
     pose = mechanism.get("pose", []) if isinstance(mechanism, Mapping) else []
     limits = (v.tolist() for v in (compensator.limit, compensator.safe, compensator.safe_sd, compensator.sd_scale))
     facts: dict[str, Any] = {
-        "format": FORMAT if compensator.geometry is None else FORMAT_GEOMETRY,
+        "format": _format(compensator),
         **{key: fields[key] for key in _REQUIRED},
         "joints": [_plain(c) for c in compensator.joints],
         "covariates": [_plain(c) for c in compensator.covariates],
@@ -64,6 +76,8 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
     }
     if compensator.geometry is not None:
         facts["geometry"] = compensator.geometry.describe()
+    if compensator.effects is not None:
+        facts["effects"] = compensator.effects.describe()
     facts["sha256"] = {"tensors": tensor_digest(dict(compensator.state_dict()))}
     facts["sha256"]["keys"] = _digest(facts)
     return facts
@@ -76,11 +90,11 @@ def check_keys(facts: Any) -> dict[str, Any]:
         ModelFileError: they are not.
     """
     written = str(facts.get("format")) if isinstance(facts, dict) else ""
-    known = written in (FORMAT, FORMAT_GEOMETRY)
+    known = written in _KNOWN
     if not known and written.startswith(_FORMATS):
         raise ModelFileError(
-            f"it has the form '{written}' of another version of this package, which reads '{FORMAT}' and "
-            f"'{FORMAT_GEOMETRY}'; write it again with this version (ccnn run …, or save_model)"
+            f"it has the form '{written}' of another version of this package, which reads "
+            f"{', '.join(repr(form) for form in _KNOWN)}; write it again with this version (ccnn run …, or save_model)"
         )
     if not isinstance(facts, dict) or not known:
         raise ModelFileError(f"it says nothing of the form '{FORMAT}', so this package did not write it" + TAKE_AGAIN)
@@ -111,6 +125,13 @@ def to_json(value: Mapping[str, Any], indent: int | None = None) -> str:
         return json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False, indent=indent)
     except (TypeError, ValueError) as problem:
         raise InputError(f"a model's fields must be JSON: {problem}") from None
+
+
+def _format(compensator: Compensator) -> str:
+    """The least form that says all."""
+    if compensator.effects is not None:
+        return FORMAT_EFFECTS
+    return FORMAT if compensator.geometry is None else FORMAT_GEOMETRY
 
 
 def _digest(facts: Mapping[str, Any]) -> str:

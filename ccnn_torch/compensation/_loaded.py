@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation._compensator import Compensator, Hook
 from ccnn_torch.compensation._domain import Domain
+from ccnn_torch.compensation._effects import PhysicalEffects
 from ccnn_torch.compensation._facts import check_keys, check_tensors, coordinates, to_json
 from ccnn_torch.compensation._geometry import Geometry
 from ccnn_torch.compensation._networks import network_from_description
@@ -280,6 +281,9 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
     geometry = network_from_description(facts["geometry"]) if "geometry" in facts else None
     if geometry is not None:
         geometry.load_state_dict(parts.get("geometry", {}))
+    effects = network_from_description(facts["effects"]) if "effects" in facts else None
+    if effects is not None:
+        effects.load_state_dict(parts.get("effects", {}))
     return Compensator(
         network.requires_grad_(False),
         Scaling(**parts["scaling"]),
@@ -293,6 +297,7 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
         tensors["sd_scale"],
         tensors["safe_sd"],
         cast(Geometry | None, geometry),
+        cast(PhysicalEffects | None, effects),
     )
 
 

@@ -18,6 +18,7 @@ _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "gp": "ccnn_torch.learners._gp_posterior:GPNetwork",
     "masked": "ccnn_torch.evolution.masked_network:MaskedNetwork",
     "serial_geometry": "ccnn_torch.compensation._serial_geometry:SerialGeometry",
+    "physical_effects": "ccnn_torch.compensation._effects:PhysicalEffects",
     "expanded_geometry": "ccnn_torch.compensation._expanded_geometry:ExpandedGeometry",
 }
 

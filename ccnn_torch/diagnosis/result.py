@@ -12,6 +12,8 @@ from ccnn_torch.effects import Acting
 
 __all__ = ["Diagnosis"]
 
+_NOT_TOLD = ("acting", "analysis", "judgement")
+
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -56,5 +58,11 @@ class Diagnosis:
 
     def to_json(self) -> Mapping[str, Any]:
         """The form of `diagnosis.json` (schema `diagnosis`)."""
-        told = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {name: value for name, value in told.items() if name not in ("acting", "analysis", "judgement")}
+        situation = self.analysis.situation
+        machine = {
+            "name": situation.mechanism.name,
+            "joints": [joint.name for joint in situation.mechanism.joints],
+            "gravity": situation.gravity.tolist(),
+        }
+        told = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NOT_TOLD}
+        return {"mechanism": machine} | told

@@ -81,5 +81,10 @@ def shown_columns(situation: Situation, columns: Callable[[Situation], Tensor]) 
         situation: whose mechanism counts.
         columns: rows -> `... x s x c x m`.
     """
-    largest = torch.nan_to_num(columns(situation.samples)).abs().amax((-3, -2))
-    return torch.nonzero(largest > _SHOWN).flatten().tolist()
+    samples = situation.samples
+    # Kept with the samples: a graph that is traced can ask no values.
+    known: dict[Callable[[Situation], Tensor], list[int]] = samples.__dict__.setdefault("_shown", {})
+    if columns not in known:
+        largest = torch.nan_to_num(columns(samples)).abs().amax((-3, -2))
+        known[columns] = torch.nonzero(largest > _SHOWN).flatten().tolist()
+    return known[columns]

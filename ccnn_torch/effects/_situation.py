@@ -138,9 +138,17 @@ class Situation:
         force = torch.stack([zero if q is None else q.expand_as(zero) for q in along], -1)
         if self.mechanism.orientations:
             return force
-        rows = self.frame_slope
-        held: Tensor = rows @ torch.linalg.solve(rows.mT @ rows, force.unsqueeze(-1))
+        held: Tensor = self.holding @ force.unsqueeze(-1)
         return held.squeeze(-1)
+
+    @cached_property
+    def holding(self) -> Tensor:
+        """Force and moment per unit of load along each pose coordinate, `... x s x c x p`."""
+        rows = self.frame_slope
+        inner = rows.mT @ rows
+        eye = torch.eye(inner.shape[-1], dtype=inner.dtype, device=inner.device)
+        inverse: Tensor = torch.linalg.solve(inner, eye.expand_as(inner))
+        return rows @ inverse
 
     @cached_property
     def load_torque(self) -> Tensor:
@@ -156,8 +164,9 @@ class Situation:
     @cached_property
     def weight_torque(self) -> Tensor:
         """What 1 N of weight on the platform asks of each joint, `... x s x n` [N or N·m per N]."""
-        torque: Tensor = _known(self.jacobian)[..., :3, :].mT @ self.down
-        return torque
+        # As a matrix product: the ONNX exporter gets that of a stack of matrices with one vector wrong.
+        torque: Tensor = _known(self.jacobian)[..., :3, :].mT @ self.down.unsqueeze(-1)
+        return torque.squeeze(-1)
 
     @cached_property
     def own_weight_torque(self) -> Tensor:
@@ -180,7 +189,7 @@ class Situation:
 
         return jacobian_of(along, self.joints)[1].squeeze(-2).detach()
 
-    @property
+    @cached_property
     def down(self) -> Tensor:
         """Unit vector along gravity, `3`; 0 where there is none."""
         size: Tensor = torch.linalg.vector_norm(self.gravity)
@@ -194,11 +203,17 @@ class Situation:
         Args:
             weight: of the machine, `...` [N].
         """
+        return (self.own_weight_torque * weight[..., None, None] + self.load_torque) / (
+            self.typical_torque * PLATFORM_WEIGHT
+        )
+
+    @cached_property
+    def typical_torque(self) -> Tensor:
+        """What 1 N of its own weight typically asks of the joints of each one's unit in the workspace, `n` [N, N·m per N]."""
         asked = self.samples.own_weight_torque.square().mean(0)
         units = [j.unit for j in self.mechanism.joints]
         alike = torch.tensor([[a == b for b in units] for a in units], dtype=asked.dtype)
-        typical = (alike @ asked / alike.sum(-1)).sqrt().clamp_min(_LEAST) * PLATFORM_WEIGHT
-        return (self.own_weight_torque * weight[..., None, None] + self.load_torque) / typical
+        return (alike @ asked / alike.sum(-1)).sqrt().clamp_min(_LEAST)
 
     @cached_property
     def directed(self) -> list[int]:

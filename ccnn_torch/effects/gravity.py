@@ -69,15 +69,15 @@ class Gravity:
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x m`."""
         mechanism, joints = situation.mechanism, situation.joints
-        turning = torch.tensor([j.unit == "rad" for j in mechanism.joints])
-        lever = torch.where(turning, _LEVER, 1.0)
+        turning = [j.unit == "rad" for j in mechanism.joints]
+        lever = torch.tensor([_LEVER if turns else 1.0 for turns in turning], dtype=joints.dtype)
         arm = isinstance(mechanism, SerialArm)
         weight = situation.own_weight_torque
         parts = [weight, weight * weight.abs() / lever]
         parts += [situation.weight_torque] if arm else [torch.cos(joints), torch.sin(joints)]
         columns = by_joint(torch.stack(parts, -1))
         if not arm:
-            kept = [4 * i + k for i, turns in enumerate(turning.tolist()) for k in (range(4) if turns else range(2))]
+            kept = [4 * i + k for i, turns in enumerate(turning) for k in (range(4) if turns else range(2))]
             columns = columns[..., kept]
         return torch.cat([columns, _off_centre(situation)], -1) if _centred(mechanism) else columns
 

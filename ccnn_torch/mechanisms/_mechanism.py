@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -58,6 +58,8 @@ class Mechanism(nn.Module):
         nominal: nominal parameters, `k` [SI], buffer.
         low, high: box of poses that `sample_workspace` draws from, `p` [SI], buffers.
         home_pose, home_joints: a configuration on the nominal branch, `p` and `n` [SI], buffers; where Newton starts.
+        closed_form: which direction is a closed form of sums, products, roots, sines and cosines, so that it can stand
+            in an exported graph: ``forward``, ``inverse``, or None.
         inverse_kinematics: child module around `solve_inverse`, the place for forward hooks.
         takes: covariates that the nominal machine itself depends on: a simulator's; () for all others.
     """
@@ -69,6 +71,7 @@ class Mechanism(nn.Module):
     home_joints: Tensor
     orientations: tuple[str, ...] = ()
     takes: tuple[Condition, ...] = ()
+    closed_form: Literal["forward", "inverse"] | None = None
 
     def __init__(
         self,

@@ -25,6 +25,8 @@ class _Parallelograms(Mechanism):
     platform's centre. The platform hangs below the drives.
     """
 
+    closed_form = "forward"
+
     def __init__(
         self,
         name: str,

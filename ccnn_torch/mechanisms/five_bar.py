@@ -33,6 +33,8 @@ class FiveBar(Mechanism):
     `bounds` is the square around it.
     """
 
+    closed_form = "forward"
+
     def __init__(self, l: float = 0.75, L: float = 1.1, a: float = 0.5) -> None:
         """l, L: lengths of cranks and couplers; a: distance of the cranks' feet from the origin, at (∓a, 0) [m].
 

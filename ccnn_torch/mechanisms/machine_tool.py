@@ -23,6 +23,8 @@ class MachineTool(Mechanism):
     defaults are ours. The sampling box is theta ±15°, z 0.5..0.7 m.
     """
 
+    closed_form = "inverse"
+
     def __init__(
         self,
         l_e: float = 0.2,

@@ -25,6 +25,8 @@ class Stewart(Mechanism):
     about each axis.
     """
 
+    closed_form = "inverse"
+
     def __init__(
         self,
         base_radius: float = 0.5,

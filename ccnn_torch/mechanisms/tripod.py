@@ -21,6 +21,8 @@ class Tripod(Mechanism):
     y ±0.2 m, z 0.4..0.7 m, phi ±0.3 rad.
     """
 
+    closed_form = "inverse"
+
     def __init__(self, L: float = 1.0, r: float = 0.3, per_leg: bool = False) -> None:
         """L: length of the legs [m]; r: radius of the platform [m].
 

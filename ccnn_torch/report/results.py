@@ -212,6 +212,8 @@ def pose_block(
     rotation_remainder: ArrayLike | None = None,
     position_geometry: ArrayLike | None = None,
     rotation_geometry: ArrayLike | None = None,
+    position_effects: ArrayLike | None = None,
+    rotation_effects: ArrayLike | None = None,
 ) -> Block:
     """Root mean square and maximum of the pose error over the held-out rows, before and after.
 
@@ -224,6 +226,7 @@ def pose_block(
             `not_compensable` beside `before` and `after`.
         position_geometry, rotation_geometry: what geometric calibration alone leaves, `r x s` [m], [rad]; adds
             `geometry`.
+        position_effects, rotation_effects: what known effects leave by themselves, likewise; adds `effects`.
 
     Returns:
         `{"position": {"unit": "m", "before": {"rms": S, "max": S}, "after": …}, "rotation": {…} or null}`, and `energy`
@@ -242,6 +245,7 @@ def pose_block(
             before=position_before,
             after=position_after,
             geometry=position_geometry,
+            effects=position_effects,
             not_compensable=position_remainder,
         ),
         "rotation": None,
@@ -253,6 +257,7 @@ def pose_block(
         before=rotation_before,
         after=rotation_after,
         geometry=rotation_geometry,
+        effects=rotation_effects,
         not_compensable=rotation_remainder,
     )
     if rotation_weight is not None:

@@ -30,7 +30,8 @@ def verdict(results: Results) -> str:
     position = results["pose"]["position"]
     best = results.get("best_method") or next(iter(results["methods"]), "the model")
     # What is left is left of both: the identified geometry, and what the method learned of the rest.
-    whose = f"geometry + {best}" if "geometry" in position else best
+    parts = [part for part in ("geometry", "effects") if part in position]
+    whose = " + ".join([*parts, best])
     rows = count_text(results["rows"]["test"], "held-out row")
     before, after = position["before"]["rms"], position["after"]["rms"]
     removed = removed_percent(before, after)
@@ -216,6 +217,7 @@ def _pose_table(results: Results) -> Table:
         extra
         for extra in (
             ("geometry", "RMS geometry alone", "Geometry alone: link parameters and frames fitted to the same rows."),
+            ("effects", "RMS effects alone", "Effects alone: those of the diagnosis, fitted to the training rows."),
             (
                 "not_compensable",
                 "RMS not compensable",

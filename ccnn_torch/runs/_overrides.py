@@ -15,6 +15,9 @@ __all__ = ["apply_overrides", "resolve_paths"]
 # Keys whose value is text however it looks: a path may hold a colon, a name may be 2024.
 _TEXT = ("name", "out", "records", "transfer", "mechanism")
 
+# What a file stands behind in `effects`.
+_FROM = "from:"
+
 _PLUGINS = ("methods", "auto.methods", "effects")
 
 
@@ -34,7 +37,8 @@ def apply_overrides(tree: dict[str, Any], overrides: Iterable[str], folder: Path
         steps = key.split(".")
         if not equals or not all(steps):
             raise InputError(f"'{override}': write key=value, e.g. seed=1 or split.test=0.2")
-        value = parse_yaml(text, f"'{override}'") if key not in _TEXT or text in ("", "null", "~") else text
+        plain = key in _TEXT or (key == "effects" and text.startswith(_FROM))
+        value = text if plain and text not in ("", "null", "~") else parse_yaml(text, f"'{override}'")
         node = tree
         for depth, step in enumerate(steps[:-1]):
             if node.get(step) is None:
@@ -59,6 +63,8 @@ def _resolve(key: str, value: Any, folder: Path) -> Any:
         return {name: _resolve(f"auto.{name}", entry, folder) for name, entry in value.items()}
     if key in _PLUGINS and isinstance(value, list):
         return [_resolve(key, entry, folder) for entry in value]
+    if key == "effects" and isinstance(value, str) and value.startswith(_FROM):
+        return _FROM + os.path.abspath(folder / Path(value.removeprefix(_FROM).strip()).expanduser())
     if not isinstance(value, str) or not _is_path(key, value):
         return value
     return os.path.abspath(folder / Path(value).expanduser())

@@ -24,7 +24,7 @@ from ccnn_torch.runs.auto import Comparison
 from ccnn_torch.runs.choosing import Plan
 from ccnn_torch.runs.config import RunConfig
 from ccnn_torch.runs.dataset import Dataset, Rows, pad_rows
-from ccnn_torch.runs.evaluate import Outcome, pose_with_geometry
+from ccnn_torch.runs.evaluate import Outcome, pose_with_effects, pose_with_geometry
 from ccnn_torch.runs.prepare import Prepared
 from ccnn_torch.runs.simulation import Simulation
 from ccnn_torch.runs.uncertainty import coverage, inside_domain
@@ -114,6 +114,7 @@ def assemble(
         "auto": None if comparison is None else comparison.block(best),
         "pose": _pose(config, prepared, before, outcomes[best].after),
         "records": None if prepared.simulated else _records(prepared),
+        **_effects(prepared, test),
         "data_sha256": prepared.data_hash,
         "notes": [*prepared.notes, *_notes(plan_of(config))],
         "versions": versions(),
@@ -198,7 +199,7 @@ def _pose(config: RunConfig, prepared: Prepared, before: PoseError, after: PoseE
     """Over all test rows, those that were not fit to be trained on as well."""
     rows = pad_rows([split.test for split in prepared.dataset.splits])
     remainder = prepared.pseudoerror
-    geometry = pose_with_geometry(prepared)
+    geometry, effects = pose_with_geometry(prepared), pose_with_effects(prepared)
 
     def held_out(values: Tensor | None) -> Tensor | None:
         return None if values is None else rows.take(values.expand(len(rows.index), -1))
@@ -216,11 +217,22 @@ def _pose(config: RunConfig, prepared: Prepared, before: PoseError, after: PoseE
         held_out(_finite(remainder.remainder_rotation)),
         held_out(None if geometry is None else geometry.position),
         held_out(None if geometry is None else geometry.rotation),
+        held_out(None if effects is None else effects.position),
+        held_out(None if effects is None else effects.rotation),
     )
 
 
 def _finite(values: Tensor | None) -> Tensor | None:
     return None if values is None else torch.nan_to_num(values, nan=0.0)
+
+
+def _effects(prepared: Prepared, test: Rows) -> dict[str, Any]:
+    """What known effects do by themselves, where they are a part of the compensator."""
+    if prepared.effects is None:
+        return {}
+    left = test.take(prepared.dataset.deviation)
+    errors = joint_errors(torch.zeros_like(left), left, test.weights, prepared.mechanism.joints)
+    return {"effects": {"from": prepared.effects.path, "test": errors, "coefficients": prepared.effects.block()}}
 
 
 def _records(prepared: Prepared) -> dict[str, Any]:

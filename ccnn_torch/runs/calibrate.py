@@ -75,10 +75,13 @@ class Calibration:
             # A learner without a variance of its own has one standard deviation everywhere, here as in the results.
             sd_scale = fitted.sd(prepared.dataset.inputs[:, :1])[repeat, 0] / fitted.scaling.deviation[repeat]
         inputs, margin = prepared.dataset.inputs[repeat, there], self.config.compensation.margin
-        limit, geometry = _limit(self.config, len(prepared.mechanism.joints)), None
-        if prepared.geometry is not None:
-            # What the geometry leaves at singular poses can be larger than what was there.
+        limit, geometry, effects = _limit(self.config, len(prepared.mechanism.joints)), None, None
+        if prepared.geometry is not None or prepared.effects is not None:
+            # What these leave at singular poses can be larger than what was there.
             limit = default_limit(prepared.total[repeat, there]) if limit is None else limit
+        if prepared.effects is not None:
+            effects = prepared.effects.module(repeat, there, margin)
+        if prepared.geometry is not None:
             geometry = prepared.geometry.module(repeat, inputs[:, : len(prepared.mechanism.joints)], margin)
         return fit_compensator(
             network,
@@ -91,6 +94,7 @@ class Calibration:
             margin=margin,
             sd_scale=sd_scale,
             geometry=geometry,
+            effects=effects,
         )
 
     def save(

@@ -198,6 +198,13 @@ class RunConfig(_Part):
         description="identify = find all geometric parameters on the training rows of records, and let the network "
         "learn only what they leave; the model files hold both. none = the network learns everything",
     )
+    effects: str = Field(
+        default="none",
+        pattern=r"^(none|from:.+)$",
+        description="from:DIR/diagnosis.json = take the effects that a diagnosis named, fit their coefficients to the "
+        "training rows of records, and let the network learn only what they leave; the model files hold both. none = "
+        "the network learns everything",
+    )
     rotation_weight: float = Field(
         default=0.04, gt=0, description="weight of orientation against position in m per rad (η of eq. 5)"
     )
@@ -274,6 +281,8 @@ class RunConfig(_Part):
             raise ValueError("order: records have the order in which they were measured; remove the key")
         if self.case is not None and self.geometry != "none":
             raise ValueError("geometry: a case is there to compare learners; write geometry=none, or take records")
+        if self.case is not None and self.effects != "none":
+            raise ValueError("effects: a case is there to compare learners; write effects=none, or take records")
         folds = self.training.folds > 1 or self.methods == ["auto"]
         if self.training.early_stop and self.split.validation == 0 and not folds:
             raise ValueError(

@@ -11,7 +11,7 @@ from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.runs.fitting import Fitted
 from ccnn_torch.runs.prepare import Prepared
 
-__all__ = ["Outcome", "evaluate", "pose_before", "pose_with_geometry"]
+__all__ = ["Outcome", "evaluate", "pose_before", "pose_with_effects", "pose_with_geometry"]
 
 # The fixed point q = q* - δ(q) gains a factor of the Lipschitz constant of δ each time, about 1e-3 for real machines.
 _COMMAND_ITERATIONS = 8
@@ -22,8 +22,8 @@ class Outcome:
     """A method's figures on every row of every repeat; which rows are held out is for the reader to choose.
 
     Attributes:
-        deviation: predicted deviation at the commanded joints, `r x s x n` [SI]; of what the identified geometry leaves
-            where that is a part of the compensator.
+        deviation: predicted deviation at the commanded joints, `r x s x n` [SI]; of what identified geometry and known
+            effects leave where these are a part of the compensator.
         after: pose error with the correction, `r x s`.
         after_systematic: the same without the machine's noise, where it is simulated.
     """
@@ -58,21 +58,32 @@ def evaluate(prepared: Prepared, fitted: Fitted) -> Outcome:
     """Predict on every row, and find the pose error that is left.
 
     Simulated: the machine is commanded q with q + δ(q) = q*, and the pose that it then reaches is solved.
-    Recorded: FK(q + δ(q)) predicts the measured pose, δ with the identified geometry where there is one.
+    Recorded: FK(q + δ(q)) predicts the measured pose, δ with identified geometry and known effects where there are.
     """
-    mechanism = prepared.mechanism
     joints = prepared.joints
     deviation = _deviation(prepared, fitted, joints)
     if prepared.simulation is None:
-        total = deviation
-        if prepared.geometry is not None:
-            total = deviation + prepared.geometry.deviation(prepared.pose)(joints + deviation)
-        reached = mechanism.forward_kinematics(joints + total, prepared.parameters)
-        return Outcome(fitted, deviation, mechanism.pose_error(prepared.pose, reached))
+        return Outcome(fitted, deviation, _pose_left(prepared, deviation))
     command = joints
     for _ in range(_COMMAND_ITERATIONS):
         command = joints - _deviation(prepared, fitted, command)
     return Outcome(fitted, deviation, *prepared.simulation.pose_errors(command))
+
+
+def pose_with_effects(prepared: Prepared) -> PoseError | None:
+    """Pose error that known effects leave by themselves, with the geometry beside them, `r x s`; None without them."""
+    return None if prepared.effects is None else _pose_left(prepared, torch.zeros_like(prepared.joints))
+
+
+def _pose_left(prepared: Prepared, deviation: Tensor) -> PoseError:
+    """Between measured poses and those predicted with the learned part of the deviation, `r x s x n` [SI]."""
+    joints, total = prepared.joints, deviation
+    if prepared.effects is not None:
+        total = total + prepared.effects.deviation(joints + total)
+    if prepared.geometry is not None:
+        total = total + prepared.geometry.deviation(prepared.pose)(joints + total)
+    reached = prepared.mechanism.forward_kinematics(joints + total, prepared.parameters)
+    return prepared.mechanism.pose_error(prepared.pose, reached)
 
 
 def _deviation(prepared: Prepared, fitted: Fitted, joints: Tensor) -> Tensor:

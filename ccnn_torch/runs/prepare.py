@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -20,7 +20,8 @@ from ccnn_torch.records import check_rows, load_records
 from ccnn_torch.runs.cases import build_case
 from ccnn_torch.runs.config import RunConfig
 from ccnn_torch.runs.dataset import Dataset
-from ccnn_torch.runs.geometry import Identified, fit_machine
+from ccnn_torch.runs.effects import KnownEffects, fit_effects, verdict_of
+from ccnn_torch.runs.geometry import Fitted, Identified, fit_machine
 from ccnn_torch.runs.machines import build_machine
 from ccnn_torch.runs.simulation import CaseSimulation, Simulation, simulate_realistic
 from ccnn_torch.splits import Column, Split, split_rows
@@ -39,11 +40,12 @@ class Prepared:
         covariates: `r x s x m` [SI].
         pose: measured poses, `r x s x p` [SI].
         pseudoerror: what the poses say about the joints, and what is learned: with `geometry`, that of the identified
-            machine.
-        total: deviation of the joints of the nominal machine, `r x s x n` [SI]; without `geometry` that is learned.
+            machine, and with `effects` what they leave of it.
+        total: deviation of the joints of the nominal machine, `r x s x n` [SI]; without these two that is learned.
         identified: geometry with all parameters fitted to the training rows of each repeat, like `parameters`: what a
             geometric calibration would command by, to be compared with; None where it was not fitted.
         geometry: the same where it is a part of the compensator, so that the network learns what it leaves.
+        effects: known effects that are a part of it, likewise.
         simulation: the machine behind simulated rows, or None for measured records.
         notes: sentences for the person who reads the results.
     """
@@ -60,6 +62,7 @@ class Prepared:
     data_hash: str
     identified: Tensor | None = None
     geometry: Identified | None = None
+    effects: KnownEffects | None = None
     simulation: Simulation | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -191,6 +194,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
             "(records: a CSV file; mechanism: tripod, machine_tool, a DH file, a URDF, or file.py:Name)"
         )
     mechanism = load_mechanism(config.mechanism)
+    verdict = None if config.effects == "none" else verdict_of(config.effects, mechanism)
     records = load_records(config.records, mechanism, config.covariates)
     check_rows(records, mechanism)
     if isinstance(mechanism, SerialArm) and records.orientation == "none":
@@ -203,11 +207,22 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         return joint_deviations(mechanism, records.joints, records.pose, parameters=parameters, **settings)
 
     total = deviations = solved(fitted.parameters)
-    learned, identified = fitted.parameters, None
-    if config.geometry == "identify":
-        learned = fitted.geometry
+    learned, identified, effects, margin = fitted.parameters, None, None, config.compensation.margin
+    identify, notes = config.geometry == "identify", [*records.notes, *fitted.notes]
+    beside: Fitted | None = fitted if identify else None
+    if verdict is not None:
+        about = (splits, fitted.parameters, total.deviation, total.usable, identify, margin)
+        of_pose = (settings["rotation_weight"], settings["damping"])
+        effects, values, said = fit_effects(verdict, mechanism, records, *about, of_pose)
+        beside = None if values is None else replace(fitted, geometry=values)
+        notes += said
+    if beside is not None:
+        learned = beside.geometry
         deviations = solved(learned)
-        identified = fitted.beside(mechanism, records.joints, total.deviation, splits, config.compensation.margin)
+        identified = beside.beside(mechanism, records.joints, total.deviation, splits, margin)
+    if effects is not None:
+        joints, whole = (_by_repeat(rows, seeds) for rows in (records.joints, deviations.deviation))
+        deviations = replace(deviations, deviation=effects.remainder(joints, whole))
     jacobian = mechanism.jacobian(records.joints, learned, guess=records.pose)
     return Prepared(
         mechanism=mechanism,
@@ -222,7 +237,8 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         data_hash=records.data_hash,
         identified=fitted.geometry,
         geometry=identified,
-        notes=[*records.notes, *fitted.notes, *deviations.notes()],
+        effects=effects,
+        notes=[*notes, *deviations.notes()],
     )
 
 

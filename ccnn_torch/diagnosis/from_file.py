@@ -1,0 +1,191 @@
+"""The effects that a diagnosis.json stands by, built again to be compensated."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.effects import EFFECTS, OUTLIER, Coefficient, Effect, Shape, Situation, make_effect
+from ccnn_torch.errors import InputError
+
+__all__ = ["Known", "Verdict", "one_row_at_a_time", "read_verdict"]
+
+
+@dataclass(frozen=True)
+class Known:
+    """An effect with the numbers of a file.
+
+    Attributes:
+        shape: `h` [SI].
+        coefficients: `m` [SI]; 0 where the file names none.
+        used: numbers of the coefficients that the file names, ascending.
+    """
+
+    effect: Effect
+    shape: Tensor
+    coefficients: Tensor
+    used: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a file stands by.
+
+    Attributes:
+        path: the file.
+        gravity: `3` [m/s²] as it was diagnosed with, or None where the file does not say.
+        parameters: of each effect of the verdict, in its order: name -> value [SI].
+    """
+
+    path: str
+    gravity: Tensor | None
+    parameters: dict[str, dict[str, float]]
+
+    def on(self, situation: Situation) -> tuple[list[Known], list[str]]:
+        """The effects on a machine and rows, for a controller that knows one row and not what was before it.
+
+        Without a column of times there is no history: a thermal lag is none, the machine has settled. Effects that are
+        nothing without it (drift) are refused.
+
+        Args:
+            situation: rows with all their covariates, time as well where it was measured.
+
+        Returns:
+            The effects, whose situation is `one_row_at_a_time`; and notes on what was left out, one sentence each.
+
+        Raises:
+            InputError: the machine or its covariates do not fit what the file names, or an effect needs history.
+        """
+        alone, found, notes = one_row_at_a_time(situation), [], []
+        for name, values in self.parameters.items():
+            effect = make_effect(name)
+            key = f"{self.path}: effects, {name}"
+            lacking = effect.missing(situation.mechanism, [*situation.covariates])
+            if lacking:
+                raise InputError(f"{key}: needs {lacking}, which is no input of this run; add it to covariates")
+            history = effect.missing(alone.mechanism, [*alone.covariates])
+            if effect.ordered or history:
+                need = history or "the rows in the order measured"
+                raise InputError(
+                    f"{key}: needs {need}, and a command is one row that knows nothing before it; diagnose again "
+                    f"without {name} (--effects) and let the network learn it, or calibrate anew when it has drifted"
+                )
+            whole = _named([*effect.coefficients(situation), *effect.shapes(situation)])
+            strange = [n for n in values if n not in whole]
+            if strange:
+                raise InputError(
+                    f"{key}, parameters: '{strange[0]}' is no parameter of {name} on {situation.mechanism.name} with "
+                    "the covariates of this run; give the mechanism and covariates that were diagnosed"
+                )
+            known = _known(effect, alone, values)
+            left = [n for n in values if n not in _named([*effect.coefficients(alone), *effect.shapes(alone)])]
+            if left:
+                notes.append(
+                    f"What {name} has of {', '.join(left)} comes from before a row, which a command does not know: the "
+                    "machine is taken as settled under its covariates."
+                )
+            found.append(known)
+        return found, notes
+
+
+def one_row_at_a_time(situation: Situation) -> Situation:
+    """The same rows as if each stood alone: without their times."""
+    covariates = {name: value for name, value in situation.covariates.items() if name != "time"}
+    return Situation(
+        situation.mechanism, situation.joints, covariates, situation.gravity, situation.parameters, situation.guess
+    )
+
+
+def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Verdict:
+    """Read a `diagnosis.json`.
+
+    Args:
+        path: the file.
+        mechanism: name of the mechanism that it is to be used on.
+        joints: names of its joints.
+
+    Raises:
+        InputError: there is no such file, it is none of `ccnn diagnose`, it is of another machine, or its verdict names
+            no effect that could be compensated.
+    """
+    try:
+        told = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as reason:
+        raise InputError(f"{path}: cannot be read: {reason.strerror}; give effects=from:DIR/diagnosis.json") from None
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        raise InputError(f"{path}: is no JSON; give the diagnosis.json that ccnn diagnose wrote") from None
+    try:
+        verdict = told["verdict"]
+        names, outside, nothing = list(verdict["effects"]), bool(verdict["outside_library"]), bool(verdict["none"])
+        listed = {
+            str(e["name"]): {str(n): _number(p["value"]) for n, p in e["parameters"].items()} for e in told["effects"]
+        }
+        machine = told.get("mechanism") or {}
+        gravity = None if machine.get("gravity") is None else [_number(g) for g in machine["gravity"]]
+        theirs = [str(j) for j in machine.get("joints") or joints]
+    except (KeyError, TypeError, AttributeError, ValueError):
+        raise InputError(f"{path}: is no diagnosis; give the diagnosis.json that ccnn diagnose wrote") from None
+    if machine and (machine.get("name") != mechanism or theirs != [*joints]):
+        raise InputError(
+            f"{path}: mechanism: was diagnosed on {machine.get('name')} with the joints {', '.join(theirs)}, and this "
+            f"run has {mechanism} with {', '.join(joints)}; give the same mechanism"
+        )
+    _refuse(str(path), names, outside, nothing, listed)
+    return Verdict(
+        str(path),
+        None if gravity is None else torch.tensor(gravity, dtype=torch.float64),
+        {name: listed[name] for name in names},
+    )
+
+
+def _refuse(path: str, names: list[str], outside: bool, nothing: bool, listed: dict[str, Any]) -> None:
+    """Raise InputError where a verdict has no effects to take."""
+    key, remedy = f"{path}: verdict", "write effects=none"
+    if nothing:
+        raise InputError(f"{key}: none: the gap is no more than the noise, so there is no effect to take; {remedy}")
+    if outside:
+        raise InputError(
+            f"{key}: outside_library: something is there that no effect describes, so none is taken; {remedy} and let "
+            "the network learn it"
+        )
+    if OUTLIER in names:
+        raise InputError(f"{key}: effects: bad rows are the only finding, so there is no effect to take; {remedy}")
+    if not names:
+        raise InputError(f"{key}: effects: names no effect; {remedy}")
+    for name in names:
+        if name not in EFFECTS:
+            raise InputError(
+                f"{key}: effects: '{name}' is no effect of this version's library, which a model file could hold; "
+                "diagnose again with the library's (--effects)"
+            )
+        if name not in listed:
+            raise InputError(f"{path}: effects: has no entry '{name}', which the verdict names; diagnose again")
+
+
+def _known(effect: Effect, situation: Situation, values: dict[str, float]) -> Known:
+    coefficients, shapes = effect.coefficients(situation), effect.shapes(situation)
+    middles = [s.grid[len(s.grid) // 2] for s in shapes]
+    return Known(
+        effect,
+        torch.tensor([values.get(s.name, m) for s, m in zip(shapes, middles, strict=True)], dtype=torch.float64),
+        torch.tensor([values.get(c.name, 0.0) for c in coefficients], dtype=torch.float64),
+        tuple(i for i, c in enumerate(coefficients) if c.name in values),
+    )
+
+
+def _named(parameters: Iterable[Coefficient | Shape]) -> set[str]:
+    return {p.name for p in parameters}
+
+
+def _number(value: Any) -> float:
+    """A finite number, or ValueError."""
+    number = float(value)
+    if number != number or number in (float("inf"), -float("inf")):
+        raise ValueError(value)
+    return number

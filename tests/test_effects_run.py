@@ -1,0 +1,304 @@
+"""`effects: from:diagnosis.json`: simulated, diagnosed, compensated; and the effects in the files of a run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from ccnn_torch import calibrate
+from ccnn_torch.cli._main import app
+from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
+from ccnn_torch.compensation._export import quiet_exporter, to_onnx
+from ccnn_torch.compensation._networks import describe_network, network_from_description
+from ccnn_torch.compensation._session import open_onnx
+from ccnn_torch.diagnosis.from_file import Verdict
+from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, measured_pose, reached
+from ccnn_torch.effects.covariates import draw_covariates
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.records import read_table, write_table
+from ccnn_torch.report.json_files import load_schema
+from ccnn_torch.runs.config import load_config, make_config
+from ccnn_torch.runs.prepare import prepare
+
+Cli = Callable[..., tuple[int, str, str]]
+ARM = str(Path(__file__).parent / "effects" / "arm.yaml")
+NOISE = 5e-6
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A five-bar with wrong gains and compliance away from singular poses: records, diagnosis and a config."""
+    folder = tmp_path_factory.mktemp("then")
+    runner = CliRunner()
+    words = ["--mechanism", "five_bar", "--effect", "compliance", "--effect", "joint_gain", "--rows", "160"]
+    words += ["--noise", str(NOISE), "--seed", "3", "--out", str(folder / "rows.csv"), "--quiet"]
+    assert runner.invoke(app, ["simulate", *words]).exit_code == 0
+    table, bar = read_table(folder / "rows.csv"), load_mechanism("five_bar")
+    joints = torch.as_tensor(np.stack([table.column(q, "rad") for q in ("q1", "q2")], -1))
+    fine = (bar.condition_number(joints, 0.04) < 4).numpy()
+    assert fine.sum() > 100
+    write_table(folder / "rows.csv", {f"{n}[{table.units[n]}]": table.raw(n)[fine] for n in table.names})
+    words = [
+        "--records",
+        str(folder / "rows.csv"),
+        "--mechanism",
+        "five_bar",
+        "--out",
+        str(folder / "found"),
+        "--quiet",
+    ]
+    words += ["--effects", "compliance,joint_gain,backlash,gravity,drift"]
+    assert runner.invoke(app, ["diagnose", *words]).exit_code == 0
+    text = "records: rows.csv\nmechanism: five_bar\nmethods: [gp]\neffects: from:found/diagnosis.json\n"
+    (folder / "config.yaml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def keys(played: Path, **more: Any) -> dict[str, Any]:
+    found = f"from:{played / 'found' / 'diagnosis.json'}"
+    return {
+        "records": str(played / "rows.csv"),
+        "mechanism": "five_bar",
+        "methods": ["constant"],
+        "effects": found,
+    } | more
+
+
+def test_held_out_rows_come_near_the_noise(played: Path) -> None:
+    told = json.loads((played / "found" / "diagnosis.json").read_text(encoding="utf-8"))
+    jsonschema.validate(told, load_schema("diagnosis"))
+    assert sorted(told["verdict"]["effects"]) == ["compliance", "joint_gain"]
+    found = calibrate(**keys(played, repeats=2))
+    pose = found.results["pose"]["position"]
+    before, alone, after = (pose[key]["rms"]["median"] for key in ("before", "effects", "after"))
+    floor = 2**0.5 * NOISE
+    assert before > 30 * floor
+    assert alone < 1.6 * floor and after < 1.6 * floor
+    block = found.results["effects"]
+    assert block["test"]["q1"]["mse"]["median"] < 0.01 * before**2
+    # Of each repeat's own training rows, near the file's, which saw all rows.
+    gain = block["coefficients"]["joint_gain"]["q1"]["values"]
+    given = next(e for e in told["effects"] if e["name"] == "joint_gain")["parameters"]["q1"]["value"]
+    assert gain[0] != gain[1] and gain == pytest.approx([given] * 2, rel=0.02)
+    assert any("fitted anew to the training rows" in note for note in found.results["notes"])
+    jsonschema.validate(json.loads(json.dumps(found.results)), load_schema("results"))
+    # The compensator, effects and network in it, does so on held-out rows inside its domain.
+    prepared, made = found.prepared, found.compensator()
+    k = found.repeat()
+    test = prepared.dataset.splits[k].test
+    joints, covariates = prepared.joints[k, test], prepared.covariates[k, test]
+    bar, told_of = found.mechanism(), made.solve(joints, covariates)
+    left = bar.pose_error(prepared.pose[k, test], bar.forward_kinematics(told_of.ideal)).position
+    inside = told_of.ideal_inside_domain
+    assert int(inside.sum()) > 15 and float(left[inside].square().mean().sqrt()) < 1.6 * floor
+
+
+def test_held_out_rows_do_not_change_the_coefficients(played: Path, tmp_path: Path) -> None:
+    first = prepare(make_config(**keys(played)))
+    assert first.effects is not None
+    lines = (played / "rows.csv").read_text(encoding="utf-8").splitlines()
+    for row in first.dataset.splits[0].test.tolist():
+        cells = lines[row + 1].split(",")
+        cells[2] = str(float(cells[2]) + 1e-3)
+        lines[row + 1] = ",".join(cells)
+    (tmp_path / "rows.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    other = prepare(make_config(**keys(played, records=str(tmp_path / "rows.csv"), split={"kind": "random"})))
+    assert other.effects is not None
+    assert torch.equal(first.dataset.splits[0].test, other.dataset.splits[0].test)
+    assert first.effects.block() == other.effects.block()
+
+
+def test_the_network_learns_what_is_left_exactly(played: Path) -> None:
+    found = prepare(make_config(**keys(played)))
+    assert found.effects is not None
+    left = found.dataset.deviation
+    whole = left + found.effects.deviation(found.joints + left)
+    usable = found.dataset.usable
+    torch.testing.assert_close(whole[usable], found.total[usable], rtol=0, atol=1e-10)
+
+
+def test_with_identified_geometry_beside_it(played: Path) -> None:
+    found = prepare(make_config(**keys(played, geometry="identify")))
+    assert found.effects is not None and found.geometry is not None
+    left, joints = found.dataset.deviation, found.joints
+    part = left + found.effects.deviation(joints + left)
+    whole = part + found.geometry.deviation(found.pose)(joints + part)
+    usable = found.dataset.usable
+    torch.testing.assert_close(whole[usable], found.total[usable], rtol=0, atol=1e-8)
+    test = found.dataset.splits[0].test
+    assert float(left[0, test].square().mean().sqrt()) < 0.1 * float(found.total[0, test].square().mean().sqrt())
+
+
+def test_a_run_from_the_command_line_and_its_files(cli: Cli, tmp_path: Path) -> None:
+    rows, out = tmp_path / "rows.csv", tmp_path / "run"
+    words = ("--mechanism", "five_bar", "--effect", "joint_gain", "--rows", "80", "--noise", "5e-6", "--seed", "3")
+    assert cli("simulate", *words, "--out", rows, "--quiet")[0] == 0
+    found = ("--effects", "joint_gain,backlash", "--out", tmp_path / "found", "--quiet")
+    assert cli("diagnose", "--records", rows, *words[:2], *found)[0] == 0
+    (tmp_path / "c.yaml").write_text("records: rows.csv\nmechanism: five_bar\nmethods: [constant]\n", encoding="utf-8")
+    effects = f"effects=from:{tmp_path / 'found' / 'diagnosis.json'}"
+    code, _, told = cli("run", tmp_path / "c.yaml", effects, f"out={out}", "save_report=false", "--quiet")
+    assert code == 0, told
+    results = json.loads((out / "results.json").read_text(encoding="utf-8"))
+    pose = results["pose"]["position"]
+    assert pose["after"]["rms"]["median"] < 1.3 * 2**0.5 * NOISE < 0.2 * pose["before"]["rms"]["median"]
+    assert "effects + constant removes" in (out / "results.md").read_text(encoding="utf-8")
+    card = json.loads((out / "card.json").read_text(encoding="utf-8"))
+    assert card["format"] == "ccnn_torch compensator 4" and set(card["effects"]["numbers"]) == {"joint_gain"}
+    assert any("double precision" in note for note in card["notes"])
+    # Every form gives the commands of the master, and these reach the pose to the noise of the numbers.
+    table = read_table(rows)
+    master = load_model(out / "model.safetensors")
+    joints = np.stack([table.column(c.name, c.unit) for c in master.joints], -1)
+    covariates = np.stack([table.column(c.name, c.unit) for c in master.covariates], -1)
+    wanted = master(joints, covariates)
+    for form in ("onnx", "pt2"):
+        got = load_model(out / f"model.{form}")(joints, covariates)
+        np.testing.assert_allclose(got["command"], wanted["command"], rtol=0, atol=1e-14)
+    gain = torch.tensor([results["effects"]["coefficients"]["joint_gain"][q]["values"][0] for q in ("q1", "q2")])
+    moved = (wanted["command"] + wanted["deviation"]) - joints
+    assert np.abs(moved).max() < 1e-12 and (gain.abs() > 1e-4).all()
+
+
+def test_a_killed_run_resumes_to_the_same(cli: Cli, played: Path, tmp_path: Path) -> None:
+    quick = ("methods=bp_lm", "save_report=false", "save_models=false", "--quiet")
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    for out in (whole, cut):
+        assert cli("run", played / "config.yaml", f"out={out}", *quick)[0] == 0
+    (cut / "results.json").unlink()
+    assert cli("run", "--resume", cut, "--quiet")[0] == 0
+    first, again = (json.loads((p / "results.json").read_text(encoding="utf-8")) for p in (whole, cut))
+    assert first["pose"] == again["pose"] and first["effects"] == again["effects"]
+    assert first["methods"]["bp_lm"]["test"] == again["methods"]["bp_lm"]["test"]
+
+
+@pytest.mark.parametrize("name", ["five_bar", "tripod", "machine_tool", ARM])
+@pytest.mark.parametrize("effects", [("compliance", "friction"), ("thermal", "frame")])
+def test_the_module_does_what_the_effects_do(name: str, effects: tuple[str, ...]) -> None:
+    mechanism = load_mechanism(name)
+    generator = torch.Generator().manual_seed(2)
+    joints = mechanism.sample_joints(400, generator)
+    joints = joints[mechanism.condition_number(joints, 0.3) < 25][:60]
+    covariates = draw_covariates(mechanism, joints, generator)
+    del covariates["time"]
+    situation = Situation(mechanism, joints, covariates, default_gravity(mechanism))
+    acting = []
+    for effect in map(make_effect, effects):
+        sizes = [0.0 if c.secondary else 0.1 * c.scale for c in effect.coefficients(situation)]
+        none = torch.zeros(0, dtype=torch.float64)
+        acting.append(Acting(effect, none, torch.tensor(sizes, dtype=torch.float64)))
+    care = Care(0.3, 1e-3)
+    module = expand_effects(situation, acting, [*covariates], 0.1, care)
+    given = torch.stack([*covariates.values()], -1)
+    deviation = module(joints, given)
+    exact = effect_deviation(situation, acting, mechanism.jacobian, care)
+    size = float(exact.abs().max())
+    torch.testing.assert_close(deviation, exact, rtol=0, atol=1e-4 * size)
+    # Joints that stand where the machine with the effects stands.
+    wanted = measured_pose(situation, reached(situation, acting))
+    there = mechanism.forward_kinematics(joints + exact, guess=wanted)
+    left, gap = (mechanism.pose_error(wanted, pose).position for pose in (there, situation.pose))
+    assert float(left.median()) < 0.02 * float(gap.median())
+    # Whatever comes in, what comes out is finite.
+    odd = torch.cat([joints * 50, joints * 0 + 1e3])
+    assert bool(torch.isfinite(module(odd, given.repeat(2, 1) * 100)).all())
+
+
+def test_an_exported_graph_has_the_numbers_of_the_effects() -> None:
+    # 293.15 K and other numbers in their code are none that single precision could hold.
+    bar, generator = load_mechanism("five_bar"), torch.Generator().manual_seed(4)
+    joints = bar.sample_joints(60, generator)
+    covariates = draw_covariates(bar, joints, generator)
+    del covariates["time"]
+    situation = Situation(bar, joints, covariates, default_gravity(bar))
+    acting = []
+    for effect in map(make_effect, ("thermal", "backlash")):
+        sizes = [c.scale for c in effect.coefficients(situation)]
+        acting.append(Acting(effect, torch.zeros(0, dtype=torch.float64), torch.tensor(sizes, dtype=torch.float64)))
+    module = expand_effects(situation, acting, [*covariates], 0.1, Care(0.04, 0.0, 2.0, 4.0))
+    given = torch.stack([*covariates.values()], -1)
+    batch = torch.export.Dim("batch")
+    shapes = {"joints": {0: batch}, "covariates": {0: batch}}
+    with quiet_exporter():
+        program = torch.export.export(module, (joints[:3], given[:3]), dynamic_shapes=shapes)
+    session = open_onnx(to_onnx(program, None, ["deviation"], 20, "{}", False).SerializeToString())
+    found = session.run(None, {"joints": joints.numpy(), "covariates": given.numpy()})[0]
+    np.testing.assert_allclose(found, module(joints, given).numpy(), rtol=0, atol=1e-13)
+    again = network_from_description(json.loads(json.dumps(describe_network(module))))
+    again.load_state_dict(module.state_dict())
+    assert torch.equal(again(joints, given), module(joints, given))
+
+
+def edited(played: Path, tmp_path: Path, change: Callable[[dict[str, Any]], None]) -> str:
+    told = json.loads((played / "found" / "diagnosis.json").read_text(encoding="utf-8"))
+    change(told)
+    (tmp_path / "diagnosis.json").write_text(json.dumps(told), encoding="utf-8")
+    return f"from:{tmp_path / 'diagnosis.json'}"
+
+
+def _rename(told: dict[str, Any]) -> None:
+    entry = next(e for e in told["effects"] if e["name"] == "joint_gain")
+    entry["parameters"]["q9"] = entry["parameters"].pop("q1")
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda d: d["verdict"].update(effects=[], none=True), "verdict: none: the gap is no more than the noise"),
+        (lambda d: d["verdict"].update(outside_library=True), "verdict: outside_library: something is there that no"),
+        (lambda d: d["verdict"].update(effects=["outlier"]), "bad rows are the only finding"),
+        (lambda d: d["verdict"].update(effects=["wobble"]), "'wobble' is no effect of this version's library"),
+        (lambda d: d["verdict"].update(effects=["drift"]), "effects, drift: needs the time of each row"),
+        (lambda d: d["mechanism"].update(name="tripod"), "mechanism: was diagnosed on tripod"),
+        (_rename, "joint_gain, parameters: 'q9' is no parameter of joint_gain on five_bar"),
+        (lambda d: d.pop("verdict"), "is no diagnosis"),
+    ],
+)
+def test_what_does_not_fit_is_one_sentence(
+    played: Path, tmp_path: Path, change: Callable[[dict[str, Any]], None], sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence) as caught:
+        prepare(make_config(**keys(played, effects=edited(played, tmp_path, change))))
+    assert "\n" not in str(caught.value) and "diagnosis.json" in str(caught.value)
+
+
+def test_keys_that_do_not_go_together(played: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="effects: a case is there to compare learners"):
+        make_config(case="tripod", effects="from:x.json")
+    with pytest.raises(InputError, match="effects"):
+        make_config(**keys(played, effects="found/diagnosis.json"))
+    with pytest.raises(InputError, match="compliance: needs a column of the load"):
+        prepare(make_config(**keys(played, covariates=["time"])))
+    with pytest.raises(InputError, match=r"cannot be read"):
+        prepare(make_config(**keys(played, effects="from:nowhere.json")))
+
+
+def test_paths_start_where_the_key_stands(played: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = played / "config.yaml"
+    assert load_config(path).effects == f"from:{played / 'found' / 'diagnosis.json'}"
+    assert load_config(path, ["effects=from:d.json"]).effects == f"from:{tmp_path / 'd.json'}"
+
+
+def test_a_lag_is_left_out_and_said(played: Path) -> None:
+    config = make_config(**keys(played, effects="none"))
+    rows = prepare(config)
+    names = [c.name for c in rows.covariate_coordinates]
+    covariates = dict(zip(names, rows.covariates[0].unbind(-1), strict=True))
+    situation = Situation(rows.mechanism, rows.joints[0], covariates, default_gravity(rows.mechanism))
+    verdict = Verdict("d.json", None, {"thermal": {"growth": 1.1e-5, "lag": 900.0, "at once": 1e-6}})
+    known, notes = verdict.on(situation)
+    assert len(notes) == 1 and "What thermal has of lag, at once comes from before" in notes[0]
+    assert known[0].shape.shape == (0,) and float(known[0].coefficients[0]) == 1.1e-5
+    bare = replace(situation, covariates={n: v for n, v in covariates.items() if n != "time"})
+    assert len(known[0].coefficients) == len(known[0].effect.coefficients(bare))
