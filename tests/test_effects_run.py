@@ -12,6 +12,7 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
@@ -21,7 +22,7 @@ from ccnn_torch.compensation._export import quiet_exporter, to_onnx
 from ccnn_torch.compensation._networks import describe_network, network_from_description
 from ccnn_torch.compensation._session import open_onnx
 from ccnn_torch.diagnosis.from_file import Verdict
-from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, measured_pose, reached
+from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, measured_pose, reached
 from ccnn_torch.effects.covariates import draw_covariates
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
@@ -182,6 +183,12 @@ def test_a_killed_run_resumes_to_the_same(cli: Cli, played: Path, tmp_path: Path
     assert first["methods"]["bp_lm"]["test"] == again["methods"]["bp_lm"]["test"]
 
 
+def usual(effect: Effect, situation: Situation) -> Tensor:
+    """Shapes that a simulation takes."""
+    values = [s.grid[len(s.grid) // 2] if s.usual is None else s.usual for s in effect.shapes(situation)]
+    return torch.tensor(values, dtype=torch.float64)
+
+
 @pytest.mark.parametrize("name", ["five_bar", "tripod", "machine_tool", ARM])
 @pytest.mark.parametrize("effects", [("compliance", "friction"), ("thermal", "frame")])
 def test_the_module_does_what_the_effects_do(name: str, effects: tuple[str, ...]) -> None:
@@ -195,8 +202,7 @@ def test_the_module_does_what_the_effects_do(name: str, effects: tuple[str, ...]
     acting = []
     for effect in map(make_effect, effects):
         sizes = [0.0 if c.secondary else 0.1 * c.scale for c in effect.coefficients(situation)]
-        none = torch.zeros(0, dtype=torch.float64)
-        acting.append(Acting(effect, none, torch.tensor(sizes, dtype=torch.float64)))
+        acting.append(Acting(effect, usual(effect, situation), torch.tensor(sizes, dtype=torch.float64)))
     care = Care(0.3, 1e-3)
     module = expand_effects(situation, acting, [*covariates], 0.1, care)
     given = torch.stack([*covariates.values()], -1)
@@ -224,7 +230,7 @@ def test_an_exported_graph_has_the_numbers_of_the_effects() -> None:
     acting = []
     for effect in map(make_effect, ("thermal", "backlash")):
         sizes = [c.scale for c in effect.coefficients(situation)]
-        acting.append(Acting(effect, torch.zeros(0, dtype=torch.float64), torch.tensor(sizes, dtype=torch.float64)))
+        acting.append(Acting(effect, usual(effect, situation), torch.tensor(sizes, dtype=torch.float64)))
     module = expand_effects(situation, acting, [*covariates], 0.1, Care(0.04, 0.0, 2.0, 4.0))
     given = torch.stack([*covariates.values()], -1)
     batch = torch.export.Dim("batch")

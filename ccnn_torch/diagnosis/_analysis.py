@@ -189,18 +189,26 @@ def _same_shape(atom: Atom, shaped: Shaped) -> bool:
 
 
 def _best_part(situation: Situation, atom: Atom, white: Whitening, y: Tensor) -> Atom | None:
-    """Of an effect with many coefficients those of the one joint or leg that explains most of `y` by itself."""
+    """Of an effect with many coefficients those of the one joint or leg that explains most of `y`, and of others beside
+    it that the evidence is for, up to half of them."""
     assert atom.effect is not None
     coefficients = atom.effect.coefficients(situation)
     owners = [c.joint if c.leg is None else c.leg for c in coefficients]
     parts = [[k for k, o in enumerate(owners) if o == owner] for owner in dict.fromkeys(owners) if owner is not None]
     if len(coefficients) < _MANY or len(parts) < 2:
         return None
-    evidence, _ = alone(grams_of(white(atom.columns), white(y)), [torch.tensor(p) for p in parts], _SIZE_SPREAD)
-    part = parts[int(evidence[1:].argmax())]
-    return replace(
-        atom, columns=atom.columns[..., part], log_prior=atom.log_prior - math.log(len(parts)), used=tuple(part)
-    )
+    grams = grams_of(white(atom.columns), white(y))
+    charge, lots, reached = math.log(len(parts)), 0, -math.inf
+    chosen: list[int] = []
+    while lots < max(len(parts) // 2, 1):
+        wider = [sorted(chosen + p) if not set(p) <= set(chosen) else p for p in parts]
+        evidence = alone(grams, [torch.tensor(p) for p in wider], _SIZE_SPREAD)[0][1:]
+        best = int(evidence.argmax())
+        if float(evidence[best]) < reached + charge or wider[best] == chosen:
+            break
+        chosen, reached = wider[best], float(evidence[best])
+        lots += 1
+    return replace(atom, columns=atom.columns[..., chosen], log_prior=atom.log_prior - lots * charge, used=tuple(chosen))
 
 
 def _only(white: Whitening, usable: Tensor) -> Whitening:

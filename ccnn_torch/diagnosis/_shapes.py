@@ -140,6 +140,8 @@ class Scan:
             return [torch.cartesian_prod(*grids)]
         found = []
         for k, grid in enumerate(grids):
+            if level and not self.shapes[part.shapes[k]].refined:
+                continue
             table = value[part.shapes].expand(len(grid), -1).clone()
             table[:, k] = grid
             found.append(table)

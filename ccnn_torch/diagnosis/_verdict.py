@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import torch
+
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._catch_all import ANY
 from ccnn_torch.diagnosis._search import Found, scored
@@ -14,14 +16,17 @@ __all__ = ["Judgement", "judge"]
 # Share of the gap's energy that goes with a member of a set and not without it: below this a library effect is how the
 # form of the others differs from the textbook; so is a catch-all beside library effects, and so are library effects
 # beside a catch-all, which stands for whatever was not thought of.
-_FORM, _FORM_CATCH_ALL, _BESIDE_CATCH_ALL = 0.008, 0.015, 0.1
+_FORM, _FORM_CATCH_ALL, _BESIDE_CATCH_ALL = 0.008, 0.002, 0.1
 # Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is stood by.
-_VETO = 0.02
+_VETO, _MUCH = 0.005, 1.5
 # Or times the noise's energy, whatever the gap.
 _VETO_NOISE = 25.0
 # What a claim is worth where a name carries less than this share of the gap, or where there are three names or more:
 # the textbook forms of effects are too rough to be surer.
 _SMALL, _UNSURE = 0.1, 0.85
+# A name is not claimed more surely than this where it could as well take over another candidate's typical part of the
+# gap, all but so many squares in units of the noise: then it could take over what the library does not know, too.
+_MIMIC, _MIMICKED = 0.9, 60.0
 # Odds up to which one name for another is not told apart by the data.
 _ODDS = math.log(20.0)
 # Log odds against the most probable set beyond which nobody looks.
@@ -85,8 +90,27 @@ def judge(analysis: Analysis) -> Judgement:
         names and not outside and _above_noise(analysis, found)
     ):
         probability *= _UNSURE
+    if names and not outside and _could_be_another(analysis, found):
+        probability = min(probability, _MIMIC)
     ordered = tuple(sorted(names, key=lambda n: -_energy(analysis, found, n)))
     return Judgement(found, ordered, classes, min(probability, 1.0), outside, driver, marginal, leading)
+
+
+def _could_be_another(analysis: Analysis, found: Found) -> bool:
+    """Whether what a set can do holds what some candidate beside it is likely to do, to within the noise."""
+    atoms, groups, grams = analysis.library.atoms, analysis.library.groups, analysis.library.grams
+    names = {atoms[i].name for i in found.members}
+    own = torch.cat([groups[i] for i in found.members])
+    inverse = torch.linalg.pinv(grams.xx[own][:, own], rtol=1e-9, hermitian=True)
+    gap = float(grams.yy) - analysis.floor * grams.values
+    for atom, group in zip(atoms, groups, strict=True):
+        total = float(grams.xx[group, group].sum())
+        if atom.catch_all or atom.name in names or total <= 0:
+            continue
+        cross = grams.xx[own][:, group]
+        if gap * (1 - float((cross * (inverse @ cross)).sum()) / total) < _MIMICKED:
+            return True
+    return False
 
 
 def _net(
@@ -162,7 +186,7 @@ def _unexplained(analysis: Analysis, found: Found) -> bool:
     floor = analysis.floor
     significant = left > floor * (1 + 5 * math.sqrt(2 / count))
     gap = float(analysis.library.grams.yy) / count
-    much = left - floor > _VETO * max(gap - floor, 0.0) and left > 1.5 * floor
+    much = left - floor > _VETO * max(gap - floor, 0.0) and left > _MUCH * floor
     return significant and (much or left > _VETO_NOISE * floor)
 
 

@@ -51,8 +51,9 @@ def refit(
         fine &= torch.isfinite(there.jacobian).flatten(1).all(-1)
         target, every = torch.where(fine[:, None], target, 0.0), torch.where(fine[:, None, None], every, 0.0)
         if white is None:
-            channels = moving_channels(target, torch.nan_to_num(situation.jacobian))
-            white = fitted_whitening(target, every, channels, None, fine)
+            channels = moving_channels(situation)
+            apart = every.split([c.shape[-1] for c in columns], -1)
+            white = fitted_whitening(target, apart, channels, None, fine)
         white = replace(white, weight=torch.where(fine, white.weight, 0.0))
         ends = torch.tensor([c.shape[-1] for c in columns]).cumsum(0).tolist()
         groups = [torch.arange(e - c.shape[-1], e) for c, e in zip(columns, ends, strict=True) if c.shape[-1]]

@@ -50,6 +50,7 @@ class Shape:
         grid: values to look at, ascending; the search refines between neighbours and never leaves the grid's ends.
         columns: which coefficients depend on it, or None where all do; shapes without a common coefficient are
             searched one by one.
+        refined: whether values between those of the grid are possible.
         usual: what a simulation takes unless told otherwise; drawn from the lower half of the grid where None.
     """
 
@@ -58,6 +59,7 @@ class Shape:
     grid: tuple[float, ...]
     columns: tuple[int, ...] | None = None
     usual: float | None = None
+    refined: bool = True
 
 
 @runtime_checkable

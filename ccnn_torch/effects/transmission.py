@@ -19,7 +19,7 @@ _SCALE = {"m": 5e-5, "rad": 1e-4}
 # Waves: harmonics of the period, and how large they are likely to be.
 _HARMONICS = tuple(
     (f"{wave}{'' if k == 1 else f' {k}'}", size)
-    for k, size in ((1, 1.0), (2, 0.5), (3, 0.05), (4, 0.05))
+    for k, size in ((1, 1.0), (2, 0.5), (3, 0.02), (4, 0.02))
     for wave in ("sin", "cos")
 )
 # Harmonics of a turn; those of a harmonic drive's ball cage and teeth lie near the hundredth.
@@ -63,6 +63,7 @@ class Transmission:
                 f"rad/{j.unit}" if j.unit != "rad" else "1",
                 _frequencies(j.unit, high[i] - low[i]),
                 tuple(range(count * i, count * (i + 1))),
+                refined=j.unit != "rad",
             )
             for i, j in enumerate(situation.mechanism.joints)
         )

@@ -29,6 +29,9 @@ _SHARE = 0.1
 _FREE = 1e3
 """Prior scale of the coefficients in units of what is plausible: it keeps the fit regular and else asks nothing."""
 _STEPS = 3
+_FAR = 3.0
+"""Rows in which the joints move the platform so many times as far as usual tell nothing by first-order columns: they are
+left out, whatever the answer."""
 _SWEEPS, _REFINEMENTS = 3, 3
 _CHUNK = 16
 
@@ -73,7 +76,7 @@ class Judge:
     @property
     def numbers(self) -> int:
         """How many were measured: rows times pose coordinates."""
-        return self._case.true.numel()
+        return int(self._regular.sum()) * self._case.true.shape[-1]
 
     @cached_property
     def total(self) -> float:
@@ -116,17 +119,25 @@ class Judge:
         inverse: Tensor = torch.linalg.pinv(jacobian_of(flat, case.pose)[1])
         return inverse / case.sd[:, None]
 
+    @cached_property
+    def _regular(self) -> Tensor:
+        """Rows that count, `s`; by the true machine's own measure of how near singular they are."""
+        weight = torch.tensor([1.0, 1.0, 1.0, 0.3, 0.3, 0.3], dtype=torch.float64)
+        jacobian = torch.nan_to_num(self._situation.jacobian)
+        size = torch.linalg.matrix_norm(jacobian * weight[: jacobian.shape[-2], None], 2)
+        return (size <= _FAR * size.median()).double()
+
     def _white(self, channels: Tensor) -> Tensor:
         """Channels `s x c x …` as pose coordinates in units of their noise, flat: `sp x …`."""
         wide = channels.flatten(2) if channels.dim() > 2 else channels[..., None]
-        return (self._channels @ wide).flatten(0, 1).reshape(-1, *channels.shape[2:])
+        return (self._regular[:, None, None] * (self._channels @ wide)).flatten(0, 1).reshape(-1, *channels.shape[2:])
 
     def _columns(self, effect: Effect, shape: Tensor) -> Tensor:
         """Signatures at several shapes `g x h`, in units of the noise per `_FREE` plausible sizes, `g x sp x m`."""
         scale = torch.tensor([c.scale for c in effect.coefficients(self._situation)], dtype=torch.float64) * _FREE
         raw = signature(self._situation, effect, shape)
         raw = torch.nan_to_num(raw).expand(len(shape), *raw.shape[-3:])
-        return (self._channels @ raw).flatten(1, 2) * scale
+        return (self._regular[:, None, None] * (self._channels @ raw)).flatten(1, 2) * scale
 
     def _fit(self, effects: Sequence[Effect]) -> Explained:
         """Shapes first, one after the other, then the coefficients in the true kinematics."""
