@@ -27,6 +27,8 @@ _SMALL, _UNSURE = 0.1, 0.85
 # A name is not claimed more surely than this where it could as well take over another candidate's typical part of the
 # gap, all but so many squares in units of the noise: then it could take over what the library does not know, too.
 _MIMIC, _MIMICKED = 0.9, 60.0
+# Share of an effect's own squares that must not be borrowed from what other effects do.
+_OWN = 0.1
 # Odds up to which one name for another is not told apart by the data.
 _ODDS = math.log(20.0)
 # Log odds against the most probable set beyond which nobody looks.
@@ -76,6 +78,11 @@ def judge(analysis: Analysis) -> Judgement:
     if not outside and _unexplained(analysis, found):
         outside = True
         driver = _driver_of_remainder(analysis)
+    borrowed = _borrowed(analysis, found)
+    if borrowed:
+        # Something is there that looks like a part of these effects, and nothing of what makes them what they are.
+        names, outside = names - borrowed, True
+        driver = driver or _driver_alone(analysis)
     marginal: dict[str, float] = {a.name: 0.0 for a in analysis.library.atoms if not a.catch_all}
     for members, _, p, _ in leading:
         for name in members:
@@ -94,6 +101,21 @@ def judge(analysis: Analysis) -> Judgement:
         probability = min(probability, _MIMIC)
     ordered = tuple(sorted(names, key=lambda n: -_energy(analysis, found, n)))
     return Judgement(found, ordered, classes, min(probability, 1.0), outside, driver, marginal, leading)
+
+
+def _borrowed(analysis: Analysis, found: Found) -> frozenset[str]:
+    """Names of a set that rest on what other effects do as well."""
+    grams, names = analysis.library.grams, set()
+    for i, mean in zip(found.members, found.mean, strict=True):
+        atom, group = analysis.library.atoms[i], analysis.library.groups[i]
+        own = torch.tensor([not c.borrowed for c in atom.coefficients(analysis.situation)])
+        if atom.catch_all or bool(own.all()):
+            continue
+        gram = grams.xx[group][:, group]
+        alone, whole = (float(m @ gram @ m) for m in (mean * own, mean))
+        if alone < _OWN * whole:
+            names.add(atom.name)
+    return frozenset(names)
 
 
 def _could_be_another(analysis: Analysis, found: Found) -> bool:
@@ -197,6 +219,13 @@ def _driver_of_remainder(analysis: Analysis) -> str | None:
         if driver is not None:
             return driver
     return None
+
+
+def _driver_alone(analysis: Analysis) -> str | None:
+    """The driver that explains most by itself."""
+    atoms = analysis.library.atoms
+    alone = (f for f in analysis.found if len(f.members) == 1 and atoms[f.members[0]].catch_all)
+    return next((_named(analysis, f)[1] for f in alone), None)
 
 
 def _classes(analysis: Analysis, found: Found, names: frozenset[str]) -> dict[str, tuple[str, ...]]:

@@ -98,6 +98,8 @@ def fitted_whitening(
             whole = grams_of(x, y)
         y = white(left)
         rest = [g for g in groups if not any(g is c for c in chosen)]
+        if not rest:
+            break
         beside = Grams(whole.xx, x.flatten(0, 1).mT @ y.flatten(), y.square().sum(), whole.values)
         evidence, _ = alone(beside, rest, _ANY_SIZE)
         best = int(evidence[1:].argmax())

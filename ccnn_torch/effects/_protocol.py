@@ -27,7 +27,9 @@ class Coefficient:
         joint: name of the joint that it belongs to alone, or None.
         leg: number of the leg that it belongs to alone, or None.
         secondary: whether it stands for what the textbook form leaves out (a stiffening spring, a second harmonic); a
-            simulation leaves it 0 unless told otherwise, and it does not speak for the effect by itself.
+            simulation leaves it 0 unless told otherwise.
+        borrowed: whether by itself it is what another effect does (a zero, a constant part): it does not speak for this
+            one.
         positive: whether physics allows it no negative value (play, compliance); for drawing it in a simulation.
     """
 
@@ -37,6 +39,7 @@ class Coefficient:
     joint: str | None = None
     leg: int | None = None
     secondary: bool = False
+    borrowed: bool = False
     positive: bool = False
 
 
