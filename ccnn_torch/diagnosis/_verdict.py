@@ -160,7 +160,13 @@ def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fo
             i: _FORM_CATCH_ALL if atoms[i].catch_all else _BESIDE_CATCH_ALL if beside else _FORM for i in found.members
         }
         shares = _net(analysis, found, tried)
-        idle = [i for i, (share, _) in shares.items() if share < limits[i]]
+        # What leaves more than the noise when it goes is missed, however small it is.
+        missed = _unexplained(analysis, found)
+        idle = [
+            i
+            for i, (share, fewer) in shares.items()
+            if share < limits[i] and (missed or not _unexplained(analysis, tried[fewer]))
+        ]
         if not idle:
             break
         # A catch-all can stand in for much of the library, so it is the first to go; else what is missed least.

@@ -28,7 +28,7 @@ class Coefficient:
         leg: number of the leg that it belongs to alone, or None.
         secondary: whether it stands for what the textbook form leaves out (a stiffening spring, a second harmonic); a
             simulation leaves it 0 unless told otherwise.
-        borrowed: whether by itself it is what another effect does (a zero, a constant part): it does not speak for this
+        borrowed: whether by itself it is what another effect does (a constant part): it does not speak for this
             one.
         positive: whether physics allows it no negative value (play, compliance); for drawing it in a simulation.
     """

@@ -37,7 +37,7 @@ class Coupling:
             Coefficient(f"{i.name} by {j.name}", unit, size.get(unit, 1e-3), joint=i.name)
             for (i, j), unit in zip(pairs, units, strict=True)
         ]
-        found += [Coefficient(f"{j.name} zero", j.unit, ZERO[j.unit], joint=j.name, secondary=True, borrowed=True) for j in joints]
+        found += [Coefficient(f"{j.name} zero", j.unit, ZERO[j.unit], joint=j.name, secondary=True) for j in joints]
         return tuple(found)
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:

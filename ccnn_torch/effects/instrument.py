@@ -20,8 +20,8 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 _COEFFICIENTS = (
     *(Coefficient(f"scale {a}", "1", 3e-4) for a in _AXES),
     *(Coefficient(f"shear {_AXES[i]}{_AXES[j]}", "rad", 3e-4) for i, j in _PAIRS),
-    *(Coefficient(f"lean {_AXES[i]}{_AXES[j]}", "rad", 1e-4, secondary=True, borrowed=True) for i, j in _PAIRS),
-    *(Coefficient(f"zero {a}", "m", 1e-4, secondary=True, borrowed=True) for a in _AXES),
+    *(Coefficient(f"lean {_AXES[i]}{_AXES[j]}", "rad", 1e-4, secondary=True) for i, j in _PAIRS),
+    *(Coefficient(f"zero {a}", "m", 1e-4, secondary=True) for a in _AXES),
     *(Coefficient(f"scale r{a}", "1", 1e-3, secondary=True) for a in _AXES),
 )
 

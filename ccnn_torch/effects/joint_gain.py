@@ -38,7 +38,7 @@ class JointGain:
             for j in situation.mechanism.joints
             for one in (
                 Coefficient(j.name, "1", _GAIN, joint=j.name),
-                Coefficient(f"{j.name} zero", j.unit, ZERO[j.unit], joint=j.name, secondary=True, borrowed=True),
+                Coefficient(f"{j.name} zero", j.unit, ZERO[j.unit], joint=j.name, secondary=True),
             )
         )
 
