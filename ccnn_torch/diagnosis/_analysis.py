@@ -208,7 +208,9 @@ def _best_part(situation: Situation, atom: Atom, white: Whitening, y: Tensor) ->
             break
         chosen, reached = wider[best], float(evidence[best])
         lots += 1
-    return replace(atom, columns=atom.columns[..., chosen], log_prior=atom.log_prior - lots * charge, used=tuple(chosen))
+    return replace(
+        atom, columns=atom.columns[..., chosen], log_prior=atom.log_prior - lots * charge, used=tuple(chosen)
+    )
 
 
 def _only(white: Whitening, usable: Tensor) -> Whitening:

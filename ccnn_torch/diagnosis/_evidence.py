@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Fits", "Grams", "alone", "fit_sets", "grams_of", "of_like_width"]
+__all__ = ["Fits", "Grams", "alone", "block_grams", "fit_sets", "grams_of", "of_like_width"]
 
 _BUCKET = 16
 # Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
@@ -63,6 +63,16 @@ def grams_of(x: Tensor, y: Tensor) -> Grams:
     """x: `s x c x P` whitened columns; y: `s x c`."""
     flat, value = x.reshape(-1, x.shape[-1]), y.reshape(-1)
     return Grams(flat.mT @ flat, flat.mT @ value, value @ value, float(len(value)))
+
+
+def block_grams(x: Tensor, y: Tensor, groups: Sequence[Tensor]) -> Grams:
+    """As `grams_of`, but 0 between columns of different groups: all that fits of one group at a time ask for."""
+    flat, value = x.reshape(-1, x.shape[-1]), y.reshape(-1)
+    xx = flat.new_zeros(flat.shape[-1], flat.shape[-1])
+    for group in groups:
+        first, end = int(group[0]), int(group[-1]) + 1
+        xx[first:end, first:end] = flat[:, first:end].mT @ flat[:, first:end]
+    return Grams(xx, flat.mT @ value, value @ value, float(len(value)))
 
 
 def fit_sets(

@@ -18,6 +18,8 @@ __all__ = ["Scan", "Shaped"]
 _FINE, _ROUNDS = 9, 2
 # Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
 _LOOSE = 10.0
+# Values of the residual, at most, that the grids are looked at on; between their values all count.
+_COARSE = 1200
 # Shapes that share coefficients are looked for together where that are no more values.
 _TOGETHER = 150
 
@@ -62,18 +64,25 @@ class Scan:
         kind = {"joints": lambda: there.jacobian, "parameters": lambda: there.parameter_jacobian}.get(effect.kind)
         self.lead = whiten(torch.nan_to_num(kind())) if kind is not None else None
         free = [c for c in range(len(coefficients)) if not any(c in p.columns for p in self.parts)]
-        self.unshaped = self._whitened(effect.basis(situation, self.start)[None], free)[0]
+        self.unshaped = self._whitened(effect.basis(situation, self.start)[None], free, None)[0]
+        rows = len(situation.joints)
+        few = max(1, _COARSE * rows // max(len(self.unshaped.flatten(0, 1)), 1))
+        drawn = torch.randperm(rows, generator=torch.Generator().manual_seed(0))[:few].sort().values
+        self.rows = drawn if few < rows else None
         self.coarse: list[_Turn] | None = None
 
-    def columns(self, candidates: Tensor) -> list[Tensor]:
-        """Of each part, whitened, in plausible sizes, `g x N x m`; candidates: `g x h`."""
+    def columns(self, candidates: Tensor, rows: Tensor | None) -> list[Tensor]:
+        """Of each part, whitened, in plausible sizes, `g x N x m`; candidates: `g x h`; rows: which, None = all."""
         basis = self.effect.basis(self.situation, candidates)
-        return [self._whitened(basis, part.columns) for part in self.parts]
+        return [self._whitened(basis, part.columns, rows).flatten(1, 2) for part in self.parts]
 
-    def _whitened(self, basis: Tensor, columns: list[int]) -> Tensor:
-        mine = basis[..., columns] * self.size[columns]
-        z = self.lead @ mine if self.lead is not None else torch.stack([self.whiten(b) for b in mine])
-        return torch.nan_to_num(z).flatten(1, 2)
+    def _whitened(self, basis: Tensor, columns: list[int], rows: Tensor | None) -> Tensor:
+        """`g x s x c x m`."""
+        if self.lead is None:
+            mine = basis[..., columns] * self.size[columns]
+            return torch.nan_to_num(torch.stack([_of(self.whiten(b), rows, 0) for b in mine]))
+        mine = _of(basis, rows, 1)[..., columns] * self.size[columns]
+        return torch.nan_to_num(_of(self.lead, rows, 0) @ mine)
 
     def best(self, y: Tensor, others: Tensor, start: Tensor | None = None) -> Shaped:
         """The shapes that explain most of `y`.
@@ -85,11 +94,16 @@ class Scan:
                 other.
         """
         value = self.start if start is None else start
-        target, fixed = y.flatten(), _LOOSE * torch.cat([others.flatten(0, 1), self.unshaped], -1)
+        beside = _LOOSE * torch.cat([others, self.unshaped], -1)
         gains = [0.0] * len(self.parts)
         charges = [0.0] * len(self.parts)
-        plain = _Left(target, fixed)
         for level in range(_ROUNDS + 1):
+            rows = self.rows if level == 0 else None
+            if level < 2:
+                target, fixed = _of(y, rows, 0).flatten(), _of(beside, rows, 0).flatten(0, 1)
+                plain = _Left(target, fixed)
+            # Squares of all rows, as the part of them that was looked at tells.
+            times = y.numel() / len(target)
             for candidates, pieces, sizes in self._level(value, level):
                 chosen = [self._nearest(candidates, value, part) for part in self.parts]
                 spent = [0.0] * len(self.parts)
@@ -101,7 +115,7 @@ class Scan:
                         if sweep:
                             own = [_LOOSE * p[chosen[j]] for j, p in enumerate(pieces) if j != i]
                             left = _Left(target, torch.cat([fixed, *own], -1))
-                        score = left.gain(z[: sizes[i]])
+                        score = times * left.gain(z[: sizes[i]])
                         chosen[i] = int(score.argmax())
                         gains[i] = float(score[chosen[i]])
                         spent[i] = _charge(score) if level == 0 else 0.0
@@ -128,7 +142,7 @@ class Scan:
                     candidates[: len(table), part.shapes] = table
                     candidates[len(table) :, part.shapes] = table[-1]
             sizes = [len(table) if table.shape[-1] else 0 for table in mine]
-            found.append(_Turn(candidates, self.columns(candidates), sizes))
+            found.append(_Turn(candidates, self.columns(candidates, self.rows if level == 0 else None), sizes))
         if level == 0:
             self.coarse = found
         return found
@@ -170,6 +184,10 @@ class Scan:
             return Shaped(value, None, charge)
         unshaped = set(range(len(self.size))) - {c for p in self.parts for c in p.columns}
         return Shaped(value, tuple(sorted(unshaped | {c for i in kept for c in self.parts[i].columns})), charge)
+
+
+def _of(values: Tensor, rows: Tensor | None, dim: int) -> Tensor:
+    return values if rows is None else values.index_select(dim, rows)
 
 
 def _charge(gain: Tensor) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._evidence import Grams, alone, fit_sets, grams_of
+from ccnn_torch.diagnosis._evidence import alone, block_grams, fit_sets, grams_of
 from ccnn_torch.effects import Situation
 
 __all__ = ["Whitening", "fitted_whitening", "moving_channels", "reweighted"]
@@ -84,29 +84,26 @@ def fitted_whitening(
     if noise is None:
         white = replace(white, sigma=sigma * _noise_share(white(unit), white(residual), groups).sqrt())
     chosen: list[Tensor] = []
+    least = None if noise is not None else 1e-4 * rms
     left, free = residual, 1.0
     for _ in range(_RICH):
-        x, y = white(unit), white(residual)
-        whole = grams_of(x, y)
         if chosen:
-            fit = fit_sets(whole, [chosen], 0.0, spread=_ANY_SIZE)
-            index = fit.columns[0]
-            left = residual - unit[..., index] @ fit.mean[0]
+            own = unit[..., torch.cat(chosen)]
+            ends = torch.tensor([len(g) for g in chosen]).cumsum(0).tolist()
+            parts = [torch.arange(e - len(g), e) for e, g in zip(ends, chosen, strict=True)]
+            fit = fit_sets(grams_of(white(own), white(residual)), [parts], 0.0, spread=_ANY_SIZE)
+            left = residual - own @ fit.mean[0]
             free = max(1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), 0.1)
-            white = _settled(white, left, usable, free, None if noise is not None else 1e-4 * rms)
-            x, y = white(unit), white(residual)
-            whole = grams_of(x, y)
-        y = white(left)
+            white = _settled(white, left, usable, free, least)
         rest = [g for g in groups if not any(g is c for c in chosen)]
         if not rest:
             break
-        beside = Grams(whole.xx, x.flatten(0, 1).mT @ y.flatten(), y.square().sum(), whole.values)
-        evidence, _ = alone(beside, rest, _ANY_SIZE)
+        evidence, _ = alone(block_grams(white(unit), white(left), rest), rest, _ANY_SIZE)
         best = int(evidence[1:].argmax())
         if float(evidence[best + 1] - evidence[0]) < _SLIGHT:
             break
         chosen.append(rest[best])
-    white = _settled(white, left, usable, free, None if noise is not None else 1e-4 * rms)
+    white = _settled(white, left, usable, free, least)
     return replace(white, known=0.0 if noise is None else 50.0)
 
 
@@ -117,7 +114,7 @@ def _noise_share(x: Tensor, y: Tensor, groups: Sequence[Tensor]) -> Tensor:
     """
     share = []
     for c in range(y.shape[-1]):
-        evidence, left = alone(grams_of(x[:, c : c + 1], y[:, c : c + 1]), groups, _ANY_SIZE)
+        evidence, left = alone(block_grams(x[:, c : c + 1], y[:, c : c + 1], groups), groups, _ANY_SIZE)
         best = int(evidence.argmax())
         clear = float(evidence[best] - evidence[0]) > _SLIGHT
         share.append(left[best] / left[0] if clear else torch.ones_like(left[0]))

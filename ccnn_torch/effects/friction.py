@@ -53,7 +53,11 @@ class Friction:
                 unit = per_force(joint.unit)
                 found.append(Coefficient(f"{joint.name} together", unit, size, joint=joint.name, secondary=True))
             constant = _CONSTANT[joint.unit]
-            found.append(Coefficient(f"{joint.name} constant", joint.unit, constant, joint=joint.name, secondary=True, borrowed=True))
+            found.append(
+                Coefficient(
+                    f"{joint.name} constant", joint.unit, constant, joint=joint.name, secondary=True, borrowed=True
+                )
+            )
         return tuple(found)
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
