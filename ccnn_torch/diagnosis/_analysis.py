@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._atoms import Atom, default_shape
+from ccnn_torch.diagnosis._atoms import Atom
+from ccnn_torch.diagnosis._candidates import cleaned, first_candidates, plain_atom, renewed_candidates
 from ccnn_torch.diagnosis._catch_all import catch_alls
-from ccnn_torch.diagnosis._evidence import alone, grams_of
-from ccnn_torch.diagnosis._linear import remainder, signature_at, tangent
+from ccnn_torch.diagnosis._evidence import grams_of
+from ccnn_torch.diagnosis._linear import tangent
 from ccnn_torch.diagnosis._search import Found, Library, search
-from ccnn_torch.diagnosis._shapes import Scan, Shaped
 from ccnn_torch.diagnosis._whitening import Whitening, fitted_whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 
 __all__ = ["Analysis", "analyse"]
 
-LOG_PRIOR = math.log(0.1)
 # Rows are left out where the Jacobian is worse conditioned than this and than ten times the usual.
 _CONDITION = 50.0
-# Effects with so many coefficients are looked for in one joint or leg, too; spread of their log size there.
-_MANY, _SIZE_SPREAD = 8, 4.0
 # Or where the joints move the platform so many times as far as usual.
 _GAIN = 3.0
 
@@ -82,10 +78,8 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     usable = torch.isfinite(residual).all(-1) & torch.isfinite(situation.jacobian).flatten(1).all(-1) & ~near
     residual = torch.where(usable[:, None], residual, 0.0)
 
-    atoms = [_atom(situation, situation, e, Shaped(default_shape(situation, e), None, 0.0)) for e in effects]
-    rest = [a for a in catch_alls(situation) if bool(torch.isfinite(a.columns[usable]).all())]
-    atoms = [_cleaned(a, usable) for a in atoms]
-    rest = [_cleaned(a, usable) for a in rest]
+    atoms = [cleaned(plain_atom(situation, situation, e), usable) for e in effects]
+    rest = [cleaned(a, usable) for a in catch_alls(situation) if bool(torch.isfinite(a.columns[usable]).all())]
     fitted = _frame_columns(situation, usable)
     # What does not show at all in these rows is no candidate (latency at rest).
     size = [
@@ -100,20 +94,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     white = fitted_whitening(residual, [fitted, *everything], channels, noise, usable)
 
     rich = white.sigma
-    # Shapes by themselves and with the rest of the library beside them: two ways to start, both stay candidates.
-    fixed = [a for a in atoms if a.shape.numel() == 0]
-    fixed += [part for a in fixed if (part := _best_part(situation, a, white, residual)) is not None]
-    shaped = [a for a in atoms if a.shape.numel()]
-    alone = white(fitted)
-    beside = torch.cat([alone, *(white(a.columns) for a in fixed)], -1)
-    starts: list[Atom] = []
-    for atom in shaped:
-        assert atom.effect is not None
-        scan = Scan(situation, situation, atom.effect, _only(white, usable))
-        for nuisance in (alone, beside):
-            shaped_so = scan.best(white(residual), nuisance)
-            if not any(a.effect is atom.effect and _same_shape(a, shaped_so) for a in starts):
-                starts.append(_cleaned(_atom(situation, situation, atom.effect, shaped_so), usable))
+    fixed, starts = first_candidates(situation, atoms, white, residual, usable, fitted)
     result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest], near, rich, fitted)
 
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
@@ -129,30 +110,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
             there, target, ok = situation, residual, usable
         target = torch.where(ok[:, None], target, 0.0)
         white = _renewed(result, noise, ok)
-        atoms = []
-        for effect in effects:
-            inside = [a for a in acting if a.effect is effect]
-            start = inside[0].shape if inside else None
-            if not effect.shapes(situation):
-                none = Shaped(default_shape(situation, effect), None, 0.0)
-                atoms.append(_cleaned(_atom(situation, there, effect, none), ok))
-                beside = [a for a in acting if a.effect is not effect]
-                left = torch.where(ok[:, None], torch.nan_to_num(remainder(situation, measured, beside)), 0.0)
-                part = _best_part(situation, atoms[-1], white, left)
-                atoms += [part] if part is not None else []
-                continue
-            others = [
-                white(_cleaned(_atom(situation, there, a.effect, Shaped(a.shape, None, 0.0)), ok).columns)
-                for a in acting
-                if a.effect is not effect
-            ]
-            beside = torch.cat([white(fitted), *others], -1)
-            shaped_so = Scan(situation, there, effect, _only(white, ok)).best(white(target), beside, start)
-            atoms.append(_cleaned(_atom(situation, there, effect, shaped_so), ok))
-            # What was found at first stays a candidate: what acts now may have hidden the better shape.
-            for old in (a for a in starts if a.effect is effect and not _same_shape(a, shaped_so)):
-                so = Shaped(old.shape, old.used, LOG_PRIOR - old.log_prior)
-                atoms.append(_cleaned(_atom(situation, there, effect, so), ok))
+        atoms = renewed_candidates(situation, there, measured, target, effects, acting, starts, white, ok, fitted)
         result = _searched(situation, measured, target, white, [*atoms, *rest], near, rich, fitted)
     return result
 
@@ -175,53 +133,6 @@ def _frame_columns(situation: Situation, usable: Tensor) -> Tensor:
     index = [k for k, g in enumerate(situation.mechanism.geometry) if g.name.partition("_")[0] in unknown]
     columns = situation.parameter_jacobian[..., index] if index else situation.jacobian[..., :0]
     return torch.where(usable[:, None, None], columns, 0.0)
-
-
-def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped) -> Atom:
-    columns = signature_at(situation, there, effect, shaped.value)
-    if shaped.used is not None:
-        columns = columns[..., list(shaped.used)]
-    return Atom(effect.name, effect, shaped.value, columns, LOG_PRIOR - shaped.charge, shaped.used)
-
-
-def _same_shape(atom: Atom, shaped: Shaped) -> bool:
-    return atom.used == shaped.used and torch.allclose(atom.shape, shaped.value, rtol=1e-3)
-
-
-def _best_part(situation: Situation, atom: Atom, white: Whitening, y: Tensor) -> Atom | None:
-    """Of an effect with many coefficients those of the one joint or leg that explains most of `y`, and of others beside
-    it that the evidence is for, up to half of them."""
-    assert atom.effect is not None
-    coefficients = atom.effect.coefficients(situation)
-    owners = [c.joint if c.leg is None else c.leg for c in coefficients]
-    parts = [[k for k, o in enumerate(owners) if o == owner] for owner in dict.fromkeys(owners) if owner is not None]
-    if len(coefficients) < _MANY or len(parts) < 2:
-        return None
-    grams = grams_of(white(atom.columns), white(y))
-    charge, lots, reached = math.log(len(parts)), 0, -math.inf
-    chosen: list[int] = []
-    while lots < max(len(parts) // 2, 1):
-        wider = [sorted(chosen + p) if not set(p) <= set(chosen) else p for p in parts]
-        evidence = alone(grams, [torch.tensor(p) for p in wider], _SIZE_SPREAD)[0][1:]
-        best = int(evidence.argmax())
-        if float(evidence[best]) < reached + charge or wider[best] == chosen:
-            break
-        chosen, reached = wider[best], float(evidence[best])
-        lots += 1
-    return replace(
-        atom, columns=atom.columns[..., chosen], log_prior=atom.log_prior - lots * charge, used=tuple(chosen)
-    )
-
-
-def _only(white: Whitening, usable: Tensor) -> Whitening:
-    """The same with rows that are left out set to zero."""
-    return replace(white, weight=torch.where(usable, white.weight, 0.0))
-
-
-def _cleaned(atom: Atom, usable: Tensor) -> Atom:
-    """With rows that are left out set to zero."""
-    columns = torch.where(usable[:, None, None], atom.columns, 0.0)
-    return replace(atom, columns=columns)
 
 
 def _searched(

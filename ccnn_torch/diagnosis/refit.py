@@ -52,7 +52,7 @@ def refit(
         target, every = torch.where(fine[:, None], target, 0.0), torch.where(fine[:, None, None], every, 0.0)
         if white is None:
             channels = moving_channels(situation)
-            apart = every.split([c.shape[-1] for c in columns], -1)
+            apart = torch.split(every, [c.shape[-1] for c in columns], -1)
             white = fitted_whitening(target, apart, channels, None, fine)
         white = replace(white, weight=torch.where(fine, white.weight, 0.0))
         ends = torch.tensor([c.shape[-1] for c in columns]).cumsum(0).tolist()

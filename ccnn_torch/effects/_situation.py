@@ -209,7 +209,7 @@ class Situation:
 
     @cached_property
     def typical_torque(self) -> Tensor:
-        """What 1 N of its own weight typically asks of the joints of each one's unit in the workspace, `n` [N, N·m per N]."""
+        """What 1 N of its own weight typically asks of joints in this one's unit, `n` [N or N·m per N]."""
         asked = self.samples.own_weight_torque.square().mean(0)
         units = [j.unit for j in self.mechanism.joints]
         alike = torch.tensor([[a == b for b in units] for a in units], dtype=asked.dtype)

@@ -30,8 +30,8 @@ _FREE = 1e3
 """Prior scale of the coefficients in units of what is plausible: it keeps the fit regular and else asks nothing."""
 _STEPS = 3
 _FAR = 3.0
-"""Rows in which the joints move the platform so many times as far as usual tell nothing by first-order columns: they are
-left out, whatever the answer."""
+"""Rows in which the joints move the platform so many times as far as usual tell nothing by first-order columns: they
+are left out, whatever the answer."""
 _SWEEPS, _REFINEMENTS = 3, 3
 _CHUNK = 16
 
@@ -125,7 +125,8 @@ class Judge:
         weight = torch.tensor([1.0, 1.0, 1.0, 0.3, 0.3, 0.3], dtype=torch.float64)
         jacobian = torch.nan_to_num(self._situation.jacobian)
         size = torch.linalg.matrix_norm(jacobian * weight[: jacobian.shape[-2], None], 2)
-        return (size <= _FAR * size.median()).double()
+        kept: Tensor = size <= _FAR * size.median()
+        return kept.double()
 
     def _white(self, channels: Tensor) -> Tensor:
         """Channels `s x c x …` as pose coordinates in units of their noise, flat: `sp x …`."""

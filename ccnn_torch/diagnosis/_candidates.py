@@ -1,0 +1,148 @@
+"""Candidates of a search: every effect at the shapes that suit the rows, at first and about a set that acts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis._atoms import Atom, default_shape
+from ccnn_torch.diagnosis._evidence import alone, grams_of
+from ccnn_torch.diagnosis._linear import remainder, signature_at
+from ccnn_torch.diagnosis._shapes import Scan, Shaped
+from ccnn_torch.diagnosis._whitening import Whitening
+from ccnn_torch.effects import Acting, Effect, Situation
+
+__all__ = ["cleaned", "first_candidates", "plain_atom", "renewed_candidates"]
+
+LOG_PRIOR = math.log(0.1)
+# Effects with so many coefficients are looked for in one joint or leg, too; spread of their log size there.
+_MANY, _SIZE_SPREAD = 8, 4.0
+
+
+def plain_atom(situation: Situation, there: Situation, effect: Effect) -> Atom:
+    """The effect with all coefficients, at the middle of its grids; `there`: the machine about which it is linear."""
+    return _atom(situation, there, effect, Shaped(default_shape(situation, effect), None, 0.0))
+
+
+def cleaned(atom: Atom, usable: Tensor) -> Atom:
+    """With rows that are left out set to zero."""
+    return replace(atom, columns=torch.where(usable[:, None, None], atom.columns, 0.0))
+
+
+def first_candidates(
+    situation: Situation, atoms: Sequence[Atom], white: Whitening, residual: Tensor, usable: Tensor, fitted: Tensor
+) -> tuple[list[Atom], list[Atom]]:
+    """Effects without shapes, whole and in part; and those with shapes, at what suits the residual.
+
+    Shapes are looked for by themselves and with the rest of the library beside them: two ways to start, both stay
+    candidates.
+
+    Args:
+        situation: `s` rows.
+        atoms: of all effects at the middle of their grids.
+        white: noise and weights.
+        residual: `s x c0` [m, rad].
+        usable: `s`, bool.
+        fitted: columns of what was fitted before, `s x c0 x r`.
+    """
+    fixed = [a for a in atoms if a.shape.numel() == 0]
+    fixed += [part for a in fixed if (part := _best_part(situation, a, white, residual)) is not None]
+    bare = white(fitted)
+    beside = torch.cat([bare, *(white(a.columns) for a in fixed)], -1)
+    starts: list[Atom] = []
+    for atom in (a for a in atoms if a.shape.numel()):
+        assert atom.effect is not None
+        scan = Scan(situation, situation, atom.effect, _only(white, usable))
+        for nuisance in (bare, beside):
+            shaped = scan.best(white(residual), nuisance)
+            if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
+                starts.append(cleaned(_atom(situation, situation, atom.effect, shaped), usable))
+    return fixed, starts
+
+
+def renewed_candidates(
+    situation: Situation,
+    there: Situation,
+    measured: Tensor,
+    target: Tensor,
+    effects: Sequence[Effect],
+    acting: Sequence[Acting],
+    starts: Sequence[Atom],
+    white: Whitening,
+    usable: Tensor,
+    fitted: Tensor,
+) -> list[Atom]:
+    """All effects about the machine `there`, to which those that act bring it; shapes looked for beside these.
+
+    Args:
+        situation, there: rows on the nominal machine, and on the other.
+        measured: poses, `s x p`.
+        target: what a linear model about `there` has to explain, `s x c0` [m, rad].
+        effects: candidates.
+        acting: those of the best set.
+        starts: shapes found at first: they stay candidates, since what acts now may have hidden the better ones.
+        white, usable, fitted: as in `first_candidates`.
+    """
+    atoms: list[Atom] = []
+    for effect in effects:
+        others = [a for a in acting if a.effect is not effect]
+        if not effect.shapes(situation):
+            atoms.append(cleaned(plain_atom(situation, there, effect), usable))
+            left = torch.where(usable[:, None], torch.nan_to_num(remainder(situation, measured, others)), 0.0)
+            part = _best_part(situation, atoms[-1], white, left)
+            atoms += [part] if part is not None else []
+            continue
+        columns = [_atom(situation, there, a.effect, Shaped(a.shape, None, 0.0)) for a in others]
+        beside = torch.cat([white(fitted), *(white(cleaned(c, usable).columns) for c in columns)], -1)
+        start = next((a.shape for a in acting if a.effect is effect), None)
+        shaped = Scan(situation, there, effect, _only(white, usable)).best(white(target), beside, start)
+        atoms.append(cleaned(_atom(situation, there, effect, shaped), usable))
+        for old in (a for a in starts if a.effect is effect and not _same_shape(a, shaped)):
+            so = Shaped(old.shape, old.used, LOG_PRIOR - old.log_prior)
+            atoms.append(cleaned(_atom(situation, there, effect, so), usable))
+    return atoms
+
+
+def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped) -> Atom:
+    columns = signature_at(situation, there, effect, shaped.value)
+    if shaped.used is not None:
+        columns = columns[..., list(shaped.used)]
+    return Atom(effect.name, effect, shaped.value, columns, LOG_PRIOR - shaped.charge, shaped.used)
+
+
+def _same_shape(atom: Atom, shaped: Shaped) -> bool:
+    return atom.used == shaped.used and torch.allclose(atom.shape, shaped.value, rtol=1e-3)
+
+
+def _best_part(situation: Situation, atom: Atom, white: Whitening, y: Tensor) -> Atom | None:
+    """Of an effect with many coefficients those of the one joint or leg that explains most of `y`, and of others beside
+    it that the evidence is for, up to half of them."""
+    assert atom.effect is not None
+    coefficients = atom.effect.coefficients(situation)
+    owners = [c.joint if c.leg is None else c.leg for c in coefficients]
+    parts = [[k for k, o in enumerate(owners) if o == owner] for owner in dict.fromkeys(owners) if owner is not None]
+    if len(coefficients) < _MANY or len(parts) < 2:
+        return None
+    grams = grams_of(white(atom.columns), white(y))
+    charge, lots, reached = math.log(len(parts)), 0, -math.inf
+    chosen: list[int] = []
+    while lots < max(len(parts) // 2, 1):
+        wider = [sorted(chosen + p) if not set(p) <= set(chosen) else p for p in parts]
+        evidence = alone(grams, [torch.tensor(p) for p in wider], _SIZE_SPREAD)[0][1:]
+        best = int(evidence.argmax())
+        if float(evidence[best]) < reached + charge or wider[best] == chosen:
+            break
+        chosen, reached = wider[best], float(evidence[best])
+        lots += 1
+    return replace(
+        atom, columns=atom.columns[..., chosen], log_prior=atom.log_prior - lots * charge, used=tuple(chosen)
+    )
+
+
+def _only(white: Whitening, usable: Tensor) -> Whitening:
+    """The same with rows that are left out set to zero."""
+    return replace(white, weight=torch.where(usable, white.weight, 0.0))
