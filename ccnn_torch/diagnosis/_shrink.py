@@ -16,7 +16,7 @@ __all__ = ["Gap", "HeldOut", "folds", "held_out", "resampled", "shrink_of"]
 
 _FOLDS = 5
 _REPEATS = 400
-_WIDER = 1.5
+_WIDER = 1.25
 
 
 @dataclass(frozen=True)

@@ -155,11 +155,11 @@ def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fo
     """The set without members that only mend the form of the others."""
     atoms = analysis.library.atoms
     while len(found.members) > 1:
-        beside = any(atoms[i].catch_all for i in found.members)
-        limits = {
-            i: _FORM_CATCH_ALL if atoms[i].catch_all else _BESIDE_CATCH_ALL if beside else _FORM for i in found.members
-        }
         shares = _net(analysis, found, tried)
+        # Beside a catch-all that carries less than they do, library effects are no form of it.
+        wild = max((share for i, (share, _) in shares.items() if atoms[i].catch_all), default=0.0)
+        named = max(_FORM, min(_BESIDE_CATCH_ALL, wild))
+        limits = {i: _FORM_CATCH_ALL if atoms[i].catch_all else named for i in found.members}
         # What leaves more than the noise when it goes is missed, however small it is.
         missed = _unexplained(analysis, found)
         idle = [
