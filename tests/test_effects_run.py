@@ -21,7 +21,7 @@ from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load
 from ccnn_torch.compensation._export import quiet_exporter, to_onnx
 from ccnn_torch.compensation._networks import describe_network, network_from_description
 from ccnn_torch.compensation._session import open_onnx
-from ccnn_torch.diagnosis.from_file import Verdict
+from ccnn_torch.diagnosis.from_file import Verdict, read_verdict
 from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, measured_pose, reached
 from ccnn_torch.effects.covariates import draw_covariates
 from ccnn_torch.errors import InputError
@@ -261,7 +261,7 @@ def _rename(told: dict[str, Any]) -> None:
     ("change", "sentence"),
     [
         (lambda d: d["verdict"].update(effects=[], none=True), "verdict: none: the gap is no more than the noise"),
-        (lambda d: d["verdict"].update(outside_library=True), "verdict: outside_library: something is there that no"),
+        (lambda d: d["verdict"].update(outside_library=True, effects=[]), "verdict: outside_library: something is there that no"),
         (lambda d: d["verdict"].update(effects=["outlier"]), "bad rows are the only finding"),
         (lambda d: d["verdict"].update(effects=["wobble"]), "'wobble' is no effect of this version's library"),
         (lambda d: d["verdict"].update(effects=["drift"]), "effects, drift: needs the time of each row"),
@@ -308,3 +308,16 @@ def test_a_lag_is_left_out_and_said(played: Path) -> None:
     assert known[0].shape.shape == (0,) and float(known[0].coefficients[0]) == 1.1e-5
     bare = replace(situation, covariates={n: v for n, v in covariates.items() if n != "time"})
     assert len(known[0].coefficients) == len(known[0].effect.coefficients(bare))
+
+
+def test_names_beside_something_outside_are_taken_and_the_rest_is_said(played: Path, tmp_path: Path) -> None:
+    told = json.loads((played / "found" / "diagnosis.json").read_text(encoding="utf-8"))
+    told["verdict"] |= {"outside_library": True, "driver": "workspace"}
+    (tmp_path / "d.json").write_text(json.dumps(told), encoding="utf-8")
+    verdict = read_verdict(tmp_path / "d.json", "five_bar", ["q1", "q2"])
+    rows = prepare(make_config(**keys(played, effects="none")))
+    covariates = dict(zip([c.name for c in rows.covariate_coordinates], rows.covariates[0].unbind(-1), strict=True))
+    situation = Situation(rows.mechanism, rows.joints[0], covariates, default_gravity(rows.mechanism))
+    known, notes = verdict.on(situation)
+    assert [k.effect.name for k in known] == told["verdict"]["effects"]
+    assert any("left to the network" in note for note in notes)

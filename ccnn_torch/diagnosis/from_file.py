@@ -41,11 +41,13 @@ class Verdict:
         path: the file.
         gravity: `3` [m/s²] as it was diagnosed with, or None where the file does not say.
         parameters: of each effect of the verdict, in its order: name -> value [SI].
+        outside: whether something is there beside them that no effect describes.
     """
 
     path: str
     gravity: Tensor | None
     parameters: dict[str, dict[str, float]]
+    outside: bool = False
 
     def on(self, situation: Situation) -> tuple[list[Known], list[str]]:
         """The effects on a machine and rows, for a controller that knows one row and not what was before it.
@@ -63,6 +65,8 @@ class Verdict:
             InputError: the machine or its covariates do not fit what the file names, or an effect needs history.
         """
         alone, found, notes = one_row_at_a_time(situation), [], []
+        if self.outside:
+            notes.append("Beside the effects something is there that none describes: it is left to the network.")
         for name, values in self.parameters.items():
             effect = make_effect(name)
             key = f"{self.path}: effects, {name}"
@@ -141,6 +145,7 @@ def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Ver
         str(path),
         None if gravity is None else torch.tensor(gravity, dtype=torch.float64),
         {name: listed[name] for name in names},
+        outside,
     )
 
 
@@ -149,7 +154,7 @@ def _refuse(path: str, names: list[str], outside: bool, nothing: bool, listed: d
     key, remedy = f"{path}: verdict", "write effects=none"
     if nothing:
         raise InputError(f"{key}: none: the gap is no more than the noise, so there is no effect to take; {remedy}")
-    if outside:
+    if outside and not names:
         raise InputError(
             f"{key}: outside_library: something is there that no effect describes, so none is taken; {remedy} and let "
             "the network learn it"
