@@ -261,7 +261,7 @@ def _rename(told: dict[str, Any]) -> None:
     ("change", "sentence"),
     [
         (lambda d: d["verdict"].update(effects=[], none=True), "verdict: none: the gap is no more than the noise"),
-        (lambda d: d["verdict"].update(outside_library=True, effects=[]), "verdict: outside_library: something is there that no"),
+        (lambda d: d["verdict"].update(outside_library=True, effects=[]), "something is there that no effect"),
         (lambda d: d["verdict"].update(effects=["outlier"]), "bad rows are the only finding"),
         (lambda d: d["verdict"].update(effects=["wobble"]), "'wobble' is no effect of this version's library"),
         (lambda d: d["verdict"].update(effects=["drift"]), "effects, drift: needs the time of each row"),
