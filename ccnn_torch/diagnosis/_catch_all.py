@@ -20,6 +20,8 @@ __all__ = ["ANY", "SPEED", "catch_alls"]
 
 # A catch-all is that much less probable than no deviation of its kind, before the data are seen.
 LOG_PRIOR = math.log(1e-3)
+# And one that holds most of what a library effect does has to be better than that effect by as much again.
+_NEAR_LIBRARY = math.log(1e-5)
 # A joint may be off by this much for reasons that nobody thought of [m], [rad].
 _SCALE = {"m": 3e-4, "rad": 5e-4}
 ANY = "*"
@@ -42,7 +44,11 @@ def catch_alls(situation: Situation) -> list[Atom]:
     around = torch.cat([one, place, _bumps(place, min(24, max(6, rows // 8)))], -1)
     most = min(_MOST_PLACES, max(_MOST, rows // 4))
     found = [_atom(situation, "workspace", around, most=most)]
-    found.append(_atom(situation, "workspace", torch.cat([one, *_configuration(situation)], -1), most=most))
+    found.append(
+        _atom(
+            situation, "workspace", torch.cat([one, *_configuration(situation)], -1), most=most, log_prior=_NEAR_LIBRARY
+        )
+    )
     for i, joint in enumerate(mechanism.joints):
         q = _unit(situation.joints[..., i : i + 1])
         found.append(_atom(situation, f"joint {joint.name}", torch.cat([one, q, _BEND * _bumps(q, few)], -1)))
@@ -65,7 +71,7 @@ def catch_alls(situation: Situation) -> list[Atom]:
         if driver.startswith("load"):
             # What a load asks of a joint goes with the slope of the kinematics, which is no plane over the workspace.
             features.append(_BEND * d * _products(place))
-            found.append(_atom(situation, driver, _asked(_under(situation, name)), most=most))
+            found.append(_atom(situation, driver, _asked(_under(situation, name)), most=most, log_prior=_NEAR_LIBRARY))
         if driver == "temperature" and "time" in situation.covariates:
             features += [_lagged(value, situation.covariates["time"], k) for k in (0.05, 0.2)]
         found.append(_atom(situation, driver, torch.cat(features, -1)))
@@ -76,7 +82,7 @@ def catch_alls(situation: Situation) -> list[Atom]:
         if sum(a.name.startswith(kind) for a in found) > 1:
             found.append(_atom(situation, f"{kind} {ANY}", torch.cat([one, *features], -1)))
             if kind == "load":
-                found.append(_atom(situation, f"{kind} {ANY}", _asked(situation), most=most))
+                found.append(_atom(situation, f"{kind} {ANY}", _asked(situation), most=most, log_prior=_NEAR_LIBRARY))
     return found
 
 
@@ -173,14 +179,21 @@ def _whole(situation: Situation, driver: str, features: Tensor) -> Atom:
     return Atom(driver, None, features.new_zeros(0), columns[..., shown], LOG_PRIOR)
 
 
-def _atom(situation: Situation, driver: str, features: Tensor, only: int | None = None, most: int = _MOST) -> Atom:
+def _atom(
+    situation: Situation,
+    driver: str,
+    features: Tensor,
+    only: int | None = None,
+    most: int = _MOST,
+    log_prior: float = LOG_PRIOR,
+) -> Atom:
     """features: `s x f`; columns = joints' Jacobian times the features, reduced to the directions that matter."""
     sizes = torch.tensor([_SCALE.get(j.unit, 5e-4) for j in situation.mechanism.joints], dtype=features.dtype)
     jacobian = situation.jacobian * sizes
     if only is not None:
         jacobian = jacobian[..., only : only + 1]
     columns = (jacobian.unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
-    return Atom(driver, None, features.new_zeros(0), _reduced(columns, most), LOG_PRIOR)
+    return Atom(driver, None, features.new_zeros(0), _reduced(columns, most), log_prior)
 
 
 def _reduced(columns: Tensor, most: int) -> Tensor:
