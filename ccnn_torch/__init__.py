@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from ccnn_torch.compensation import Compensator as Compensator
     from ccnn_torch.compensation import load_model as load_model
     from ccnn_torch.compensation import save_model as save_model
+    from ccnn_torch.diagnosis import diagnose as diagnose
     from ccnn_torch.mechanisms import Mechanism as Mechanism
     from ccnn_torch.mechanisms import load_mechanism as load_mechanism
     from ccnn_torch.pseudoerror import joint_deviations as joint_deviations
@@ -25,6 +26,7 @@ _HOMES = {
     "Compensator": "ccnn_torch.compensation",
     "Mechanism": "ccnn_torch.mechanisms",
     "calibrate": "ccnn_torch.runs.api",
+    "diagnose": "ccnn_torch.diagnosis",
     "identify": "ccnn_torch.runs.api",
     "joint_deviations": "ccnn_torch.pseudoerror",
     "load_mechanism": "ccnn_torch.mechanisms",

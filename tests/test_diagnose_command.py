@@ -17,7 +17,7 @@ Cli = Callable[..., tuple[int, str, str]]
 @pytest.fixture
 def rows(cli: Cli, tmp_path: Path) -> Path:
     """Records of a five-bar with play, beside a config that names them by a relative path."""
-    words = ("--mechanism", "five_bar", "--effect", "backlash", "--rows", "80", "--noise", "1e-5", "--seed", "3")
+    words = ("--mechanism", "five_bar", "--effect", "backlash", "--rows", "80", "--noise", "1e-5", "--seed", "4")
     code, _, told = cli("simulate", *words, "--out", tmp_path / "rows.csv", "--quiet")
     assert code == 0, told
     (tmp_path / "config.yaml").write_text("records: rows.csv\nmechanism: five_bar\nnoise: 1e-5\n", encoding="utf-8")
@@ -36,7 +36,7 @@ def test_a_config_beside_its_records_gives_verdict_and_report(
     assert results["verdict"]["effects"] == ["backlash"]
     assert "acklash" in shown and " SI " not in shown
     network = results["network"]
-    assert network["reason"] == "what the effects leave is no more than the noise" or network["gain_ci95"][0] <= 0
+    assert network["reason"] == "what the effects leave is no more than the noise"
     assert [step["name"] for step in results["in_order"]] == ["backlash"] and results["where_ci95"][
         "joints"
     ].keys() == {

@@ -13,7 +13,7 @@ from ccnn_torch.diagnosis._candidates import cleaned, first_candidates, plain_at
 from ccnn_torch.diagnosis._catch_all import catch_alls
 from ccnn_torch.diagnosis._evidence import grams_of
 from ccnn_torch.diagnosis._linear import tangent
-from ccnn_torch.diagnosis._search import Found, Library, search
+from ccnn_torch.diagnosis._search import Dictionary, Found, search
 from ccnn_torch.diagnosis._whitening import Whitening, fitted_whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 
@@ -34,7 +34,7 @@ class Analysis:
         measured: poses, `s x p`.
         residual: measured less nominal, `s x c0` [m, rad].
         whitening: channels, noise and row weights in the end.
-        library: atoms and Gram matrices in the end.
+        dictionary: atoms and Gram matrices in the end.
         columns: of every atom, whitened, `s x c x P`.
         y: what they explain, whitened, `s x c`.
         found: sets, most probable first.
@@ -46,7 +46,7 @@ class Analysis:
     measured: Tensor
     residual: Tensor
     whitening: Whitening
-    library: Library
+    dictionary: Dictionary
     columns: Tensor
     y: Tensor
     found: list[Found]
@@ -57,7 +57,7 @@ class Analysis:
         """The effects of a set with their most probable numbers; catch-alls are left out."""
         out = []
         for i, mean in zip(found.members, found.mean, strict=True):
-            atom = self.library.atoms[i]
+            atom = self.dictionary.atoms[i]
             if atom.effect is not None:
                 out.append(Acting(atom.effect, atom.shape, atom.spread(self.situation, mean)))
         return out
@@ -100,7 +100,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
     before: tuple[str, ...] | None = None
     for _ in range(2):
-        best = next(f for f in result.found if not any(result.library.atoms[i].catch_all for i in f.members))
+        best = next(f for f in result.found if not any(result.dictionary.atoms[i].catch_all for i in f.members))
         acting = result.acting(best)
         if before == (before := tuple(a.effect.name for a in acting)) and noise is not None:
             break
@@ -159,9 +159,9 @@ def _searched(
     groups = tuple(torch.arange(e - a.columns.shape[-1], e) for a, e in zip(atoms, ends, strict=True))
     # Noise that was given is right to some per cent, however many rows there are.
     known = white.known * (1 + y[keep].numel() / 100)
-    library = Library(tuple(atoms), groups, grams_of(columns[keep], y[keep]), known)
+    dictionary = Dictionary(tuple(atoms), groups, grams_of(columns[keep], y[keep]), known)
     floor = min(float((rich / white.sigma).square().mean()), 1.0)
-    return Analysis(situation, measured, target, white, library, columns, y, search(library), near, floor)
+    return Analysis(situation, measured, target, white, dictionary, columns, y, search(dictionary), near, floor)
 
 
 def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitening:
@@ -169,9 +169,9 @@ def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitenin
     best, white = result.found[0], result.whitening
     theta = torch.zeros(result.columns.shape[-1], dtype=result.columns.dtype)
     for i, mean in zip(best.members, best.mean, strict=True):
-        theta[result.library.groups[i]] = mean
-    raw = result.residual - torch.cat([a.columns for a in result.library.atoms], -1) @ theta
-    free = 1 - best.effective / max(result.library.grams.values, 1.0)
+        theta[result.dictionary.groups[i]] = mean
+    raw = result.residual - torch.cat([a.columns for a in result.dictionary.atoms], -1) @ theta
+    free = 1 - best.effective / max(result.dictionary.grams.values, 1.0)
     if noise is None:
         rows = (white.weight > 0) & usable
         spread = raw[rows][:, white.channels].abs().median(0).values * 1.4826 / max(free, 0.1) ** 0.5

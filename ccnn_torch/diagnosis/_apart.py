@@ -27,12 +27,12 @@ def signatures_apart(analysis: Analysis, judgement: Judgement) -> dict[str, dict
     Returns:
         `{effect: {other: {"angle" [rad], "separation" [1, times the noise]}}}`.
     """
-    atoms, keep = analysis.library.atoms, analysis.whitening.keep()
+    atoms, keep = analysis.dictionary.atoms, analysis.whitening.keep()
     found = judgement.found
     flat = analysis.columns[keep].flatten(0, 1)
 
     def columns(members: Sequence[int]) -> Tensor:
-        return torch.cat([flat[:, :0], *(flat[:, analysis.library.groups[i]] for i in members)], -1)
+        return torch.cat([flat[:, :0], *(flat[:, analysis.dictionary.groups[i]] for i in members)], -1)
 
     told: dict[str, dict[str, dict[str, float]]] = {}
     for i, mean in zip(found.members, found.mean, strict=True):

@@ -109,16 +109,16 @@ def remaining_gain(
 
 def _left(analysis: Analysis, judgement: Judgement, fold: Tensor) -> Tensor:
     """What the effects, fitted without each fold, leave of all rows in units of the noise, `f x s x c`; fold: `s`."""
-    library, white = analysis.library, analysis.whitening
+    dictionary, white = analysis.dictionary, analysis.whitening
     keep = white.keep()
-    chosen = [library.groups[i] for i in judgement.found.members if not library.atoms[i].catch_all]
+    chosen = [dictionary.groups[i] for i in judgement.found.members if not dictionary.atoms[i].catch_all]
     x, y = analysis.columns[keep], analysis.y[keep]
-    weight, whole = white.weight[keep].sqrt()[:, None], library.grams
+    weight, whole = white.weight[keep].sqrt()[:, None], dictionary.grams
     left = []
     for k in range(_FOLDS):
         away = grams_of(x[fold == k], y[fold == k])
         rest = Grams(whole.xx - away.xx, whole.xy - away.xy, whole.yy - away.yy, whole.values - away.values)
-        fit = fit_sets(rest, [chosen], library.noise_dof, 6)
+        fit = fit_sets(rest, [chosen], dictionary.noise_dof, 6)
         index = fit.columns[0][fit.columns[0] >= 0]
         left.append((y - x[..., index] @ fit.mean[0, : len(index)]) / weight)
     return torch.stack(left)

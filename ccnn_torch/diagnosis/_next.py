@@ -73,7 +73,7 @@ def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Found
 
     What cannot be told from the verdict is among them, even where the search did not come across it.
     """
-    atoms, own = analysis.library.atoms, judgement.found
+    atoms, own = analysis.dictionary.atoms, judgement.found
     plain = [
         (probability, one)
         for _, driver, probability, one in judgement.leading
@@ -89,7 +89,7 @@ def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Found
         if a.name == name
     }
     known = [_names(analysis, one) for _, one in plain]
-    for one in sorted(scored(analysis.library, sorted(like)), key=lambda f: -f.log_posterior):
+    for one in sorted(scored(analysis.dictionary, sorted(like)), key=lambda f: -f.log_posterior):
         if _names(analysis, one) not in known:
             known.append(_names(analysis, one))
             plain.append((plain[0][0] * math.exp(min(one.log_posterior - own.log_posterior, 0.0)), one))
@@ -97,7 +97,7 @@ def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Found
 
 
 def _names(analysis: Analysis, found: Found) -> set[str]:
-    return {analysis.library.atoms[i].name for i in found.members}
+    return {analysis.dictionary.atoms[i].name for i in found.members}
 
 
 def _candidates(analysis: Analysis, seed: int) -> Situation:
@@ -133,7 +133,7 @@ def _columns(analysis: Analysis, found: Found, there: Situation) -> Tensor:
     """Deviation at the candidates per plausible size of each coefficient of a set, in units of the noise."""
     columns = [there.jacobian[..., :0]]
     for i in found.members:
-        atom = analysis.library.atoms[i]
+        atom = analysis.dictionary.atoms[i]
         assert atom.effect is not None
         full = scaled_signature(there, atom.effect, atom.shape)
         columns.append(full if atom.used is None else full[..., list(atom.used)])

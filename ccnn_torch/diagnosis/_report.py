@@ -24,7 +24,7 @@ class Blocks:
         self.before = residual[white.keep()][:, white.channels]
         self.floor = noise_floor(analysis)
         self.position = white.channels < 3
-        atoms = analysis.library.atoms
+        atoms = analysis.dictionary.atoms
         self.candidates = _best_alone(analysis)
         members = judgement.found.members
         alone = [[i] for i in self.candidates.values()]
@@ -41,7 +41,7 @@ class Blocks:
         white = self.analysis.whitening
         channels = self.position if position else ~self.position
         exact = white.known > 0
-        dof = 0.0 if exact else max(self.analysis.library.grams.values - self.judgement.found.effective, 1.0)
+        dof = 0.0 if exact else max(self.analysis.dictionary.grams.values - self.judgement.found.effective, 1.0)
         return shrink_of(self.before, held, self.floor, channels, dof, self.seed)
 
     def main(self, held: HeldOut) -> Gap:
@@ -70,13 +70,13 @@ def in_order(made: Blocks) -> list[dict[str, Any]]:
 def noise_floor(analysis: Analysis) -> Tensor:
     """Variance of the noise, `c`: given, or the mean square that the most probable set of all leaves, tails and all."""
     white, best = analysis.whitening, analysis.found[0]
-    if white.known > 0 or not analysis.library.grams.values:
+    if white.known > 0 or not analysis.dictionary.grams.values:
         return white.sigma.square()
     keep = white.keep()
     left = analysis.y[keep]
     for i, mean in zip(best.members, best.mean, strict=True):
-        left = left - analysis.columns[keep][..., analysis.library.groups[i]] @ mean
-    free = max(1 - best.effective / analysis.library.grams.values, 0.1)
+        left = left - analysis.columns[keep][..., analysis.dictionary.groups[i]] @ mean
+    free = max(1 - best.effective / analysis.dictionary.grams.values, 0.1)
     return (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * analysis.floor
 
 
@@ -109,7 +109,7 @@ def _effect(made: Blocks, name: str) -> dict[str, Any]:
 def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
     """Value and standard deviation in the most probable set that has it, else by itself."""
     analysis = made.analysis
-    atoms = analysis.library.atoms
+    atoms = analysis.dictionary.atoms
     own = made.judgement.found
     if not any(atoms[i].name == name for i in own.members):
         alone = made.candidates[name]
@@ -133,7 +133,7 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
 
 def _best_alone(analysis: Analysis) -> dict[str, int]:
     """Of each library name the atom that the verdict's set uses, or that is most probable by itself."""
-    atoms = analysis.library.atoms
+    atoms = analysis.dictionary.atoms
     best: dict[str, int] = {}
     for found in analysis.found:
         if len(found.members) == 1 and not atoms[found.members[0]].catch_all:

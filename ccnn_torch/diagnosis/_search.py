@@ -12,7 +12,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._evidence import Grams, fit_sets, of_like_width
 
-__all__ = ["Found", "Library", "scored", "search"]
+__all__ = ["Dictionary", "Found", "scored", "search"]
 
 _MOST = 4
 # A third cause at once is rarer still than a second one.
@@ -20,7 +20,7 @@ _CROWD = math.log(0.1)
 
 
 @dataclass(frozen=True)
-class Library:
+class Dictionary:
     """Atoms with their columns side by side: `groups[i]` are the columns of atom i in `grams`."""
 
     atoms: tuple[Atom, ...]
@@ -48,17 +48,17 @@ class Found:
     effective: float
 
 
-def scored(library: Library, sets: Sequence[tuple[int, ...]], iterations: int = 8) -> list[Found]:
+def scored(dictionary: Dictionary, sets: Sequence[tuple[int, ...]], iterations: int = 8) -> list[Found]:
     """Fit the sets, those of like width side by side."""
-    groups = [[library.groups[i] for i in s] for s in sets]
+    groups = [[dictionary.groups[i] for i in s] for s in sets]
     found: dict[int, Found] = {}
     for members in of_like_width(groups):
-        fits = fit_sets(library.grams, [groups[k] for k in members], library.noise_dof, iterations)
+        fits = fit_sets(dictionary.grams, [groups[k] for k in members], dictionary.noise_dof, iterations)
         for row, k in enumerate(members):
-            prior = sum(library.atoms[i].log_prior for i in sets[k]) + _CROWD * max(len(sets[k]) - 2, 0)
+            prior = sum(dictionary.atoms[i].log_prior for i in sets[k]) + _CROWD * max(len(sets[k]) - 2, 0)
             evidence = float(fits.log_evidence[row])
             evidence = evidence if math.isfinite(evidence) else -math.inf
-            sizes = [len(library.groups[i]) for i in sets[k]]
+            sizes = [len(dictionary.groups[i]) for i in sets[k]]
             mean = fits.mean[row, : sum(sizes)]
             found[k] = Found(
                 members=tuple(sets[k]),
@@ -74,14 +74,14 @@ def scored(library: Library, sets: Sequence[tuple[int, ...]], iterations: int = 
     return [found[k] for k in range(len(sets))]
 
 
-def search(library: Library, beam: int = 5) -> list[Found]:
+def search(dictionary: Dictionary, beam: int = 5) -> list[Found]:
     """Sets by log posterior, best first; no set holds a name twice, or two catch-alls."""
-    atoms = library.atoms
+    atoms = dictionary.atoms
     tried: dict[tuple[int, ...], Found] = {}
 
     def look(sets: Sequence[tuple[int, ...]]) -> None:
         fresh = sorted({s for s in sets if s not in tried})
-        tried.update(zip(fresh, scored(library, fresh), strict=True))
+        tried.update(zip(fresh, scored(dictionary, fresh), strict=True))
 
     def best(size: int, count: int) -> list[Found]:
         return sorted((f for s, f in tried.items() if len(s) == size), key=lambda f: -f.log_posterior)[:count]

@@ -58,15 +58,15 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     sigma = analysis.whitening.sigma
     left = [y.clone() for _ in sets]
     uncertain = [torch.zeros_like(y) for _ in sets]
-    groups = [[analysis.library.groups[i] for i in s] for s in sets]
-    whole = analysis.library.grams
+    groups = [[analysis.dictionary.groups[i] for i in s] for s in sets]
+    whole = analysis.dictionary.grams
     for k in range(_FOLDS):
         there = fold == k
         away = grams_of(x[there], y[there])
         rest = Grams(whole.xx - away.xx, whole.xy - away.xy, whole.yy - away.yy, whole.values - away.values)
         order = sorted(range(len(sets)), key=lambda i: sum(map(len, groups[i])))
         for part in (order[i : i + 8] for i in range(0, len(order), 8)):
-            fits = fit_sets(rest, [groups[i] for i in part], analysis.library.noise_dof, 6)
+            fits = fit_sets(rest, [groups[i] for i in part], analysis.dictionary.noise_dof, 6)
             for row, i in enumerate(part):
                 columns = fits.columns[row][fits.columns[row] >= 0]
                 m = len(columns)

@@ -83,7 +83,7 @@ def judge(analysis: Analysis) -> Judgement:
         # Something is there that looks like a part of these effects, and nothing of what makes them what they are.
         names, outside = names - borrowed, True
         driver = driver or _driver_alone(analysis)
-    marginal: dict[str, float] = {a.name: 0.0 for a in analysis.library.atoms if not a.catch_all}
+    marginal: dict[str, float] = {a.name: 0.0 for a in analysis.dictionary.atoms if not a.catch_all}
     for members, _, p, _ in leading:
         for name in members:
             marginal[name] += p
@@ -105,9 +105,9 @@ def judge(analysis: Analysis) -> Judgement:
 
 def _borrowed(analysis: Analysis, found: Found) -> frozenset[str]:
     """Names of a set that rest on what other effects do as well."""
-    grams, names = analysis.library.grams, set()
+    grams, names = analysis.dictionary.grams, set()
     for i, mean in zip(found.members, found.mean, strict=True):
-        atom, group = analysis.library.atoms[i], analysis.library.groups[i]
+        atom, group = analysis.dictionary.atoms[i], analysis.dictionary.groups[i]
         own = torch.tensor([not c.borrowed for c in atom.coefficients(analysis.situation)])
         if atom.catch_all or bool(own.all()):
             continue
@@ -120,7 +120,7 @@ def _borrowed(analysis: Analysis, found: Found) -> frozenset[str]:
 
 def _could_be_another(analysis: Analysis, found: Found) -> bool:
     """Whether what a set can do holds what some candidate beside it is likely to do, to within the noise."""
-    atoms, groups, grams = analysis.library.atoms, analysis.library.groups, analysis.library.grams
+    atoms, groups, grams = analysis.dictionary.atoms, analysis.dictionary.groups, analysis.dictionary.grams
     names = {atoms[i].name for i in found.members}
     own = torch.cat([groups[i] for i in found.members])
     inverse = torch.linalg.pinv(grams.xx[own][:, own], rtol=1e-9, hermitian=True)
@@ -139,10 +139,10 @@ def _net(
     analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]
 ) -> dict[int, tuple[float, tuple[int, ...]]]:
     """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
-    gap = max(float(analysis.library.grams.yy) - analysis.floor * analysis.library.grams.values, 1e-300)
+    gap = max(float(analysis.dictionary.grams.yy) - analysis.floor * analysis.dictionary.grams.values, 1e-300)
     fewer = {i: tuple(m for m in found.members if m != i) for i in found.members}
     fresh = [s for s in fewer.values() if s not in tried]
-    tried.update(zip(fresh, scored(analysis.library, fresh), strict=True))
+    tried.update(zip(fresh, scored(analysis.dictionary, fresh), strict=True))
     return {i: ((tried[s].rss - found.rss) / gap, s) for i, s in fewer.items()}
 
 
@@ -153,10 +153,10 @@ def _smallest(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fou
 
 def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]) -> Found:
     """The set without members that only mend the form of the others."""
-    atoms = analysis.library.atoms
+    atoms = analysis.dictionary.atoms
     while len(found.members) > 1:
         shares = _net(analysis, found, tried)
-        # Library effects are a form of the catch-all beside them only where that carries much more than they do.
+        # Dictionary effects are a form of the catch-all beside them only where that carries much more than they do.
         wild = max((share for i, (share, _) in shares.items() if atoms[i].catch_all), default=0.0)
         named = max(_FORM, min(_BESIDE_CATCH_ALL, wild / 2))
         limits = {i: _FORM_CATCH_ALL if atoms[i].catch_all else named for i in found.members}
@@ -181,7 +181,7 @@ def _plainest(found: list[Found]) -> Found:
 
 
 def _named(analysis: Analysis, found: Found) -> tuple[frozenset[str], str | None]:
-    atoms = analysis.library.atoms
+    atoms = analysis.dictionary.atoms
     names = frozenset(atoms[i].name for i in found.members if not atoms[i].catch_all)
     driver = next((atoms[i].name for i in found.members if atoms[i].catch_all), None)
     if driver is not None and driver.endswith(ANY):
@@ -191,29 +191,29 @@ def _named(analysis: Analysis, found: Found) -> tuple[frozenset[str], str | None
 
 def _leader(analysis: Analysis, kind: str) -> str:
     """Of drivers of one kind the one that explains most by itself."""
-    atoms = analysis.library.atoms
+    atoms = analysis.dictionary.atoms
     alone = (f for f in analysis.found if len(f.members) == 1)
     names = (atoms[f.members[0]].name for f in alone)
     return next(n for n in names if n.startswith(kind) and not n.endswith(ANY))
 
 
 def _energy(analysis: Analysis, found: Found, name: str) -> float:
-    return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.library.atoms[i].name == name)
+    return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.dictionary.atoms[i].name == name)
 
 
 def _above_noise(analysis: Analysis, found: Found) -> bool:
     """Whether a set leaves more than the noise by three standard deviations."""
-    count = analysis.library.grams.values
+    count = analysis.dictionary.grams.values
     return found.rss / max(count - found.effective, 1.0) > analysis.floor * (1 + 3 * math.sqrt(2 / count))
 
 
 def _unexplained(analysis: Analysis, found: Found) -> bool:
     """Whether what a set leaves is clearly more than the noise (given, or of the richest fit)."""
-    count = analysis.library.grams.values
+    count = analysis.dictionary.grams.values
     left = found.rss / max(count - found.effective, 1.0)
     floor = analysis.floor
     significant = left > floor * (1 + 5 * math.sqrt(2 / count))
-    gap = float(analysis.library.grams.yy) / count
+    gap = float(analysis.dictionary.grams.yy) / count
     much = left - floor > _VETO * max(gap - floor, 0.0) and left > _MUCH * floor
     return significant and (much or left > _VETO_NOISE * floor)
 
@@ -229,14 +229,14 @@ def _driver_of_remainder(analysis: Analysis) -> str | None:
 
 def _driver_alone(analysis: Analysis) -> str | None:
     """The driver that explains most by itself."""
-    atoms = analysis.library.atoms
+    atoms = analysis.dictionary.atoms
     alone = (f for f in analysis.found if len(f.members) == 1 and atoms[f.members[0]].catch_all)
     return next((_named(analysis, f)[1] for f in alone), None)
 
 
 def _classes(analysis: Analysis, found: Found, names: frozenset[str]) -> dict[str, tuple[str, ...]]:
     """For each name of the set those that can stand in its place, as far as these rows can tell."""
-    atoms = analysis.library.atoms
+    atoms = analysis.dictionary.atoms
     library = [i for i, a in enumerate(atoms) if not a.catch_all]
     classes: dict[str, tuple[str, ...]] = {}
     for i in found.members:
@@ -244,7 +244,7 @@ def _classes(analysis: Analysis, found: Found, names: frozenset[str]) -> dict[st
             continue
         others = [j for j in library if atoms[j].name not in names]
         sets = [tuple(sorted(j if m == i else m for m in found.members)) for j in others]
-        trials = scored(analysis.library, sets)
+        trials = scored(analysis.dictionary, sets)
         like = {
             atoms[j].name: t.log_posterior
             for j, t in zip(others, trials, strict=True)

@@ -41,7 +41,7 @@ class _Draws:
         rows = resampled(len(analysis.whitening.keep()), generator)
         self.counts = torch.zeros(rows.shape, dtype=analysis.y.dtype)
         self.counts.scatter_add_(1, rows, torch.ones_like(self.counts))
-        values, effective = analysis.library.grams.values, analysis.found[0].effective
+        values, effective = analysis.dictionary.grams.values, analysis.found[0].effective
         spread = 0.0 if analysis.whitening.known > 0 else math.sqrt(2 / max(values - effective, 1.0))
         drawn = torch.randn(len(rows), 1, generator=generator, dtype=self.counts.dtype)
         self.floor, self.floors = analysis.floor, (analysis.floor * (1 + spread * drawn)).clamp_min(0.0)

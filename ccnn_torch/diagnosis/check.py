@@ -58,7 +58,7 @@ def check_rows(
     keep = white.keep()
     spans: dict[str, Tensor] = {}
     weak = {}
-    for atom, group in zip(analysis.library.atoms, analysis.library.groups, strict=True):
+    for atom, group in zip(analysis.dictionary.atoms, analysis.dictionary.groups, strict=True):
         if atom.catch_all or atom.name in spans:
             continue
         x = analysis.columns[keep][..., group].flatten(0, 1)

@@ -57,13 +57,13 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
     }
     arrays |= {f"covariate.{name}": value for name, value in situation.covariates.items()}
     labels: dict[str, Any] = {}
-    parts = [analysis.library.atoms[i].columns @ mean for i, mean in zip(found.members, found.mean, strict=True)]
+    parts = [analysis.dictionary.atoms[i].columns @ mean for i, mean in zip(found.members, found.mean, strict=True)]
     columns = _drivers(analysis, place)
     shown = set(diagnosis.verdict["effects"]) | {diagnosis.verdict["driver"]}
     # What the whole set leaves, catch-all and all: the signature of one cause is drawn with all others taken off.
     left = _remainder(analysis, residual, found.members, seed, catch_alls=True)
     for i, part in zip(found.members, parts, strict=True):
-        name = analysis.library.atoms[i].name
+        name = analysis.dictionary.atoms[i].name
         if name not in shown or not bool((part[keep] != 0).any()):
             continue
         # In the pose and in the joints; what follows one column best shows the cause best.
@@ -87,7 +87,7 @@ def _remainder(
     analysis: Analysis, residual: Tensor, members: tuple[int, ...], seed: int, *, catch_alls: bool = False
 ) -> Tensor:
     """What a set's effects leave of each row by a fit to others, `s x c0`; the residual where a row is set aside."""
-    atoms = analysis.library.atoms
+    atoms = analysis.dictionary.atoms
     chosen = [i for i in members if catch_alls or not atoms[i].catch_all]
     out = residual.clone()
     keep = analysis.whitening.keep()

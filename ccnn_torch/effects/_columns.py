@@ -11,7 +11,16 @@ from ccnn_torch.effects._situation import Situation
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
 from ccnn_torch.rotations import skew
 
-__all__ = ["TWIST", "by_joint", "caused_by", "own_parameters", "per_force", "shown_columns", "twist_columns"]
+__all__ = [
+    "TWIST",
+    "by_joint",
+    "caused_by",
+    "own_parameters",
+    "parameter_columns",
+    "per_force",
+    "shown_columns",
+    "twist_columns",
+]
 
 _SHOWN = 1e-9
 
@@ -55,6 +64,13 @@ def own_parameters(mechanism: Mechanism) -> list[int]:
 def caused_by(mechanism: Mechanism, cause: str) -> list[int]:
     """Numbers of the mechanism's own parameters that are wrong by this cause, ``geometry`` where they name none."""
     return [k for k in own_parameters(mechanism) if (mechanism.geometry[k].cause or "geometry") == cause]
+
+
+def parameter_columns(situation: Situation, cause: str) -> Tensor:
+    """Change of the mechanism's parameters by one in each of those that `caused_by` gives, `... x s x k x m`."""
+    chosen = torch.eye(len(situation.mechanism.geometry), dtype=situation.joints.dtype, device=situation.joints.device)
+    chosen = chosen[:, caused_by(situation.mechanism, cause)]
+    return chosen.expand(*situation.joints.shape[:-1], *chosen.shape)
 
 
 def twist_columns(situation: Situation, arm: Tensor, axes: Tensor) -> Tensor:

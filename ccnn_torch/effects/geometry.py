@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import plausible_error
-from ccnn_torch.effects._columns import caused_by
+from ccnn_torch.effects._columns import caused_by, parameter_columns
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
@@ -54,7 +53,4 @@ class Geometry:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """Columns of the identity at every row, `... x s x k x m`."""
-        count = len(situation.mechanism.geometry)
-        eye = torch.eye(count, dtype=situation.joints.dtype, device=situation.joints.device)
-        chosen = eye[:, caused_by(situation.mechanism, self.name)]
-        return chosen.expand(*situation.joints.shape[:-1], *chosen.shape)
+        return parameter_columns(situation, self.name)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import plausible_error
-from ccnn_torch.effects._columns import caused_by, own_parameters
+from ccnn_torch.effects._columns import caused_by, own_parameters, parameter_columns
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.mechanisms import Mechanism
@@ -47,10 +46,7 @@ class ParameterCause:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """Columns of the identity at every row, `... x s x k x m`."""
-        count = len(situation.mechanism.geometry)
-        eye = torch.eye(count, dtype=situation.joints.dtype, device=situation.joints.device)
-        chosen = eye[:, caused_by(situation.mechanism, self.cause)]
-        return chosen.expand(*situation.joints.shape[:-1], *chosen.shape)
+        return parameter_columns(situation, self.cause)
 
 
 def parameter_causes(mechanism: Mechanism) -> list[ParameterCause]:

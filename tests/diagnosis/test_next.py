@@ -71,7 +71,7 @@ def test_chosen_rows_say_more_together_than_any_drawn_at_random_would() -> None:
     wanted = said.next_measurements
 
     def names(found: Found) -> set[str]:
-        return {analysis.library.atoms[i].name for i in found.members}
+        return {analysis.dictionary.atoms[i].name for i in found.members}
 
     first, *others = [one for _, driver, _, one in said.judgement.leading if driver is None]
     second = next(one for one in others if sorted(names(first) ^ names(one)) == wanted[0]["separates"])

@@ -50,18 +50,18 @@ def test_why_one_effect_is_not_told_from_another_is_their_angle() -> None:
     pairs = [{"joint_offset", other} for other in effect["signatures"]]
     assert all(set(m["separates"]) in pairs for m in said.next_measurements[:3])
     analysis, found = said.analysis, said.judgement.found
-    keep, library = analysis.whitening.keep(), analysis.library
+    keep, dictionary = analysis.whitening.keep(), analysis.dictionary
 
     def columns(name: str) -> np.ndarray:
-        atom = next(i for i, a in enumerate(library.atoms) if a.name == name)
-        return analysis.columns[keep][..., library.groups[atom]].flatten(0, 1).numpy()
+        atom = next(i for i, a in enumerate(dictionary.atoms) if a.name == name)
+        return analysis.columns[keep][..., dictionary.groups[atom]].flatten(0, 1).numpy()
 
     q, _ = np.linalg.qr(columns("compliance"))
-    place = [library.atoms[i].name for i in found.members].index("joint_offset")
+    place = [dictionary.atoms[i].name for i in found.members].index("joint_offset")
     own = columns("joint_offset") @ found.mean[place].numpy()
     own = (own - q @ (q.T @ own))[:, None]
     for other, told in effect["signatures"].items():
-        if sum(a.name == other for a in library.atoms) > 1:
+        if sum(a.name == other for a in dictionary.atoms) > 1:
             continue
         z = columns(other)
         angle = float(subspace_angles(own, z - q @ (q.T @ z))[0])

@@ -183,7 +183,9 @@ def test_what_a_load_holds_on_a_flank_does_not_depend_on_the_side_of_approach() 
     push = held.push(torch.tensor(10.0, dtype=torch.float64))
     pushed = push.abs() > 20
     assert bool(pushed.any()) and torch.allclose(sides[0][pushed], sides[1][pushed], atol=1e-12)
-    assert torch.allclose(sides[0][pushed], 1e-4 * push[pushed].sign(), rtol=0.01)
+    # The play is the way between the two sides of approach, which the soft edge leaves a little short of the flanks.
+    flank = 1e-4 / math.tanh(1 / 0.3)
+    assert torch.allclose(sides[0][pushed], flank * push[pushed].sign())
 
 
 @pytest.mark.parametrize("name", ["five_bar", "stewart"])
