@@ -11,8 +11,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._candidates import cleaned, first_candidates, plain_atom, renewed_candidates
 from ccnn_torch.diagnosis._catch_all import catch_alls
-from ccnn_torch.diagnosis._evidence import grams_of
-from ccnn_torch.diagnosis._linear import tangent
+from ccnn_torch.diagnosis._linear import remainder, tangent
 from ccnn_torch.diagnosis._search import Dictionary, Found, search
 from ccnn_torch.diagnosis._whitening import Whitening, fitted_whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
@@ -23,6 +22,9 @@ __all__ = ["Analysis", "analyse"]
 _CONDITION = 50.0
 # Or where the joints move the platform so many times as far as usual.
 _GAIN = 3.0
+# Another look is spared where the noise of the channels changed among each other by less than this, and the fit by such
+# a share of the noise's square.
+_SAME_NOISE, _SAME_FIT = 0.1, 0.01
 
 
 @dataclass(frozen=True)
@@ -102,17 +104,33 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     for _ in range(2):
         best = next(f for f in result.found if not any(result.dictionary.atoms[i].catch_all for i in f.members))
         acting = result.acting(best)
-        if before == (before := tuple(a.effect.name for a in acting)) and noise is not None:
+        same = before == (before := tuple(a.effect.name for a in acting))
+        new = _renewed(result, noise, usable)
+        if same and _settled(result, best, new, remainder(situation, measured, acting)):
             break
         there, target = tangent(situation, measured, acting)
         ok = usable & torch.isfinite(target).all(-1) & torch.isfinite(there.jacobian).flatten(1).all(-1)
         if int(ok.sum()) < 0.9 * int(usable.sum()):
             there, target, ok = situation, residual, usable
         target = torch.where(ok[:, None], target, 0.0)
-        white = _renewed(result, noise, ok)
+        white = new if bool((ok == usable).all()) else _renewed(result, noise, ok)
         atoms = renewed_candidates(situation, there, measured, target, effects, acting, starts, white, ok, fitted)
         result = _searched(situation, measured, target, white, [*atoms, *rest], near, rich, fitted)
     return result
+
+
+def _settled(result: Analysis, best: Found, new: Whitening, left: Tensor) -> bool:
+    """Whether to look again would change little: the same rows are set aside, the channels' noise is in the same
+    proportion, and what the best set leaves of every row by the machine itself, `s x c0`, is what the linear model
+    says."""
+    old = result.whitening
+    change = (new.sigma / old.sigma).log()
+    if not torch.equal(new.keep(), old.keep()) or float((change - change.mean()).abs().max()) > _SAME_NOISE:
+        return False
+    linear = result.y
+    for i, mean in zip(best.members, best.mean, strict=True):
+        linear = linear - result.columns[..., result.dictionary.groups[i]] @ mean
+    return float((old(torch.nan_to_num(left)) - linear)[old.keep()].square().mean()) < _SAME_FIT
 
 
 def _near_singular(situation: Situation, channels: Tensor) -> Tensor:
@@ -155,13 +173,11 @@ def _searched(
         y = (y.flatten() - q @ (q.mT @ y.flatten())).reshape(y.shape)
         flat = columns.flatten(0, 1)
         columns = (flat - q @ (q.mT @ flat)).reshape(columns.shape)
-    ends = torch.tensor([a.columns.shape[-1] for a in atoms]).cumsum(0).tolist()
-    groups = tuple(torch.arange(e - a.columns.shape[-1], e) for a, e in zip(atoms, ends, strict=True))
     # Noise that was given is right to some per cent, however many rows there are.
     known = white.known * (1 + y[keep].numel() / 100)
-    dictionary = Dictionary(tuple(atoms), groups, grams_of(columns[keep], y[keep]), known)
+    dictionary, found = search(atoms, columns[keep], y[keep], known)
     floor = min(float((rich / white.sigma).square().mean()), 1.0)
-    return Analysis(situation, measured, target, white, dictionary, columns, y, search(dictionary), near, floor)
+    return Analysis(situation, measured, target, white, dictionary, columns, y, found, near, floor)
 
 
 def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitening:

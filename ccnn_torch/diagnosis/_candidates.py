@@ -87,19 +87,24 @@ def renewed_candidates(
         starts: shapes found at first: they stay candidates, since what acts now may have hidden the better ones.
         white, usable, fitted: as in `first_candidates`.
     """
+
+    def beside(others: Sequence[Acting]) -> Tensor:
+        return torch.where(usable[:, None], torch.nan_to_num(remainder(situation, measured, others)), 0.0)
+
     atoms: list[Atom] = []
+    all_act = beside(acting)
     for effect in effects:
         others = [a for a in acting if a.effect is not effect]
         if not effect.shapes(situation):
             atoms.append(cleaned(plain_atom(situation, there, effect), usable))
-            left = torch.where(usable[:, None], torch.nan_to_num(remainder(situation, measured, others)), 0.0)
+            left = all_act if len(others) == len(acting) else beside(others)
             part = _best_part(situation, atoms[-1], white, left)
             atoms += [part] if part is not None else []
             continue
         columns = [_atom(situation, there, a.effect, Shaped(a.shape, None, 0.0)) for a in others]
-        beside = torch.cat([white(fitted), *(white(cleaned(c, usable).columns) for c in columns)], -1)
+        present = torch.cat([white(fitted), *(white(cleaned(c, usable).columns) for c in columns)], -1)
         start = next((a.shape for a in acting if a.effect is effect), None)
-        shaped = Scan(situation, there, effect, _only(white, usable)).best(white(target), beside, start)
+        shaped = Scan(situation, there, effect, _only(white, usable)).best(white(target), present, start)
         atoms.append(cleaned(_atom(situation, there, effect, shaped), usable))
         for old in (a for a in starts if a.effect is effect and not _same_shape(a, shaped)):
             so = Shaped(old.shape, old.used, LOG_PRIOR - old.log_prior)

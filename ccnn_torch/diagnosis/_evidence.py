@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Fits", "Grams", "alone", "block_grams", "fit_sets", "grams_of", "of_like_width"]
+__all__ = ["Fits", "Grams", "alone", "block_grams", "crossed", "fit_sets", "grams_of", "of_like_width", "without"]
 
 _BUCKET = 16
 # Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
@@ -61,22 +61,52 @@ class Fits(NamedTuple):
 
 def grams_of(x: Tensor, y: Tensor) -> Grams:
     """x: `s x c x P` whitened columns; y: `s x c`."""
-    flat, value = x.reshape(-1, x.shape[-1]), y.reshape(-1)
+    flat, value = x.flatten(0, 1), y.reshape(-1)
     return Grams(flat.mT @ flat, flat.mT @ value, value @ value, float(len(value)))
 
 
 def block_grams(x: Tensor, y: Tensor, groups: Sequence[Tensor]) -> Grams:
-    """As `grams_of`, but 0 between columns of different groups: all that fits of one group at a time ask for."""
-    flat, value = x.reshape(-1, x.shape[-1]), y.reshape(-1)
-    xx = flat.new_zeros(flat.shape[-1], flat.shape[-1])
+    """As `grams_of`, but NaN between columns of different groups: all that fits of one group at a time ask for.
+
+    groups: runs of columns that stand side by side.
+    """
+    flat, value = x.flatten(0, 1), y.reshape(-1)
+    xx = flat.new_full((flat.shape[-1], flat.shape[-1]), torch.nan)
     for group in groups:
         first, end = int(group[0]), int(group[-1]) + 1
         xx[first:end, first:end] = flat[:, first:end].mT @ flat[:, first:end]
     return Grams(xx, flat.mT @ value, value @ value, float(len(value)))
 
 
+def crossed(grams: Grams, x: Tensor, first: Sequence[Tensor], second: Sequence[Tensor]) -> Grams:
+    """With the inner products between the columns of the first groups and those of the second filled in."""
+    if not first or not second:
+        return grams
+    one, other = torch.cat(list(first)), torch.cat(list(second))
+    flat = x.flatten(0, 1)
+    between = flat[:, one].mT @ flat[:, other]
+    xx = grams.xx.clone()
+    xx[one[:, None], other] = between
+    xx[other[:, None], one] = between.mT
+    return grams._replace(xx=xx)
+
+
+def without(grams: Grams, x: Tensor, y: Tensor, columns: Tensor) -> Grams:
+    """Less what some of the rows bring, NaN but for these columns; x: `t x c x P`, y: `t x c`, of those rows."""
+    away = grams_of(x[..., columns], y)
+    xx, xy = torch.full_like(grams.xx, torch.nan), torch.full_like(grams.xy, torch.nan)
+    xx[columns[:, None], columns] = grams.xx[columns[:, None], columns] - away.xx
+    xy[columns] = grams.xy[columns] - away.xy
+    return Grams(xx, xy, grams.yy - away.yy, grams.values - away.values)
+
+
 def fit_sets(
-    grams: Grams, sets: Sequence[Sequence[Tensor]], noise_dof: float, iterations: int = 8, spread: float = _SPREAD
+    grams: Grams,
+    sets: Sequence[Sequence[Tensor]],
+    noise_dof: float,
+    iterations: int = 8,
+    spread: float = _SPREAD,
+    start: tuple[Tensor, Tensor] | None = None,
 ) -> Fits:
     """Fit every set of groups.
 
@@ -86,31 +116,38 @@ def fit_sets(
         noise_dof: weight of the prior of σ² about 1, in values; 0 = the noise is not known.
         iterations: MacKay updates.
         spread: standard deviation of log α².
+        start: `log_scale` and `noise` of a fit of the same sets, to go on from there.
     """
     columns, slot = _padded(sets)
     columns, slot = columns.to(grams.xy.device), slot.to(grams.xy.device)
     groups = max(max(map(len, sets), default=0), 1)
-    here = (columns >= 0).to(grams.xx.dtype)
     safe = columns.clamp_min(0)
-    g = grams.xx[safe[:, :, None], safe[:, None, :]] * here[:, :, None] * here[:, None, :]
-    b = grams.xy[safe] * here
-    member = torch.nn.functional.one_hot(slot.clamp_min(0), groups).to(g.dtype) * here[..., None]  # b x M x groups
+    # Products with columns that are not there are NaN, and no factor 0 makes a number of that.
+    real = columns >= 0
+    g = torch.where(real[:, :, None] & real[:, None, :], grams.xx[safe[:, :, None], safe[:, None, :]], 0.0)
+    b = torch.where(real, grams.xy[safe], 0.0)
+    member = torch.nn.functional.one_hot(slot.clamp_min(0), groups).to(g.dtype) * real[..., None]  # b x M x groups
     there = member.sum(1) > 0
     # Start where the prior of each group could make the whole gap, and the noise is a tenth of it.
     trace = (member * g.diagonal(dim1=-2, dim2=-1)[..., None]).sum(1).clamp_min(1e-300)
     psi = torch.log((grams.yy.clamp_min(1e-300) / trace).clamp(math.exp(-_LIMIT), math.exp(_LIMIT))) * there
     noise = (grams.yy / grams.values / 10).clamp_min(1e-12).expand(len(columns)).clone()
     noise = torch.where(torch.tensor(noise_dof > 0), torch.ones_like(noise), noise)
-    eye = torch.eye(columns.shape[1], dtype=g.dtype, device=g.device)
+    if start is not None:
+        psi, noise = start
+    width = columns.shape[1]
     for k in range(iterations + 1):
         scale = (member @ (psi / 2).exp()[..., None])[..., 0]
-        a = scale[:, :, None] * g * scale[:, None, :] / noise[:, None, None]
-        # Columns that are nearly the same, under next to no noise, would leave no digit of the 1 on the diagonal.
-        a = a + (1 + _DIGITS * a.diagonal(dim1=-2, dim2=-1).amax(-1))[:, None, None] * eye if a.shape[-1] else a
+        whole = scale / noise.sqrt()[:, None]
+        a = (g * whole[:, :, None]).mul_(whole[:, None, :])
+        if width:
+            # Columns that are nearly the same, under next to no noise, would leave no digit of the 1 on the diagonal.
+            diagonal = a.diagonal(dim1=-2, dim2=-1)
+            diagonal += (1 + _DIGITS * diagonal.amax(-1))[:, None]
         factor = torch.linalg.cholesky_ex(a).L
         c = scale * b / noise[:, None]
         u = torch.cholesky_solve(c[..., None], factor)[..., 0]
-        inverse = torch.cholesky_inverse(factor) if columns.shape[1] else a
+        inverse = torch.cholesky_inverse(factor) if width else a
         gamma = ((1 - inverse.diagonal(dim1=-2, dim2=-1))[..., None] * member).sum(1)
         size = (u.square()[..., None] * member).sum(1)
         mean = scale * u

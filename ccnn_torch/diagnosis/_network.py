@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis
-from ccnn_torch.diagnosis._evidence import Grams, fit_sets, grams_of
+from ccnn_torch.diagnosis._evidence import fit_sets, without
 from ccnn_torch.diagnosis._report import noise_floor
 from ccnn_torch.diagnosis._shrink import folds, resampled
 from ccnn_torch.diagnosis._verdict import Judgement
@@ -113,11 +113,11 @@ def _left(analysis: Analysis, judgement: Judgement, fold: Tensor) -> Tensor:
     keep = white.keep()
     chosen = [dictionary.groups[i] for i in judgement.found.members if not dictionary.atoms[i].catch_all]
     x, y = analysis.columns[keep], analysis.y[keep]
-    weight, whole = white.weight[keep].sqrt()[:, None], dictionary.grams
+    weight = white.weight[keep].sqrt()[:, None]
+    used = torch.cat([torch.arange(0), *chosen])
     left = []
     for k in range(_FOLDS):
-        away = grams_of(x[fold == k], y[fold == k])
-        rest = Grams(whole.xx - away.xx, whole.xy - away.xy, whole.yy - away.yy, whole.values - away.values)
+        rest = without(dictionary.grams, x[fold == k], y[fold == k], used)
         fit = fit_sets(rest, [chosen], dictionary.noise_dof, 6)
         index = fit.columns[0][fit.columns[0] >= 0]
         left.append((y - x[..., index] @ fit.mean[0, : len(index)]) / weight)

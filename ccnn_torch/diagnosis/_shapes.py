@@ -63,8 +63,11 @@ class Scan:
         self.start = default_shape(situation, effect)
         kind = {"joints": lambda: there.jacobian, "parameters": lambda: there.parameter_jacobian}.get(effect.kind)
         self.lead = whiten(torch.nan_to_num(kind())) if kind is not None else None
+        ends = torch.tensor([[s.grid[0], s.grid[-1]] for s in self.shapes], dtype=self.start.dtype).mT
+        first = effect.basis(situation, torch.stack([self.start, *ends]))
+        self.movers = _movers(first) if self.lead is not None else None
         free = [c for c in range(len(coefficients)) if not any(c in p.columns for p in self.parts)]
-        self.unshaped = self._whitened(effect.basis(situation, self.start)[None], free, None)[0]
+        self.unshaped = self._whitened(first[:1], free, None)[0]
         rows = len(situation.joints)
         few = max(1, _COARSE * rows // max(len(self.unshaped.flatten(0, 1)), 1))
         drawn = torch.randperm(rows, generator=torch.Generator().manual_seed(0))[:few].sort().values
@@ -81,6 +84,10 @@ class Scan:
         if self.lead is None:
             mine = basis[..., columns] * self.size[columns]
             return torch.nan_to_num(torch.stack([_of(self.whiten(b), rows, 0) for b in mine]))
+        if self.movers is not None:
+            moved = self.movers[columns]
+            one = torch.nan_to_num(_of(basis[..., moved, columns], rows, 1) * self.size[columns])
+            return _of(self.lead, rows, 0)[..., moved] * one[..., None, :]
         mine = _of(basis, rows, 1)[..., columns] * self.size[columns]
         return torch.nan_to_num(_of(self.lead, rows, 0) @ mine)
 
@@ -184,6 +191,13 @@ class Scan:
             return Shaped(value, None, charge)
         unshaped = set(range(len(self.size))) - {c for p in self.parts for c in p.columns}
         return Shaped(value, tuple(sorted(unshaped | {c for i in kept for c in self.parts[i].columns})), charge)
+
+
+def _movers(basis: Tensor) -> Tensor | None:
+    """The one joint or parameter that each column moves, `m`, or None where one moves several; basis:
+    `g x s x k x m`."""
+    there = torch.nan_to_num(basis).flatten(0, -3).abs().amax(0) > 0
+    return there.to(torch.int8).argmax(0) if bool((there.sum(0) <= 1).all()) else None
 
 
 def _of(values: Tensor, rows: Tensor | None, dim: int) -> Tensor:

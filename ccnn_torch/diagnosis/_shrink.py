@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis
-from ccnn_torch.diagnosis._evidence import Grams, fit_sets, grams_of
+from ccnn_torch.diagnosis._evidence import fit_sets, without
 
 __all__ = ["Gap", "HeldOut", "folds", "held_out", "resampled", "shrink_of"]
 
@@ -59,11 +59,10 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     left = [y.clone() for _ in sets]
     uncertain = [torch.zeros_like(y) for _ in sets]
     groups = [[analysis.dictionary.groups[i] for i in s] for s in sets]
-    whole = analysis.dictionary.grams
+    used = torch.cat([torch.arange(0), *(analysis.dictionary.groups[i] for i in sorted({i for s in sets for i in s}))])
     for k in range(_FOLDS):
         there = fold == k
-        away = grams_of(x[there], y[there])
-        rest = Grams(whole.xx - away.xx, whole.xy - away.xy, whole.yy - away.yy, whole.values - away.values)
+        rest = without(analysis.dictionary.grams, x[there], y[there], used)
         order = sorted(range(len(sets)), key=lambda i: sum(map(len, groups[i])))
         for part in (order[i : i + 8] for i in range(0, len(order), 8)):
             fits = fit_sets(rest, [groups[i] for i in part], analysis.dictionary.noise_dof, 6)

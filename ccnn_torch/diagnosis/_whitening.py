@@ -40,7 +40,9 @@ class Whitening:
         """`s x c0` or `s x c0 x m` raw to `s x c` or `s x c x m`, in units of the noise, rows weighted."""
         flat = values.dim() == 2
         three = values.unsqueeze(-1) if flat else values
-        three = three[:, self.channels] / self.sigma[:, None] * self.weight.sqrt()[:, None, None]
+        if len(self.channels) < three.shape[1]:
+            three = three[:, self.channels]
+        three = three * (self.weight.sqrt()[:, None] / self.sigma).unsqueeze(-1)
         return three.squeeze(-1) if flat else three
 
     def keep(self) -> Tensor:
