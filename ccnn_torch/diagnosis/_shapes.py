@@ -18,8 +18,8 @@ __all__ = ["Scan", "Shaped"]
 _FINE, _ROUNDS = 9, 2
 # Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
 _LOOSE = 10.0
-# Values of the residual, at most, that the grids are looked at on; between their values all count.
-_COARSE = 1200
+# Values of the residual, at most, that the grids are looked at on, and that count between their values.
+_COARSE, _CLOSE = 1200, 4800
 # Shapes that share coefficients are looked for together where that are no more values.
 _TOGETHER = 150
 
@@ -69,9 +69,9 @@ class Scan:
         free = [c for c in range(len(coefficients)) if not any(c in p.columns for p in self.parts)]
         self.unshaped = self._whitened(first[:1], free, None)[0]
         rows = len(situation.joints)
-        few = max(1, _COARSE * rows // max(len(self.unshaped.flatten(0, 1)), 1))
-        drawn = torch.randperm(rows, generator=torch.Generator().manual_seed(0))[:few].sort().values
-        self.rows = drawn if few < rows else None
+        drawn = torch.randperm(rows, generator=torch.Generator().manual_seed(0))
+        few = [max(1, most * rows // max(len(self.unshaped.flatten(0, 1)), 1)) for most in (_COARSE, _CLOSE)]
+        self.rows = [drawn[:count].sort().values if count < rows else None for count in few]
         self.coarse: list[_Turn] | None = None
 
     def columns(self, candidates: Tensor, rows: Tensor | None) -> list[Tensor]:
@@ -105,7 +105,7 @@ class Scan:
         gains = [0.0] * len(self.parts)
         charges = [0.0] * len(self.parts)
         for level in range(_ROUNDS + 1):
-            rows = self.rows if level == 0 else None
+            rows = self.rows[min(level, 1)]
             if level < 2:
                 target, fixed = _of(y, rows, 0).flatten(), _of(beside, rows, 0).flatten(0, 1)
                 plain = _Left(target, fixed)
@@ -122,7 +122,8 @@ class Scan:
                         if sweep:
                             own = [_LOOSE * p[chosen[j]] for j, p in enumerate(pieces) if j != i]
                             left = _Left(target, torch.cat([fixed, *own], -1))
-                        score = times * left.gain(z[: sizes[i]])
+                        # What chance explains does not grow with the rows.
+                        score = times * (left.gain(z[: sizes[i]]) - z.shape[-1]) + z.shape[-1]
                         chosen[i] = int(score.argmax())
                         gains[i] = float(score[chosen[i]])
                         spent[i] = _charge(score) if level == 0 else 0.0
@@ -149,7 +150,7 @@ class Scan:
                     candidates[: len(table), part.shapes] = table
                     candidates[len(table) :, part.shapes] = table[-1]
             sizes = [len(table) if table.shape[-1] else 0 for table in mine]
-            found.append(_Turn(candidates, self.columns(candidates, self.rows if level == 0 else None), sizes))
+            found.append(_Turn(candidates, self.columns(candidates, self.rows[min(level, 1)]), sizes))
         if level == 0:
             self.coarse = found
         return found

@@ -17,6 +17,8 @@ __all__ = ["Gap", "HeldOut", "folds", "held_out", "resampled", "shrink_of"]
 _FOLDS = 5
 _REPEATS = 400
 _WIDER = 1.25
+# What a 95 % interval leaves out.
+_TAIL = 0.05
 
 
 @dataclass(frozen=True)
@@ -62,14 +64,15 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     used = torch.cat([torch.arange(0), *(analysis.dictionary.groups[i] for i in sorted({i for s in sets for i in s}))])
     for k in range(_FOLDS):
         there = fold == k
-        rest = without(analysis.dictionary.grams, x[there], y[there], used)
+        mine = x[there]
+        rest = without(analysis.dictionary.grams, mine, y[there], used)
         order = sorted(range(len(sets)), key=lambda i: sum(map(len, groups[i])))
         for part in (order[i : i + 8] for i in range(0, len(order), 8)):
             fits = fit_sets(rest, [groups[i] for i in part], analysis.dictionary.noise_dof, 6)
             for row, i in enumerate(part):
                 columns = fits.columns[row][fits.columns[row] >= 0]
                 m = len(columns)
-                here = x[there][..., columns]
+                here = mine[..., columns]
                 left[i][there] = y[there] - here @ fits.mean[row, :m]
                 uncertain[i][there] = ((here @ fits.covariance[row, :m, :m]) * here).sum(-1)
     return [
@@ -110,7 +113,9 @@ def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, fl
     # Wider than the draws alone: the form of the effect, the noise and the fit are not quite what they are taken for.
     excess = excess.mean() + _WIDER * (excess - excess.mean())
     share = (1 - excess / gap).clamp(0.0, 1.0)
-    low, high = torch.quantile(share, torch.tensor([0.025, 0.975], dtype=share.dtype)).tolist()
+    # Where draws reach 1, all of the gap, the interval ends there and leaves out draws on the lower side alone.
+    above = 0.0 if float((share >= 1).to(share.dtype).mean()) > _TAIL / 2 else _TAIL / 2
+    low, high = torch.quantile(share, torch.tensor([_TAIL - above, 1 - above], dtype=share.dtype)).tolist()
     return Gap(math.sqrt(b2), math.sqrt(a2), math.sqrt(noise), plain, (min(low, plain), max(high, plain)))
 
 

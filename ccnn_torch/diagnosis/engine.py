@@ -23,8 +23,8 @@ from ccnn_torch.errors import InputError
 __all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows"]
 
 OUTLIER = "outlier"
-# More rows than this name a cause no better: so many are drawn.
-_MOST_ROWS = 2000
+# More rows, and more measured values, than this name a cause no better: so many are drawn.
+_MOST_ROWS, _MOST_VALUES = 2000, 9000
 _FEWEST_ROWS = 20
 # Times the noise from which a row is bad and not unlucky.
 _GROSS = 15.0
@@ -167,9 +167,10 @@ def usable_rows(situation: Situation, measured: Tensor) -> Tensor:
 
 
 def thinned(situation: Situation, measured: Tensor, fine: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:
-    """At most `_MOST_ROWS` of the fine rows, in order, and which they are."""
+    """As many of the fine rows as are looked at, in order, and which they are."""
     chosen = torch.nonzero(fine).squeeze(-1)
-    if len(chosen) > _MOST_ROWS:
-        drawn = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]
+    most = min(_MOST_ROWS, _MOST_VALUES // len(situation.mechanism.pose))
+    if len(chosen) > most:
+        drawn = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(seed))[:most]
         chosen = chosen[drawn.sort().values]
     return picked(situation, chosen), measured[chosen], chosen
