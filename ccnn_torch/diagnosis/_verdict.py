@@ -29,6 +29,8 @@ _SMALL, _UNSURE = 0.1, 0.85
 _MIMIC, _MIMICKED = 0.9, 60.0
 # Share of an effect's own squares that must not be borrowed from what other effects do.
 _OWN = 0.1
+# Or of its main coefficients, where those that only mend its form are so many times as large in plausible sizes.
+_CHIEF, _MENDED = 0.5, 15.0
 # Odds up to which one name for another is not told apart by the data.
 _ODDS = math.log(20.0)
 # Log odds against the most probable set beyond which nobody looks.
@@ -81,6 +83,8 @@ def judge(analysis: Analysis) -> Judgement:
     borrowed = _borrowed(analysis, found)
     if borrowed:
         # Something is there that looks like a part of these effects, and nothing of what makes them what they are.
+        found = _best_without(analysis, borrowed, tried) or found
+        names, driver = _named(analysis, found)
         names, outside = names - borrowed, True
         driver = driver or _driver_alone(analysis)
     marginal: dict[str, float] = {a.name: 0.0 for a in analysis.dictionary.atoms if not a.catch_all}
@@ -104,18 +108,30 @@ def judge(analysis: Analysis) -> Judgement:
 
 
 def _borrowed(analysis: Analysis, found: Found) -> frozenset[str]:
-    """Names of a set that rest on what other effects do as well."""
+    """Names of a set that rest on what other effects do as well, or on what should only mend their form."""
     grams, names = analysis.dictionary.grams, set()
     for i, mean in zip(found.members, found.mean, strict=True):
         atom, group = analysis.dictionary.atoms[i], analysis.dictionary.groups[i]
-        own = torch.tensor([not c.borrowed for c in atom.coefficients(analysis.situation)])
-        if atom.catch_all or bool(own.all()):
+        coefficients = atom.coefficients(analysis.situation)
+        own = torch.tensor([not c.borrowed for c in coefficients])
+        main = torch.tensor([not c.secondary for c in coefficients])
+        if atom.catch_all or bool(main.all()):
             continue
         gram = grams.xx[group][:, group]
-        alone, whole = (float(m @ gram @ m) for m in (mean * own, mean))
-        if alone < _OWN * whole:
+        alone, chief, whole = (float(m @ gram @ m) for m in (mean * own, mean * main, mean))
+        largest, mended = (float((mean * kind).abs().max()) for kind in (main, own & ~main))
+        if alone < _OWN * whole or (chief < _CHIEF * whole and mended > _MENDED * largest):
             names.add(atom.name)
     return frozenset(names)
+
+
+def _best_without(analysis: Analysis, names: frozenset[str], tried: dict[tuple[int, ...], Found]) -> Found | None:
+    """The most probable set with a catch-all and none of these names."""
+    atoms = analysis.dictionary.atoms
+    for found in analysis.found:
+        if any(atoms[i].catch_all for i in found.members) and not names & {atoms[i].name for i in found.members}:
+            return _essential(analysis, found, tried)
+    return None
 
 
 def _could_be_another(analysis: Analysis, found: Found) -> bool:
