@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.identify_config import load_identify_config
 from ccnn_torch.runs.suite import load_suite
 
+Cli = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parent.parent
 TRIPOD = ROOT / "experiments" / "tripod.yaml"
 SHORT = {
@@ -204,7 +206,7 @@ def test_an_interrupted_run_says_so_in_one_sentence_and_keeps_its_checkpoint(tmp
     ("delay", "more"),
     [(0.0, []), (0.5, ["training.early_stop=true", "split.validation=0.2", "ccnn.refinement_iterations=3"])],
 )
-def test_a_killed_run_resumes_to_identical_results(tmp_path: Path, delay: float, more: list[str]) -> None:
+def test_a_killed_run_resumes_to_identical_results(cli: Cli, tmp_path: Path, delay: float, more: list[str]) -> None:
     keys = ["ccnn.generations=60", "ccnn.population=40", "training.checkpoint_every=5", "seed=2"]
     keys += ["save_models=false", "save_report=false"]
     keys += more
@@ -212,7 +214,7 @@ def test_a_killed_run_resumes_to_identical_results(tmp_path: Path, delay: float,
     start_run(load_config(TRIPOD, [*keys, f"out={whole}"]), quiet=True)
     code, _ = stopped(killed, keys, delay, signal.SIGKILL)
     assert code == -signal.SIGKILL
-    subprocess.run(command("--resume", str(killed)), check=True, env=ENVIRONMENT, capture_output=True)
+    assert cli("run", "--resume", killed)[0] == 0
     for path in (whole / "checkpoints").iterdir():
         again = load_file(killed / "checkpoints" / path.name)
         for name, tensor in load_file(path).items():

@@ -95,31 +95,35 @@ class ClosedKinematics(nn.Module):
 
 def _slope(function: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
     """Derivative of `s x k` -> `s x o` by central differences, `s x o x k`; `_LOST` where a neighbour is no number."""
+    return _difference(function(_neighbours(point)))
+
+
+def _neighbours(point: Tensor) -> Tensor:
+    """All of `s x k` that the derivative needs, `4 x k x s x k`: a graph is as long as its calls are many."""
     step, unit = torch.tensor(_STEP, dtype=point.dtype), torch.eye(point.shape[-1], dtype=point.dtype)
-    away = torch.stack([unit, -unit, 2 * unit, -2 * unit]).unsqueeze(-2) * step
-    # All neighbours in one call: a graph is as long as its calls are many.
-    near, before, far, behind = function(point + away).unbind(0)
-    slope = (8 * (near - before) - (far - behind)) / (12 * step)
+    return point + torch.stack([unit, -unit, 2 * unit, -2 * unit]).unsqueeze(-2) * step
+
+
+def _difference(values: Tensor) -> Tensor:
+    """The derivative out of the values at `_neighbours`, `4 x k x s x o`."""
+    near, before, far, behind = values.unbind(0)
+    slope = (8 * (near - before) - (far - behind)) / (12 * torch.tensor(_STEP, dtype=values.dtype))
     # An edge of the workspace is as near as that, and there the Jacobian is out of all proportion.
     return torch.nan_to_num(slope, nan=_LOST, posinf=_LOST, neginf=-_LOST).permute(1, 2, 0)
 
 
 def _frame_slope(function: Callable[[Tensor], tuple[Tensor, Tensor | None]], point: Tensor) -> Tensor:
     """Derivative of position and rotation vector (base frame) of a frame, `s x c x k`; see `frame_jacobian`."""
-    position = _slope(lambda x: function(x)[0], point)
+    positions, rotations = function(_neighbours(point))
+    if rotations is None:
+        return _difference(positions)
     rotation = function(point)[1]
-    if rotation is None:
-        return position
-
-    def turned(x: Tensor) -> Tensor:
-        there = function(x)[1]
-        assert there is not None
-        # The skew part of dR Rᵀ is the rotation vector's, and its second order is symmetric.
-        turn = there @ rotation.mT
-        skew = (turn - turn.mT) * torch.tensor(0.5, dtype=turn.dtype)
-        return torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
-
-    return torch.cat([position, _slope(turned, point)], -2)
+    assert rotation is not None
+    # The skew part of dR Rᵀ is the rotation vector's, and its second order is symmetric.
+    turn = rotations @ rotation.mT
+    skew = (turn - turn.mT) * torch.tensor(0.5, dtype=turn.dtype)
+    turned = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
+    return torch.cat([_difference(positions), _difference(turned)], -2)
 
 
 def _pseudo_inverse(matrix: Tensor) -> Tensor:
