@@ -47,8 +47,7 @@ class _Variance(nn.Module):
 def test_a_trained_model_goes_into_files_and_back(name: str, tmp_path: Path) -> None:
     joints = tripod_joints(60)
     generator = torch.Generator().manual_seed(4)
-    # So small that two steps solve for the command: fewer operations to trace.
-    deviations = 1e-7 * torch.sin(8 * joints) + 1e-8 * torch.randn(joints.shape, generator=generator).double()
+    deviations = 1e-4 * torch.sin(8 * joints) + 1e-5 * torch.randn(joints.shape, generator=generator).double()
     rows = torch.ones(1, len(joints), dtype=torch.float64)
     scaling = Scaling.fit(joints[None], deviations[None], rows, torch.zeros(3, dtype=torch.bool))
     data = TrainingData(
