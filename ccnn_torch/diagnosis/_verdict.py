@@ -29,8 +29,9 @@ _SMALL, _UNSURE = 0.1, 0.85
 _MIMIC, _MIMICKED = 0.9, 60.0
 # Share of an effect's own squares that must not be borrowed from what other effects do.
 _OWN = 0.1
-# Or of its main coefficients, where those that only mend its form are so many times as large in plausible sizes.
-_CHIEF, _MENDED = 0.5, 15.0
+# Or that must come from other coefficients than those that mend its form, where these are so many times as large, in
+# plausible sizes.
+_MAIN, _MENDED = 0.5, 15.0
 # Odds up to which one name for another is not told apart by the data.
 _ODDS = math.log(20.0)
 # Log odds against the most probable set beyond which nobody looks.
@@ -114,13 +115,13 @@ def _borrowed(analysis: Analysis, found: Found) -> frozenset[str]:
         atom, group = analysis.dictionary.atoms[i], analysis.dictionary.groups[i]
         coefficients = atom.coefficients(analysis.situation)
         own = torch.tensor([not c.borrowed for c in coefficients])
-        main = torch.tensor([not c.secondary for c in coefficients])
-        if atom.catch_all or bool(main.all()):
+        mends = torch.tensor([c.mends for c in coefficients])
+        if atom.catch_all or bool((own & ~mends).all()):
             continue
         gram = grams.xx[group][:, group]
-        alone, chief, whole = (float(m @ gram @ m) for m in (mean * own, mean * main, mean))
-        largest, mended = (float((mean * kind).abs().max()) for kind in (main, own & ~main))
-        if alone < _OWN * whole or (chief < _CHIEF * whole and mended > _MENDED * largest):
+        alone, main, whole = (float(m @ gram @ m) for m in (mean * own, mean * ~mends, mean))
+        largest, mended = (float((mean * kind).abs().max()) for kind in (~mends, mends))
+        if alone < _OWN * whole or (main < _MAIN * whole and mended > _MENDED * largest):
             names.add(atom.name)
     return frozenset(names)
 

@@ -26,8 +26,9 @@ OUTLIER = "outlier"
 # More rows, and more measured values, than this name a cause no better: so many are drawn.
 _MOST_ROWS, _MOST_VALUES = 2000, 9000
 _FEWEST_ROWS = 20
-# Times the noise from which a row is bad and not unlucky.
-_GROSS = 15.0
+# Times the noise from which a row is bad and not unlucky: by itself; and where more than so many rows in a hundred, one
+# at least, are beyond the second, since the tail of a t distribution with three degrees comes that far now and then.
+_GROSS, _GROSS_TOGETHER, _SHARE_TOGETHER = 60.0, 15.0, 0.01
 # Half of the rows beyond reach are no outliers any more: the model or the units are wrong.
 _USABLE = 0.5
 
@@ -144,8 +145,11 @@ def _why_set_aside(analysis: Analysis, fine: Tensor, chosen: Tensor) -> dict[int
 def gross_rows(analysis: Analysis) -> Tensor:
     """Rows set aside that are so far off that no heavy tail of ordinary noise makes them, `s` bool."""
     white = analysis.whitening
-    far = (analysis.residual[:, white.channels] / white.sigma).abs().amax(-1) > _GROSS
-    return far & (white.weight <= 0) & ~analysis.near_singular
+    size = (analysis.residual[:, white.channels] / white.sigma).abs().amax(-1)
+    aside = (white.weight <= 0) & ~analysis.near_singular
+    far = aside & (size > _GROSS_TOGETHER)
+    together = int(far.sum()) > max(1.0, _SHARE_TOGETHER * len(far))
+    return far if together else aside & (size > _GROSS)
 
 
 def usable_rows(situation: Situation, measured: Tensor) -> Tensor:

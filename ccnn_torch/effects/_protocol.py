@@ -30,6 +30,7 @@ class Coefficient:
             simulation leaves it 0 unless told otherwise.
         borrowed: whether by itself it is what another effect does (a constant part): it does not speak for this
             one.
+        mends: whether it is but a correction of the form of the others, and cannot be many times as large as they are.
         positive: whether physics allows it no negative value (play, compliance); for drawing it in a simulation.
     """
 
@@ -40,6 +41,7 @@ class Coefficient:
     leg: int | None = None
     secondary: bool = False
     borrowed: bool = False
+    mends: bool = False
     positive: bool = False
 
 

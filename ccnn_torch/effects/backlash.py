@@ -44,13 +44,19 @@ class Backlash:
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Play, and what a softer and a harder edge change, of each joint whose direction is known."""
-        parts = (("", 1.0), *((edge, 0.5) for edge, _ in _EDGES))
+        parts = (("", 1.0, False), *((edge, 0.5, True) for edge, _ in _EDGES))
         return tuple(
             Coefficient(
-                f"{j.name}{part}", j.unit, _SCALE[j.unit] * size, joint=j.name, secondary=size < 1, positive=size == 1
+                f"{j.name}{part}",
+                j.unit,
+                _SCALE[j.unit] * size,
+                joint=j.name,
+                secondary=mends,
+                mends=mends,
+                positive=not mends,
             )
             for j in (situation.mechanism.joints[i] for i in situation.directed)
-            for part, size in parts
+            for part, size, mends in parts
         )
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:

@@ -11,6 +11,7 @@ from diagnosis._machines import NOISE, measured, rows_of
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
 from ccnn_torch.diagnosis.check import check_rows
+from ccnn_torch.effects import EFFECTS
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import load_schema, plain
 
@@ -65,6 +66,15 @@ def test_a_cause_that_the_library_lacks_is_outside_and_its_driver_is_named() -> 
     assert "compliance" not in said.verdict["effects"]
 
 
+def test_play_and_springs_that_cancel_are_not_taken_for_friction() -> None:
+    """Edges of the play many times as large as the play, against a compliance, come near what friction does."""
+    situation = rows_of("delta", 80, 3)
+    effects = [name for name in EFFECTS if name != "friction"]
+    said = diagnose_rows(situation, measured(situation, {"friction": 10.0}, 4), effects=effects)
+    assert said.verdict["outside_library"] and said.verdict["driver"].startswith("direction")
+    assert said.verdict["effects"] == []
+
+
 def test_bad_rows_are_set_aside_and_do_not_hide_the_cause() -> None:
     situation = rows_of("five_bar", 200, 9)
     pose = measured(situation, {"backlash": 10.0}, 10)
@@ -82,6 +92,16 @@ def test_nothing_but_bad_rows_is_outlier() -> None:
     said = diagnose_rows(situation, pose)
     assert said.verdict["effects"] == ["outlier"] and not said.verdict["none"]
     assert set(said.rows_set_aside) == {10, 20, 30, *near_singular(said)}
+
+
+def test_one_row_of_a_heavy_tail_is_no_cause_and_one_far_beyond_is() -> None:
+    situation = rows_of("five_bar", 200, 11)
+    for times, none in ((25, True), (150, False)):
+        pose = measured(situation, {}, 12)
+        pose[20, 0] += times * NOISE
+        said = diagnose_rows(situation, pose)
+        assert said.verdict["none"] is none and (20 in said.rows_set_aside)
+        assert said.verdict["effects"] == ([] if none else ["outlier"])
 
 
 def test_what_the_records_lack_is_said_and_not_a_candidate() -> None:
