@@ -25,6 +25,7 @@ _GAIN = 3.0
 # Another look is spared where the noise of the channels changed among each other by less than this, and the fit by such
 # a share of the noise's square.
 _SAME_NOISE, _SAME_FIT = 0.1, 0.01
+_FAR_BELOW = 0.5
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ class Analysis:
         y: what they explain, whitened, `s x c`.
         found: sets, most probable first.
         near_singular: `s`, bool.
-        floor: mean square of the noise in the units of `y`: 1 where it was given, else that of the richest fit.
+        floor: mean square of the noise in the units of `y`: 1 where it was given, else that of the richest fit or,
+            where that is far less, of the most probable set.
     """
 
     situation: Situation
@@ -176,7 +178,10 @@ def _searched(
     # Noise that was given is right to some per cent, however many rows there are.
     known = white.known * (1 + y[keep].numel() / 100)
     dictionary, found = search(atoms, columns[keep], y[keep], known)
+    # The richest fit knows no shapes: where these are most of the gap the best set leaves far less.
+    left = found[0].rss / max(y[keep].numel() - found[0].effective, 1.0)
     floor = min(float((rich / white.sigma).square().mean()), 1.0)
+    floor = left if white.known == 0 and left < _FAR_BELOW * floor else floor
     return Analysis(situation, measured, target, white, dictionary, columns, y, found, near, floor)
 
 

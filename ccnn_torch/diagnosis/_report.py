@@ -77,7 +77,9 @@ def noise_floor(analysis: Analysis) -> Tensor:
     for i, mean in zip(best.members, best.mean, strict=True):
         left = left - analysis.columns[keep][..., analysis.dictionary.groups[i]] @ mean
     free = max(1 - best.effective / analysis.dictionary.grams.values, 0.1)
-    return (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * analysis.floor
+    # No more than the richest fit leaves.
+    share = min(analysis.floor / max(float(left.square().mean()) / free, 1e-300), 1.0)
+    return (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * share
 
 
 def _gap(gap: Gap, unit: str) -> dict[str, Any]:
