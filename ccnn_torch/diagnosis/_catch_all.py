@@ -49,15 +49,11 @@ def catch_alls(situation: Situation) -> list[Atom]:
             situation, "workspace", torch.cat([one, *_configuration(situation)], -1), most=most, log_prior=_NEAR_LIBRARY
         )
     )
-    each: list[Tensor] = []
     for i, joint in enumerate(mechanism.joints):
         q = _unit(situation.joints[..., i : i + 1])
         found.append(_atom(situation, f"joint {joint.name}", torch.cat([one, q, _BEND * _bumps(q, few)], -1)))
         fine = torch.cat([one, q, _bumps(q, min(_MOST, rows // 6))], -1)
         found.append(_atom(situation, f"joint {joint.name}", fine, only=i))
-        each.append(found[-1].columns)
-    # One cause may sit in all drives, and follow in each the joint that it drives.
-    found.append(Atom(f"joint {ANY}", None, each[0].new_zeros(0), torch.cat(each, -1), LOG_PRIOR))
     together: dict[str, list[Tensor]] = {}
     for name, value in situation.covariates.items():
         driver = _driver(name)
