@@ -63,6 +63,7 @@ class Scan:
         self.start = default_shape(situation, effect)
         kind = {"joints": lambda: there.jacobian, "parameters": lambda: there.parameter_jacobian}.get(effect.kind)
         self.lead = whiten(torch.nan_to_num(kind())) if kind is not None else None
+        # Which joint a column moves is a matter of the effect's form: the middle and the ends of its grids show it.
         ends = torch.tensor([[s.grid[0], s.grid[-1]] for s in self.shapes], dtype=self.start.dtype).mT
         first = effect.basis(situation, torch.stack([self.start, *ends]))
         self.movers = _movers(first) if self.lead is not None else None
