@@ -216,17 +216,20 @@ class _Left:
 
     def __init__(self, y: Tensor, nuisance: Tensor) -> None:
         """y: `N`; nuisance: `N x P`, whitened, in units of their prior scale."""
-        self.nuisance = nuisance
         eye = torch.eye(nuisance.shape[1], dtype=y.dtype, device=y.device)
-        self.factor = torch.linalg.cholesky(eye + nuisance.mT @ nuisance)
-        self.y = y - (nuisance @ torch.cholesky_solve(nuisance.mT @ y[:, None], self.factor))[:, 0]
+        factor = torch.linalg.cholesky(eye + nuisance.mT @ nuisance)
+        # Rows whose Gram matrix is what the nuisance takes out: (I + NᵀN)^-1/2 Nᵀ.
+        self.taken = torch.linalg.solve_triangular(factor, nuisance.mT, upper=False)
+        self.y = y - self.taken.mT @ (self.taken @ y)
 
     def gain(self, z: Tensor) -> Tensor:
         """Squares that each candidate explains, `g`; z: `g x N x m`."""
         inner = z.mT @ z
-        if self.nuisance.shape[1]:
-            cross = self.nuisance.mT @ z
-            inner = inner - cross.mT @ torch.cholesky_solve(cross, self.factor)
+        if len(self.taken):
+            count, rows, width = z.shape
+            flat = z.transpose(0, 1).reshape(rows, count * width)
+            cross = (self.taken @ flat).reshape(-1, count, width).transpose(0, 1)
+            inner = inner - cross.mT @ cross
         b = (z.mT @ self.y[:, None])[..., 0]
         ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
         inner = inner + torch.diag_embed(ridge[:, None].expand(-1, inner.shape[-1]))
