@@ -270,10 +270,14 @@ def to_onnx(
         part.ClearField("metadata_props")
     for tensor in model.graph.initializer:
         tensor.ClearField("doc_string")
-    for part in (*model.graph.value_info, *model.graph.input, *model.graph.output):
+    for part in (*model.graph.input, *model.graph.output):
         for size in part.type.tensor_type.shape.dim:
             if size.dim_param:
                 size.dim_param = "batch"
+    # Inside, a length may be a multiple of the batch, and ONNX Runtime reuses memory of what bears the same name.
+    for part in model.graph.value_info:
+        for size in part.type.tensor_type.shape.dim:
+            size.ClearField("dim_param")
     model.graph.name = "compensator"
     model.ClearField("doc_string")
     model.ClearField("metadata_props")

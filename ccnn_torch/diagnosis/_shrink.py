@@ -16,7 +16,7 @@ __all__ = ["Gap", "HeldOut", "folds", "held_out", "resampled", "shrink_of"]
 
 _FOLDS = 5
 _REPEATS = 400
-_WIDER = 1.1
+_WIDER = 1.2
 # What a 95 % interval leaves out.
 _TAIL = 0.05
 
