@@ -13,7 +13,7 @@ from ccnn_torch.diagnosis._candidates import cleaned, first_candidates, plain_at
 from ccnn_torch.diagnosis._catch_all import catch_alls
 from ccnn_torch.diagnosis._linear import remainder, tangent
 from ccnn_torch.diagnosis._search import Dictionary, Found, search
-from ccnn_torch.diagnosis._whitening import Whitening, fitted_whitening, moving_channels, reweighted
+from ccnn_torch.diagnosis._whitening import NO_NOISE, Whitening, fitted_whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 
 __all__ = ["Analysis", "analyse"]
@@ -197,5 +197,7 @@ def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitenin
         rows = (white.weight > 0) & usable
         spread = raw[rows][:, white.channels].abs().median(0).values * 1.4826 / max(free, 0.1) ** 0.5
         rms = result.residual[rows][:, white.channels].abs().median(0).values * 1.4826
-        white = Whitening(white.channels, torch.maximum(spread, 1e-4 * rms).clamp_min(1e-15), white.weight, white.known)
+        white = Whitening(
+            white.channels, torch.maximum(spread, 1e-4 * rms).clamp_min(NO_NOISE), white.weight, white.known
+        )
     return reweighted(white, raw, usable, free)

@@ -20,6 +20,7 @@ _FINE, _ROUNDS = 9, 2
 _LOOSE = 10.0
 # Values of the residual, at most, that the grids are looked at on, and that count between their values.
 _COARSE, _CLOSE = 1200, 4800
+_DIGITS = 1e-13
 # Shapes that share coefficients are looked for together where that are no more values.
 _TOGETHER = 150
 
@@ -216,8 +217,11 @@ class _Left:
 
     def __init__(self, y: Tensor, nuisance: Tensor) -> None:
         """y: `N`; nuisance: `N x P`, whitened, in units of their prior scale."""
-        eye = torch.eye(nuisance.shape[1], dtype=y.dtype, device=y.device)
-        factor = torch.linalg.cholesky(eye + nuisance.mT @ nuisance)
+        gram = nuisance.mT @ nuisance
+        diagonal = gram.diagonal()
+        # Columns that are the same, far above the noise, would leave no digit of the 1.
+        diagonal += 1 + _DIGITS * diagonal.amax(0, keepdim=True) if len(gram) else 0
+        factor = torch.linalg.cholesky(gram)
         # Rows whose Gram matrix is what the nuisance takes out: (I + NᵀN)^-1/2 Nᵀ.
         self.taken = torch.linalg.solve_triangular(factor, nuisance.mT, upper=False)
         self.y = y - self.taken.mT @ (self.taken @ y)

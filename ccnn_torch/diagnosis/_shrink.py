@@ -16,7 +16,6 @@ __all__ = ["Gap", "HeldOut", "folds", "held_out", "resampled", "shrink_of"]
 
 _FOLDS = 5
 _REPEATS = 400
-_WIDER = 1.2
 # What a 95 % interval leaves out.
 _TAIL = 0.05
 
@@ -110,9 +109,9 @@ def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, fl
         drawn = noise * (1 + math.sqrt(2 / floor_dof) * torch.randn(_REPEATS, generator=generator, dtype=old.dtype))
     excess = (new - unsure)[rows].mean(-1) - drawn
     gap = (old[rows].mean(-1) - drawn).clamp_min(1e-3 * (b2 - noise))
-    # Wider than the draws alone: the form of the effect, the noise and the fit are not quite what they are taken for.
-    excess = excess.mean() + _WIDER * (excess - excess.mean())
-    share = (1 - excess / gap).clamp(0.0, 1.0)
+    share = 1 - excess / gap
+    # Less than the noise that was told is left: no cause takes away more than all, and the spread of the draws stays.
+    share = (share - (share.mean() - 1).clamp_min(0.0)).clamp(0.0, 1.0)
     # Where draws reach 1, all of the gap, the interval ends there and leaves out draws on the lower side alone.
     above = 0.0 if float((share >= 1).to(share.dtype).mean()) > _TAIL / 2 else _TAIL / 2
     low, high = torch.quantile(share, torch.tensor([_TAIL - above, 1 - above], dtype=share.dtype)).tolist()

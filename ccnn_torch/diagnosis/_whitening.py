@@ -11,13 +11,15 @@ from torch import Tensor
 from ccnn_torch.diagnosis._evidence import alone, block_grams, fit_sets, grams_of
 from ccnn_torch.effects import Situation
 
-__all__ = ["Whitening", "fitted_whitening", "moving_channels", "reweighted"]
+__all__ = ["NO_NOISE", "Whitening", "fitted_whitening", "moving_channels", "reweighted"]
 
 # Degrees of freedom of the row weights (Student t), and beyond how many times its noise a row is set aside.
 _DEGREES = 4.0
 # The richest fit: at most so many candidates, the log evidence from which one is taken in, the spread of its log size.
 _RICH, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
 _GROSS = 6.0
+NO_NOISE = 1e-10
+"""Less noise than any device has [m], [rad], and more than solvers leave: what lies below it is rounding."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ def fitted_whitening(
         noise: known standard deviation of each of the c0 channels, or None.
         usable: `s`, False where a row is left out from the start.
     """
-    rms = residual[usable][:, channels].abs().median(0).values.clamp_min(1e-15) * 1.4826
+    rms = residual[usable][:, channels].abs().median(0).values * 1.4826
+    rms = rms.clamp_min(NO_NOISE)
     sigma = rms if noise is None else noise[channels]
     white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0)
     shown = [c / _size(c[usable][:, channels] / sigma[:, None]) for c in columns if c.shape[-1]]
@@ -86,7 +89,7 @@ def fitted_whitening(
     if noise is None:
         white = replace(white, sigma=sigma * _noise_share(white(unit), white(residual), groups).sqrt())
     chosen: list[Tensor] = []
-    least = None if noise is not None else 1e-4 * rms
+    least = None if noise is not None else (1e-4 * rms).clamp_min(NO_NOISE)
     left, free = residual, 1.0
     for _ in range(_RICH):
         if chosen:

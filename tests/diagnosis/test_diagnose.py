@@ -94,6 +94,12 @@ def test_nothing_but_bad_rows_is_outlier() -> None:
     assert set(said.rows_set_aside) == {10, 20, 30, *near_singular(said)}
 
 
+@pytest.mark.parametrize("machine", ["five_bar", "stewart"])
+def test_poses_as_the_model_says_to_the_last_digit_have_no_cause(machine: str) -> None:
+    situation = rows_of(machine, 60, 21)
+    assert diagnose_rows(situation, situation.pose).verdict["none"]
+
+
 def test_one_row_of_a_heavy_tail_is_no_cause_and_one_far_beyond_is() -> None:
     situation = rows_of("five_bar", 200, 11)
     for times, none in ((25, True), (150, False)):
