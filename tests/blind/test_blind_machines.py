@@ -96,6 +96,14 @@ def test_plans_are_even() -> None:
     assert plans == plan_cases(320, 0, MACHINES, tuple(KINDS))
 
 
+def test_the_simulator_of_others_has_nothing_outside_the_library() -> None:
+    plans = plan_cases(60, 0, ("mujoco_five_bar", "tripod"), tuple(KINDS))
+    assert {p.machine for p in plans if p.kind == "outside"} == {"tripod"}
+    assert {p.kind for p in plan_cases(20, 0, ("mujoco_five_bar",), tuple(KINDS))} == {"single", "pair", "none"}
+    with pytest.raises(InputError, match="kinds: mujoco_five_bar has nothing outside the library"):
+        plan_cases(20, 0, ("mujoco_five_bar",), ("outside",))
+
+
 @pytest.mark.parametrize(
     ("count", "machines", "kinds", "said"),
     [

@@ -67,15 +67,20 @@ def plan_cases(count: int, seed: int, machines: Sequence[str], kinds: Sequence[s
     """Draw so many cases; the same for the same arguments.
 
     Raises:
-        InputError: a machine or kind that is not there, or no case at all.
+        InputError: a machine or kind that is not there, no case at all, or none that these machines can have.
     """
     _check(count, machines, kinds)
+    # Nothing outside the library is built into the simulator of others.
+    able = {kind: [m for m in machines if kind != "outside" or m != "mujoco_five_bar"] for kind in kinds}
+    kinds = [kind for kind in kinds if able[kind]]
+    if not kinds:
+        raise InputError("kinds: mujoco_five_bar has nothing outside the library; name another mechanism beside it")
     g = np.random.default_rng([seed, 0])
     share = np.array([KINDS[kind] for kind in kinds])
     edges = np.round(np.cumsum(share) / share.sum() * count).astype(int)
     order = np.repeat(np.array(list(kinds)), np.diff(edges, prepend=0))
     g.shuffle(order)
-    decks = {kind: _Deck(kind, machines, g) for kind in kinds}
+    decks = {kind: _Deck(kind, able[kind], g) for kind in kinds}
     plans = []
     for number, kind in enumerate(order.tolist()):
         machine, causes, strength = decks[kind].next()
