@@ -9,6 +9,8 @@ from pathlib import Path
 import jsonschema
 import pytest
 
+from ccnn_torch import diagnose, load_mechanism, load_records
+from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import load_schema
 
 Cli = Callable[..., tuple[int, str, str]]
@@ -87,3 +89,9 @@ def test_what_is_wrong_is_one_sentence(
     monkeypatch.chdir(rows.parent)
     code, _, told = cli("diagnose", "--records", rows, "--mechanism", "five_bar", *words)
     assert code == 2 and sentence in told and len(told.strip().splitlines()) == 1
+
+
+def test_records_of_another_machine_are_refused_in_python(rows: Path) -> None:
+    records = load_records(rows, load_mechanism("five_bar"))
+    with pytest.raises(InputError, match="records: they have 2 joints and tripod has 3"):
+        diagnose(records, load_mechanism("tripod"))

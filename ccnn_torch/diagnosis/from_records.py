@@ -54,7 +54,16 @@ def diagnose(
 
 
 def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float] | None = None) -> Situation:
-    """Rows of records on the nominal machine; unknown frames of an arm are fitted to them."""
+    """Rows of records on the nominal machine; unknown frames of an arm are fitted to them.
+
+    Raises:
+        InputError: records of another machine, gravity of another length, or too many rows out of reach.
+    """
+    if records.joints.shape[-1] != len(mechanism.joints):
+        raise InputError(
+            f"records: they have {records.joints.shape[-1]} joints and {mechanism.name} has {len(mechanism.joints)}; "
+            "load them with the mechanism that was measured"
+        )
     if isinstance(mechanism, SerialArm) and records.orientation == "none":
         mechanism = mechanism.with_orientation("none")
     parameters = None
