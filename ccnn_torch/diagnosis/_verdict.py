@@ -173,7 +173,7 @@ def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fo
     atoms = analysis.dictionary.atoms
     while len(found.members) > 1:
         shares = _net(analysis, found, tried)
-        # Dictionary effects are a form of the catch-all beside them only where that carries much more than they do.
+        # Library effects are a form of the catch-all beside them only where that carries much more than they do.
         wild = max((share for i, (share, _) in shares.items() if atoms[i].catch_all), default=0.0)
         named = max(_FORM, min(_BESIDE_CATCH_ALL, wild / 2))
         limits = {i: _FORM_CATCH_ALL if atoms[i].catch_all else named for i in found.members}
