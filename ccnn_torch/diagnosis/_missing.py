@@ -13,7 +13,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._atoms import default_shape, scaled_signature
 from ccnn_torch.diagnosis._rows import picked
-from ccnn_torch.effects import Effect, Situation
+from ccnn_torch.effects import Effect, Situation, pose_residual
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
 
 __all__ = ["missing_covariates"]
@@ -30,8 +30,9 @@ def missing_covariates(
     """The block `missing_covariates` of diagnosis.json: what to record beside the pose, most promising first.
 
     The plausible size of an effect is what its coefficients, each of its plausible size, do to the median row under
-    conditions drawn for them (`draw_covariates`: a shift in a hall, loads of 60 N and 6 N·m). Where something
-    that no effect describes follows the time, the temperature comes first.
+    conditions drawn for them (`draw_covariates`: a shift in a hall, loads of 60 N and 6 N·m). What a simulator takes
+    and was not told goes by the simulator's name. Where something that no effect describes follows the time, the
+    temperature comes first.
 
     Args:
         analysis: of the rows.
@@ -55,6 +56,12 @@ def missing_covariates(
         size = 0.0 if added is None else _plausible(there, effect, position)
         if added is not None and size > 0:
             found.setdefault(added, {})[effect.name] = size
+    for condition in mechanism.lacking(names):
+        if condition.name in drawn:
+            other = replace(here, covariates={**here.covariates, condition.name: drawn[condition.name]})
+            size = _usual(pose_residual(other, here.pose), position)
+            if size > 0:
+                found.setdefault((condition.name,), {})[mechanism.name] = size
     told: list[dict[str, Any]] = [
         {"columns": [f"{n}[{units[n]}]" for n in added], "effects": sizes, "unit": "m" if position else "rad"}
         for added, sizes in found.items()
@@ -75,5 +82,10 @@ def _plausible(situation: Situation, effect: Effect, position: bool) -> float:
     """What an effect of plausible size does to the usual row [m] or [rad]."""
     main = [i for i, c in enumerate(effect.coefficients(situation)) if not c.secondary]
     columns = scaled_signature(situation, effect, default_shape(situation, effect))[..., main]
-    block: Tensor = columns[:, :3] if position else columns[:, 3:]
-    return float(torch.nan_to_num(block).square().sum((1, 2)).median().sqrt())
+    return _usual(columns, position)
+
+
+def _usual(change: Tensor, position: bool) -> float:
+    """Size of a change of the usual row, given as `s x c` or by parts, `s x c x m` [m] or [rad]."""
+    block = torch.nan_to_num(change[:, :3] if position else change[:, 3:])
+    return float(block.square().flatten(1).sum(1).median().sqrt())

@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import analyse
+from ccnn_torch.diagnosis._cautions import row_cautions
 from ccnn_torch.diagnosis.engine import candidates, thinned, usable_rows
+from ccnn_torch.diagnosis.words import lacking_text
 from ccnn_torch.effects import Effect, Situation
 
 __all__ = ["Check", "check_rows"]
@@ -32,6 +34,7 @@ class Check:
         confusable: pairs of effects with the share of the first that the second can take over (cosine), largest first.
         condition: largest condition number of the Jacobian over the rows that count.
         remarks: what else to know, such as covariates that a simulator takes and the records lack, one sentence each.
+        cautions: signs that the rows and the model do not fit each other, one sentence each.
     """
 
     rows: int
@@ -43,6 +46,7 @@ class Check:
     confusable: list[tuple[str, str, float]]
     condition: float
     remarks: list[str] = field(default_factory=list)
+    cautions: list[str] = field(default_factory=list)
 
 
 def check_rows(
@@ -77,7 +81,10 @@ def check_rows(
         weak=weak,
         confusable=_confusable(spans),
         condition=float(condition.max()),
-        remarks=situation.mechanism.remarks([*situation.covariates]),
+        remarks=[
+            lacking_text(situation.mechanism.name, c) for c in situation.mechanism.lacking([*situation.covariates])
+        ],
+        cautions=row_cautions(analysis, len(lost) / rows),
     )
 
 

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis, analyse
+from ccnn_torch.diagnosis._belonging import belonging
 from ccnn_torch.diagnosis._catch_all import SPEED
+from ccnn_torch.diagnosis._cautions import DOUBTED, cautions
 from ccnn_torch.diagnosis._missing import missing_covariates
 from ccnn_torch.diagnosis._next import next_measurements
 from ccnn_torch.diagnosis._report import Blocks, blocks, in_order
@@ -16,7 +18,7 @@ from ccnn_torch.diagnosis._rows import picked
 from ccnn_torch.diagnosis._verdict import judge
 from ccnn_torch.diagnosis._where import where
 from ccnn_torch.diagnosis.result import Diagnosis
-from ccnn_torch.diagnosis.words import unseen_text, verdict_text
+from ccnn_torch.diagnosis.words import lacking_text, unseen_text, verdict_text
 from ccnn_torch.effects import Effect, Situation, effect_names, make_effect, pose_residual
 from ccnn_torch.errors import InputError
 
@@ -29,8 +31,6 @@ _FEWEST_ROWS = 20
 # Times the noise from which a row is bad and not unlucky: by itself; and where more than so many rows in a hundred, one
 # at least, are beyond the second, since the tail of a t distribution with three degrees comes that far now and then.
 _GROSS, _GROSS_TOGETHER, _SHARE_TOGETHER = 60.0, 15.0, 0.01
-# Half of the rows beyond reach are no outliers any more: the model or the units are wrong.
-_USABLE = 0.5
 
 
 def candidates(
@@ -76,6 +76,7 @@ def diagnose_rows(
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
     fine = usable_rows(situation, measured)
+    astray = ~fine & torch.isfinite(pose_residual(situation, measured)).all(-1)
     situation, measured, chosen = thinned(situation, measured, fine, seed)
     residual = pose_residual(situation, measured)
     every = _made(situation, effects)
@@ -86,10 +87,13 @@ def diagnose_rows(
     gap, gap_rotation, listed = blocks(made)
     together = made.main(made.together)
     nothing = not judgement.names and not judgement.outside
-    outlier = nothing and bool(gross_rows(analysis).any())
+    outlier = nothing and bool(astray.any() or gross_rows(analysis).any())
+    lost = int((~fine).sum())
+    missing = missing_covariates(analysis, every, lacking, judgement.driver, seed)
+    doubts = cautions(analysis, judgement, lost / len(fine), missing)
     verdict = {
         "effects": [OUTLIER] if outlier else list(judgement.names),
-        "probability": judgement.probability,
+        "probability": min(judgement.probability, DOUBTED) if doubts else judgement.probability,
         "shrink": together.shrink,
         "shrink_ci95": None if together.interval is None else list(together.interval),
         "none": nothing and not outlier,
@@ -97,16 +101,14 @@ def diagnose_rows(
         "driver": None if (judgement.driver or "").startswith(SPEED) else judgement.driver,
         "text": "",
     }
-    why = _why_set_aside(analysis, fine, chosen)
-    told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict}
+    why = _why_set_aside(analysis, fine, astray, chosen)
+    told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": doubts}
     verdict["text"] = verdict_text(told | {"rows_set_aside": sorted(why)})
     places, intervals = where(analysis, residual, seed)
-    lost = int((~fine).sum())
     notes = [unseen_text(name, reason) for name, reason in lacking.items()]
-    notes += situation.mechanism.remarks([*situation.covariates])
+    notes += [lacking_text(situation.mechanism.name, c) for c in situation.mechanism.lacking([*situation.covariates])]
     if len(chosen) < len(fine) - lost:
         notes.append(f"{len(chosen)} of {len(fine)} rows, drawn at random, were looked at")
-    missing = missing_covariates(analysis, every, lacking, judgement.driver, seed)
     if nothing and analysis.whitening.known == 0 and missing:
         columns = ", ".join(column for entry in missing for column in entry["columns"])
         notes.append(
@@ -127,6 +129,7 @@ def diagnose_rows(
         not_seen=lacking,
         rows_set_aside=sorted(why),
         why_set_aside=[why[row] for row in sorted(why)],
+        cautions=doubts,
         notes=notes,
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,
@@ -134,9 +137,10 @@ def diagnose_rows(
     )
 
 
-def _why_set_aside(analysis: Analysis, fine: Tensor, chosen: Tensor) -> dict[int, str]:
-    """Reason by row, counted from 0 in the file; fine: `s` bool; chosen: the rows looked at."""
+def _why_set_aside(analysis: Analysis, fine: Tensor, astray: Tensor, chosen: Tensor) -> dict[int, str]:
+    """Reason by row, counted from 0 in the file; fine, astray: `s` bool; chosen: the rows looked at."""
     why = dict.fromkeys(torch.nonzero(~fine).squeeze(-1).tolist(), "the machine does not reach it")
+    why |= dict.fromkeys(torch.nonzero(astray).squeeze(-1).tolist(), "far from where its joints put it")
     aside, near = analysis.whitening.weight <= 0, analysis.near_singular
     why |= dict.fromkeys(chosen[aside & ~near].tolist(), "far from what any fit to the other rows says")
     return why | dict.fromkeys(chosen[aside & near].tolist(), "next to a singularity")
@@ -156,18 +160,12 @@ def usable_rows(situation: Situation, measured: Tensor) -> Tensor:
     """Rows that the mechanism can have reached, `s` bool.
 
     Raises:
-        InputError: too few rows, or most of them out of reach.
+        InputError: too few rows, or most of them out of reach or far from where the model puts them.
     """
     rows = len(situation.joints)
     if rows < _FEWEST_ROWS:
         raise InputError(f"{rows} rows are too few for a diagnosis; measure at least {_FEWEST_ROWS}, better 100")
-    fine = torch.isfinite(pose_residual(situation, measured)).all(-1)
-    if float(fine.double().mean()) < _USABLE:
-        raise InputError(
-            f"{int((~fine).sum())} of {len(fine)} rows are outside the reach of {situation.mechanism.name}; check the "
-            "units, the order of the joints, and that this is the machine that was measured"
-        )
-    return fine
+    return belonging(situation, measured)
 
 
 def thinned(situation: Situation, measured: Tensor, fine: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:

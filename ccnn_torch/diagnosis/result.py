@@ -33,6 +33,8 @@ class Diagnosis:
         not_seen: effects that these records cannot show, with what is missing for each.
         rows_set_aside: rows (0-based) that no fit saw: outliers, near-singular ones, rows outside the reach.
         why_set_aside: the reason for each of them.
+        cautions: signs that records and model do not fit each other, one sentence each; beside one nothing is claimed
+            more surely than 0.9.
         notes: what was left out and why, one sentence each.
         acting: the verdict's effects with their numbers, to be simulated or compensated.
         analysis, judgement: everything that was looked at.
@@ -51,6 +53,7 @@ class Diagnosis:
     not_seen: dict[str, str]
     rows_set_aside: list[int]
     why_set_aside: list[str]
+    cautions: list[str]
     notes: list[str]
     acting: tuple[Acting, ...] = field(repr=False)
     analysis: Analysis = field(repr=False)

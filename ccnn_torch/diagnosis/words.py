@@ -7,12 +7,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccnn_torch._display import count_text, display_unit, number_text
+from ccnn_torch.coordinates import Condition
 
 __all__ = [
     "SURE",
     "driver_words",
     "effect_words",
     "gap_words",
+    "lacking_text",
     "listed",
     "network_text",
     "probability_words",
@@ -89,18 +91,29 @@ def gap_words(results: Block) -> str:
 def verdict_text(results: Block) -> str:
     """Two sentences that an engineer understands without knowing the method: how large the gap is, and what causes it.
 
+    One more for each caution.
+
     Args:
         results: as in `diagnosis.json`; of `verdict` all but `text` is read.
     """
     verdict = results["verdict"]
+    said = [gap_words(results)]
     if verdict["none"]:
-        return f"{gap_words(results)} No cause beyond the noise is to be seen ({_probability(verdict)})."
-    return f"{gap_words(results)} {_cause(results)}"
+        said.append(f"No cause beyond the noise is to be seen ({_probability(verdict)}).")
+    else:
+        said.append(_cause(results))
+    return " ".join([*said, *(f"But {caution}." for caution in results.get("cautions", ()))])
 
 
 def unseen_text(name: str, why: str) -> str:
     """That the records cannot show an effect, without a full stop."""
     return f"{name} cannot be seen without {why}"
+
+
+def lacking_text(name: str, condition: Condition) -> str:
+    """That a simulator takes what the records do not have, without a full stop."""
+    usual = f"{condition.usual:g} {condition.unit}"
+    return f"{name} takes {condition.name}, which the records do not have: it was simulated with {usual}"
 
 
 def network_text(results: Block) -> str:
@@ -189,7 +202,7 @@ def _size(value: float, block: Block) -> str:
 
 
 def _times(ratio: float) -> str:
-    return f"{ratio:.0f}" if ratio >= 10 else f"{ratio:.1f}"
+    return f"{ratio:.0f}" if ratio >= 10 else f"{ratio:.1f}" if ratio >= 0.1 else f"{ratio:.1g}"
 
 
 def _probability(verdict: Block) -> str:

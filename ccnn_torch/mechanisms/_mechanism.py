@@ -244,8 +244,8 @@ class Mechanism(nn.Module):
         """
         return self
 
-    def remarks(self, conditions: Sequence[str]) -> list[str]:
-        """What somebody who reads results under these conditions should know, one sentence each."""
+    def lacking(self, conditions: Sequence[str]) -> list[Condition]:
+        """Covariates that it depends on and that neither these names nor `under` have told it."""
         return []
 
     def condition_number(

@@ -105,13 +105,9 @@ class BlackBox(Mechanism):
         twin.conditions = {**self.conditions, **mine}
         return twin
 
-    def remarks(self, conditions: Sequence[str]) -> list[str]:
-        """What it takes and is not told."""
-        lacking = [c for c in self.takes if c.name not in conditions and c.name not in self.conditions]
-        return [
-            f"{self.name} takes {c.name}, which the records do not have: it was simulated with {c.usual:g} {c.unit}"
-            for c in lacking
-        ]
+    def lacking(self, conditions: Sequence[str]) -> list[Condition]:
+        """What it takes and is not told: it has its usual value."""
+        return [c for c in self.takes if c.name not in conditions and c.name not in self.conditions]
 
     def words(self, joints: Tensor, row: int) -> str:
         """Commands `n` of a row, and the conditions of the row of this number, for a sentence."""

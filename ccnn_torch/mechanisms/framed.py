@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.batching import expand_leading
-from ccnn_torch.coordinates import Coordinate, Parameter
+from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.least_squares import jacobian_of, levenberg_marquardt
 from ccnn_torch.mechanisms._frame_start import closed_form_frames, rigid_body_frame
@@ -155,9 +155,9 @@ class Framed(Mechanism):
         twin._modules = {**self._modules, "mechanism": inner}
         return twin
 
-    def remarks(self, conditions: Sequence[str]) -> list[str]:
-        """Those of the mechanism inside."""
-        return self.mechanism.remarks(conditions)
+    def lacking(self, conditions: Sequence[str]) -> list[Condition]:
+        """As of the mechanism inside."""
+        return self.mechanism.lacking(conditions)
 
     def fitted_frames(self, joints: Tensor, measured: Frame) -> Tensor:
         """Closed-form frames between the nominal mechanism's poses of the joints and measured ones.

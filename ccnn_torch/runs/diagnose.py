@@ -116,6 +116,7 @@ def check_text(check: Check) -> list[str]:
         f"Covariates: {', '.join(check.covariates) or 'none'}.",
     ]
     lines += [f"{remark}." for remark in check.remarks]
+    lines += [f"Caution: {caution}." for caution in check.cautions]
     lines += [f"{name} cannot be seen without {why}." for name, why in check.missing.items()]
     lines += [f"{name} could hide: its plausible size is {size:.2g} of the noise." for name, size in check.weak.items()]
     return lines

@@ -104,7 +104,7 @@ def test_conditions_reach_it_and_its_inverse() -> None:
     torch.testing.assert_close(slider.forward_kinematics(joints), joints)
     torch.testing.assert_close(pushed.solve_inverse(pose), joints, rtol=0, atol=1e-9)
     assert slider.under({"temperature": load}) is slider
-    assert slider.remarks([]) and not slider.remarks(["load_x"]) and not pushed.remarks([])
+    assert slider.lacking([]) and not slider.lacking(["load_x"]) and not pushed.lacking([])
     seen = load_mechanism("framed", mechanism=PRESS).under({"load_y": load})
     bent = seen.forward_kinematics(joints * 0 + torch.tensor([2.0, 1.1], dtype=torch.float64))
     assert float((bent[2] - bent[0]).norm()) > 1e-3
