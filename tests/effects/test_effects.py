@@ -126,6 +126,9 @@ class Descending(Good):
 
 
 class Infinite(Good):
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        return ()
+
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         return torch.diag_embed(situation.joints / (situation.joints.abs() < 50))
 
@@ -165,8 +168,8 @@ class Random(Good):
         (NoScale, "the scale 0.0, expected more than 0"),
         (Unsaid, "needs the column 'time', which missing"),
         (Descending, "the grid of shape 'power' does not ascend"),
-        (Infinite, "not finite where the nominal machine has no pose"),
-        (OneShape, "basis at two shapes"),
+        (Infinite, "not finite in 1 of 8 rows"),
+        (OneShape, r"expected \(3, 8, 2, 2\): sets of shapes, rows, joints"),
         (OneSet, "differs from single calls"),
         (Ordered, "depends on the order of the rows"),
         (Idle, "does nothing to mechanism 'five_bar'"),
