@@ -52,8 +52,8 @@ def candidates(
         InputError: the records can show none of them, two have one name, or a user's own breaks what `Effect` says.
     """
     every = _made(situation, effects)
-    refuse_one_name(every)
     lacking = {e.name: tried(e, situation) for e in every}
+    refuse_one_name(every)
     if every and all(lacking.values()):
         need = "; ".join(f"{name} needs {why}" for name, why in lacking.items())
         raise InputError(f"effects: these records can show none of the candidates: {need}")

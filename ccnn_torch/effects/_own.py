@@ -9,13 +9,14 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Tensor
 
+from ccnn_torch.batching import leading_shape
 from ccnn_torch.effects._protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.plugins import USER_ERRORS, failure
 
-__all__ = ["OwnEffect", "label_of", "owned"]
+__all__ = ["OwnEffect", "label_of", "of_library", "owned"]
 
 _Part = TypeVar("_Part", Coefficient, Shape)
 
@@ -104,18 +105,13 @@ class OwnEffect:
         return tuple(found)
 
     def _wrong_form(self, situation: Situation, shape: Tensor, found: Tensor) -> str:
-        mechanism, (rows, n) = situation.mechanism, situation.joints.shape[-2:]
-        m, sets = len(self.coefficients(situation)), shape.shape[:-1]
-        changed, d = {
-            "joints": lambda: ("joints", n),
-            "parameters": lambda: ("parameters", len(mechanism.geometry)),
-            "pose": lambda: ("channels of the pose", 3 if mechanism.frame(mechanism.home_pose)[1] is None else 6),
-        }[self.kind]()
-        over = situation.joints.shape[:-2]
-        # Without a shape that it depends on, a basis need not repeat itself over the sets of shapes.
-        leads = [torch.broadcast_shapes(over, sets)] + ([] if shape.shape[-1] else [over])
-        if situation.parameters is not None:
-            leads += [torch.broadcast_shapes(lead, situation.parameters.shape[:-2]) for lead in leads]
+        changed, d = self._changed(situation)
+        rows, m = situation.joints.shape[-2], len(self.coefficients(situation))
+        over, sets = situation.joints[..., 0, :], shape.shape[:-1]
+        # A basis without shapes need not repeat itself over sets of none.
+        leads = [leading_shape(over, shape)] + ([] if shape.shape[-1] else [leading_shape(over)])
+        if situation.parameters is not None and situation.parameters.dim() > 1:
+            leads.append(leading_shape(over, shape, situation.parameters[..., 0, :]))
         if found.shape not in [(*lead, rows, d, m) for lead in leads]:
             many = f"; shape is {tuple(shape.shape)} here: take shape[..., 0] of it, and keep its leading dims"
             axes = f"{'sets of shapes, ' if sets else ''}rows, {changed} and coefficients{many if sets else ''}"
@@ -123,6 +119,16 @@ class OwnEffect:
         if found.dtype != situation.joints.dtype:
             return f"gives {found.dtype}, expected {situation.joints.dtype}"
         return ""
+
+    def _changed(self, situation: Situation) -> tuple[str, int]:
+        """What it changes, and how many of these the mechanism has."""
+        mechanism = situation.mechanism
+        if self.kind == "joints":
+            return "joints", situation.joints.shape[-1]
+        if self.kind == "parameters":
+            return "parameters", len(mechanism.geometry)
+        # Not by the situation's Jacobian, which may be slow, or recorded as something that the effect looks at.
+        return "pose channels", 3 if mechanism.frame(mechanism.home_pose)[1] is None else 6
 
     def _not_finite(self, situation: Situation, shape: Tensor, found: Tensor) -> str:
         if bool(torch.isfinite(found).all()):
@@ -154,7 +160,7 @@ def owned(effect: object, label: str | None = None) -> Effect:
     Raises:
         InputError: it is no effect.
     """
-    if isinstance(effect, OwnEffect) or type(effect).__module__.startswith(f"{__package__}."):
+    if isinstance(effect, OwnEffect) or of_library(effect):
         return cast(Effect, effect)
     if isinstance(effect, type):
         raise InputError(f"effects: {effect.__name__} is a class; give an object of it, {effect.__name__}()")
@@ -166,6 +172,11 @@ def owned(effect: object, label: str | None = None) -> Effect:
             "(ccnn_torch.testing.check_effect tells all that an effect needs)"
         )
     return OwnEffect(cast(Effect, effect), called)
+
+
+def of_library(effect: object) -> bool:
+    """Whether an effect's class comes with this package, by whose tests it is held to `Effect`."""
+    return type(effect).__module__.startswith(f"{__package__}.")
 
 
 def label_of(effect: object) -> str:

@@ -9,14 +9,14 @@ from numbers import Real
 
 import torch
 
-from ccnn_torch.effects._own import OwnEffect
+from ccnn_torch.effects._own import OwnEffect, of_library
 from ccnn_torch.effects._protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects._registry import OUTLIER, effect_names
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.errors import InputError
 from ccnn_torch.units import to_si
 
-__all__ = ["refuse_one_name", "tried", "wrong_with"]
+__all__ = ["refuse_one_name", "tried"]
 
 
 def tried(effect: Effect, situation: Situation) -> str:
@@ -35,7 +35,7 @@ def tried(effect: Effect, situation: Situation) -> str:
             raise InputError(f"{effect.label}: {wrong}")
     lacks = effect.missing(situation.mechanism, [*situation.covariates])
     if isinstance(effect, OwnEffect) and not lacks:
-        wrong = wrong_with(effect, situation)
+        wrong = _wrong_with(effect, situation)
         if wrong:
             raise InputError(f"{effect.label}: {wrong}")
     return lacks
@@ -52,7 +52,7 @@ def refuse_one_name(effects: Sequence[Effect]) -> None:
     raise InputError(f"effects: two candidates are called '{twice}'{what}; name each once, and give each its own name")
 
 
-def wrong_with(effect: OwnEffect, situation: Situation) -> str:
+def _wrong_with(effect: OwnEffect, situation: Situation) -> str:
     """What its coefficients and shapes break, '' where nothing; the basis is asked at the middle and the ends of grids.
 
     Args:
@@ -93,7 +93,7 @@ def wrong_with(effect: OwnEffect, situation: Situation) -> str:
 def _wrong_name(effect: OwnEffect, situation: Situation) -> str:
     if not effect.name.strip() or not effect.name.isprintable():
         return f"its name is {effect.name!r}, expected a word or two"
-    if effect.name in (*effect_names(situation.mechanism), OUTLIER):
+    if not of_library(effect.own) and effect.name in (*effect_names(situation.mechanism), OUTLIER):
         return f"its name '{effect.name}' is one of the library's, which a verdict would mean; give it one of its own"
     return ""
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, owned, reached, signature
 from ccnn_torch.effects._own import OwnEffect, label_of
-from ccnn_torch.effects._trial import wrong_with
+from ccnn_torch.effects._trial import tried
 from ccnn_torch.effects.covariates import draw_covariates
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
@@ -57,9 +57,9 @@ def _made(effect: str | Callable[[], Effect]) -> OwnEffect:
 
 def _check(made: OwnEffect, machine: Mechanism, seed: int) -> None:
     situation = _situation(machine, seed)
+    lacks = tried(made, situation)
+    _require(not lacks, made, f"finds nothing to act on in mechanism '{machine.name}': {lacks}")
     _check_needs(made, situation)
-    wrong = wrong_with(made, situation)
-    _require(not wrong, made, wrong)
     _check_basis(made, situation)
     _check_order(made, situation)
     _check_batches(made, situation)
@@ -92,9 +92,6 @@ def _shape(effect: Effect, situation: Situation) -> Tensor:
 
 def _check_needs(effect: Effect, situation: Situation) -> None:
     """`missing` tells the truth: without complaint the effect works with the columns there are."""
-    names = list(situation.covariates)
-    said = effect.missing(situation.mechanism, names)
-    _require(not said, effect, f"finds nothing to act on in mechanism '{situation.mechanism.name}': {said}")
     if effect.missing(situation.mechanism, []):
         return
     alone = replace(situation, covariates={})

@@ -101,7 +101,8 @@ class Good:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         if self.column:
-            return torch.diag_embed(situation.joints * situation.covariates[self.column][..., None])
+            column = situation.covariates[self.column][..., None]
+            return torch.diag_embed(situation.joints * column * shape.unsqueeze(-2))
         return torch.diag_embed(situation.joints.abs().clamp_max(9.0) ** shape.unsqueeze(-2))
 
 
