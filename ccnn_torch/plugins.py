@@ -101,8 +101,6 @@ def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
         raise InputError(f"{spec}: {file} line {error.lineno} is no valid Python: {error.msg}") from error
     except ImportError as error:
         raise InputError(f"{spec}: {file} imports something that is not installed: {error}") from error
-    except InputError:
-        raise
     except USER_ERRORS as error:
         raise InputError(f"{spec}: {file} {failure(error, spec)}") from error
     found = getattr(module, name, None)

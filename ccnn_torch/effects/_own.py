@@ -86,8 +86,6 @@ class OwnEffect:
     def _asked(self, verb: str, *given: object) -> Any:
         try:
             return getattr(self.own, verb)(*given)
-        except InputError:
-            raise
         except USER_ERRORS as error:
             raise InputError(f"{self.label}: {verb}() {failure(error, self.label)}{_hint(error, given[0])}") from error
 

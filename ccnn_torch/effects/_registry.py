@@ -68,8 +68,6 @@ def make_effect(name: str, mechanism: Mechanism | None = None) -> Effect:
         make = load_plugin(name)
         try:
             effect = make()
-        except InputError:
-            raise
         except USER_ERRORS as error:
             raise InputError(f"{name}: making it without arguments {failure(error, name)}") from error
         return owned(effect, name)
