@@ -6,13 +6,33 @@ import ast
 import hashlib
 import importlib.util
 import inspect
+import os
 import sys
+import sysconfig
+import traceback
 from pathlib import Path
 from typing import Any
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["class_hint", "is_plugin", "load_plugin"]
+__all__ = ["USER_ERRORS", "class_hint", "failure", "is_plugin", "load_plugin"]
+
+USER_ERRORS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    ImportError,
+    LookupError,
+    NameError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+"""What a user's code may raise by a mistake; a caller makes a sentence of it by `failure`."""
+
+# Lines of this package, of Python and of what is installed tell a user nothing about the own file.
+_OTHERS = (f"{Path(__file__).parent}{os.sep}", f"{sysconfig.get_path('stdlib')}{os.sep}", "<")
 
 
 def is_plugin(spec: str) -> bool:
@@ -42,11 +62,27 @@ def class_hint(file: str) -> str:
     return f"{file}: names no class; write {' or '.join(f'{file}:{name}' for name in names)}"
 
 
+def failure(error: BaseException, label: str) -> str:
+    """`fails at line N: KeyError: 'q1'`, the end of a sentence that `label` (`path/to/file.py:Name`) opens.
+
+    The line is the innermost in the user's code; its file is named where it is not the label's.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    users = [f for f in frames if not f.filename.startswith(_OTHERS) and "site-packages" not in f.filename]
+    where = ""
+    if users:
+        file = Path(users[-1].filename)
+        own = file.resolve() == Path(label.rpartition(":")[0]).resolve()
+        where = f" at line {users[-1].lineno}{'' if own else f' of {file}'}"
+    said = (str(error).strip().splitlines() or [""])[0]
+    return f"fails{where}: {type(error).__name__}{': ' if said else ''}{said}"
+
+
 def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
     """Run the file and return what it calls `Name`: something that can be called, or an object of a class of `also`.
 
     Raises:
-        InputError: there is no such file or name in it, or the file cannot be run.
+        InputError: there is no such file or name in it, or the file cannot be run (the sentence names the line).
     """
     file, _, name = spec.rpartition(":")
     path = Path(file)
@@ -65,6 +101,8 @@ def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
         raise InputError(f"{spec}: {file} line {error.lineno} is no valid Python: {error.msg}") from error
     except ImportError as error:
         raise InputError(f"{spec}: {file} imports something that is not installed: {error}") from error
+    except USER_ERRORS as error:
+        raise InputError(f"{spec}: {file} {failure(error, spec)}") from error
     found = getattr(module, name, None)
     if not callable(found) and not isinstance(found, also):
         classes = [n for n, o in vars(module).items() if inspect.isclass(o) and o.__module__ == module.__name__]

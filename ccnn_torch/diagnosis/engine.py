@@ -17,9 +17,19 @@ from ccnn_torch.diagnosis._report import Blocks, blocks, in_order
 from ccnn_torch.diagnosis._rows import picked
 from ccnn_torch.diagnosis._verdict import judge
 from ccnn_torch.diagnosis._where import where
+from ccnn_torch.diagnosis.from_file import not_held_notes
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.words import lacking_text, unseen_text, verdict_text
-from ccnn_torch.effects import Effect, Situation, effect_names, make_effect, pose_residual
+from ccnn_torch.effects import (
+    Effect,
+    Situation,
+    effect_names,
+    make_effect,
+    owned,
+    pose_residual,
+    refuse_one_name,
+    tried,
+)
 from ccnn_torch.errors import InputError
 
 __all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows"]
@@ -39,11 +49,11 @@ def candidates(
     """Effects that these records could show, and for the others what is missing.
 
     Raises:
-        InputError: the records can show none of them.
+        InputError: the records can show none of them, two have one name, or a user's own breaks what `Effect` says.
     """
     every = _made(situation, effects)
-    names = [*situation.covariates]
-    lacking = {e.name: e.missing(situation.mechanism, names) for e in every}
+    lacking = {e.name: tried(e, situation) for e in every}
+    refuse_one_name(every)
     if every and all(lacking.values()):
         need = "; ".join(f"{name} needs {why}" for name, why in lacking.items())
         raise InputError(f"effects: these records can show none of the candidates: {need}")
@@ -53,7 +63,7 @@ def candidates(
 def _made(situation: Situation, effects: Sequence[Effect | str] | None) -> list[Effect]:
     """Candidates, those of the library and of the mechanism when None."""
     named = effect_names(situation.mechanism) if effects is None else effects
-    return [make_effect(e, situation.mechanism) if isinstance(e, str) else e for e in named]
+    return [make_effect(e, situation.mechanism) if isinstance(e, str) else owned(e) for e in named]
 
 
 def diagnose_rows(
@@ -107,6 +117,7 @@ def diagnose_rows(
     places, intervals = where(analysis, residual, seed)
     notes = [unseen_text(name, reason) for name, reason in lacking.items()]
     notes += [lacking_text(situation.mechanism.name, c) for c in situation.mechanism.lacking([*situation.covariates])]
+    notes += not_held_notes(judgement.names)
     if len(chosen) < len(fine) - lost:
         notes.append(f"{len(chosen)} of {len(fine)} rows, drawn at random, were looked at")
     if nothing and analysis.whitening.known == 0 and missing:

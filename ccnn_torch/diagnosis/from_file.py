@@ -14,7 +14,7 @@ from torch import Tensor
 from ccnn_torch.effects import EFFECTS, OUTLIER, Coefficient, Effect, Shape, Situation, make_effect
 from ccnn_torch.errors import InputError
 
-__all__ = ["Known", "Verdict", "one_row_at_a_time", "read_verdict"]
+__all__ = ["Known", "Verdict", "not_held_notes", "one_row_at_a_time", "read_verdict"]
 
 
 @dataclass(frozen=True)
@@ -164,13 +164,29 @@ def _refuse(path: str, names: list[str], outside: bool, nothing: bool, listed: d
     if not names:
         raise InputError(f"{key}: effects: names no effect; {remedy}")
     for name in names:
-        if name not in EFFECTS:
+        if not _held(name):
             raise InputError(
                 f"{key}: effects: '{name}' is no effect of this version's library, which a model file could hold; "
-                "diagnose again with the library's (--effects)"
+                f"diagnose again with the library's (--effects), or {remedy} and let the network learn it"
             )
         if name not in listed:
             raise InputError(f"{path}: effects: has no entry '{name}', which the verdict names; diagnose again")
+
+
+def not_held_notes(names: Sequence[str]) -> list[str]:
+    """A sentence for a verdict with effects that `read_verdict` refuses; names: of the verdict."""
+    others = [name for name in names if name != OUTLIER and not _held(name)]
+    if not others:
+        return []
+    return [
+        f"{' and '.join(others)}: no effect of the library, and a compensator of effects=from:… (ccnn run) can hold "
+        "only those; let its network learn the gap (effects=none), or put it into the model that commands are made with"
+    ]
+
+
+def _held(name: str) -> bool:
+    """Whether a model file could hold an effect: its code comes with this package, and its name is all that is kept."""
+    return name in EFFECTS
 
 
 def _known(effect: Effect, situation: Situation, values: dict[str, float]) -> Known:

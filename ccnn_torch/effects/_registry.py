@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable
-from typing import cast
+from pathlib import Path
 
-from ccnn_torch.effects._protocol import Effect, missing_verbs
+from ccnn_torch.effects._own import owned
+from ccnn_torch.effects._protocol import Effect
 from ccnn_torch.effects.backlash import Backlash
 from ccnn_torch.effects.compliance import Compliance
 from ccnn_torch.effects.coupling import Coupling
@@ -25,7 +26,7 @@ from ccnn_torch.effects.tool import Tool
 from ccnn_torch.effects.transmission import Transmission
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.plugins import is_plugin, load_plugin
+from ccnn_torch.plugins import USER_ERRORS, class_hint, failure, is_plugin, load_plugin
 
 __all__ = ["EFFECTS", "OUTLIER", "effect_names", "make_effect"]
 
@@ -60,17 +61,18 @@ def make_effect(name: str, mechanism: Mechanism | None = None) -> Effect:
         mechanism: the one that the effect is for.
 
     Raises:
-        InputError: no effect has this name, or what the file has is no effect.
+        InputError: no effect has this name, or what the file has is no effect. What a user's own effect gives later is
+            checked whenever it is asked (`OwnEffect`).
     """
     if is_plugin(name):
-        effect = load_plugin(name)()
-        missing = missing_verbs(effect)
-        if missing:
-            raise InputError(
-                f"effects: {name} is no effect, it lacks {', '.join(missing)} "
-                "(ccnn_torch.testing.check_effect tells all that an effect needs)"
-            )
-        return cast(Effect, effect)
+        make = load_plugin(name)
+        try:
+            effect = make()
+        except USER_ERRORS as error:
+            raise InputError(f"{name}: making it without arguments {failure(error, name)}") from error
+        return owned(effect, name)
+    if Path(name).suffix == ".py":
+        raise InputError(f"effects: {class_hint(name)}")
     if name not in EFFECTS:
         own = {} if mechanism is None else {e.name: e for e in parameter_causes(mechanism)}
         plain = {_plain(n): e for n, e in own.items()}

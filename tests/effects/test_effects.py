@@ -101,7 +101,8 @@ class Good:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         if self.column:
-            return torch.diag_embed(situation.joints * situation.covariates[self.column][..., None])
+            column = situation.covariates[self.column][..., None]
+            return torch.diag_embed(situation.joints * column * shape.unsqueeze(-2))
         return torch.diag_embed(situation.joints.abs().clamp_max(9.0) ** shape.unsqueeze(-2))
 
 
@@ -126,6 +127,9 @@ class Descending(Good):
 
 
 class Infinite(Good):
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        return ()
+
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         return torch.diag_embed(situation.joints / (situation.joints.abs() < 50))
 
@@ -165,8 +169,8 @@ class Random(Good):
         (NoScale, "the scale 0.0, expected more than 0"),
         (Unsaid, "needs the column 'time', which missing"),
         (Descending, "the grid of shape 'power' does not ascend"),
-        (Infinite, "not finite where the nominal machine has no pose"),
-        (OneShape, "basis at two shapes"),
+        (Infinite, "not finite in 1 of 8 rows"),
+        (OneShape, r"expected \(3, 8, 2, 2\): sets of shapes, rows, joints"),
         (OneSet, "differs from single calls"),
         (Ordered, "depends on the order of the rows"),
         (Idle, "does nothing to mechanism 'five_bar'"),

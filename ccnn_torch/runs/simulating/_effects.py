@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch._table import nearest
-from ccnn_torch.effects import EFFECTS, OUTLIER, Acting, Coefficient, Effect, Situation, make_effect
+from ccnn_torch.effects import EFFECTS, OUTLIER, Acting, Coefficient, Effect, Situation, make_effect, tried
 from ccnn_torch.errors import InputError
 from ccnn_torch.units import to_si
 
@@ -88,12 +88,13 @@ def act(wanted: Wanted, situation: Situation, generator: torch.Generator) -> Act
     not given are drawn from the lower half of their grid.
 
     Raises:
-        InputError: no such effect, one that these rows cannot show, or a parameter that it does not have.
+        InputError: no such effect, one that these rows cannot show, a parameter that it does not have, or a user's own
+            that breaks what `Effect` says.
     """
     if wanted.name not in EFFECTS and nearest(wanted.name, [OUTLIER], 0.8):
         raise InputError(f"effects: '{wanted.name}' is no effect; did you mean '{OUTLIER}'?")
     effect = make_effect(wanted.name, situation.mechanism)
-    missing = effect.missing(situation.mechanism, list(situation.covariates))
+    missing = tried(effect, situation)
     if missing:
         raise InputError(f"--effect {wanted.name}: it needs {missing}")
     found, shapes = effect.coefficients(situation), effect.shapes(situation)
