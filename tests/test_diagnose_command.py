@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -71,6 +72,38 @@ def test_check_says_what_rows_can_show_without_a_verdict(cli: Cli, rows: Path) -
     assert code == 0
     assert "80 rows" in shown and "tool cannot be seen without" in shown
     assert list(rows.parent.glob("*.json")) == []
+
+
+def test_rows_set_aside_are_called_by_one_name_everywhere(cli: Cli, tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    words = ("--mechanism", "five_bar", "--effect", "outlier:share=0.05,size=0.01", "--rows", 60, "--noise", "1e-5")
+    code, shown, _ = cli("simulate", *words, "--seed", 2, "--out", path)
+    lines, rows = (re.findall(rf"{kind}s? ([\d, ]+)", " ".join(shown.split()))[-1].strip() for kind in ("line", "row"))
+    assert code == 0 and len(rows.split(", ")) == 3
+    assert [int(line) for line in lines.split(",")] == [int(row) + 1 for row in rows.split(",")]
+    # Bad by the file itself: the line that is named there is far off.
+    file = path.read_text(encoding="utf-8").splitlines()
+    records = load_records(path, load_mechanism("five_bar"))
+    gap = (records.pose - load_mechanism("five_bar").forward_kinematics(records.joints)).norm(dim=-1)
+    assert set(gap.argsort(descending=True)[:3].tolist()) == {int(row) - 1 for row in rows.split(",")}
+    # A blank line below the header: lines go up by one, rows stay.
+    path.write_text("\n".join([file[0], "", *file[1:]]) + "\n", encoding="utf-8")
+    moved = ", ".join(str(int(line) + 1) for line in lines.split(","))
+    name = f"lines {moved} (rows {rows})"
+    sentence = f"Far from what any fit to the other rows says: 3, at {name}."
+    code, shown, _ = cli("check", "--records", path, "--mechanism", "five_bar", "--out", tmp_path)
+    assert code == 0 and sentence in " ".join(shown.split())
+    looked = json.loads((tmp_path / "check.json").read_text(encoding="utf-8"))
+    assert {int(row) for row in rows.split(",")} <= {row + 1 for row in looked["aside"]}
+    assert looked["lines_aside"] == [row + 3 for row in looked["aside"]]
+    assert f"{len(looked['aside'])} rows set aside. " in " ".join(shown.split())
+    code, shown, _ = cli("diagnose", "--records", path, "--mechanism", "five_bar", "--out", tmp_path, "--no-network")
+    assert code == 0 and sentence in " ".join(shown.split())
+    results = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
+    assert results["rows_set_aside"] == looked["aside"] and results["why_set_aside"] == looked["why_aside"]
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for line, row in zip(moved.split(", "), rows.split(", "), strict=True):
+        assert f"<td>{line}</td><td>{row}</td>" in page
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from ccnn_torch.diagnosis.words import unseen_text, verdict_text
 from ccnn_torch.effects import Effect, Situation, effect_names, make_effect, pose_residual
 from ccnn_torch.errors import InputError
 
-__all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows"]
+__all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows", "why_set_aside"]
 
 OUTLIER = "outlier"
 # More rows, and more measured values, than this name a cause no better: so many are drawn.
@@ -97,7 +97,7 @@ def diagnose_rows(
         "driver": None if (judgement.driver or "").startswith(SPEED) else judgement.driver,
         "text": "",
     }
-    why = _why_set_aside(analysis, fine, chosen)
+    why = why_set_aside(analysis, fine, chosen)
     told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict}
     verdict["text"] = verdict_text(told | {"rows_set_aside": sorted(why)})
     places, intervals = where(analysis, residual, seed)
@@ -134,7 +134,7 @@ def diagnose_rows(
     )
 
 
-def _why_set_aside(analysis: Analysis, fine: Tensor, chosen: Tensor) -> dict[int, str]:
+def why_set_aside(analysis: Analysis, fine: Tensor, chosen: Tensor) -> dict[int, str]:
     """Reason by row, counted from 0 in the file; fine: `s` bool; chosen: the rows looked at."""
     why = dict.fromkeys(torch.nonzero(~fine).squeeze(-1).tolist(), "the machine does not reach it")
     aside, near = analysis.whitening.weight <= 0, analysis.near_singular

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -50,6 +51,7 @@ def diagnose(
     """
     situation = situation_of(records, mechanism, gravity)
     said = diagnose_rows(situation, records.pose, noise_of(noise, situation), effects, seed)
+    said = replace(said, lines=tuple(records.lines.tolist()))
     return with_network(said, seed) if network else said
 
 

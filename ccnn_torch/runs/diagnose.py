@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of
 from ccnn_torch.diagnosis.check import Check, check_rows
 from ccnn_torch.diagnosis.pictures import picture_arrays
+from ccnn_torch.diagnosis.words import aside_text
 from ccnn_torch.effects import Effect, make_effect
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
@@ -61,7 +63,8 @@ def run_check(config: DiagnoseConfig) -> Check:
     """Load and look at what the records can show; raises as `run_diagnosis`."""
     records, mechanism, effects = _loaded(config)
     situation = situation_of(records, mechanism, config.gravity)
-    return check_rows(situation, records.pose, noise_of(config.noise, situation), effects)
+    found = check_rows(situation, records.pose, noise_of(config.noise, situation), effects)
+    return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside])
 
 
 def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
@@ -95,7 +98,8 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str]
     arrays, labels = picture_arrays(diagnosis, seed)
     mechanism = diagnosis.analysis.situation.mechanism
     units = covariate_units(mechanism) | {c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)}
-    told = {"noise": _noise_text(diagnosis), **(about or {}), "units": units}
+    lines = [diagnosis.lines[row] for row in diagnosis.rows_set_aside] if diagnosis.lines else []
+    told = {"noise": _noise_text(diagnosis), **(about or {}), "units": units, "lines": lines}
     write_diagnosis_report(folder, plain(diagnosis.to_json()), arrays, labels | {"about": told})
     return path
 
@@ -115,6 +119,7 @@ def check_text(check: Check) -> list[str]:
         f"Noise (m, rad): {noise}.",
         f"Covariates: {', '.join(check.covariates) or 'none'}.",
     ]
+    lines += [aside_text(check.aside, check.why_aside, check.lines_aside)] if check.aside else []
     lines += [f"{remark}." for remark in check.remarks]
     lines += [f"{name} cannot be seen without {why}." for name, why in check.missing.items()]
     lines += [f"{name} could hide: its plausible size is {size:.2g} of the noise." for name, size in check.weak.items()]

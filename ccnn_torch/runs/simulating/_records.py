@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,7 +15,7 @@ from ccnn_torch.effects import Acting, Situation, default_gravity, measured_pose
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
-from ccnn_torch.records import write_table
+from ccnn_torch.records import name_lines, write_table
 from ccnn_torch.report.table_form import Table
 from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.runs.simulate_config import SimulateConfig
@@ -136,7 +137,11 @@ def injected_table(simulated: Simulated) -> Table:
         for name, (value, unit) in one.parameters.items()
     ]
     alone = "; ".join(f"{one.name} alone {one.gap * 1e6:.3g} µm" for one in simulated.injected)
-    bad = f"; bad rows: {', '.join(str(row + 1) for row in simulated.outliers)}" if simulated.outliers else ""
+    bad = ""
+    if simulated.outliers:
+        # As the file will have them, below a header.
+        lines = np.arange(len(simulated.joints), dtype=np.int64) + 2
+        bad = f"; bad rows: {name_lines(lines, simulated.outliers, len(simulated.outliers))}"
     note = f"RMS error of the position {simulated.gap * 1e6:.3g} µm without noise{f' ({alone})' if alone else ''}{bad}"
     return Table("Injected", ("effect", "parameter", "value", "unit"), tuple(rows), note)
 
