@@ -124,6 +124,33 @@ def test_what_is_wrong_is_one_sentence(
     assert code == 2 and sentence in told and len(told.strip().splitlines()) == 1
 
 
+def _stop(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_stopped_before_the_verdict_it_says_that_nothing_was_written(
+    cli: Cli, rows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("--records", rows, "--mechanism", "five_bar", "--out", tmp_path / "found")
+    monkeypatch.setattr("ccnn_torch.runs.diagnose.diagnose", _stop)
+    monkeypatch.setattr("ccnn_torch.runs.diagnose.check_rows", _stop)
+    assert cli("diagnose", *words) == (130, "", "interrupted before there was a verdict; nothing was written\n")
+    assert cli("check", *words) == (130, "", "interrupted; nothing was written\n")
+    assert not (tmp_path / "found").exists()
+
+
+def test_stopped_after_the_verdict_it_says_where_that_is(
+    cli: Cli, rows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ccnn_torch.diagnosis.with_network", _stop)
+    words = ("--records", rows, "--mechanism", "five_bar", "--effects", "backlash", "--out", tmp_path / "found")
+    code, shown, told = cli("diagnose", *words)
+    kept = tmp_path / "found" / "diagnosis.json"
+    assert code == 130 and "acklash" in shown and f"the verdict, which is kept in {kept};" in told
+    assert json.loads(kept.read_text(encoding="utf-8"))["verdict"]["effects"] == ["backlash"]
+    assert not (tmp_path / "found" / "report.html").exists()
+
+
 def test_records_of_another_machine_are_refused_in_python(rows: Path) -> None:
     records = load_records(rows, load_mechanism("five_bar"))
     with pytest.raises(InputError, match="records: they have 2 joints and tripod has 3"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of
@@ -26,6 +26,7 @@ __all__ = [
     "parse_noise",
     "run_check",
     "run_diagnosis",
+    "write_check",
     "write_diagnosis",
     "write_result",
 ]
@@ -73,13 +74,25 @@ def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
     Raises:
         InputError: the folder cannot be written.
     """
+    _make(folder)
+    path = folder / "diagnosis.json"
+    write_json(path, plain(diagnosis.to_json()))
+    return path
+
+
+def write_check(folder: Path, check: Check) -> Path:
+    """Write `check.json`; raises as `write_result`."""
+    _make(folder)
+    path = folder / "check.json"
+    write_json(path, asdict(check))
+    return path
+
+
+def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as reason:
         raise InputError(f"{folder}: cannot be made: {reason.strerror}") from None
-    path = folder / "diagnosis.json"
-    write_json(path, plain(diagnosis.to_json()))
-    return path
 
 
 def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str] | None = None, seed: int = 0) -> Path:
