@@ -113,6 +113,13 @@ def test_rows_set_aside_are_called_by_one_name_everywhere(cli: Cli, tmp_path: Pa
         (["--out", "x", "--effects", "backlsh"], "did you mean 'backlash'?"),
         (["--out", "x", "--effects", "tool"], "can show none of the candidates: tool needs"),
         (["--out", "x", "--noise", "abc"], "'abc' is neither a number nor NAME=S"),
+        (["--out", "x", "--noise", "0"], "--noise 0: must be a standard deviation of the pose in SI, a number above 0"),
+        (["--out", "x", "--noise", "-1"], "--noise -1: must be a standard deviation"),
+        (["--out", "x", "--noise", "nan"], "--noise nan: must be a standard deviation"),
+        (["--out", "x", "--noise", "x=1e-5,y=0"], "--noise x=1e-5,y=0: must be a standard deviation"),
+        (["--out", "x", "--noise", "=1"], "'=1' is neither a number nor NAME=S"),
+        (["--out", "x", "noise=0"], "'noise=0': noise: must be a standard deviation of the pose in SI, a number above"),
+        (["--out", "x", "noise={x: wide}"], "noise: must be a standard deviation"),
         (["--out", "x", "--noise", "z=1e-5"], "there is no pose coordinate z"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.diagnosis_report import write_diagnosis_report
 from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.table_form import Table
-from ccnn_torch.runs.diagnose_config import DiagnoseConfig
+from ccnn_torch.runs.diagnose_config import WRONG_NOISE, DiagnoseConfig
 
 __all__ = [
     "check_table",
@@ -36,18 +37,24 @@ def parse_noise(text: str) -> str:
     """`--noise` as an override: one number, or `NAME=S,…`.
 
     Raises:
-        InputError: it is neither.
+        InputError: it is neither, or not above 0.
     """
     parts = [p.strip() for p in text.split(",") if p.strip()]
     pairs = [p.partition("=") for p in parts]
+    alone = len(parts) == 1 and not pairs[0][1]
     try:
-        if len(parts) == 1 and not pairs[0][1]:
-            return f"noise={float(parts[0])!r}"
-        return "noise={" + ", ".join(f"{n.strip()}: {float(v)!r}" for n, _, v in pairs) + "}"
+        values = {n.strip(): float(v) for n, _, v in pairs} if not alone else {"all": float(parts[0])}
     except ValueError:
+        values = {}
+    if not values or not all(values):
         raise InputError(
             f"--noise: '{text}' is neither a number nor NAME=S,NAME=S,… (standard deviation of the pose in SI)"
-        ) from None
+        )
+    if not all(0 < value < math.inf for value in values.values()):
+        raise InputError(f"--noise {text}: {WRONG_NOISE}")
+    if alone:
+        return f"noise={values['all']!r}"
+    return "noise={" + ", ".join(f"{name}: {value!r}" for name, value in values.items()) + "}"
 
 
 def run_diagnosis(config: DiagnoseConfig) -> Diagnosis:
