@@ -131,6 +131,39 @@ def test_what_is_wrong_is_one_sentence(
     assert code == 2 and sentence in told and len(told.strip().splitlines()) == 1
 
 
+def _first_rows(rows: Path) -> None:
+    head = "".join(rows.read_text(encoding="utf-8").splitlines(keepends=True)[:6])
+    rows.write_text(head, encoding="utf-8")
+
+
+def _moved_away(rows: Path) -> None:
+    header, *lines = rows.read_text(encoding="utf-8").splitlines()
+    x = header.split(",").index("q1[rad]")
+    cells = [line.split(",") for line in lines]
+    # Cranks that point away from each other: no coupler reaches.
+    rows.write_text("\n".join([header, *(",".join([*c[:x], "3.1", "0.0", *c[x + 2 :]]) for c in cells)]) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (_first_rows, "5 rows are too few for a diagnosis; measure at least 20"),
+        (_moved_away, "80 of 80 rows are outside the reach of five_bar"),
+        (lambda rows: rows.write_text(""), "the file is empty; line 1 must be the header"),
+        (Path.unlink, "cannot be read: No such file or directory"),
+        (lambda rows: (rows.unlink(), rows.mkdir()), "cannot be read: Is a directory"),
+    ],
+)
+@pytest.mark.parametrize("command", ["diagnose", "check"])
+def test_wrong_records_are_named(
+    cli: Cli, rows: Path, tmp_path: Path, command: str, change: Callable[[Path], object], sentence: str
+) -> None:
+    change(rows)
+    code, _, told = cli(command, "--records", rows, "--mechanism", "five_bar", "--out", tmp_path / "found")
+    assert code == 2 and told.startswith(f"{rows}: {sentence}"), told
+    assert len(told.strip().splitlines()) == 1 and not (tmp_path / "found").exists()
+
+
 def _stop(*_: object, **__: object) -> None:
     raise KeyboardInterrupt
 

@@ -18,7 +18,7 @@ from ccnn_torch.diagnosis._where import where
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.words import unseen_text, verdict_text
 from ccnn_torch.effects import Effect, Situation, effect_names, make_effect, pose_residual
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import InputError, RowsError
 
 __all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows", "why_set_aside"]
 
@@ -156,14 +156,14 @@ def usable_rows(situation: Situation, measured: Tensor) -> Tensor:
     """Rows that the mechanism can have reached, `s` bool.
 
     Raises:
-        InputError: too few rows, or most of them out of reach.
+        RowsError: too few rows, or most of them out of reach.
     """
     rows = len(situation.joints)
     if rows < _FEWEST_ROWS:
-        raise InputError(f"{rows} rows are too few for a diagnosis; measure at least {_FEWEST_ROWS}, better 100")
+        raise RowsError(f"{rows} rows are too few for a diagnosis; measure at least {_FEWEST_ROWS}, better 100")
     fine = torch.isfinite(pose_residual(situation, measured)).all(-1)
     if float(fine.double().mean()) < _USABLE:
-        raise InputError(
+        raise RowsError(
             f"{int((~fine).sum())} of {len(fine)} rows are outside the reach of {situation.mechanism.name}; check the "
             "units, the order of the joints, and that this is the machine that was measured"
         )

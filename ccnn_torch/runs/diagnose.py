@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of
 from ccnn_torch.diagnosis.check import Check, check_rows
+from ccnn_torch.diagnosis.from_records import naming
 from ccnn_torch.diagnosis.pictures import picture_arrays
 from ccnn_torch.diagnosis.words import aside_text
 from ccnn_torch.effects import Effect, make_effect
@@ -71,7 +72,8 @@ def run_check(config: DiagnoseConfig) -> Check:
     """Load and look at what the records can show; raises as `run_diagnosis`."""
     records, mechanism, effects = _loaded(config)
     situation = situation_of(records, mechanism, config.gravity)
-    found = check_rows(situation, records.pose, noise_of(config.noise, situation), effects)
+    with naming(records):
+        found = check_rows(situation, records.pose, noise_of(config.noise, situation), effects)
     return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside])
 
 
