@@ -29,21 +29,16 @@ def refuse_impossible(name: str, effect: Effect, situation: Situation, values: M
     """
     for c in effect.coefficients(situation):
         value = values.get(c.name, 0.0)
+        given, usual = f"--effect {name}: {c.name} = {_said(value, c.unit)}", _said(c.scale, c.unit)
         if c.positive and value < 0:
-            raise InputError(
-                f"--effect {name}: {c.name} = {_said(value, c.unit)} is below 0, which physics does not allow; plausible "
-                f"is about {_said(c.scale, c.unit)}"
-            )
+            raise InputError(f"{given} is below 0, which physics does not allow; plausible is about {usual}")
         if abs(value) > _ABSURD * c.scale:
-            raise InputError(
-                f"--effect {name}: {c.name} = {_said(value, c.unit)} is more than {_ABSURD:g} times what a machine has; "
-                f"plausible is about {_said(c.scale, c.unit)}"
-            )
+            raise InputError(f"{given} is more than {_ABSURD:g} times what a machine has; plausible is about {usual}")
     for s in effect.shapes(situation):
         if s.grid[0] >= 0 > values.get(s.name, 0.0):
             raise InputError(
-                f"--effect {name}: {s.name} = {_said(values[s.name], s.unit)} is below 0; on these rows a diagnosis looks "
-                f"from {s.grid[0]:g} to {_said(s.grid[-1], s.unit)}"
+                f"--effect {name}: {s.name} = {_said(values[s.name], s.unit)} is below 0; on these rows a diagnosis "
+                f"looks from {s.grid[0]:g} to {_said(s.grid[-1], s.unit)}"
             )
 
 
@@ -66,8 +61,8 @@ def refuse_beyond_bounds(situation: Situation, acting: Sequence[Acting]) -> None
             names = [one.effect.name for one, change in zip(changing, changes, strict=True) if change[:, k].any()]
             there = least if low else most
             raise InputError(
-                f"--effect {names[0]}: {parameter.name} would be {_said(there, parameter.unit)}, and the mechanism has it "
-                f"{_range(parameter, 0.0)}; give a difference to its nominal {parameter.nominal:g} "
+                f"--effect {names[0]}: {parameter.name} would be {_said(there, parameter.unit)}, and the mechanism has "
+                f"it {_range(parameter, 0.0)}; give a difference to its nominal {parameter.nominal:g} "
                 f"{_range(parameter, parameter.nominal)}"
             )
 
