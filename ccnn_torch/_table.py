@@ -103,15 +103,15 @@ def nearest(name: str, candidates: Sequence[str], cutoff: float = 0.6) -> str | 
     return folded[near[0]] if near else None
 
 
-def name_lines(lines: NDArray[np.int64], rows: Sequence[int] | NDArray[np.int64]) -> str:
-    """Name rows (given 0-based) for a person, at most five of them: "line 17 (row 16)".
+def name_lines(lines: NDArray[np.int64], rows: Sequence[int] | NDArray[np.int64], most: int = 5) -> str:
+    """Name rows (given 0-based) for a person, at most `most` of them: "line 17 (row 16)".
 
     The line is that of the file, whose first line is the header; the row counts the rows below it from 1.
     """
     plural = "s" if len(rows) > 1 else ""
-    more = f" and {len(rows) - 5} more" if len(rows) > 5 else ""
-    shown_lines = ", ".join(str(int(lines[row])) for row in rows[:5])
-    shown_rows = ", ".join(str(int(row) + 1) for row in rows[:5])
+    more = f" and {len(rows) - most} more" if len(rows) > most else ""
+    shown_lines = ", ".join(str(int(lines[row])) for row in rows[:most])
+    shown_rows = ", ".join(str(int(row) + 1) for row in rows[:most])
     return f"line{plural} {shown_lines} (row{plural} {shown_rows}){more}"
 
 

@@ -11,6 +11,10 @@ class InputError(CcnnError):
     """Bad input from outside: records, a config, a mechanism file. The command line shows it and exits with 2."""
 
 
+class RowsError(InputError):
+    """Rows that cannot be looked at as a whole: too few, or out of reach. Where they are from a file, it is named."""
+
+
 class ModelFileError(InputError):
     """A model file or its card is damaged, foreign, tampered with, or made for another mechanism."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -73,6 +74,38 @@ def test_check_says_what_rows_can_show_without_a_verdict(cli: Cli, rows: Path) -
     assert list(rows.parent.glob("*.json")) == []
 
 
+def test_rows_set_aside_are_called_by_one_name_everywhere(cli: Cli, tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    words = ("--mechanism", "five_bar", "--effect", "outlier:share=0.05,size=0.01", "--rows", 60, "--noise", "1e-5")
+    code, shown, _ = cli("simulate", *words, "--seed", 2, "--out", path)
+    lines, rows = (re.findall(rf"{kind}s? ([\d, ]+)", " ".join(shown.split()))[-1].strip() for kind in ("line", "row"))
+    assert code == 0 and len(rows.split(", ")) == 3
+    assert [int(line) for line in lines.split(",")] == [int(row) + 1 for row in rows.split(",")]
+    # Bad by the file itself: the line that is named there is far off.
+    file = path.read_text(encoding="utf-8").splitlines()
+    records = load_records(path, load_mechanism("five_bar"))
+    gap = (records.pose - load_mechanism("five_bar").forward_kinematics(records.joints)).norm(dim=-1)
+    assert set(gap.argsort(descending=True)[:3].tolist()) == {int(row) - 1 for row in rows.split(",")}
+    # A blank line below the header: lines go up by one, rows stay.
+    path.write_text("\n".join([file[0], "", *file[1:]]) + "\n", encoding="utf-8")
+    moved = ", ".join(str(int(line) + 1) for line in lines.split(","))
+    name = f"lines {moved} (rows {rows})"
+    sentence = f"Far from what any fit to the other rows says: 3, at {name}."
+    code, shown, _ = cli("check", "--records", path, "--mechanism", "five_bar", "--out", tmp_path)
+    assert code == 0 and sentence in " ".join(shown.split())
+    looked = json.loads((tmp_path / "check.json").read_text(encoding="utf-8"))
+    assert {int(row) for row in rows.split(",")} <= {row + 1 for row in looked["aside"]}
+    assert looked["lines_aside"] == [row + 3 for row in looked["aside"]]
+    assert f"{len(looked['aside'])} rows set aside. " in " ".join(shown.split())
+    code, shown, _ = cli("diagnose", "--records", path, "--mechanism", "five_bar", "--out", tmp_path, "--no-network")
+    assert code == 0 and sentence in " ".join(shown.split())
+    results = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
+    assert results["rows_set_aside"] == looked["aside"] and results["why_set_aside"] == looked["why_aside"]
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for line, row in zip(moved.split(", "), rows.split(", "), strict=True):
+        assert f"<td>{line}</td><td>{row}</td>" in page
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -80,6 +113,13 @@ def test_check_says_what_rows_can_show_without_a_verdict(cli: Cli, rows: Path) -
         (["--out", "x", "--effects", "backlsh"], "did you mean 'backlash'?"),
         (["--out", "x", "--effects", "tool"], "can show none of the candidates: tool needs"),
         (["--out", "x", "--noise", "abc"], "'abc' is neither a number nor NAME=S"),
+        (["--out", "x", "--noise", "0"], "--noise 0: must be a standard deviation of the pose in SI, a number above 0"),
+        (["--out", "x", "--noise", "-1"], "--noise -1: must be a standard deviation"),
+        (["--out", "x", "--noise", "nan"], "--noise nan: must be a standard deviation"),
+        (["--out", "x", "--noise", "x=1e-5,y=0"], "--noise x=1e-5,y=0: must be a standard deviation"),
+        (["--out", "x", "--noise", "=1"], "'=1' is neither a number nor NAME=S"),
+        (["--out", "x", "noise=0"], "'noise=0': noise: must be a standard deviation of the pose in SI, a number above"),
+        (["--out", "x", "noise={x: wide}"], "noise: must be a standard deviation"),
         (["--out", "x", "--noise", "z=1e-5"], "there is no pose coordinate z"),
     ],
 )
@@ -89,6 +129,66 @@ def test_what_is_wrong_is_one_sentence(
     monkeypatch.chdir(rows.parent)
     code, _, told = cli("diagnose", "--records", rows, "--mechanism", "five_bar", *words)
     assert code == 2 and sentence in told and len(told.strip().splitlines()) == 1
+
+
+def _first_rows(rows: Path) -> None:
+    head = "".join(rows.read_text(encoding="utf-8").splitlines(keepends=True)[:6])
+    rows.write_text(head, encoding="utf-8")
+
+
+def _moved_away(rows: Path) -> None:
+    header, *lines = rows.read_text(encoding="utf-8").splitlines()
+    x = header.split(",").index("q1[rad]")
+    cells = [line.split(",") for line in lines]
+    # Cranks that point away from each other: no coupler reaches.
+    rows.write_text("\n".join([header, *(",".join([*c[:x], "3.1", "0.0", *c[x + 2 :]]) for c in cells)]) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (_first_rows, "5 rows are too few for a diagnosis; measure at least 20"),
+        (_moved_away, "80 of 80 rows are outside the reach of five_bar"),
+        (lambda rows: rows.write_text(""), "the file is empty; line 1 must be the header"),
+        (Path.unlink, "cannot be read: No such file or directory"),
+        (lambda rows: (rows.unlink(), rows.mkdir()), "cannot be read: Is a directory"),
+    ],
+)
+@pytest.mark.parametrize("command", ["diagnose", "check"])
+def test_wrong_records_are_named(
+    cli: Cli, rows: Path, tmp_path: Path, command: str, change: Callable[[Path], object], sentence: str
+) -> None:
+    change(rows)
+    code, _, told = cli(command, "--records", rows, "--mechanism", "five_bar", "--out", tmp_path / "found")
+    assert code == 2 and told.startswith(f"{rows}: {sentence}"), told
+    assert len(told.strip().splitlines()) == 1 and not (tmp_path / "found").exists()
+
+
+def _stop(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_stopped_before_the_verdict_it_says_that_nothing_was_written(
+    cli: Cli, rows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("--records", rows, "--mechanism", "five_bar", "--out", tmp_path / "found")
+    monkeypatch.setattr("ccnn_torch.runs.diagnose.diagnose", _stop)
+    monkeypatch.setattr("ccnn_torch.runs.diagnose.check_rows", _stop)
+    assert cli("diagnose", *words) == (130, "", "interrupted before there was a verdict; nothing was written\n")
+    assert cli("check", *words) == (130, "", "interrupted; nothing was written\n")
+    assert not (tmp_path / "found").exists()
+
+
+def test_stopped_after_the_verdict_it_says_where_that_is(
+    cli: Cli, rows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ccnn_torch.diagnosis.with_network", _stop)
+    words = ("--records", rows, "--mechanism", "five_bar", "--effects", "backlash", "--out", tmp_path / "found")
+    code, shown, told = cli("diagnose", *words)
+    kept = tmp_path / "found" / "diagnosis.json"
+    assert code == 130 and "acklash" in shown and f"the verdict, which is kept in {kept};" in told
+    assert json.loads(kept.read_text(encoding="utf-8"))["verdict"]["effects"] == ["backlash"]
+    assert not (tmp_path / "found" / "report.html").exists()
 
 
 def test_records_of_another_machine_are_refused_in_python(rows: Path) -> None:

@@ -283,8 +283,14 @@ def test_keys_that_do_not_go_together(played: Path, tmp_path: Path) -> None:
         make_config(case="tripod", effects="from:x.json")
     with pytest.raises(InputError, match="effects"):
         make_config(**keys(played, effects="found/diagnosis.json"))
-    with pytest.raises(InputError, match="compliance: needs a column of the load"):
+    with pytest.raises(InputError, match=r"rows\.csv: compliance of .* a column of the load.*not among covariates"):
         prepare(make_config(**keys(played, covariates=["time"])))
+    table = read_table(played / "rows.csv")
+    kept = {f"{n}[{table.units[n]}]": table.raw(n) for n in table.names if not n.startswith("load_")}
+    write_table(tmp_path / "unloaded.csv", kept)
+    sentence = r"unloaded\.csv: compliance of .*diagnosis\.json needs .*load_x.* there is no such column; add it"
+    with pytest.raises(InputError, match=sentence):
+        prepare(make_config(**keys(played, records=str(tmp_path / "unloaded.csv"))))
     with pytest.raises(InputError, match=r"cannot be read"):
         prepare(make_config(**keys(played, effects="from:nowhere.json")))
 

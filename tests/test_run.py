@@ -198,7 +198,7 @@ def stopped(out: Path, keys: list[str], delay: float, number: signal.Signals) ->
 def test_an_interrupted_run_says_so_in_one_sentence_and_keeps_its_checkpoint(tmp_path: Path) -> None:
     code, told = stopped(tmp_path / "run", ["ccnn.generations=5000"], 0.5, signal.SIGINT)
     assert code == 130
-    assert told.strip() == "interrupted; what was computed is kept"
+    assert told.strip() == "interrupted; what was written so far is kept"
     assert list((tmp_path / "run" / "checkpoints").iterdir())
 
 

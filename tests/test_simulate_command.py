@@ -119,6 +119,14 @@ def test_an_own_effect_takes_part(cli: Cli, tmp_path: Path) -> None:
         ("outlier:share=2", "share must be above 0 and at most 0.5"),
         ("outlier:sise=2", "it has no parameter 'sise'; it has share"),
         ("geometry:l1=3", "has no pose in"),
+        ("thermal:growth=1.2e-5,lag=-30min", "--effect thermal: lag = -1800 s is below 0; on these rows a diagnosis"),
+        ("transmission:q1_sin=1e-4,q1_frequency=-2", "q1 frequency = -2 is below 0"),
+        ("latency:delay=-1ms", "delay = -0.001 s is below 0, which physics does not allow; plausible is about 0.005 s"),
+        (
+            "joint_offset:q1=100",
+            "q1 = 100 rad is more than 1000 times what a machine has; plausible is about 0.002",
+        ),
+        ("backlash:size=-1", "size = -1: give a factor from 0 to 1000"),
         ("nowhere.py:Mine", "there is no file nowhere.py"),
     ],
 )
@@ -127,6 +135,37 @@ def test_a_wrong_effect_is_one_sentence(cli: Cli, tmp_path: Path, effect: str, s
     assert code == 2 and sentence in err, err
     assert len(err.strip().splitlines()) == 1 and "Traceback" not in err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("effects", "sentence"),
+    [
+        (["parameter spring1:spring1=-6e4"], "spring1: spring1 would be -20000 N*m/rad, and the mechanism has it from"),
+        (["parameter spring1:spring1=-6e4"], " from 1000 up; give a difference to its nominal 40000 from -39000 up"),
+        (["parameter spring1:spring1=-2e4", "parameter spring1:spring1=-3e4"], "spring1 would be -10000 N*m/rad"),
+    ],
+)
+def test_a_parameter_of_a_simulator_stays_within_its_bounds(
+    cli: Cli, tmp_path: Path, effects: list[str], sentence: str
+) -> None:
+    press = f"{ROOT / 'experiments' / 'my_simulator.py'}:PRESS"
+    more = [word for effect in effects for word in ("--effect", effect)]
+    code, _, err = cli(*words(press, *more, "--noise", 0, "--out", tmp_path / "r.csv"))
+    assert code == 2 and sentence in err and len(err.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+    assert simulate_records(press, ["parameter spring1:spring1=-38999"], 20).gap > 0
+
+
+def test_what_is_told_is_what_acts(cli: Cli, tmp_path: Path) -> None:
+    out = ("--noise", 0, "--out", tmp_path / "r.csv")
+    _, told, _ = cli(*words("five_bar", "--effect", "thermal:growth=1.2e-5,lag=30min", *out))
+    assert "lag" in told and "late lag" not in told
+    _, told, _ = cli(*words("five_bar", "--effect", "thermal:late=1.2e-5", *out))
+    assert "late lag" in told
+    _, told, _ = cli(*words("five_bar", "--effect", "outlier", *out))
+    assert "by bad rows" in told and "without" not in told and " 0 µm" not in told
+    _, told, _ = cli(*words("five_bar", "--effect", "outlier", "--effect", "backlash", *out))
+    assert "without noise and bad rows (backlash alone" in " ".join(told.split())
 
 
 @pytest.mark.parametrize(

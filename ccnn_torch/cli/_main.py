@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from ccnn_torch import __version__
+from ccnn_torch.cli._stopped import Stopped
 from ccnn_torch.cli.blind_check import blind_check
 from ccnn_torch.cli.check import check
 from ccnn_torch.cli.compensate import compensate
@@ -58,16 +59,19 @@ def main() -> None:
     # long on two cores; alone no clear difference was seen.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
-        # 130 comes back where a person pressed Ctrl-C.
+        # 130 comes back where a person pressed Ctrl-C and the command had no sentence of its own for that.
         code = app(standalone_mode=False) or 0
     except (InputError, MethodFailedError) as problem:
         code = _say(str(problem))
     except typer.TyperException as problem:
         code = _say(f"{problem.format_message()} (ccnn --help, or ccnn COMMAND --help, tells what there is)")
+    except Stopped as stopped:
+        _say(str(stopped))
+        sys.exit(130)
     except typer.Abort:
         code = 130
     if code == 130:
-        _say("interrupted; what was computed is kept")
+        _say("interrupted; what was written so far is kept")
     sys.exit(code)
 
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from ccnn_torch.cli._diagnosed import configured
+from ccnn_torch.cli._stopped import NOTHING_WRITTEN, if_stopped
 
 __all__ = ["check"]
 
@@ -33,19 +34,15 @@ def check(
 
     ccnn check --records measured.csv --mechanism my_simulator.py:PRESS
     """
-    from dataclasses import asdict
-
-    from ccnn_torch.report.json_files import write_json
     from ccnn_torch.report.table_form import print_table
-    from ccnn_torch.runs.diagnose import check_table, check_text, run_check
+    from ccnn_torch.runs.diagnose import check_table, check_text, run_check, write_check
     from ccnn_torch.runs.screen import stdout
 
-    wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)
-    found = run_check(wanted)
+    with if_stopped(NOTHING_WRITTEN):
+        wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)
+        found = run_check(wanted)
     if wanted.out is not None:
-        folder = Path(wanted.out)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "check.json", asdict(found))
+        write_check(Path(wanted.out), found)
     if quiet:
         return
     for line in check_text(found):

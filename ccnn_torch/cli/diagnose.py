@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ccnn_torch.cli._diagnosed import configured
+from ccnn_torch.cli._stopped import if_stopped
 from ccnn_torch.errors import InputError
+
+if TYPE_CHECKING:
+    from ccnn_torch.diagnosis import Diagnosis
+    from ccnn_torch.runs.diagnose_config import DiagnoseConfig
 
 __all__ = ["diagnose"]
 
@@ -47,41 +52,61 @@ def diagnose(
 
     ccnn diagnose --records measured.csv --mechanism my_simulator.py:PRESS --out runs/press
     """
-    from ccnn_torch.diagnosis import Diagnosis, with_network
+    with if_stopped("interrupted before there was a verdict; nothing was written"):
+        wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out, network)
+        if wanted.out is None:
+            raise InputError("name the folder to write with --out DIR")
+        found = _search(wanted, quiet)
+    folder = Path(wanted.out)
+    kept = folder / "diagnosis.json"
+    with if_stopped(f"interrupted after the verdict, which is kept in {kept}; what comes after it is not complete"):
+        _tell(wanted, folder, found, quiet)
+
+
+def _search(wanted: DiagnoseConfig, quiet: bool) -> Diagnosis:
+    """The verdict; what was found is kept, whatever becomes of the rest."""
     from ccnn_torch.mechanisms import simulated_rows
-    from ccnn_torch.report.diagnosis_data import about_of, load_labels
-    from ccnn_torch.report.diagnosis_report import print_diagnosis
-    from ccnn_torch.runs.diagnose import run_diagnosis, write_diagnosis, write_result
-    from ccnn_torch.runs.screen import stderr, stdout
-
-    wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out, network)
-    if wanted.out is None:
-        raise InputError("name the folder to write with --out DIR")
-    shown = stderr.is_terminal and not quiet
-
-    def watched(text: str, work: Callable[[Callable[[str], None]], Diagnosis]) -> Diagnosis:
-        if not shown:
-            return work(lambda how_far: None)
-        with stderr.status(text) as status:
-            return work(lambda how_far: status.update(f"{text} {how_far}"))
+    from ccnn_torch.runs.diagnose import run_diagnosis, write_result
 
     def search(tell: Callable[[str], None]) -> Diagnosis:
         with simulated_rows(lambda n: tell(f"{n:,} rows simulated")):
             return run_diagnosis(wanted)
 
     # Thousands of rows of an arm take half a minute, a slow simulator more; how much is left nobody knows.
-    found = watched("looking for the effects that make the gap …", search)
-    folder = Path(wanted.out)
-    # What was found is kept, whatever becomes of the rest.
-    write_result(folder, found)
+    found = _watched("looking for the effects that make the gap …", search, quiet)
+    write_result(Path(str(wanted.out)), found)
+    return found
+
+
+def _tell(wanted: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -> None:
+    """The verdict at once, then all that takes longer."""
+    from ccnn_torch.diagnosis import with_network
+    from ccnn_torch.report.diagnosis_data import about_of, load_labels
+    from ccnn_torch.report.diagnosis_report import print_diagnosis
+    from ccnn_torch.runs.diagnose import write_diagnosis
+    from ccnn_torch.runs.screen import stdout
+
     if not quiet:
         stdout.print(found.verdict["text"], style="bold", markup=False)
     if wanted.network:
-        text = "training a network on what the effects leave …"
-        found = watched(text, lambda tell: with_network(found, wanted.seed, lambda share: tell(f"{100 * share:.0f} %")))
+
+        def train(tell: Callable[[str], None]) -> Diagnosis:
+            return with_network(found, wanted.seed, lambda share: tell(f"{100 * share:.0f} %"))
+
+        found = _watched("training a network on what the effects leave …", train, quiet)
     about = {"name": folder.name, "mechanism": str(wanted.mechanism), "records": str(wanted.records)}
     path = write_diagnosis(folder, found, about, wanted.seed)
     if quiet:
         return
     print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False)
     typer.echo(f"Written: {path} and report.html beside it")
+
+
+def _watched(text: str, work: Callable[[Callable[[str], None]], Diagnosis], quiet: bool) -> Diagnosis:
+    """Work that says how far it is, where a person is looking."""
+    from ccnn_torch.runs.screen import stderr
+
+    if quiet or not stderr.is_terminal:
+        return work(lambda how_far: None)
+    with stderr.status(text) as status:
+        return work(lambda how_far: status.update(f"{text} {how_far}"))

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from ccnn_torch.cli._stopped import NOTHING_WRITTEN, if_stopped
+
 __all__ = ["simulate"]
 
 
@@ -54,8 +56,9 @@ def simulate(
     from ccnn_torch.runs.simulate_config import load_simulate_config
     from ccnn_torch.runs.simulating import injected_table, read_noise, simulate_records, write_simulated
 
-    wanted = load_simulate_config(config, overrides or [])
-    made = simulate_records(mechanism, effect or [], rows, read_noise(noise), wanted, seed)
+    with if_stopped(NOTHING_WRITTEN):
+        wanted = load_simulate_config(config, overrides or [])
+        made = simulate_records(mechanism, effect or [], rows, read_noise(noise), wanted, seed)
     write_simulated(out, made)
     if quiet:
         return

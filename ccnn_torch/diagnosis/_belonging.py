@@ -12,10 +12,10 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._rows import picked
 from ccnn_torch.effects import Situation, pose_residual
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import RowsError
 from ccnn_torch.mechanisms import BlackBox, Framed
 
-__all__ = ["Size", "belonging", "distance", "size_of"]
+__all__ = ["Belonging", "Size", "belonging", "distance", "size_of"]
 
 # Sizes of the machine: a row farther off is of other joints; and where the usual row is so far off, no small deviation
 # is to be looked for in any of them.
@@ -66,17 +66,24 @@ def distance(situation: Situation, measured: Tensor, size: Size) -> Tensor:
     return far
 
 
-def belonging(situation: Situation, measured: Tensor) -> Tensor:
-    """Rows whose pose lies about where their joints put it, `s` bool.
+class Belonging(NamedTuple):
+    """Rows that are of the machine, and those that are not because their pose lies elsewhere; `s` bool each."""
+
+    fine: Tensor
+    astray: Tensor
+
+
+def belonging(situation: Situation, measured: Tensor) -> Belonging:
+    """Whether the pose of each row lies about where its joints put it.
 
     Raises:
-        InputError: most of them do not.
+        RowsError: most of them do not, or are out of reach.
     """
     size = size_of(situation)
     far = distance(situation, measured, size)
     reached = torch.isfinite(far)
     if 2 * int(reached.sum()) < len(far):
-        raise InputError(
+        raise RowsError(
             f"{int((~reached).sum())} of {len(far)} rows are outside the reach of {situation.mechanism.name}; "
             + (
                 _remedy(situation, measured, size)
@@ -85,7 +92,7 @@ def belonging(situation: Situation, measured: Tensor) -> Tensor:
         )
     usual = float(far[reached].median())
     if usual > _USUAL:
-        raise InputError(
+        raise RowsError(
             f"the usual pose lies {usual:.2g} times as far from where {situation.mechanism.name} puts it as its poses "
             "are spread over the workspace, so that these rows are not of this model; "
             + (
@@ -94,7 +101,7 @@ def belonging(situation: Situation, measured: Tensor) -> Tensor:
                 "that joints and pose of a row belong together"
             )
         )
-    return reached & (far < _ROW)
+    return Belonging(reached & (far < _ROW), reached & (far >= _ROW))
 
 
 def _remedy(situation: Situation, measured: Tensor, size: Size) -> str:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import analyse
 from ccnn_torch.diagnosis._cautions import row_cautions
-from ccnn_torch.diagnosis.engine import candidates, thinned, usable_rows
+from ccnn_torch.diagnosis.engine import candidates, thinned, usable_rows, why_set_aside
 from ccnn_torch.diagnosis.words import lacking_text
 from ccnn_torch.effects import Effect, Situation
 
@@ -33,6 +33,8 @@ class Check:
         weak: by effect, its plausible size in units of the noise where that is below 1: it could hide.
         confusable: pairs of effects with the share of the first that the second can take over (cosine), largest first.
         condition: largest condition number of the Jacobian over the rows that count.
+        why_aside: the reason for each of the rows in `aside`.
+        lines_aside: the line of each of them in the file, the header being line 1; empty for rows of no file.
         remarks: what else to know, such as covariates that a simulator takes and the records lack, one sentence each.
         cautions: signs that the rows and the model do not fit each other, one sentence each.
     """
@@ -47,14 +49,16 @@ class Check:
     condition: float
     remarks: list[str] = field(default_factory=list)
     cautions: list[str] = field(default_factory=list)
+    why_aside: list[str] = field(default_factory=list)
+    lines_aside: list[int] = field(default_factory=list)
 
 
 def check_rows(
     situation: Situation, measured: Tensor, noise: Tensor | None = None, effects: Sequence[Effect | str] | None = None
 ) -> Check:
     """Look at rows as `diagnose_rows` does, and say what they can and cannot show; arguments as there."""
-    fine = usable_rows(situation, measured)
-    rows, lost = len(fine), torch.nonzero(~fine).squeeze(-1).tolist()
+    fine, astray = usable_rows(situation, measured)
+    rows = len(fine)
     situation, measured, chosen = thinned(situation, measured, fine, 0)
     usable, lacking = candidates(situation, effects)
     analysis = analyse(situation, measured, usable, noise)
@@ -70,21 +74,23 @@ def check_rows(
         size = float(x.square().sum(-1).mean().sqrt())
         if size < 1:
             weak[atom.name] = size
+    why = why_set_aside(analysis, fine, astray, chosen)
     condition = situation.mechanism.condition_number(situation.joints[keep], parameters=situation.parameters)
     names = ("x", "y", "z", "rx", "ry", "rz")
     return Check(
         rows=rows,
-        aside=sorted([*lost, *chosen[white.weight <= 0].tolist()]),
+        aside=sorted(why),
         noise={names[int(c)]: float(s) for c, s in zip(white.channels, white.sigma, strict=True)},
         covariates=[n for n, v in situation.covariates.items() if float(v.max() - v.min()) > 0],
         missing=lacking,
         weak=weak,
         confusable=_confusable(spans),
         condition=float(condition.max()),
+        why_aside=[why[row] for row in sorted(why)],
         remarks=[
             lacking_text(situation.mechanism.name, c) for c in situation.mechanism.lacking([*situation.covariates])
         ],
-        cautions=row_cautions(analysis, len(lost) / rows),
+        cautions=row_cautions(analysis, 1 - float(fine.double().mean())),
     )
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis, analyse
-from ccnn_torch.diagnosis._belonging import belonging
+from ccnn_torch.diagnosis._belonging import Belonging, belonging
 from ccnn_torch.diagnosis._catch_all import SPEED
 from ccnn_torch.diagnosis._cautions import DOUBTED, cautions
 from ccnn_torch.diagnosis._missing import missing_covariates
@@ -30,9 +30,9 @@ from ccnn_torch.effects import (
     refuse_one_name,
     tried,
 )
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import InputError, RowsError
 
-__all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows"]
+__all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows", "why_set_aside"]
 
 OUTLIER = "outlier"
 # More rows, and more measured values, than this name a cause no better: so many are drawn.
@@ -85,8 +85,7 @@ def diagnose_rows(
     Raises:
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
-    fine = usable_rows(situation, measured)
-    astray = ~fine & torch.isfinite(pose_residual(situation, measured)).all(-1)
+    fine, astray = usable_rows(situation, measured)
     situation, measured, chosen = thinned(situation, measured, fine, seed)
     residual = pose_residual(situation, measured)
     every = _made(situation, effects)
@@ -111,7 +110,7 @@ def diagnose_rows(
         "driver": None if (judgement.driver or "").startswith(SPEED) else judgement.driver,
         "text": "",
     }
-    why = _why_set_aside(analysis, fine, astray, chosen)
+    why = why_set_aside(analysis, fine, astray, chosen)
     told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": doubts}
     verdict["text"] = verdict_text(told | {"rows_set_aside": sorted(why)})
     places, intervals = where(analysis, residual, seed)
@@ -148,7 +147,7 @@ def diagnose_rows(
     )
 
 
-def _why_set_aside(analysis: Analysis, fine: Tensor, astray: Tensor, chosen: Tensor) -> dict[int, str]:
+def why_set_aside(analysis: Analysis, fine: Tensor, astray: Tensor, chosen: Tensor) -> dict[int, str]:
     """Reason by row, counted from 0 in the file; fine, astray: `s` bool; chosen: the rows looked at."""
     why = dict.fromkeys(torch.nonzero(~fine).squeeze(-1).tolist(), "the machine does not reach it")
     why |= dict.fromkeys(torch.nonzero(astray).squeeze(-1).tolist(), "far from where its joints put it")
@@ -167,15 +166,15 @@ def gross_rows(analysis: Analysis) -> Tensor:
     return far if together else aside & (size > _GROSS)
 
 
-def usable_rows(situation: Situation, measured: Tensor) -> Tensor:
-    """Rows that the mechanism can have reached, `s` bool.
+def usable_rows(situation: Situation, measured: Tensor) -> Belonging:
+    """Rows that the mechanism can have reached.
 
     Raises:
-        InputError: too few rows, or most of them out of reach or far from where the model puts them.
+        RowsError: too few rows, or most of them out of reach or far from where the model puts them.
     """
     rows = len(situation.joints)
     if rows < _FEWEST_ROWS:
-        raise InputError(f"{rows} rows are too few for a diagnosis; measure at least {_FEWEST_ROWS}, better 100")
+        raise RowsError(f"{rows} rows are too few for a diagnosis; measure at least {_FEWEST_ROWS}, better 100")
     return belonging(situation, measured)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -12,12 +14,12 @@ from ccnn_torch.diagnosis._told import refuse_lost_rows, told
 from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Effect, Situation, default_gravity
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import InputError, RowsError
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.mechanisms.frames import fit_frames
 from ccnn_torch.records import Records
 
-__all__ = ["diagnose", "noise_of", "situation_of"]
+__all__ = ["diagnose", "naming", "noise_of", "situation_of"]
 
 _POSITION = {"x": 0, "y": 1, "z": 2}
 _TURN = {"rx": 3, "ry": 4, "rz": 5}
@@ -49,8 +51,19 @@ def diagnose(
         InputError: too few rows, most of them out of reach, or noise of a coordinate that there is not.
     """
     situation = situation_of(records, mechanism, gravity)
-    said = diagnose_rows(situation, records.pose, noise_of(noise, situation), effects, seed)
+    with naming(records):
+        said = diagnose_rows(situation, records.pose, noise_of(noise, situation), effects, seed)
+    said = replace(said, lines=tuple(records.lines.tolist()))
     return with_network(said, seed) if network else said
+
+
+@contextmanager
+def naming(records: Records) -> Iterator[None]:
+    """Within it a sentence about the rows names the file that they are from."""
+    try:
+        yield
+    except RowsError as reason:
+        raise RowsError(f"{records.path}: {reason}") from None
 
 
 def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float] | None = None) -> Situation:

@@ -12,7 +12,7 @@ from ccnn_torch.effects import Acting
 
 __all__ = ["Diagnosis"]
 
-_NOT_TOLD = ("acting", "analysis", "judgement")
+_NOT_TOLD = ("acting", "analysis", "judgement", "lines")
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class Diagnosis:
         notes: what was left out and why, one sentence each.
         acting: the verdict's effects with their numbers, to be simulated or compensated.
         analysis, judgement: everything that was looked at.
+        lines: line of every row in the file that it came from, the header being line 1; () for rows of no file.
     """
 
     gap: dict[str, Any]
@@ -58,6 +59,7 @@ class Diagnosis:
     acting: tuple[Acting, ...] = field(repr=False)
     analysis: Analysis = field(repr=False)
     judgement: Judgement = field(repr=False)
+    lines: tuple[int, ...] = field(default=(), repr=False)
 
     def to_json(self) -> Mapping[str, Any]:
         """The form of `diagnosis.json` (schema `diagnosis`)."""

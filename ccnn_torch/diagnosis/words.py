@@ -6,11 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from ccnn_torch._display import count_text, display_unit, number_text
+from ccnn_torch._table import name_lines
 from ccnn_torch.coordinates import Condition
 
 __all__ = [
     "SURE",
+    "aside_text",
     "driver_words",
     "effect_words",
     "gap_words",
@@ -114,6 +118,32 @@ def lacking_text(name: str, condition: Condition) -> str:
     """That a simulator takes what the records do not have, without a full stop."""
     usual = f"{condition.usual:g} {condition.unit}"
     return f"{name} takes {condition.name}, which the records do not have: it was simulated with {usual}"
+
+
+def aside_text(rows: Sequence[int], why: Sequence[str], lines: Sequence[int] = ()) -> str:
+    """Which rows were set aside and why, the first few of each reason; empty where none was.
+
+    Args:
+        rows: their numbers, from 0.
+        why: the reason for each of them.
+        lines: of each of them in the file; () where there is no file: they are then called by their number from 1.
+    """
+    if not rows:
+        return ""
+    parts = []
+    for reason in dict.fromkeys(why):
+        those = [i for i, one in enumerate(why) if one == reason]
+        if lines:
+            # By row, as `name_lines` takes them.
+            by_row = np.zeros(max(rows) + 1, dtype=np.int64)
+            by_row[list(rows)] = lines
+            named = name_lines(by_row, [rows[i] for i in those])
+        else:
+            more = f" and {len(those) - 5} more" if len(those) > 5 else ""
+            numbers = ", ".join(str(rows[i] + 1) for i in those[:5])
+            named = f"row{'s' if len(those) > 1 else ''} {numbers} (counted from 1){more}"
+        parts.append(f"{_capital(reason)}: {len(those)}, at {named}.")
+    return f"{count_text(len(rows), 'row')} set aside. {' '.join(parts)}"
 
 
 def network_text(results: Block) -> str:

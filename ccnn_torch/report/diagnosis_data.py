@@ -71,6 +71,7 @@ class About:
         noise: where the noise floor is from, as a sentence.
         units: SI units of joints, covariates and place coordinates by name.
         notes: further sentences.
+        lines: line in the file of each row of `rows_set_aside`, the header being line 1; () where nobody said.
     """
 
     name: str = "Diagnosis"
@@ -79,6 +80,7 @@ class About:
     noise: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    lines: tuple[int, ...] = ()
 
     def unit(self, name: str) -> str:
         """SI unit of a column; by its name where nobody said, and `SI` where the name tells nothing."""
@@ -103,7 +105,7 @@ def about_of(labels: Mapping[str, Any]) -> About:
         )
     axes = [block["x"] for name, block in labels.items() if name != "about"]
     given["units"] = {axis["name"]: axis["unit"] for axis in axes} | dict(given.get("units", {}))
-    given["notes"] = tuple(given.get("notes", ()))
+    given |= {key: tuple(given.get(key, ())) for key in ("notes", "lines")}
     return About(**given)
 
 

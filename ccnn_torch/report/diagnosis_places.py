@@ -20,6 +20,8 @@ __all__ = ["aside_table", "next_table", "quantity_text", "region_table", "shares
 Block = Mapping[str, Any]
 _KELVIN = 273.15
 _SHARES = ("share of the gap [%]", "95 % interval [%]")
+# More joints and conditions than this do not fit side by side on a page.
+_MOST_COLUMNS = 8
 _SHARE = "Share: of the gap's mean square that lies there."
 
 
@@ -105,7 +107,7 @@ def region_table(results: Block, about: About) -> Table | None:
 
 
 def next_table(results: Block, about: About) -> Table | None:
-    """What to measure next, most telling first."""
+    """What to measure next, most telling first: a row each, or a column each where it is told by many numbers."""
     wanted = results["next_measurements"]
     if not wanted:
         return None
@@ -120,6 +122,8 @@ def next_table(results: Block, about: About) -> Table | None:
         rows.append((str(number), *cells, " or ".join(entry["separates"]) or "–", number_text(entry["gain"], 3)))
     columns = ("number", *joints, *covariates, "tells apart", "gain [nat]")
     note = "Gain: expected information on which explanation is right. The same as a file: next_measurements.csv."
+    if len(joints) + len(covariates) > _MOST_COLUMNS:
+        columns, *rows = zip(columns, *rows, strict=True)
     return Table("What should be measured next?", columns, tuple(rows), note, ("tells apart",))
 
 
@@ -147,12 +151,16 @@ def _columns(results: Block) -> tuple[list[str], list[str]]:
     return joints, covariates
 
 
-def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]]) -> Table | None:
-    """Rows that were set aside, how far they are off, and why where that is known."""
+def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]], about: About) -> Table | None:
+    """Rows that were set aside, as a person finds them in the file, how far they are off, and why."""
     numbers = results["rows_set_aside"]
     if not numbers:
         return None
-    columns, cells = ["row"], [[str(number)] for number in numbers]
+    columns, cells = ["row"], [[str(number + 1)] for number in numbers]
+    note = "The first row is row 1 (0 in diagnosis.json)."
+    if len(about.lines) == len(numbers):
+        columns, cells = ["line", "row"], [[str(line), *cell] for line, cell in zip(about.lines, cells, strict=True)]
+        note = "Line: of the file, the header being line 1; the row below it is row 1 (0 in diagnosis.json)."
     residual = arrays.get("residual")
     if residual is not None:
         _, aside = used_rows(arrays, len(residual))
@@ -167,5 +175,5 @@ def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]]) -> Ta
         columns.append("why")
         for row, reason in zip(cells, reasons, strict=True):
             row.append(reason)
-    note = "Counted from 0. They speak neither for nor against any effect and count in no figure above."
+    note = f"They speak neither for nor against any effect and count in no figure above. {note}"
     return Table("Which rows were set aside?", tuple(columns), tuple(map(tuple, cells)), note, ("why",))

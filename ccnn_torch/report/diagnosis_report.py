@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from torch import Tensor
 
-from ccnn_torch.diagnosis.words import network_text, unseen_text, verdict_text
+from ccnn_torch.diagnosis.words import aside_text, network_text, unseen_text, verdict_text
 from ccnn_torch.report.diagnosis_data import (
     ARRAYS,
     LABELS,
@@ -159,7 +159,10 @@ def print_diagnosis(results: Block, console: Console, about: About | None = None
     for table in shown:
         if table is not None:
             print_table(table, console)
-    for sentence in _notes(results, about):
+    aside = results["rows_set_aside"]
+    why = results.get("why_set_aside") or ["for a reason that is not told"] * len(aside)
+    told = aside_text(aside, why, about.lines)
+    for sentence in ([told] if told else []) + _notes(results, about):
         console.print(escape(sentence), style="yellow")
     if text := network_text(results):
         console.print(escape(text))
@@ -193,7 +196,7 @@ def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str
         ("What can these rows not tell apart?", (), (confusable_table(results),)),
         ("What can these records not show?", (), (unseen_table(results), record_table(results))),
         ("What should be measured next?", (), (next_table(results, about),)),
-        ("Which rows were set aside?", (), (aside_table(results, arrays),)),
+        ("Which rows were set aside?", (), (aside_table(results, arrays, about),)),
     ]
     sections = []
     for title, names, tables in planned:

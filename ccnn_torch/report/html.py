@@ -9,7 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ccnn_torch.report.table_form import Table
-from ccnn_torch.report.tables import failures, result_tables, verdict
+from ccnn_torch.report.tables import cautions, result_tables, verdict
 
 __all__ = ["InlineFigure", "html_text", "page_text", "render", "trusted"]
 
@@ -39,7 +39,7 @@ def html_text(
         optional | dict(results),
         verdict(results),
         result_tables(results),
-        failures(results),
+        cautions(results),
         figures,
         config,
         files,

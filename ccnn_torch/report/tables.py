@@ -20,9 +20,22 @@ from ccnn_torch.report.display import count_text, display_unit, interval_text, n
 from ccnn_torch.report.paper_tables import PAPER, PaperCase
 from ccnn_torch.report.table_form import Table, print_table
 
-__all__ = ["Table", "markdown_table", "markdown_text", "print_tables", "result_tables", "verdict", "write_tables"]
+__all__ = [
+    "Table",
+    "cautions",
+    "failures",
+    "markdown_table",
+    "markdown_text",
+    "print_tables",
+    "result_tables",
+    "verdict",
+    "worse_text",
+    "write_tables",
+]
 
 Results = Mapping[str, Any]
+# By less a learned part may be worse on other rows by chance.
+_WORSE = 1.01
 
 
 def verdict(results: Results) -> str:
@@ -68,7 +81,7 @@ def print_tables(results: Results, console: Console) -> None:
     """Show the verdict and the tables on a terminal."""
     for table in result_tables(results):
         print_table(table, console)
-    for sentence in failures(results):
+    for sentence in cautions(results):
         console.print(escape(sentence), style="yellow")
     for note in results.get("notes", []):
         console.print(escape(note), style="dim")
@@ -86,7 +99,7 @@ def markdown_table(table: Table) -> str:
 
 def markdown_text(results: Results) -> str:
     """The verdict and the tables as Markdown (`results.md`)."""
-    parts = [f"# {results['name']}", verdict(results), *failures(results)]
+    parts = [f"# {results['name']}", verdict(results), *cautions(results)]
     parts += map(markdown_table, result_tables(results))
     return "\n\n".join(parts) + "\n"
 
@@ -95,6 +108,33 @@ def write_tables(folder: Path, results: Results) -> None:
     """Write `results.csv` and `results.md`."""
     write_csv(folder / "results.csv", results)
     (folder / "results.md").write_text(markdown_text(results), encoding="utf-8")
+
+
+def cautions(results: Results) -> list[str]:
+    """What a person must know before they use the model: `worse_text` and `failures`."""
+    worse = worse_text(results)
+    return [*([worse] if worse else []), *failures(results)]
+
+
+def worse_text(results: Results) -> str:
+    """One sentence where the best method's RMS position error on held-out rows is larger than without it; else empty.
+
+    Without it: what identified geometry and known effects leave by themselves where these are a part, else no
+    correction at all.
+    """
+    position, best = results["pose"]["position"], results.get("best_method")
+    without = next((part for part in ("effects", "geometry") if part in position), "before")
+    alone, after = position[without]["rms"]["median"], position["after"]["rms"]["median"]
+    if best is None or not alone or after is None or after <= _WORSE * alone:
+        return ""
+    parts = [part for part in ("geometry", "effects") if part in position]
+    scale, unit = display_unit("m", alone)
+    left, right = (number_text(value / scale, 3) for value in (alone, after))
+    instead = " + ".join(parts) + " alone" if parts else "no correction at all"
+    text = f"On held-out rows {best} makes it worse than {instead} ({left} → {right} {unit} RMS position error)"
+    if best == "constant":
+        return f"{text}: what it learned of the training rows does not hold on others."
+    return f"{text}: methods=constant leaves the network out, methods=auto chooses by cross-validation."
 
 
 def failures(results: Results) -> list[str]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of
 from ccnn_torch.diagnosis.check import Check, check_rows
+from ccnn_torch.diagnosis.from_records import naming
 from ccnn_torch.diagnosis.pictures import picture_arrays
+from ccnn_torch.diagnosis.words import aside_text
 from ccnn_torch.effects import Effect, make_effect
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
@@ -16,7 +20,7 @@ from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.diagnosis_report import write_diagnosis_report
 from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.table_form import Table
-from ccnn_torch.runs.diagnose_config import DiagnoseConfig
+from ccnn_torch.runs.diagnose_config import WRONG_NOISE, DiagnoseConfig
 
 __all__ = [
     "check_table",
@@ -24,6 +28,7 @@ __all__ = [
     "parse_noise",
     "run_check",
     "run_diagnosis",
+    "write_check",
     "write_diagnosis",
     "write_result",
 ]
@@ -33,18 +38,24 @@ def parse_noise(text: str) -> str:
     """`--noise` as an override: one number, or `NAME=S,…`.
 
     Raises:
-        InputError: it is neither.
+        InputError: it is neither, or not above 0.
     """
     parts = [p.strip() for p in text.split(",") if p.strip()]
     pairs = [p.partition("=") for p in parts]
+    alone = len(parts) == 1 and not pairs[0][1]
     try:
-        if len(parts) == 1 and not pairs[0][1]:
-            return f"noise={float(parts[0])!r}"
-        return "noise={" + ", ".join(f"{n.strip()}: {float(v)!r}" for n, _, v in pairs) + "}"
+        values = {n.strip(): float(v) for n, _, v in pairs} if not alone else {"all": float(parts[0])}
     except ValueError:
+        values = {}
+    if not values or not all(values):
         raise InputError(
             f"--noise: '{text}' is neither a number nor NAME=S,NAME=S,… (standard deviation of the pose in SI)"
-        ) from None
+        )
+    if not all(0 < value < math.inf for value in values.values()):
+        raise InputError(f"--noise {text}: {WRONG_NOISE}")
+    if alone:
+        return f"noise={values['all']!r}"
+    return "noise={" + ", ".join(f"{name}: {value!r}" for name, value in values.items()) + "}"
 
 
 def run_diagnosis(config: DiagnoseConfig) -> Diagnosis:
@@ -61,7 +72,9 @@ def run_check(config: DiagnoseConfig) -> Check:
     """Load and look at what the records can show; raises as `run_diagnosis`."""
     records, mechanism, effects = _loaded(config)
     situation = situation_of(records, mechanism, config.gravity)
-    return check_rows(situation, records.pose, noise_of(config.noise, situation), effects)
+    with naming(records):
+        found = check_rows(situation, records.pose, noise_of(config.noise, situation), effects)
+    return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside])
 
 
 def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
@@ -70,13 +83,25 @@ def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
     Raises:
         InputError: the folder cannot be written.
     """
+    _make(folder)
+    path = folder / "diagnosis.json"
+    write_json(path, plain(diagnosis.to_json()))
+    return path
+
+
+def write_check(folder: Path, check: Check) -> Path:
+    """Write `check.json`; raises as `write_result`."""
+    _make(folder)
+    path = folder / "check.json"
+    write_json(path, asdict(check))
+    return path
+
+
+def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as reason:
         raise InputError(f"{folder}: cannot be made: {reason.strerror}") from None
-    path = folder / "diagnosis.json"
-    write_json(path, plain(diagnosis.to_json()))
-    return path
 
 
 def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str] | None = None, seed: int = 0) -> Path:
@@ -95,7 +120,8 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str]
     arrays, labels = picture_arrays(diagnosis, seed)
     mechanism = diagnosis.analysis.situation.mechanism
     units = covariate_units(mechanism) | {c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)}
-    told = {"noise": _noise_text(diagnosis), **(about or {}), "units": units}
+    lines = [diagnosis.lines[row] for row in diagnosis.rows_set_aside] if diagnosis.lines else []
+    told = {"noise": _noise_text(diagnosis), **(about or {}), "units": units, "lines": lines}
     write_diagnosis_report(folder, plain(diagnosis.to_json()), arrays, labels | {"about": told})
     return path
 
@@ -115,6 +141,7 @@ def check_text(check: Check) -> list[str]:
         f"Noise (m, rad): {noise}.",
         f"Covariates: {', '.join(check.covariates) or 'none'}.",
     ]
+    lines += [aside_text(check.aside, check.why_aside, check.lines_aside)] if check.aside else []
     lines += [f"{remark}." for remark in check.remarks]
     lines += [f"Caution: {caution}." for caution in check.cautions]
     lines += [f"{name} cannot be seen without {why}." for name, why in check.missing.items()]

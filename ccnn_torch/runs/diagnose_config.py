@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from ccnn_torch.runs._config_tree import Names, Section, config_from_options
 from ccnn_torch.runs._keys import list_keys
 
-__all__ = ["DiagnoseConfig", "describe_diagnose_keys", "load_diagnose_config"]
+__all__ = ["WRONG_NOISE", "DiagnoseConfig", "describe_diagnose_keys", "load_diagnose_config"]
+
+WRONG_NOISE = (
+    "must be a standard deviation of the pose in SI, a number above 0 or one for each coordinate; leave it out to have "
+    "it estimated"
+)
 
 
-Positive = Annotated[float, Field(gt=0)]
+def _deviation(value: Any) -> Any:
+    """Noise as it stands in a config: None, a number above 0, or numbers above 0 by name."""
+    numbers = list(value.values()) if isinstance(value, dict) else [value]
+    try:
+        fine = value is None or (numbers and all(0 < float(number) < math.inf for number in numbers))
+    except (TypeError, ValueError):
+        fine = False
+    if not fine or (isinstance(value, dict) and not all(isinstance(name, str) for name in value)):
+        raise ValueError(f"{WRONG_NOISE} (it is {value})")
+    return value
 
 
 class DiagnoseConfig(Section):
@@ -28,7 +43,7 @@ class DiagnoseConfig(Section):
         default=None,
         description="covariate columns by name or pattern; null = time, temperature, load_*, direction*, …",
     )
-    noise: Positive | dict[str, Positive] | None = Field(
+    noise: Annotated[float | dict[str, float] | None, BeforeValidator(_deviation)] = Field(
         default=None,
         description="standard deviation of the measured pose in SI, one number for every coordinate or by coordinate; "
         "null = estimated from the records; one number is metres for lengths and radians for angles alike",

@@ -12,7 +12,7 @@ from ccnn_torch.compensation import Care, PhysicalEffects, effect_deviation, exp
 from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.diagnosis.from_file import Known, Verdict, one_row_at_a_time, read_verdict
 from ccnn_torch.diagnosis.refit import refit
-from ccnn_torch.effects import Acting, Situation, default_gravity, measured_pose, reached
+from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, measured_pose, reached
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry
 from ccnn_torch.mechanisms import Mechanism, SerialArm
@@ -140,6 +140,7 @@ def fit_effects(
     covariates = {c.name: records.covariates[:, i] for i, c in enumerate(records.covariate_coordinates)}
     gravity = default_gravity(mechanism) if verdict.gravity is None else verdict.gravity
     guess = records.pose if records.pose.shape[-1] == len(mechanism.pose) else None
+    _refuse_lacking(verdict, mechanism, records)
     known, notes = verdict.on(Situation(mechanism, records.joints, covariates, gravity, None, guess))
     if identify and any(k.effect.kind == "parameters" for k in known):
         known = [k for k in known if k.effect.kind != "parameters"]
@@ -175,6 +176,23 @@ def fit_effects(
     )
     found = KnownEffects(verdict.path, situations, moving, acting, names, care)
     return found, None if torch.equal(changed, base_all) else changed, notes
+
+
+def _refuse_lacking(verdict: Verdict, mechanism: Mechanism, records: Records) -> None:
+    """Raise InputError where the records have no column, or no varying one, that the verdict's effects need."""
+    inputs = [c.name for c in records.covariate_coordinates]
+    for name in verdict.parameters:
+        effect = make_effect(name)
+        lacking = effect.missing(mechanism, inputs)
+        if not lacking:
+            continue
+        what = f"{records.path}: {name} of {verdict.path} needs {lacking}"
+        if effect.missing(mechanism, [*records.columns]):
+            raise InputError(f"{what}, and there is no such column; add it to the records, or write effects=none")
+        raise InputError(
+            f"{what}; the column is there but no input of this run, because it is constant or not among covariates: "
+            "name it there, give records in which it varies, or write effects=none"
+        )
 
 
 def _fitted(

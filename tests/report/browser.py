@@ -19,7 +19,9 @@ addEventListener("load", () => {
   const all = s => [...document.querySelectorAll(s)].map(box);
   document.body.innerHTML = "<pre id=measured></pre>".replace("><", ">" + JSON.stringify({
     page: document.documentElement.scrollWidth, window: innerWidth, verdict: box(document.querySelector(".verdict")),
-    figures: all("figure svg"), tables: all("table"), text: document.body.innerText,
+    figures: all("figure svg"), tables: all("table"), boxes: [...document.querySelectorAll(".wide")].map(e => ({
+      ...box(e), inside: e.clientWidth, content: e.scrollWidth, overflow: getComputedStyle(e).overflowX,
+      name: e.querySelector("th").innerText})), text: document.body.innerText,
     fetched: performance.getEntriesByType("resource").length,
   }).replace(/&/g, "&amp;").replace(/</g, "&lt;") + "<");
 });

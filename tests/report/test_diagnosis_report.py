@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_run_report import Page
 
 from ccnn_torch._display import unit_text
-from ccnn_torch.diagnosis.words import driver_words, effect_words, network_text, probability_words, verdict_text
+from ccnn_torch.diagnosis.words import (
+    aside_text,
+    driver_words,
+    effect_words,
+    network_text,
+    probability_words,
+    verdict_text,
+)
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.diagnosis_data import About, about_of, load_diagnosis_arrays, signatures_of
 from ccnn_torch.report.diagnosis_places import (
@@ -144,10 +152,26 @@ def test_tables_hold_the_numbers() -> None:
     assert regions.rows[0] == ("0 mm to 100 mm", "300 mm to 400 mm", "40.0", "34.0 to 46.0", "50")
     told = {part: (share, interval) for _, part, share, interval in shares(results, about)}
     assert told["output x"] == (0.7, [0.66, 0.74]) and told["load_z 60 N to 120 N"] == (0.85, [0.8, 0.9])
-    aside = aside_table(results, _numpy(arrays))
+    aside = aside_table(results, _numpy(arrays), about)
     assert aside is not None and aside.columns == ("row", "residual [mm]", "why")
     expected = [1e3 * float(arrays["residual"][i, :3].norm()) for i in (17, 90)]
     assert [float(row[1]) for row in aside.rows] == pytest.approx(expected, rel=1e-3)
+    assert [row[0] for row in aside.rows] == ["18", "91"]
+    named = aside_table(results, _numpy(arrays), replace(about, lines=(19, 93)))
+    assert named is not None and named.columns[:2] == ("line", "row")
+    assert [row[:2] for row in named.rows] == [("19", "18"), ("93", "91")]
+
+
+def test_rows_set_aside_are_told_by_reason_and_the_first_few_by_name() -> None:
+    far, near = "far from the others", "next to a singularity"
+    assert aside_text([], []) == ""
+    assert aside_text([3], [far]) == "1 row set aside. Far from the others: 1, at row 4 (counted from 1)."
+    rows = [2, 4, 6, 8, 10, 12, 30]
+    told = aside_text(rows, [far, *[near] * 6], [row + 3 for row in rows])
+    assert told == (
+        "7 rows set aside. Far from the others: 1, at line 5 (row 3). "
+        "Next to a singularity: 6, at lines 7, 9, 11, 13, 15 (rows 5, 7, 9, 11, 13) and 1 more."
+    )
 
 
 def test_pairs_are_told_once_with_their_angle_and_what_separates_them() -> None:
@@ -247,6 +271,30 @@ def test_a_browser_shows_all_of_the_page(folder: Path, tmp_path: Path) -> None:
         assert len(seen["figures"]) == 5 and len(seen["tables"]) == 10
         assert all(0.5 * min(width, 600) < f["width"] <= width and f["height"] > 60 for f in seen["figures"])
         assert "these rows cannot tell which" in seen["text"] and "&amp;" not in seen["text"]
+
+
+def test_a_machine_of_many_joints_and_conditions_has_its_next_measurements_on_the_page(tmp_path: Path) -> None:
+    results, arrays, labels = indistinguishable()
+    joints = {f"q{i}": 0.6543 for i in range(1, 7)}
+    conditions = {"temperature": 298.15, **{f"load_{n}": -160.8 for n in ("x", "y", "z", "rx", "ry", "rz")}}
+    conditions |= {f"direction{i}": -1.0 for i in range(1, 7)}
+    entry = results["next_measurements"][0] | {"joints": joints, "covariates": conditions}
+    results["next_measurements"] = [entry] * 8
+    labels["about"]["units"] = labels["about"].get("units", {}) | dict.fromkeys(joints, "m")
+    table = next_table(results, about_of(labels))
+    assert table is not None and table.columns == ("number", *map(str, range(1, 9)))
+    assert [row[0] for row in table.rows] == [*joints, *conditions, "tells apart", "gain [nat]"]
+    assert table.rows[0][1:] == ("654.3 mm",) * 8 and table.rows[-2][1] == "joint_offset or geometry"
+    page = write_diagnosis_report(tmp_path, results, arrays, labels, tensorboard=False)
+    browser = find_browser()
+    # The narrower ones: what does not fit scrolls in its box, nothing else does.
+    for width in (1100, 420) if browser else ():
+        seen = measured(browser, page, tmp_path, width)
+        assert seen["page"] <= seen["window"] and len(seen["boxes"]) == len(seen["tables"])
+        assert all(box["overflow"] == "auto" and box["width"] <= width for box in seen["boxes"])
+        if width > 1000:
+            cut = [box["name"] for box in seen["boxes"] if box["content"] > box["inside"]]
+            assert cut == [], cut
 
 
 def test_the_same_files_give_the_same_page_and_text_is_escaped(folder: Path, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from ccnn_torch.report.csv_file import tidy_rows
 from ccnn_torch.report.html import html_text
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.run_report import make_picture, write_report
-from ccnn_torch.report.tables import markdown_text, print_tables, result_tables, verdict
+from ccnn_torch.report.tables import markdown_text, print_tables, result_tables, verdict, worse_text
 from ccnn_torch.report.tensorboard import TensorBoardCallback, tags_of
 
 
@@ -91,6 +91,30 @@ def test_the_page_is_whole_and_fetches_nothing(report_folder: Path) -> None:
 def test_text_from_outside_is_escaped(results: dict[str, Any]) -> None:
     text = html_text(results | {"name": "<script>alert(1)</script>", "notes": ["a & b"]}, config="x: <b>")
     assert "<script>" not in text and "&lt;script&gt;" in text and "a &amp; b" in text and "x: &lt;b&gt;" in text
+
+
+def test_a_network_that_makes_it_worse_is_said_with_the_remedy(results: dict[str, Any]) -> None:
+    position = results["pose"]["position"]
+    after = position["after"]["rms"]["median"]
+    assert worse_text(results) == "" and "makes it worse" not in html_text(results)
+    best = results["best_method"]
+    for alone, share, said in (("geometry", 0.995, ""), ("geometry", 0.5, "geometry"), ("effects", 0.7, "geometry + ")):
+        position[alone] = {"rms": {"median": share * after, "low": 0.0, "high": 1.0, "values": [share * after]}}
+        position[alone]["max"] = position[alone]["rms"]
+        told = worse_text(results)
+        assert told.startswith(f"On held-out rows {best} makes it worse than {said}") if said else told == ""
+    left, right = (float(x) for x in re.findall(r"\(([\d.]+) → ([\d.]+) ", told)[0])
+    assert left / right == pytest.approx(0.7, rel=0.01) and "than geometry + effects alone (" in told
+    assert told.endswith("methods=constant leaves the network out, methods=auto chooses by cross-validation.")
+    assert told in markdown_text(results) and told in html_text(results)
+    screen = io.StringIO()
+    print_tables(results, Console(file=screen, width=500))
+    assert told in screen.getvalue()
+    results["best_method"] = "constant"
+    assert "methods=constant" not in worse_text(results)
+    del position["geometry"], position["effects"]
+    position["before"]["rms"]["median"] = 0.9 * after
+    assert "than no correction at all (" in worse_text(results)
 
 
 def test_verdict(results: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from ccnn_torch._table import nearest
 from ccnn_torch.effects import EFFECTS, OUTLIER, Acting, Coefficient, Effect, Situation, make_effect, tried
 from ccnn_torch.errors import InputError
+from ccnn_torch.runs.simulating._limits import refuse_impossible
 from ccnn_torch.units import to_si
 
 __all__ = ["Injected", "Wanted", "act", "read_noise", "read_wanted", "units_of"]
@@ -21,6 +22,8 @@ _FORM = re.compile(r"(?P<name>.+?\.py:[^:]+|[^:]+)(?::(?P<rest>.*))?")
 _VALUE = re.compile(r"(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\s\d].*)?")
 SIZE = "size"
 _DRAWN = (0.5, 1.5)
+# A factor beyond this is no machine.
+_LARGEST = 1000.0
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class Injected:
 
     Attributes:
         name: of the effect.
-        parameters: coefficients and shapes that are not 0 by name: value [SI] and unit.
+        parameters: coefficients that are not 0, and shapes that these depend on, by name: value [SI] and unit.
         gap: root of the mean square of the position's change by this effect alone [m].
     """
 
@@ -88,8 +91,8 @@ def act(wanted: Wanted, situation: Situation, generator: torch.Generator) -> Act
     not given are drawn from the lower half of their grid.
 
     Raises:
-        InputError: no such effect, one that these rows cannot show, a parameter that it does not have, or a user's own
-            that breaks what `Effect` says.
+        InputError: no such effect, one that these rows cannot show, a parameter that it does not have, a value that no
+            machine has, or a user's own effect that breaks what `Effect` says.
     """
     if wanted.name not in EFFECTS and nearest(wanted.name, [OUTLIER], 0.8):
         raise InputError(f"effects: '{wanted.name}' is no effect; did you mean '{OUTLIER}'?")
@@ -100,6 +103,9 @@ def act(wanted: Wanted, situation: Situation, generator: torch.Generator) -> Act
     found, shapes = effect.coefficients(situation), effect.shapes(situation)
     values = _values(wanted, effect, units_of(effect, situation) | {SIZE: "1"})
     size = values.pop(SIZE, 1.0)
+    if not 0 <= size <= _LARGEST:
+        raise InputError(f"--effect {wanted.name}: {SIZE} = {size:g}: give a factor from 0 to {_LARGEST:g}")
+    refuse_impossible(wanted.name, effect, situation, values)
     drawn = _drawn(found, generator) * size
     if any(c.name in values for c in found):
         drawn = torch.tensor([values.get(c.name, 0.0) for c in found], dtype=torch.float64)

@@ -7,18 +7,20 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects import Acting, Situation, default_gravity, measured_pose, reached
+from ccnn_torch.effects import OUTLIER, Acting, Situation, default_gravity, measured_pose, reached
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
-from ccnn_torch.records import write_table
+from ccnn_torch.records import name_lines, write_table
 from ccnn_torch.report.table_form import Table
 from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.runs.simulate_config import SimulateConfig
 from ccnn_torch.runs.simulating._effects import Injected, act, read_wanted, units_of
+from ccnn_torch.runs.simulating._limits import refuse_beyond_bounds
 from ccnn_torch.runs.simulating._outliers import bad_rows
 from ccnn_torch.runs.simulating._rows import draw_moves, draw_poses
 
@@ -67,8 +69,8 @@ def simulate_records(
         seed: of everything that is drawn.
 
     Raises:
-        InputError: an unknown effect, parameter or coordinate, an effect that these rows cannot show, or effects so
-            large that the machine does not reach its poses.
+        InputError: an unknown effect, parameter or coordinate, an effect that these rows cannot show, values that no
+            machine has, or effects so large that the machine does not reach its poses.
     """
     config = config or SimulateConfig()
     if rows < 1:
@@ -85,6 +87,7 @@ def simulate_records(
         gravity = torch.tensor(config.gravity, dtype=torch.float64)
     situation = Situation(machine, joints, kept, gravity)
     acting = [act(w, situation, generator) for w in wanted if not w.outlier]
+    refuse_beyond_bounds(situation, acting)
     frame = reached(situation, acting)
     lost = torch.nonzero(~torch.isfinite(frame).all(-1)).flatten().tolist()
     if lost:
@@ -135,10 +138,19 @@ def injected_table(simulated: Simulated) -> Table:
         for one in simulated.injected
         for name, (value, unit) in one.parameters.items()
     ]
-    alone = "; ".join(f"{one.name} alone {one.gap * 1e6:.3g} µm" for one in simulated.injected)
-    bad = f"; bad rows: {', '.join(str(row + 1) for row in simulated.outliers)}" if simulated.outliers else ""
-    note = f"RMS error of the position {simulated.gap * 1e6:.3g} µm without noise{f' ({alone})' if alone else ''}{bad}"
-    return Table("Injected", ("effect", "parameter", "value", "unit"), tuple(rows), note)
+    parts = []
+    effects = [one for one in simulated.injected if one.name != OUTLIER]
+    if effects:
+        alone = "; ".join(f"{one.name} alone {one.gap * 1e6:.3g} µm" for one in effects)
+        without = "noise and bad rows" if simulated.outliers else "noise"
+        parts.append(f"RMS error of the position {simulated.gap * 1e6:.3g} µm without {without} ({alone})")
+    if simulated.outliers:
+        # As the file will have them, below a header.
+        lines = np.arange(len(simulated.joints), dtype=np.int64) + 2
+        added = sum(one.gap**2 for one in simulated.injected if one.name == OUTLIER) ** 0.5
+        named = name_lines(lines, simulated.outliers, len(simulated.outliers))
+        parts.append(f"RMS error by bad rows {added * 1e6:.3g} µm over all rows; bad rows: {named}")
+    return Table("Injected", ("effect", "parameter", "value", "unit"), tuple(rows), "; ".join(parts))
 
 
 def _injected(situation: Situation, acting: Acting, nominal: Tensor) -> Injected:
@@ -146,7 +158,11 @@ def _injected(situation: Situation, acting: Acting, nominal: Tensor) -> Injected
     values = dict(zip((c.name for c in effect.coefficients(situation)), acting.coefficients.tolist(), strict=True))
     units = units_of(effect, situation)
     shown = {name: value for name, value in values.items() if value}
-    shown |= zip((s.name for s in effect.shapes(situation)), acting.shape.tolist(), strict=True)
+    there = list(values.values())
+    for shape, value in zip(effect.shapes(situation), acting.shape.tolist(), strict=True):
+        # Of a coefficient that is 0 it changes nothing.
+        if any(there[k] for k in (range(len(there)) if shape.columns is None else shape.columns)):
+            shown[shape.name] = value
     gap = _rms(reached(situation, [acting]) - nominal)
     return Injected(effect.name, {name: (value, units[name]) for name, value in shown.items()}, gap)
 

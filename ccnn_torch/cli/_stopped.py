@@ -1,0 +1,23 @@
+"""Ctrl-C told truly: what a command leaves behind when it is stopped depends on how far it came."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+__all__ = ["NOTHING_WRITTEN", "Stopped", "if_stopped"]
+
+NOTHING_WRITTEN = "interrupted; nothing was written"
+
+
+class Stopped(Exception):
+    """A person pressed Ctrl-C; its text is the sentence that they are told."""
+
+
+@contextmanager
+def if_stopped(sentence: str) -> Iterator[None]:
+    """Within it Ctrl-C ends the command with this sentence and the exit code 130."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Stopped(sentence) from None
