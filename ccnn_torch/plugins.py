@@ -13,23 +13,9 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import CcnnError, InputError
 
-__all__ = ["USER_ERRORS", "class_hint", "failure", "is_plugin", "load_plugin"]
-
-USER_ERRORS = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    ImportError,
-    LookupError,
-    NameError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
-"""What a user's code may raise by a mistake; a caller makes a sentence of it by `failure`."""
+__all__ = ["class_hint", "failure", "is_plugin", "load_plugin"]
 
 # Lines of this package, of Python and of what is installed tell a user nothing about the own file.
 _OTHERS = (f"{Path(__file__).parent}{os.sep}", f"{sysconfig.get_path('stdlib')}{os.sep}", "<")
@@ -101,7 +87,10 @@ def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
         raise InputError(f"{spec}: {file} line {error.lineno} is no valid Python: {error.msg}") from error
     except ImportError as error:
         raise InputError(f"{spec}: {file} imports something that is not installed: {error}") from error
-    except USER_ERRORS as error:
+    except CcnnError:
+        raise
+    # What a user's code raises nobody knows beforehand.
+    except Exception as error:
         raise InputError(f"{spec}: {file} {failure(error, spec)}") from error
     found = getattr(module, name, None)
     if not callable(found) and not isinstance(found, also):

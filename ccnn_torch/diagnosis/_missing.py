@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -15,6 +16,7 @@ from ccnn_torch.diagnosis._atoms import default_shape, scaled_signature
 from ccnn_torch.diagnosis._rows import picked
 from ccnn_torch.effects import Effect, Situation, pose_residual
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
+from ccnn_torch.errors import InputError
 
 __all__ = ["missing_covariates"]
 
@@ -53,7 +55,10 @@ def missing_covariates(
     found: dict[tuple[str, ...], dict[str, float]] = {}
     for effect in (e for e in effects if lacking.get(e.name)):
         added = next((a for a in _additions(kinds) if not effect.missing(mechanism, [*names, *a])), None)
-        size = 0.0 if added is None else _plausible(there, effect, position)
+        size = 0.0
+        # A user's own effect that fails on columns that were not recorded must not cost the verdict.
+        with suppress(InputError):
+            size = 0.0 if added is None else _plausible(there, effect, position)
         if added is not None and size > 0:
             found.setdefault(added, {})[effect.name] = size
     for condition in mechanism.lacking(names):

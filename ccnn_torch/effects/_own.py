@@ -12,9 +12,9 @@ from torch import Tensor
 from ccnn_torch.batching import leading_shape
 from ccnn_torch.effects._protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects._situation import Situation
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.plugins import USER_ERRORS, failure
+from ccnn_torch.plugins import failure
 
 __all__ = ["OwnEffect", "label_of", "of_library", "owned"]
 
@@ -86,7 +86,9 @@ class OwnEffect:
     def _asked(self, verb: str, *given: object) -> Any:
         try:
             return getattr(self.own, verb)(*given)
-        except USER_ERRORS as error:
+        except CcnnError:
+            raise
+        except Exception as error:  # whatever a user's code may raise
             raise InputError(f"{self.label}: {verb}() {failure(error, self.label)}{_hint(error, given[0])}") from error
 
     def _listed(self, verb: str, kind: type[_Part], situation: Situation) -> tuple[_Part, ...]:

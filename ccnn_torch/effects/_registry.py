@@ -24,9 +24,9 @@ from ccnn_torch.effects.parameter import parameter_causes
 from ccnn_torch.effects.thermal import Thermal
 from ccnn_torch.effects.tool import Tool
 from ccnn_torch.effects.transmission import Transmission
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.plugins import USER_ERRORS, class_hint, failure, is_plugin, load_plugin
+from ccnn_torch.plugins import class_hint, failure, is_plugin, load_plugin
 
 __all__ = ["EFFECTS", "OUTLIER", "effect_names", "make_effect"]
 
@@ -68,7 +68,9 @@ def make_effect(name: str, mechanism: Mechanism | None = None) -> Effect:
         make = load_plugin(name)
         try:
             effect = make()
-        except USER_ERRORS as error:
+        except CcnnError:
+            raise
+        except Exception as error:  # whatever a user's code may raise
             raise InputError(f"{name}: making it without arguments {failure(error, name)}") from error
         return owned(effect, name)
     if Path(name).suffix == ".py":

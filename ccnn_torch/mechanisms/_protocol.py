@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms._branch import jump_sentence, settle_home
 from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms.black_box import BlackBox
@@ -47,7 +47,9 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
         if not wrong:
             settle_home(mechanism)
             wrong = _wrong_kinematics(mechanism) or jump_sentence(mechanism)
-    except (ArithmeticError, AttributeError, LookupError, NameError, RuntimeError, TypeError, ValueError) as error:
+    except CcnnError:
+        raise
+    except Exception as error:  # whatever a user's code may raise
         said = str(error).strip().splitlines() or [""]
         raise InputError(f"{spec}{_line(spec, error)}: {type(error).__name__}: {said[0]}") from error
     if wrong:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ccnn_torch.batching import leading_shape
 from ccnn_torch.coordinates import Condition
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms.simulator import Simulator
 
 __all__ = ["Calls", "described", "simulated_rows"]
@@ -124,9 +124,9 @@ class Calls:
                 answer = simulator.simulate(commands, covariates, parameters)
             plain = answer.detach().numpy() if isinstance(answer, Tensor) else answer
             pose = np.array(plain, dtype=np.float64)
-        except InputError:
+        except CcnnError:
             raise
-        except (ArithmeticError, AttributeError, LookupError, NameError, RuntimeError, TypeError, ValueError) as error:
+        except Exception as error:  # whatever a user's code may raise
             said = (str(error).strip().splitlines() or [""])[0]
             raise InputError(
                 f"simulator '{simulator.name}': simulate fails{_line(error)} on {len(rows)} rows: "

@@ -51,6 +51,15 @@ class Raises(Good):
         return torch.ones(3) @ torch.ones(4)  # the line that a sentence names
 
 
+class OwnError(Exception):
+    """As users derive their own."""
+
+
+class RaisesOwn(Good):
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        raise OwnError("no table for this machine")
+
+
 class Unsaid(Good):
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         return super().basis(situation, shape) * situation.covariates["pressure"][:, None, None]
@@ -195,3 +204,15 @@ class NeedsFile(Good):
     def __init__(self) -> None:
         with open("no/such/table.csv", encoding="utf-8") as file:
             self.table = file.read()
+
+
+class LaterColumn(Good):
+    """Asks for a column, and fails as soon as it is there."""
+
+    name = "later column"
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        return "" if "temperature" in covariates else "the temperature: temperature[degC]"
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        raise OwnError("nobody ever came here")

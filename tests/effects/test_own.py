@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import broken_effects
 import pytest
-from broken_effects import Good
+from broken_effects import Good, LaterColumn
 from typer.testing import CliRunner
 
 from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.cli._main import app
-from ccnn_torch.diagnosis import noise_of, situation_of
+from ccnn_torch.diagnosis import diagnose_rows, noise_of, situation_of
 from ccnn_torch.diagnosis.check import check_rows
 from ccnn_torch.effects import Effect, make_effect, owned
 from ccnn_torch.errors import InputError
@@ -33,6 +34,7 @@ BROKEN = {
     "OneSet": r"basis\(\) gives shape \(80, 2, 2\), expected \(3, 80, 2, 2\): sets of shapes, rows, joints .* shape\[",
     "OneTooMany": r"basis\(\) gives shape \(80, 2, 2\), expected \(80, 2, 3\)",
     "Raises": rf"basis\(\) fails at line {LINE + 1}: RuntimeError: inconsistent tensor size",
+    "RaisesOwn": r"missing\(\) fails at line \d+: OwnError: no table for this machine",
     "Unsaid": r"basis\(\) fails at line \d+: KeyError: 'pressure' \(if .* direction1, direction2, and missing\(\) must",
     "Numpy": r"basis\(\) returned a numpy.ndarray, expected a torch tensor",
     "NaN": r"basis\(\) is not finite in every row at power = 1 1, expected",
@@ -104,6 +106,14 @@ def test_python_says_it_in_one_sentence(rows: Path, name: str) -> None:
 def test_what_the_trial_could_not_see_is_a_sentence_too(rows: Path, name: str) -> None:
     with pytest.raises(InputError, match=f"^{re.escape(FILE)}:{name}: {LATE[name]}"):
         diagnose(load_records(rows, BAR), BAR, effects=[getattr(broken_effects, name)()])
+
+
+def test_one_that_would_fail_on_a_column_not_recorded_costs_no_verdict(rows: Path) -> None:
+    records = load_records(rows, BAR)
+    there = situation_of(records, BAR)
+    columns = {n: v for n, v in there.covariates.items() if n != "temperature"}
+    found = diagnose_rows(replace(there, covariates=columns), records.pose, effects=["joint_gain", LaterColumn()])
+    assert "later column" in found.not_seen and found.verdict["effects"]
 
 
 @pytest.mark.parametrize("command", ["diagnose", "check"])
