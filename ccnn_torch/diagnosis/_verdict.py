@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,17 +11,20 @@ import torch
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._catch_all import ANY
 from ccnn_torch.diagnosis._search import Found, scored
+from ccnn_torch.effects import EXACT
 
 __all__ = ["Judgement", "judge"]
 
 # Share of the gap's energy that goes with a member of a set and not without it: below this a library effect is how the
 # form of the others differs from the textbook; so is a catch-all beside library effects, and so are library effects
-# beside a catch-all, which stands for whatever was not thought of.
-_FORM, _FORM_CATCH_ALL, _BESIDE_CATCH_ALL = 0.008, 0.002, 0.1
+# beside a catch-all, which stands for whatever was not thought of. Exact effects leave no more than the second order.
+_FORM, _FORM_CATCH_ALL, _FORM_EXACT, _BESIDE_CATCH_ALL = 0.004, 0.002, 1e-4, 0.1
 # Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is stood by.
 _VETO, _MUCH = 0.005, 1.5
 # Or times the noise's energy, whatever the gap.
 _VETO_NOISE = 25.0
+# In any case by so many standard deviations of the noise's mean square.
+_CLEARLY = 5.0
 # What a claim is worth where a name carries less than this share of the gap, or where there are three names or more:
 # the textbook forms of effects are too rough to be surer.
 _SMALL, _UNSURE = 0.1, 0.85
@@ -175,8 +179,12 @@ def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fo
         shares = _net(analysis, found, tried)
         # Library effects are a form of the catch-all beside them only where that carries much more than they do.
         wild = max((share for i, (share, _) in shares.items() if atoms[i].catch_all), default=0.0)
-        named = max(_FORM, min(_BESIDE_CATCH_ALL, wild / 2))
-        limits = {i: _FORM_CATCH_ALL if atoms[i].catch_all else named for i in found.members}
+        beside = min(_BESIDE_CATCH_ALL, wild / 2)
+        limits = {}
+        for i in found.members:
+            wide = _FORM_CATCH_ALL if atoms[i].catch_all else _FORM
+            form = _FORM_EXACT if _exact(analysis, [m for m in found.members if m != i]) else wide
+            limits[i] = form if atoms[i].catch_all else max(form, beside)
         # What leaves more than the noise when it goes is missed, however small it is.
         missed = _unexplained(analysis, found)
         idle = [
@@ -229,10 +237,17 @@ def _unexplained(analysis: Analysis, found: Found) -> bool:
     count = analysis.dictionary.grams.values
     left = found.rss / max(count - found.effective, 1.0)
     floor = analysis.floor
-    significant = left > floor * (1 + 5 * math.sqrt(2 / count))
+    significant = left > floor * (1 + _CLEARLY * math.sqrt(2 / count))
     gap = float(analysis.dictionary.grams.yy) / count
     much = left - floor > _VETO * max(gap - floor, 0.0) and left > _MUCH * floor
-    return significant and (much or left > _VETO_NOISE * floor)
+    return significant and (much or left > _VETO_NOISE * floor or _exact(analysis, found.members))
+
+
+def _exact(analysis: Analysis, members: Sequence[int]) -> bool:
+    """Whether there are library effects among these, and none could have another form than it was fitted with."""
+    atoms = (analysis.dictionary.atoms[i] for i in members)
+    names = {a.name for a in atoms if not a.catch_all}
+    return bool(names) and names <= EXACT
 
 
 def _driver_of_remainder(analysis: Analysis) -> str | None:

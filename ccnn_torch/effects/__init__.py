@@ -6,6 +6,7 @@ from ccnn_torch.effects._protocol import Effect as Effect
 from ccnn_torch.effects._protocol import Kind as Kind
 from ccnn_torch.effects._protocol import Shape as Shape
 from ccnn_torch.effects._registry import EFFECTS as EFFECTS
+from ccnn_torch.effects._registry import EXACT as EXACT
 from ccnn_torch.effects._registry import OUTLIER as OUTLIER
 from ccnn_torch.effects._registry import effect_names as effect_names
 from ccnn_torch.effects._registry import make_effect as make_effect

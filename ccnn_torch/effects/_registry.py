@@ -28,7 +28,7 @@ from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.plugins import class_hint, failure, is_plugin, load_plugin
 
-__all__ = ["EFFECTS", "OUTLIER", "effect_names", "make_effect"]
+__all__ = ["EFFECTS", "EXACT", "OUTLIER", "effect_names", "make_effect"]
 
 EFFECTS: dict[str, Callable[[], Effect]] = {
     "geometry": Geometry,
@@ -48,6 +48,10 @@ EFFECTS: dict[str, Callable[[], Effect]] = {
     "instrument": Instrument,
 }
 """Name -> maker. The order is that of listings."""
+
+EXACT = frozenset({"geometry", "joint_offset", "joint_gain", "frame", "tool", "instrument"})
+"""Effects whose form is kinematics: what they leave is something else, where friction, growth or a belt that couples
+two joints may just be of another form than the textbook's."""
 
 OUTLIER = "outlier"
 """What verdicts and simulations call bad rows. No effect: no other column foretells them."""

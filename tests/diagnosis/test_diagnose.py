@@ -158,3 +158,22 @@ def test_candidates_that_the_records_cannot_show_are_refused() -> None:
     blind = replace(situation, covariates={})
     with pytest.raises(InputError, match=r"none of the candidates: compliance needs a column of the load .*load_x"):
         diagnose_rows(blind, pose, effects=["compliance"])
+
+
+@pytest.mark.parametrize(
+    ("machine", "cause", "library"),
+    [
+        ("tripod", "frame", ["tool", "backlash"]),
+        ("delta", "geometry", ["joint_gain", "frame", "backlash"]),
+        ("five_bar", "instrument", ["geometry", "backlash"]),
+    ],
+)
+def test_an_exact_effect_has_no_other_form_that_would_excuse_a_remainder(
+    machine: str, cause: str, library: list[str]
+) -> None:
+    """These take over all but a hundredth of the cause's squares; a spring or a play might be of such another form."""
+    situation = rows_of(machine, 120, 23)
+    pose = measured(situation, {cause: 60.0}, 24)
+    found = diagnose_rows(situation, pose, effects=library)
+    assert found.verdict["outside_library"]
+    assert found.judgement.found.rss < 0.01 * float(found.analysis.dictionary.grams.yy)
