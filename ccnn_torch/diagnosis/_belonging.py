@@ -23,6 +23,8 @@ _ROW, _USUAL = 1.0, 0.3
 # A mistake is named where without it so small a share of the distance is left.
 _MENDED = 0.1
 _FEW = 40
+# Rows astray among which a mistake in common is looked for.
+_MANY = 5
 # What a machine that does not move or turn is taken to [m], [rad].
 _LEAST = 1e-6
 _TURN = 180 / torch.pi
@@ -67,10 +69,22 @@ def distance(situation: Situation, measured: Tensor, size: Size) -> Tensor:
 
 
 class Belonging(NamedTuple):
-    """Rows that are of the machine, and those that are not because their pose lies elsewhere; `s` bool each."""
+    """Which rows are of the machine.
+
+    Attributes:
+        fine: those that are, `s` bool.
+        astray: those that are not because their pose lies elsewhere, `s` bool.
+        mistake: the one that many of these have in common, in words; empty where there is none.
+    """
 
     fine: Tensor
     astray: Tensor
+    mistake: str
+
+    @property
+    def lost(self) -> float:
+        """Share of the rows that are not."""
+        return 1 - float(self.fine.double().mean())
 
 
 def belonging(situation: Situation, measured: Tensor) -> Belonging:
@@ -101,7 +115,10 @@ def belonging(situation: Situation, measured: Tensor) -> Belonging:
                 "that joints and pose of a row belong together"
             )
         )
-    return Belonging(reached & (far < _ROW), reached & (far >= _ROW))
+    astray = reached & (far >= _ROW)
+    many = int(astray.sum()) >= _MANY
+    mistake = _remedy(picked(situation, torch.nonzero(astray)[:, 0]), measured[astray], size) if many else ""
+    return Belonging(reached & ~astray, astray, mistake)
 
 
 def _remedy(situation: Situation, measured: Tensor, size: Size) -> str:

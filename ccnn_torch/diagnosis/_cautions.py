@@ -9,7 +9,7 @@ import torch
 
 from ccnn_torch._display import number_text
 from ccnn_torch.diagnosis._analysis import Analysis
-from ccnn_torch.diagnosis._belonging import distance, size_of
+from ccnn_torch.diagnosis._belonging import Belonging, distance, size_of
 from ccnn_torch.diagnosis._verdict import Judgement
 from ccnn_torch.effects import Situation
 
@@ -28,34 +28,36 @@ _MANY = 0.1
 _COLDEST, _HOTTEST = 213.15, 423.15
 
 
-def cautions(analysis: Analysis, judgement: Judgement, lost: float, missing: Sequence[Mapping[str, Any]]) -> list[str]:
+def cautions(
+    analysis: Analysis, judgement: Judgement, rows: Belonging, missing: Sequence[Mapping[str, Any]]
+) -> list[str]:
     """One sentence each, without a full stop; none where all is as it should be.
 
     Args:
         analysis: of the rows.
         judgement: what is stood by.
-        lost: share of the rows that are not where their joints put them.
+        rows: which of them are of the machine at all.
         missing: as in diagnosis.json.
     """
     return [
-        *row_cautions(analysis, lost),
+        *row_cautions(analysis, rows),
         *_of_noise(analysis, judgement),
         *_of_sizes(analysis, judgement),
         *_of_inputs(analysis, missing),
     ]
 
 
-def row_cautions(analysis: Analysis, lost: float) -> list[str]:
+def row_cautions(analysis: Analysis, rows: Belonging) -> list[str]:
     """Those of them that need no verdict."""
-    return [*_of_model(analysis, lost), *_of_temperature(analysis.situation)]
+    return [*_of_model(analysis, rows), *_of_temperature(analysis.situation)]
 
 
-def _of_model(analysis: Analysis, lost: float) -> list[str]:
+def _of_model(analysis: Analysis, rows: Belonging) -> list[str]:
     situation, said = analysis.situation, []
-    if lost > _MANY:
+    if rows.lost > _MANY:
         said.append(
-            f"{100 * lost:.0f} % of the rows are far from where their joints put them and were left out: look at their "
-            "units, and at what they have in common"
+            f"{100 * rows.lost:.0f} % of the rows are far from where their joints put them and were left out: "
+            + (rows.mistake or "look at their units, and at what they have in common")
         )
     usual = float(distance(situation, analysis.measured, size_of(situation)).nanmedian())
     if usual > _LARGE:

@@ -57,9 +57,8 @@ def check_rows(
     situation: Situation, measured: Tensor, noise: Tensor | None = None, effects: Sequence[Effect | str] | None = None
 ) -> Check:
     """Look at rows as `diagnose_rows` does, and say what they can and cannot show; arguments as there."""
-    fine, astray = usable_rows(situation, measured)
-    rows = len(fine)
-    situation, measured, chosen = thinned(situation, measured, fine, 0)
+    rows = usable_rows(situation, measured)
+    situation, measured, chosen = thinned(situation, measured, rows.fine, 0)
     usable, lacking = candidates(situation, effects)
     analysis = analyse(situation, measured, usable, noise)
     white = analysis.whitening
@@ -74,11 +73,11 @@ def check_rows(
         size = float(x.square().sum(-1).mean().sqrt())
         if size < 1:
             weak[atom.name] = size
-    why = why_set_aside(analysis, fine, astray, chosen)
+    why = why_set_aside(analysis, rows, chosen)
     condition = situation.mechanism.condition_number(situation.joints[keep], parameters=situation.parameters)
     names = ("x", "y", "z", "rx", "ry", "rz")
     return Check(
-        rows=rows,
+        rows=len(rows.fine),
         aside=sorted(why),
         noise={names[int(c)]: float(s) for c, s in zip(white.channels, white.sigma, strict=True)},
         covariates=[n for n, v in situation.covariates.items() if float(v.max() - v.min()) > 0],
@@ -90,7 +89,7 @@ def check_rows(
         remarks=[
             lacking_text(situation.mechanism.name, c) for c in situation.mechanism.lacking([*situation.covariates])
         ],
-        cautions=row_cautions(analysis, 1 - float(fine.double().mean())),
+        cautions=row_cautions(analysis, rows),
     )
 
 

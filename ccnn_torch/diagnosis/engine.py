@@ -85,8 +85,8 @@ def diagnose_rows(
     Raises:
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
-    fine, astray = usable_rows(situation, measured)
-    situation, measured, chosen = thinned(situation, measured, fine, seed)
+    rows = usable_rows(situation, measured)
+    situation, measured, chosen = thinned(situation, measured, rows.fine, seed)
     residual = pose_residual(situation, measured)
     every = _made(situation, effects)
     usable, lacking = candidates(situation, every)
@@ -96,10 +96,9 @@ def diagnose_rows(
     gap, gap_rotation, listed = blocks(made)
     together = made.main(made.together)
     nothing = not judgement.names and not judgement.outside
-    outlier = nothing and bool(astray.any() or gross_rows(analysis).any())
-    lost = int((~fine).sum())
+    outlier = nothing and bool(rows.astray.any() or gross_rows(analysis).any())
     missing = missing_covariates(analysis, every, lacking, judgement.driver, seed)
-    doubts = cautions(analysis, judgement, lost / len(fine), missing)
+    doubts = cautions(analysis, judgement, rows, missing)
     verdict = {
         "effects": [OUTLIER] if outlier else list(judgement.names),
         "probability": min(judgement.probability, DOUBTED) if doubts else judgement.probability,
@@ -110,15 +109,15 @@ def diagnose_rows(
         "driver": None if (judgement.driver or "").startswith(SPEED) else judgement.driver,
         "text": "",
     }
-    why = why_set_aside(analysis, fine, astray, chosen)
+    why = why_set_aside(analysis, rows, chosen)
     told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": doubts}
     verdict["text"] = verdict_text(told | {"rows_set_aside": sorted(why)})
     places, intervals = where(analysis, residual, seed)
     notes = [unseen_text(name, reason) for name, reason in lacking.items()]
     notes += [lacking_text(situation.mechanism.name, c) for c in situation.mechanism.lacking([*situation.covariates])]
     notes += not_held_notes(judgement.names)
-    if len(chosen) < len(fine) - lost:
-        notes.append(f"{len(chosen)} of {len(fine)} rows, drawn at random, were looked at")
+    if len(chosen) < int(rows.fine.sum()):
+        notes.append(f"{len(chosen)} of {len(rows.fine)} rows, drawn at random, were looked at")
     if nothing and analysis.whitening.known == 0 and missing:
         columns = ", ".join(column for entry in missing for column in entry["columns"])
         notes.append(
@@ -147,10 +146,10 @@ def diagnose_rows(
     )
 
 
-def why_set_aside(analysis: Analysis, fine: Tensor, astray: Tensor, chosen: Tensor) -> dict[int, str]:
-    """Reason by row, counted from 0 in the file; fine, astray: `s` bool; chosen: the rows looked at."""
-    why = dict.fromkeys(torch.nonzero(~fine).squeeze(-1).tolist(), "the machine does not reach it")
-    why |= dict.fromkeys(torch.nonzero(astray).squeeze(-1).tolist(), "far from where its joints put it")
+def why_set_aside(analysis: Analysis, rows: Belonging, chosen: Tensor) -> dict[int, str]:
+    """Reason by row, counted from 0 in the file; rows: all of them; chosen: those looked at."""
+    why = dict.fromkeys(torch.nonzero(~rows.fine).squeeze(-1).tolist(), "the machine does not reach it")
+    why |= dict.fromkeys(torch.nonzero(rows.astray).squeeze(-1).tolist(), "far from where its joints put it")
     aside, near = analysis.whitening.weight <= 0, analysis.near_singular
     why |= dict.fromkeys(chosen[aside & ~near].tolist(), "far from what any fit to the other rows says")
     return why | dict.fromkeys(chosen[aside & near].tolist(), "next to a singularity")

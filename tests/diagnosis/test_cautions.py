@@ -69,6 +69,7 @@ def test_some_rows_in_millimetres_are_set_aside_and_said() -> None:
     assert set(range(0, 90, 3)) <= set(found.rows_set_aside)
     assert "33 % of the rows are far from where their joints put them" in found.cautions[0]
     assert f"But {found.cautions[0]}." in found.verdict["text"] and found.verdict["probability"] <= DOUBTED
+    assert "the records' lengths are about 1000 times too large" in found.cautions[0]
     assert "33 %" in check_rows(situation, pose).cautions[0]
 
 
