@@ -1,14 +1,17 @@
-"""The options that `ccnn diagnose` and `ccnn check` share, as one config."""
+"""What `ccnn diagnose` and `ccnn check` share: their options as one config, and a sign of life."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from ccnn_torch.runs.diagnose_config import DiagnoseConfig
 
-__all__ = ["configured"]
+__all__ = ["configured", "watched"]
+
+_Found = TypeVar("_Found")
 
 
 def configured(
@@ -37,3 +40,13 @@ def configured(
         "out": None if out is None else str(out),
     }
     return wanted.model_copy(update={k: v for k, v in given.items() if v is not None})
+
+
+def watched(text: str, work: Callable[[Callable[[str], None]], _Found], quiet: bool) -> _Found:
+    """Work that says how far it is, where a person is looking."""
+    from ccnn_torch.runs.screen import stderr
+
+    if quiet or not stderr.is_terminal:
+        return work(lambda how_far: None)
+    with stderr.status(text) as status:
+        return work(lambda how_far: status.update(f"{text} {how_far}"))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ccnn_torch.cli._diagnosed import configured
+from ccnn_torch.cli._diagnosed import configured, watched
 from ccnn_torch.cli._stopped import NOTHING_WRITTEN, if_stopped
 
 __all__ = ["check"]
@@ -40,7 +40,7 @@ def check(
 
     with if_stopped(NOTHING_WRITTEN):
         wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)
-        found = run_check(wanted)
+        found = watched("looking at what the rows can show …", lambda tell: run_check(wanted), quiet)
     if wanted.out is not None:
         write_check(Path(wanted.out), found)
     if quiet:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ccnn_torch.cli._diagnosed import configured
+from ccnn_torch.cli._diagnosed import configured, watched
 from ccnn_torch.cli._stopped import if_stopped
 from ccnn_torch.errors import InputError
 
@@ -73,7 +73,7 @@ def _search(wanted: DiagnoseConfig, quiet: bool) -> Diagnosis:
             return run_diagnosis(wanted)
 
     # Thousands of rows of an arm take half a minute, a slow simulator more; how much is left nobody knows.
-    found = _watched("looking for the effects that make the gap …", search, quiet)
+    found = watched("looking for the effects that make the gap …", search, quiet)
     write_result(Path(str(wanted.out)), found)
     return found
 
@@ -93,20 +93,10 @@ def _tell(wanted: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -
         def train(tell: Callable[[str], None]) -> Diagnosis:
             return with_network(found, wanted.seed, lambda share: tell(f"{100 * share:.0f} %"))
 
-        found = _watched("training a network on what the effects leave …", train, quiet)
+        found = watched("training a network on what the effects leave …", train, quiet)
     about = {"name": folder.name, "mechanism": str(wanted.mechanism), "records": str(wanted.records)}
     path = write_diagnosis(folder, found, about, wanted.seed)
     if quiet:
         return
     print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False)
     typer.echo(f"Written: {path} and report.html beside it")
-
-
-def _watched(text: str, work: Callable[[Callable[[str], None]], Diagnosis], quiet: bool) -> Diagnosis:
-    """Work that says how far it is, where a person is looking."""
-    from ccnn_torch.runs.screen import stderr
-
-    if quiet or not stderr.is_terminal:
-        return work(lambda how_far: None)
-    with stderr.status(text) as status:
-        return work(lambda how_far: status.update(f"{text} {how_far}"))

@@ -127,7 +127,7 @@ def _remedy(situation: Situation, measured: Tensor, size: Size) -> str:
     here, poses = picked(situation, rows), measured[rows]
     # A row that the machine does not reach is off by its whole workspace, and more.
     before = float(distance(here, poses, size).nan_to_num(nan=10.0).median())
-    best, said = _MENDED * before, ""
+    best, said = min(_MENDED * before, _USUAL), ""
     for words, other, there in _mistakes(here, poses):
         left = float(distance(replace(other, guess=_guess(other, there)), there, size).nan_to_num(nan=10.0).median())
         if left < best:
@@ -140,9 +140,22 @@ def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Sit
     mechanism = situation.mechanism
     pose, joints = mechanism.pose, mechanism.joints
     lengths = torch.tensor([c.unit == "m" for c in pose])
-    for factor, where in ((1e-3, "the records'"), (1e3, "the model's")):
+    for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
         mended = torch.where(lengths, factor * measured, measured)
-        yield f"{where} lengths are about 1000 times too large: millimetres under m?", situation, mended
+        yield f"the pose's lengths seem to be in {unit} under m", situation, mended
+    words = (
+        "the records' lengths are about 1000 times smaller than the model's: metres under mm, or a model in millimetres"
+    )
+    yield words, situation, torch.where(lengths, 1e3 * measured, measured)
+    for i, one in enumerate(pose):
+        if one.unit == "m":
+            factors = torch.ones(len(pose), dtype=measured.dtype)
+            factors[i] = 1e-3
+            yield f"{one.name} of the pose seems to be in millimetres under m", situation, measured * factors
+    shift = torch.where(lengths, torch.nan_to_num((measured - situation.pose).nanmedian(0).values), 0.0)
+    far = ", ".join(f"{c.name} by {float(v):.4g} m" for c, v in zip(pose, shift, strict=True) if c.unit == "m")
+    words = f"the frame that the pose is given in seems to be shifted ({far}): give the pose in the model's base frame"
+    yield words, situation, measured - shift
     turned = torch.where(lengths, measured, measured / _TURN)
     yield "the pose's angles seem to be in degrees under rad", situation, turned
     for i, one in enumerate(pose):

@@ -89,7 +89,7 @@ def check_rows(
         remarks=[
             lacking_text(situation.mechanism.name, c) for c in situation.mechanism.lacking([*situation.covariates])
         ],
-        cautions=row_cautions(analysis, rows),
+        cautions=[caution.text for caution in row_cautions(analysis, rows)],
     )
 
 

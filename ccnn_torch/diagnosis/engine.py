@@ -10,7 +10,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis._analysis import Analysis, analyse
 from ccnn_torch.diagnosis._belonging import Belonging, belonging
 from ccnn_torch.diagnosis._catch_all import SPEED
-from ccnn_torch.diagnosis._cautions import DOUBTED, cautions
+from ccnn_torch.diagnosis._cautions import cautions
 from ccnn_torch.diagnosis._missing import missing_covariates
 from ccnn_torch.diagnosis._next import next_measurements
 from ccnn_torch.diagnosis._report import Blocks, blocks, in_order
@@ -98,10 +98,11 @@ def diagnose_rows(
     nothing = not judgement.names and not judgement.outside
     outlier = nothing and bool(rows.astray.any() or gross_rows(analysis).any())
     missing = missing_covariates(analysis, every, lacking, judgement.driver, seed)
-    doubts = cautions(analysis, judgement, rows, missing)
+    doubts = cautions(analysis, judgement, rows, missing, together)
+    texts = [caution.text for caution in doubts]
     verdict = {
         "effects": [OUTLIER] if outlier else list(judgement.names),
-        "probability": min(judgement.probability, DOUBTED) if doubts else judgement.probability,
+        "probability": min([judgement.probability, *(caution.most for caution in doubts)]),
         "shrink": together.shrink,
         "shrink_ci95": None if together.interval is None else list(together.interval),
         "none": nothing and not outlier,
@@ -110,7 +111,13 @@ def diagnose_rows(
         "text": "",
     }
     why = why_set_aside(analysis, rows, chosen)
-    told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": doubts}
+    told = {
+        "gap": gap,
+        "gap_rotation": gap_rotation,
+        "effects": listed,
+        "verdict": verdict,
+        "cautions": [caution.text for caution in doubts],
+    }
     verdict["text"] = verdict_text(told | {"rows_set_aside": sorted(why)})
     places, intervals = where(analysis, residual, seed)
     notes = [unseen_text(name, reason) for name, reason in lacking.items()]
@@ -138,7 +145,7 @@ def diagnose_rows(
         not_seen=lacking,
         rows_set_aside=sorted(why),
         why_set_aside=[why[row] for row in sorted(why)],
-        cautions=doubts,
+        cautions=texts,
         notes=notes,
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,

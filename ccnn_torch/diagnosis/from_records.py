@@ -50,6 +50,11 @@ def diagnose(
     Raises:
         InputError: too few rows, most of them out of reach, or noise of a coordinate that there is not.
     """
+    if not isinstance(records, Records) or not isinstance(mechanism, Mechanism):
+        raise InputError(
+            "diagnose takes records and a mechanism, not their names: mechanism = load_mechanism(name), then "
+            "diagnose(load_records(path, mechanism), mechanism)"
+        )
     situation = situation_of(records, mechanism, gravity)
     with naming(records):
         said = diagnose_rows(situation, records.pose, noise_of(noise, situation), effects, seed)

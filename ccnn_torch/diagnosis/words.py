@@ -209,7 +209,9 @@ def _with_class(name: str, like: Sequence[str], signatures: Block) -> str:
 def _removed(results: Block, joint: str) -> str:
     """What the verdict's effects take away, on the first of position and rotation that has a gap."""
     verdict, blocks = results["verdict"], _blocks(results)
-    if verdict["shrink"] is None or not blocks:
+    # An interval from nothing on tells no size; a caution stands in its place.
+    nothing = verdict["shrink_ci95"] is not None and verdict["shrink_ci95"][0] <= 0
+    if verdict["shrink"] is None or not blocks or nothing:
         return ""
     # A digit more near the top, where 99.5 % must not be read as all of it.
     digits = 1 if verdict["shrink"] > 0.985 else 0

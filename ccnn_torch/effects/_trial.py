@@ -83,7 +83,9 @@ def _wrong_with(effect: OwnEffect, situation: Situation) -> str:
             return f"shapes(): {wrong}"
     grids = [s.grid for s in shapes]
     middle, low, high = ([g[share * (len(g) - 1) // 2] for g in grids] for share in (1, 0, 2))
-    effect.basis(situation, torch.tensor(middle, dtype=torch.float64))
+    at = torch.tensor(middle, dtype=torch.float64)
+    if not torch.equal(effect.basis(situation, at), effect.basis(situation, at)):
+        return "basis() gives something else when asked again; an effect draws no random numbers and keeps no state"
     if grids:
         # As a search asks: several sets of shapes at once.
         effect.basis(situation, torch.tensor([middle, low, high], dtype=torch.float64))

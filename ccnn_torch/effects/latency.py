@@ -43,7 +43,7 @@ class Latency:
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """The delay of all, then that of each joint on top."""
         own = [Coefficient(j.name, "s", 0.3 * _DELAY, joint=j.name, secondary=True) for j in situation.mechanism.joints]
-        return (Coefficient("delay", "s", _DELAY, positive=True), *own)
+        return (Coefficient("delay", "s", _DELAY), *own)
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """None."""

@@ -121,7 +121,9 @@ def next_table(results: Block, about: About) -> Table | None:
         ]
         rows.append((str(number), *cells, " or ".join(entry["separates"]) or "–", number_text(entry["gain"], 3)))
     columns = ("number", *joints, *covariates, "tells apart", "gain [nat]")
-    note = "Gain: expected information on which explanation is right. The same as a file: next_measurements.csv."
+    rivals = any(entry["separates"] for entry in wanted)
+    aim = "which explanation is right" if rivals else "the numbers of the one explanation, which has no rival"
+    note = f"Gain: expected information on {aim}. The same as a file: next_measurements.csv."
     if len(joints) + len(covariates) > _MOST_COLUMNS:
         columns, *rows = zip(columns, *rows, strict=True)
     return Table("What should be measured next?", columns, tuple(rows), note, ("tells apart",))

@@ -40,12 +40,13 @@ def cramped(name: str, rows: int, seed: int, share: float = 0.15) -> Situation:
 
 
 def acting(situation: Situation, name: str, **values: float) -> Acting:
-    """An effect without shapes, with the named coefficients [SI] and no others."""
+    """An effect at its usual shapes, with the named coefficients [SI] and no others."""
     effect = make_effect(name)
     names = [c.name.replace(" ", "_") for c in effect.coefficients(situation)]
     assert set(values) <= set(names), names
     coefficients = [values.get(n, 0.0) for n in names]
-    return Acting(effect, torch.zeros(0, dtype=torch.float64), torch.tensor(coefficients, dtype=torch.float64))
+    shape = [s.grid[0] if s.usual is None else s.usual for s in effect.shapes(situation)]
+    return Acting(effect, *(torch.tensor(v, dtype=torch.float64) for v in (shape, coefficients)))
 
 
 def reached_with(situation: Situation, causes: list[Acting], seed: int, noise: float = NOISE) -> Tensor:
