@@ -107,7 +107,7 @@ def belonging(situation: Situation, measured: Tensor) -> Belonging:
     usual = float(far[reached].median())
     if usual > _USUAL:
         raise RowsError(
-            f"the usual pose lies {usual:.2g} times as far from where {situation.mechanism.name} puts it as its poses "
+            f"the usual pose lies {usual:.3g} times as far from where {situation.mechanism.name} puts it as its poses "
             "are spread over the workspace, so that these rows are not of this model; "
             + (
                 _remedy(situation, measured, size)
