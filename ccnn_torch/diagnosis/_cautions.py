@@ -128,7 +128,7 @@ def _of_noise(analysis: Analysis, judgement: Judgement) -> list[Caution]:
 
 def _of_nothing_gained(analysis: Analysis, judgement: Judgement, together: Gap) -> list[Caution]:
     """Whether rows that the fit has not seen show nothing of what the verdict names."""
-    if not judgement.names or together.interval is None or together.interval[0] > 0:
+    if not judgement.names or (together.interval is not None and together.interval[0] > 0):
         return []
     text = "rows not used for fitting do not show that this takes anything away"
     if analysis.whitening.known == 0:

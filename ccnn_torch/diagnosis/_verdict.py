@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -13,7 +13,7 @@ from ccnn_torch.diagnosis._catch_all import ANY
 from ccnn_torch.diagnosis._search import Found, scored
 from ccnn_torch.effects import EXACT
 
-__all__ = ["Judgement", "judge"]
+__all__ = ["Judgement", "judge", "withdrawn"]
 
 # Share of the gap's energy that goes with a member of a set and not without it: below this a library effect is how the
 # form of the others differs from the textbook; so is a catch-all beside library effects, and so are library effects
@@ -110,6 +110,12 @@ def judge(analysis: Analysis) -> Judgement:
         probability = min(probability, _MIMIC)
     ordered = tuple(sorted(names, key=lambda n: -_energy(analysis, found, n)))
     return Judgement(found, ordered, classes, min(probability, 1.0), outside, driver, marginal, leading)
+
+
+def withdrawn(analysis: Analysis, judgement: Judgement) -> Judgement:
+    """None in the place of names that are not likely and that no row outside the fit shows."""
+    empty = next(f for f in analysis.found if not f.members)
+    return replace(judgement, found=empty, names=(), classes={}, probability=0.5)
 
 
 def _borrowed(analysis: Analysis, found: Found) -> frozenset[str]:

@@ -15,7 +15,7 @@ from ccnn_torch.diagnosis._missing import missing_covariates
 from ccnn_torch.diagnosis._next import next_measurements
 from ccnn_torch.diagnosis._report import Blocks, blocks, in_order
 from ccnn_torch.diagnosis._rows import picked
-from ccnn_torch.diagnosis._verdict import judge
+from ccnn_torch.diagnosis._verdict import judge, withdrawn
 from ccnn_torch.diagnosis._where import where
 from ccnn_torch.diagnosis.from_file import not_held_notes
 from ccnn_torch.diagnosis.result import Diagnosis
@@ -38,6 +38,8 @@ OUTLIER = "outlier"
 # More rows, and more measured values, than this name a cause no better: so many are drawn.
 _MOST_ROWS, _MOST_VALUES = 2000, 9000
 _FEWEST_ROWS = 20
+# Names below this probability are stood by only where rows not used for fitting show what they take away.
+_LIKELY = 0.8
 # Times the noise from which a row is bad and not unlucky: by itself; and where more than so many rows in a hundred, one
 # at least, are beyond the second, since the tail of a t distribution with three degrees comes that far now and then.
 _GROSS, _GROSS_TOGETHER, _SHARE_TOGETHER = 60.0, 15.0, 0.01
@@ -93,8 +95,13 @@ def diagnose_rows(
     analysis = analyse(situation, measured, usable, noise)
     judgement = judge(analysis)
     made = Blocks(analysis, judgement, residual, seed)
-    gap, gap_rotation, listed = blocks(made)
     together = made.main(made.together)
+    unlikely = bool(judgement.names) and not judgement.outside and judgement.probability < _LIKELY
+    if unlikely and (together.interval is None or together.interval[0] <= 0):
+        judgement = withdrawn(analysis, judgement)
+        made = Blocks(analysis, judgement, residual, seed)
+        together = made.main(made.together)
+    gap, gap_rotation, listed = blocks(made)
     nothing = not judgement.names and not judgement.outside
     outlier = nothing and bool(rows.astray.any() or gross_rows(analysis).any())
     missing = missing_covariates(analysis, every, lacking, judgement.driver, seed)

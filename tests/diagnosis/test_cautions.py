@@ -12,7 +12,9 @@ import torch
 from diagnosis._machines import NOISE, acting, measured, reached_with, rows_of
 from torch import Tensor
 
-from ccnn_torch.diagnosis import diagnose_rows
+from ccnn_torch.diagnosis import diagnose_rows, engine
+from ccnn_torch.diagnosis._analysis import Analysis
+from ccnn_torch.diagnosis._verdict import Judgement, judge
 from ccnn_torch.diagnosis.check import check_rows
 from ccnn_torch.effects import Situation, default_gravity
 from ccnn_torch.errors import InputError
@@ -189,3 +191,20 @@ def test_what_held_out_rows_do_not_show_is_not_claimed() -> None:
         assert any("do not show that this takes anything away" in caution for caution in found.cautions) == hollow
         assert found.verdict["none"] or found.verdict["probability"] <= 0.9
         assert not hollow or (found.verdict["probability"] <= 0.5 and "would remove" not in found.verdict["text"])
+
+
+@pytest.mark.parametrize(("probability", "none"), [(0.7, True), (0.85, False)])
+def test_what_is_neither_likely_nor_shown_elsewhere_is_not_named(
+    monkeypatch: pytest.MonkeyPatch, probability: float, none: bool
+) -> None:
+    situation = rows_of("five_bar", 100, 40)
+
+    def weak(analysis: Analysis) -> Judgement:
+        atoms = analysis.dictionary.atoms
+        found = next(f for f in analysis.found if [atoms[i].name for i in f.members] == ["joint_gain"])
+        return replace(judge(analysis), found=found, names=("joint_gain",), probability=probability)
+
+    monkeypatch.setattr(engine, "judge", weak)
+    found = diagnose_rows(situation, measured(situation, {}, 41), torch.full((3,), NOISE, dtype=torch.float64))
+    assert found.verdict["none"] is none and found.verdict["probability"] == 0.5
+    assert found.verdict["effects"] == ([] if none else ["joint_gain"]) and bool(found.cautions) is not none
