@@ -121,7 +121,7 @@ def test_an_own_effect_takes_part(cli: Cli, tmp_path: Path) -> None:
         ("geometry:l1=3", "has no pose in"),
         ("thermal:growth=1.2e-5,lag=-30min", "--effect thermal: lag = -1800 s is below 0; on these rows a diagnosis"),
         ("transmission:q1_sin=1e-4,q1_frequency=-2", "q1 frequency = -2 is below 0"),
-        ("latency:delay=-1ms", "delay = -0.001 s is below 0, which physics does not allow; plausible is about 0.005 s"),
+        ("backlash:q1=-0.1mrad", "q1 = -0.0001 rad is below 0, which physics does not allow; plausible is about"),
         (
             "joint_offset:q1=100",
             "q1 = 100 rad is more than 1000 times what a machine has; plausible is about 0.002",
