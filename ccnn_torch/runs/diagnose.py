@@ -49,7 +49,8 @@ def parse_noise(text: str) -> str:
         values = {}
     if not values or not all(values):
         raise InputError(
-            f"--noise: '{text}' is neither a number nor NAME=S,NAME=S,… (standard deviation of the pose in SI)"
+            f"--noise: '{text}' is neither a number nor NAME=S,NAME=S,… (standard deviation of the pose in SI: "
+            "1e-5 for 10 µm)"
         )
     if not all(0 < value < math.inf for value in values.values()):
         raise InputError(f"--noise {text}: {WRONG_NOISE}")
