@@ -13,7 +13,7 @@ from ccnn_torch.diagnosis._belonging import Belonging
 from ccnn_torch.diagnosis._distance import distance, size_of
 from ccnn_torch.diagnosis._shrink import Gap
 from ccnn_torch.diagnosis._verdict import Judgement
-from ccnn_torch.effects import Situation
+from ccnn_torch.effects import EXACT, Situation
 
 __all__ = ["Caution", "cautions", "row_cautions"]
 
@@ -28,6 +28,8 @@ _QUIET, _LOUD = 0.5, 2.0
 _MANY = 0.1
 # A joint that moves less than this share of its workspace stands still. Rows that may be copies of others.
 _STILL, _COPIES = 1e-3, 0.2
+# Effects that only the place of a row tells from one another.
+_OF_PLACE = EXACT | {"coupling", "gravity", "transmission"}
 # Standard deviations from which a coefficient has a sign.
 _SIGNED = 3.0
 # A workshop, with something to spare [K].
@@ -54,7 +56,7 @@ def cautions(
         together: what the verdict's effects take away on held-out rows.
     """
     return [
-        *row_cautions(analysis, rows),
+        *row_cautions(analysis, rows, judgement.names),
         *_of_noise(analysis, judgement),
         *_of_nothing_gained(analysis, judgement, together),
         *_of_sizes(analysis, judgement),
@@ -63,19 +65,20 @@ def cautions(
     ]
 
 
-def row_cautions(analysis: Analysis, rows: Belonging) -> list[Caution]:
-    """Those of them that need no verdict."""
-    return [*_of_model(analysis, rows), *_of_plan(analysis), *_of_temperature(analysis.situation)]
+def row_cautions(analysis: Analysis, rows: Belonging, names: Sequence[str] = ()) -> list[Caution]:
+    """Those of them that need no verdict; names: of one, where there is one."""
+    return [*_of_model(analysis, rows), *_of_plan(analysis, names), *_of_temperature(analysis.situation)]
 
 
-def _of_plan(analysis: Analysis) -> list[Caution]:
+def _of_plan(analysis: Analysis, names: Sequence[str]) -> list[Caution]:
     """Joints that stand still, and rows that are there more than once."""
     situation, said = analysis.situation, []
     low, high = situation.workspace
     moved = (situation.joints.amax(0) - situation.joints.amin(0)) > _STILL * (high - low)
     still = [j.name for j, moves in zip(situation.mechanism.joints, moved.tolist(), strict=True) if not moves]
     if still and len(still) == len(moved):
-        said.append(Caution("all rows are at one place, where what depends on the place cannot be told apart", _HOLLOW))
+        one = "all rows are at one place, where what depends on the place cannot be told apart"
+        said.append(Caution(one, _HOLLOW if _OF_PLACE & {*names} else _DOUBTED))
     elif still:
         said.append(Caution(f"{' and '.join(still)} did not move: its errors cannot be told from those of a frame"))
     columns = [situation.joints, analysis.measured, *(v[:, None] for v in situation.covariates.values())]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from ccnn_torch.diagnosis._missing import missing_covariates
 from ccnn_torch.diagnosis._next import next_measurements
 from ccnn_torch.diagnosis._report import Blocks, blocks, in_order
 from ccnn_torch.diagnosis._rows import picked
-from ccnn_torch.diagnosis._verdict import judge, withdrawn
+from ccnn_torch.diagnosis._verdict import Judgement, judge, withdrawn
 from ccnn_torch.diagnosis._where import where
 from ccnn_torch.diagnosis.from_file import not_held_notes
 from ccnn_torch.diagnosis.result import Diagnosis
@@ -118,26 +119,9 @@ def diagnose_rows(
         "text": "",
     }
     why = why_set_aside(analysis, rows, chosen)
-    told = {
-        "gap": gap,
-        "gap_rotation": gap_rotation,
-        "effects": listed,
-        "verdict": verdict,
-        "cautions": [caution.text for caution in doubts],
-    }
+    told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": texts}
     verdict["text"] = verdict_text(told | {"rows_set_aside": sorted(why)})
     places, intervals = where(analysis, residual, seed)
-    notes = [unseen_text(name, reason) for name, reason in lacking.items()]
-    notes += [lacking_text(situation.mechanism.name, c) for c in situation.mechanism.lacking([*situation.covariates])]
-    notes += not_held_notes(judgement.names)
-    if len(chosen) < int(rows.fine.sum()):
-        notes.append(f"{len(chosen)} of {len(rows.fine)} rows, drawn at random, were looked at")
-    if nothing and analysis.whitening.known == 0 and missing:
-        columns = ", ".join(column for entry in missing for column in entry["columns"])
-        notes.append(
-            "the noise was not given, so that a cause that follows nothing recorded counts as noise: compare the noise "
-            f"with that of the measuring device, and record what may be missing ({columns})"
-        )
     return Diagnosis(
         gap=gap,
         gap_rotation=gap_rotation,
@@ -153,11 +137,34 @@ def diagnose_rows(
         rows_set_aside=sorted(why),
         why_set_aside=[why[row] for row in sorted(why)],
         cautions=texts,
-        notes=notes,
+        notes=_notes(analysis, judgement, rows, lacking, missing),
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,
         judgement=judgement,
     )
+
+
+def _notes(
+    analysis: Analysis,
+    judgement: Judgement,
+    rows: Belonging,
+    lacking: Mapping[str, str],
+    missing: Sequence[Mapping[str, Any]],
+) -> list[str]:
+    """What was left out and why, one sentence each without a full stop; arguments as in `diagnose_rows`."""
+    mechanism, covariates = analysis.situation.mechanism, [*analysis.situation.covariates]
+    notes = [unseen_text(name, reason) for name, reason in lacking.items()]
+    notes += [lacking_text(mechanism.name, condition) for condition in mechanism.lacking(covariates)]
+    notes += not_held_notes(judgement.names)
+    if len(analysis.measured) < int(rows.fine.sum()):
+        notes.append(f"{len(analysis.measured)} of {len(rows.fine)} rows, drawn at random, were looked at")
+    if not judgement.names and not judgement.outside and analysis.whitening.known == 0 and missing:
+        columns = ", ".join(column for entry in missing for column in entry["columns"])
+        notes.append(
+            "the noise was not given, so that a cause that follows nothing recorded counts as noise: compare the noise "
+            f"with that of the measuring device, and record what may be missing ({columns})"
+        )
+    return notes
 
 
 def why_set_aside(analysis: Analysis, rows: Belonging, chosen: Tensor) -> dict[int, str]:

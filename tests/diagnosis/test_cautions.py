@@ -155,7 +155,7 @@ def test_play_against_its_directions_is_doubted() -> None:
 def test_rows_at_one_place_and_a_joint_that_stands_still_are_doubted() -> None:
     situation = rows_of("five_bar", 90, 16)
     one = replace(situation, joints=situation.joints[:1].expand_as(situation.joints).clone(), guess=None)
-    found = diagnose_rows(one, measured(one, {"thermal": 15.0}, 17))
+    found = diagnose_rows(one, measured(one, {"joint_offset": 15.0}, 17))
     assert any("all rows are at one place" in caution for caution in found.cautions)
     assert found.verdict["probability"] <= 0.5
     joints = situation.joints.clone()
