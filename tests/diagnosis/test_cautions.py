@@ -62,7 +62,7 @@ def _shuffled(pose: Tensor) -> Tensor:
         ("five_bar", _joints(lambda joints: joints * math.pi / 180), "the joints seem to be in radians under deg"),
         ("five_bar", _joints(lambda joints: joints[:1].expand_as(joints)), "joints and pose of a row belong together"),
         ("five_bar", _poses(_shuffled), "joints and pose of a row belong together"),
-        ("stewart", _poses(lambda pose: pose * torch.tensor([1.0] * 3 + [180 / math.pi] * 3)), "angles .* in degrees"),
+        ("tripod", _poses(lambda pose: pose * torch.tensor([1.0, 1.0, 180 / math.pi])), "angles .* in degrees"),
         ("delta_linear", _joints(lambda joints: joints * 1000), "the joints seem to be in millimetres under m"),
     ],
 )
@@ -182,7 +182,7 @@ def test_noise_far_too_small_is_doubted() -> None:
 
 def test_what_held_out_rows_do_not_show_is_not_claimed() -> None:
     """Play without a column of directions is noise to every candidate; whatever is named then takes nothing away."""
-    for seed in range(20, 26):
+    for seed in (20, 21):
         situation = rows_of("five_bar", 150, seed)
         pose = reached_with(situation, [acting(situation, "backlash", q1=4e-4, q2=3e-4)], seed + 1)
         columns = {n: v for n, v in situation.covariates.items() if not n.startswith("direction")}
