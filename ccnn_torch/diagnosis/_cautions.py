@@ -80,7 +80,8 @@ def _of_plan(analysis: Analysis, names: Sequence[str]) -> list[Caution]:
         one = "all rows are at one place, where what depends on the place cannot be told apart"
         said.append(Caution(one, _HOLLOW if _OF_PLACE & {*names} else _DOUBTED))
     elif still:
-        said.append(Caution(f"{' and '.join(still)} did not move: its errors cannot be told from those of a frame"))
+        named = " and ".join(still)
+        said.append(Caution(f"{named} did not move: errors of {named} cannot be told from those of a frame"))
     columns = [situation.joints, analysis.measured, *(v[:, None] for v in situation.covariates.values())]
     whole = torch.cat(columns, -1)
     copies = 1 - len(torch.unique(whole, dim=0)) / len(whole)

@@ -87,7 +87,11 @@ def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
     ]
     columns = ("effect", "what it is", "probability", f"gap with it alone [{unit}]", "removed [%]", "not told from")
     before = number_text(_over(results["gap"]["before"], scale), 4)
-    note = f"● in the verdict. The gap without any of them is {before} {unit}. {_REMOVED} In brackets: 95 % interval."
+    note = (
+        f"● in the verdict. The gap without any of them is {before} {unit}. {_REMOVED} In brackets: 95 % interval. "
+        "Probability: of each name among those tried; the verdict claims less where something could stand for it or "
+        "speaks against it."
+    )
     if hidden := len(results["effects"]) - len(shown):
         note += f" Not shown: {hidden} with a probability below {least:g}."
     return Table("Which effect?", columns, tuple(rows), note, ("what it is", "not told from"))
