@@ -12,6 +12,7 @@ from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._candidates import cleaned, first_candidates, plain_atom, renewed_candidates
 from ccnn_torch.diagnosis._catch_all import catch_alls
 from ccnn_torch.diagnosis._linear import remainder, tangent
+from ccnn_torch.diagnosis._local import local_catch_alls
 from ccnn_torch.diagnosis._search import Dictionary, Found, search
 from ccnn_torch.diagnosis._whitening import NO_NOISE, Whitening, fitted_whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
@@ -99,7 +100,9 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
 
     rich = white.sigma
     fixed, starts = first_candidates(situation, atoms, white, residual, usable, fitted)
-    result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest], near, rich, fitted)
+    jacobian = torch.where(usable[:, None, None], situation.jacobian, 0.0)
+    local = local_catch_alls(situation, jacobian, residual, white, white(fitted))
+    result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest, *local], near, rich, fitted)
 
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
     before: tuple[str, ...] | None = None
@@ -117,7 +120,9 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         target = torch.where(ok[:, None], target, 0.0)
         white = new if bool((ok == usable).all()) else _renewed(result, noise, ok)
         atoms = renewed_candidates(situation, there, measured, target, effects, acting, starts, white, ok, fitted)
-        result = _searched(situation, measured, target, white, [*atoms, *rest], near, rich, fitted)
+        beside = white(torch.cat([fitted, *(a.columns for a in atoms if a.name in before)], -1))
+        places = [*local, *local_catch_alls(situation, jacobian, target, white, beside)]
+        result = _searched(situation, measured, target, white, [*atoms, *rest, *places], near, rich, fitted)
     return result
 
 

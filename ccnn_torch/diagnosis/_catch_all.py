@@ -23,7 +23,7 @@ LOG_PRIOR = math.log(1e-3)
 # And one that holds most of what a library effect does has to be better than that effect by as much again.
 _NEAR_LIBRARY = math.log(1e-5)
 # A joint may be off by this much for reasons that nobody thought of [m], [rad].
-_SCALE = {"m": 3e-4, "rad": 5e-4}
+DEVIATION = {"m": 3e-4, "rad": 5e-4}
 ANY = "*"
 """Stands in a driver's name for all of its kind; a verdict names the one that explains most by itself."""
 SPEED = "speed"
@@ -38,7 +38,7 @@ _WAVES = 18
 def catch_alls(situation: Situation) -> list[Atom]:
     """One or two atoms for each driver that the records hold."""
     mechanism, rows = situation.mechanism, situation.joints.shape[-2]
-    place = _unit(situation.pose)
+    place = unit_range(situation.pose)
     one = torch.ones_like(place[:, :1])
     few = max(4, min(8, rows // 12))
     around = torch.cat([one, place, _bumps(place, min(24, max(6, rows // 8)))], -1)
@@ -49,17 +49,21 @@ def catch_alls(situation: Situation) -> list[Atom]:
             situation, "workspace", torch.cat([one, *_configuration(situation)], -1), most=most, log_prior=_NEAR_LIBRARY
         )
     )
+    own: list[Tensor] = []
     for i, joint in enumerate(mechanism.joints):
-        q = _unit(situation.joints[..., i : i + 1])
+        q = unit_range(situation.joints[..., i : i + 1])
         found.append(_atom(situation, f"joint {joint.name}", torch.cat([one, q, _BEND * _bumps(q, few)], -1)))
         fine = torch.cat([one, q, _bumps(q, min(_MOST, rows // 6))], -1)
-        found.append(_atom(situation, f"joint {joint.name}", fine, only=i))
+        own.append(_columns(situation, fine, only=i))
+        found.append(_made(f"joint {joint.name}", own[-1]))
+    # Drives of one kind have errors of one kind, each along its own track.
+    found.append(_made(f"joint {ANY}", torch.cat(own, -1), most=most))
     together: dict[str, list[Tensor]] = {}
     for name, value in situation.covariates.items():
         driver = _driver(name)
         if driver is None or float(value.max() - value.min()) <= 0:
             continue
-        d = _unit(value.unsqueeze(-1))
+        d = unit_range(value.unsqueeze(-1))
         features = [one, d, 0.7 * d * place]
         if driver.startswith(SPEED):
             pass
@@ -96,7 +100,7 @@ def _driver(name: str) -> str | None:
     return name if name in ("temperature", "time") else None
 
 
-def _unit(values: Tensor) -> Tensor:
+def unit_range(values: Tensor) -> Tensor:
     """Each column brought to [-1, 1] over the rows."""
     low, high = values.amin(-2, keepdim=True), values.amax(-2, keepdim=True)
     return (2 * values - low - high) / (high - low).clamp_min(1e-300)
@@ -110,7 +114,7 @@ def _products(place: Tensor) -> Tensor:
 
 def _bumps(points: Tensor, count: int) -> Tensor:
     """A constant-free set of Gaussian bumps about rows far from each other, `s x count`."""
-    centres = _spread_out(points, count)
+    centres = spread_out(points, count)
     distance = torch.cdist(points, centres)
     apart = torch.cdist(centres, centres) + 1e9 * torch.eye(len(centres), dtype=points.dtype)
     width = 1.5 * apart.amin(-1).median().clamp_min(1e-6)
@@ -118,7 +122,7 @@ def _bumps(points: Tensor, count: int) -> Tensor:
     return features - features.mean(-2, keepdim=True)
 
 
-def _spread_out(points: Tensor, count: int) -> Tensor:
+def spread_out(points: Tensor, count: int) -> Tensor:
     """Rows, each as far as possible from those before (farthest-point sampling)."""
     chosen = [int((points - points.mean(0)).square().sum(-1).argmin())]
     nearest = (points - points[chosen[0]]).square().sum(-1)
@@ -132,7 +136,7 @@ def _lagged(value: Tensor, time: Tensor, share: float) -> Tensor:
     """First-order lag by a share of the time that the records span, `s x 1`, brought to [-1, 1]."""
     span = (time.max() - time.min()).clamp_min(1e-300) * share
     weight = torch.exp(-(time[:, None] - time[None, :]) / span) * (time[:, None] >= time[None, :])
-    return _unit(((weight @ value) / weight.sum(-1)).unsqueeze(-1))
+    return unit_range(((weight @ value) / weight.sum(-1)).unsqueeze(-1))
 
 
 def _configuration(situation: Situation) -> list[Tensor]:
@@ -160,7 +164,7 @@ def _over_largest(values: Tensor) -> Tensor:
 def _carried(situation: Situation, joint: int) -> Tensor:
     """What load and weight ask of a joint, by size, `s x 2 or less`: what holds it where it came from."""
     asked = torch.stack([t[:, joint].abs() for t in (situation.load_torque, situation.own_weight_torque)], -1)
-    return _unit(asked[:, (asked.amax(0) - asked.amin(0)) > 1e-9 * asked.amax().clamp_min(1e-300)])
+    return unit_range(asked[:, (asked.amax(0) - asked.amin(0)) > 1e-9 * asked.amax().clamp_min(1e-300)])
 
 
 def _waves(values: Tensor, count: int) -> Tensor:
@@ -179,21 +183,22 @@ def _whole(situation: Situation, driver: str, features: Tensor) -> Atom:
     return Atom(driver, None, features.new_zeros(0), columns[..., shown], LOG_PRIOR)
 
 
-def _atom(
-    situation: Situation,
-    driver: str,
-    features: Tensor,
-    only: int | None = None,
-    most: int = _MOST,
-    log_prior: float = LOG_PRIOR,
-) -> Atom:
-    """features: `s x f`; columns = joints' Jacobian times the features, reduced to the directions that matter."""
-    sizes = torch.tensor([_SCALE.get(j.unit, 5e-4) for j in situation.mechanism.joints], dtype=features.dtype)
+def _atom(situation: Situation, driver: str, features: Tensor, most: int = _MOST, log_prior: float = LOG_PRIOR) -> Atom:
+    return _made(driver, _columns(situation, features), most, log_prior)
+
+
+def _columns(situation: Situation, features: Tensor, only: int | None = None) -> Tensor:
+    """Joints' Jacobian times the features `s x f`, `s x c x (n f)`; only: of one joint, counted from 0."""
+    sizes = torch.tensor([DEVIATION.get(j.unit, 5e-4) for j in situation.mechanism.joints], dtype=features.dtype)
     jacobian = situation.jacobian * sizes
     if only is not None:
         jacobian = jacobian[..., only : only + 1]
-    columns = (jacobian.unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
-    return Atom(driver, None, features.new_zeros(0), _reduced(columns, most), log_prior)
+    return (jacobian.unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
+
+
+def _made(driver: str, columns: Tensor, most: int = _MOST, log_prior: float = LOG_PRIOR) -> Atom:
+    """Columns reduced to the directions that matter."""
+    return Atom(driver, None, columns.new_zeros(0), _reduced(columns, most), log_prior)
 
 
 def _reduced(columns: Tensor, most: int) -> Tensor:

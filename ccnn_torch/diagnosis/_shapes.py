@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import default_shape, scales
+from ccnn_torch.diagnosis._remainder import Remainder, search_charge
 from ccnn_torch.effects import Effect, Shape, Situation
 
 __all__ = ["Scan", "Shaped"]
@@ -20,7 +21,6 @@ _FINE, _ROUNDS = 9, 2
 _LOOSE = 10.0
 # Values of the residual, at most, that the grids are looked at on, and that count between their values.
 _COARSE, _CLOSE = 1200, 4800
-_DIGITS = 1e-13
 # Shapes that share coefficients are looked for together where that are no more values.
 _TOGETHER = 150
 
@@ -110,7 +110,7 @@ class Scan:
             rows = self.rows[min(level, 1)]
             if level < 2:
                 target, fixed = _of(y, rows, 0).flatten(), _of(beside, rows, 0).flatten(0, 1)
-                plain = _Left(target, fixed)
+                plain = Remainder(target, fixed)
             # Squares of all rows, as the part of them that was looked at tells.
             times = y.numel() / len(target)
             for candidates, pieces, sizes in self._level(value, level):
@@ -123,12 +123,12 @@ class Scan:
                         left = plain
                         if sweep:
                             own = [_LOOSE * p[chosen[j]] for j, p in enumerate(pieces) if j != i]
-                            left = _Left(target, torch.cat([fixed, *own], -1))
+                            left = Remainder(target, torch.cat([fixed, *own], -1))
                         # What chance explains does not grow with the rows.
                         score = times * (left.gain(z[: sizes[i]]) - z.shape[-1]) + z.shape[-1]
                         chosen[i] = int(score.argmax())
                         gains[i] = float(score[chosen[i]])
-                        spent[i] = _charge(score) if level == 0 else 0.0
+                        spent[i] = search_charge(score) if level == 0 else 0.0
                 charges = [c + s for c, s in zip(charges, spent, strict=True)]
                 value = value.clone()
                 for i, part in enumerate(self.parts):
@@ -205,41 +205,6 @@ def _movers(basis: Tensor) -> Tensor | None:
 
 def _of(values: Tensor, rows: Tensor | None, dim: int) -> Tensor:
     return values if rows is None else values.index_select(dim, rows)
-
-
-def _charge(gain: Tensor) -> float:
-    """Log odds that a search over a grid costs, `g` squares explained at each value: nothing where all do as well."""
-    return math.log(len(gain)) - float(torch.logsumexp((gain - gain.max()) / 2, 0))
-
-
-class _Left:
-    """What nuisance columns with their prior leave of `y`, and of whatever is put beside them."""
-
-    def __init__(self, y: Tensor, nuisance: Tensor) -> None:
-        """y: `N`; nuisance: `N x P`, whitened, in units of their prior scale."""
-        gram = nuisance.mT @ nuisance
-        diagonal = gram.diagonal()
-        # Columns that are the same, far above the noise, would leave no digit of the 1.
-        diagonal += 1 + _DIGITS * diagonal.amax(0, keepdim=True) if len(gram) else 0
-        factor = torch.linalg.cholesky(gram)
-        # Rows whose Gram matrix is what the nuisance takes out: (I + NᵀN)^-1/2 Nᵀ.
-        self.taken = torch.linalg.solve_triangular(factor, nuisance.mT, upper=False)
-        self.y = y - self.taken.mT @ (self.taken @ y)
-
-    def gain(self, z: Tensor) -> Tensor:
-        """Squares that each candidate explains, `g`; z: `g x N x m`."""
-        inner = z.mT @ z
-        if len(self.taken):
-            count, rows, width = z.shape
-            flat = z.transpose(0, 1).reshape(rows, count * width)
-            cross = (self.taken @ flat).reshape(-1, count, width).transpose(0, 1)
-            inner = inner - cross.mT @ cross
-        b = (z.mT @ self.y[:, None])[..., 0]
-        ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
-        inner = inner + torch.diag_embed(ridge[:, None].expand(-1, inner.shape[-1]))
-        solved = torch.linalg.solve(inner, b[..., None])[..., 0]
-        gain: Tensor = (b * solved).sum(-1)
-        return gain
 
 
 def _parts(shapes: tuple[Shape, ...], coefficients: int) -> list[_Part]:

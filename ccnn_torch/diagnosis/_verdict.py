@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from ccnn_torch.diagnosis._analysis import Analysis
+from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._catch_all import ANY
 from ccnn_torch.diagnosis._search import Found, scored
 from ccnn_torch.effects import EXACT
@@ -31,8 +32,8 @@ _SMALL, _UNSURE = 0.1, 0.85
 # A name is not claimed more surely than this where it could as well take over another candidate's typical part of the
 # gap, all but so many squares in units of the noise: then it could take over what the library does not know, too.
 _MIMIC, _MIMICKED = 0.9, 60.0
-# Share of an effect's own squares that must not be borrowed from what other effects do.
-_OWN = 0.1
+# Share of an effect's own squares that must not be borrowed from what other effects do, and of what may be doubtful.
+_OWN, _DOUBTED = 0.1, 0.5
 # Or that must come from other coefficients than those that mend its form, where these are so many times as large, in
 # plausible sizes.
 _MAIN, _MENDED = 0.5, 15.0
@@ -85,7 +86,7 @@ def judge(analysis: Analysis) -> Judgement:
     if not outside and _unexplained(analysis, found):
         outside = True
         driver = _driver_of_remainder(analysis)
-    borrowed = _borrowed(analysis, found)
+    borrowed = _borrowed(analysis, found, tried)
     if borrowed:
         # Something is there that looks like a part of these effects, and nothing of what makes them what they are.
         found = _best_without(analysis, borrowed, tried) or found
@@ -118,22 +119,38 @@ def withdrawn(analysis: Analysis, judgement: Judgement) -> Judgement:
     return replace(judgement, found=empty, names=(), classes={}, probability=0.5)
 
 
-def _borrowed(analysis: Analysis, found: Found) -> frozenset[str]:
+def _borrowed(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]) -> frozenset[str]:
     """Names of a set that rest on what other effects do as well, or on what should only mend their form."""
     grams, names = analysis.dictionary.grams, set()
     for i, mean in zip(found.members, found.mean, strict=True):
         atom, group = analysis.dictionary.atoms[i], analysis.dictionary.groups[i]
         coefficients = atom.coefficients(analysis.situation)
-        own = torch.tensor([not c.borrowed for c in coefficients])
-        mends = torch.tensor([c.mends for c in coefficients])
-        if atom.catch_all or bool((own & ~mends).all()):
+        if not any(c.borrowed or c.doubtful or c.mends for c in coefficients):
             continue
+        borrowed, doubtful, mends = (
+            torch.tensor(flags, dtype=torch.bool)
+            for flags in zip(*((c.borrowed, c.doubtful, c.mends) for c in coefficients), strict=True)
+        )
         gram = grams.xx[group][:, group]
-        alone, main, whole = (float(m @ gram @ m) for m in (mean * own, mean * ~mends, mean))
+        parts = (mean * ~borrowed, mean * doubtful, mean * ~mends, mean)
+        alone, unsure, main, whole = (float(m @ gram @ m) for m in parts)
         largest, mended = (float((mean * kind).abs().max()) for kind in (~mends, mends))
-        if alone < _OWN * whole or (main < _MAIN * whole and mended > _MENDED * largest):
+        if (
+            alone < _OWN * whole
+            or (main < _MAIN * whole and mended > _MENDED * largest)
+            or (unsure > _DOUBTED * whole and not _follows_need(analysis, atom, tried))
+        ):
             names.add(atom.name)
     return frozenset(names)
+
+
+def _follows_need(analysis: Analysis, atom: Atom, tried: dict[tuple[int, ...], Found]) -> bool:
+    """Whether, without an effect, something outside the library seems to follow a covariate that the effect needs."""
+    found = _best_without(analysis, frozenset({atom.name}), tried)
+    driver = None if found is None else _named(analysis, found)[1]
+    others = [c for c in analysis.situation.covariates if c != driver]
+    assert atom.effect is not None
+    return bool(atom.effect.missing(analysis.situation.mechanism, others))
 
 
 def _best_without(analysis: Analysis, names: frozenset[str], tried: dict[tuple[int, ...], Found]) -> Found | None:

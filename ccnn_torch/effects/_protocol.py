@@ -30,6 +30,8 @@ class Coefficient:
             simulation leaves it 0 unless told otherwise.
         borrowed: whether by itself it is what another effect does (a constant part): it does not speak for this
             one.
+        doubtful: whether something else may do the same as time goes by (a mount that follows the temperature, which
+            rises from morning to noon): it speaks for this effect where the gap follows what the effect needs.
         mends: whether it is but a correction of the form of the others, and cannot be many times as large as they are.
         positive: whether physics allows it no negative value (play, compliance); for drawing it in a simulation.
     """
@@ -41,6 +43,7 @@ class Coefficient:
     leg: int | None = None
     secondary: bool = False
     borrowed: bool = False
+    doubtful: bool = False
     mends: bool = False
     positive: bool = False
 

@@ -1,0 +1,99 @@
+"""Catch-alls that are found rather than given: a bump in one place of a joint's track, or of the workspace.
+
+Bumps of every place at once share one prior scale, and the evidence charges each of them; a dent or a table is in one
+place alone. So that place is looked for, and the search is charged as that for a period is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis._atoms import Atom
+from ccnn_torch.diagnosis._catch_all import DEVIATION, LOG_PRIOR, spread_out, unit_range
+from ccnn_torch.diagnosis._remainder import Remainder, search_charge
+from ccnn_torch.diagnosis._whitening import Whitening
+from ccnn_torch.effects import Situation
+
+__all__ = ["local_catch_alls"]
+
+# Places looked at along a joint's track and in the workspace, and radii as shares of half the range.
+_ALONG, _WITHIN = 21, 40
+_RADII_ALONG, _RADII_WITHIN = (0.1, 0.17, 0.3), (0.25, 0.4, 0.65)
+# Rows that a bump has to touch: fewer are bad rows.
+_TOUCHED = 4.0
+# A place is then mended by steps of this share of its radius, halved where none is better, so many times.
+_STEP, _STEPS = 0.4, 10
+# What else is there may have so many plausible sizes.
+_LOOSE = 10.0
+
+
+def local_catch_alls(
+    situation: Situation, jacobian: Tensor, target: Tensor, white: Whitening, others: Tensor
+) -> list[Atom]:
+    """The best bump of each joint's track, and that of the workspace.
+
+    Args:
+        situation: `s` rows.
+        jacobian: by the joints, where the model is linear, `s x c0 x n`; 0 in rows that are left out.
+        target: what a linear model has to explain, `s x c0` [m, rad].
+        white: noise and weights.
+        others: whitened columns of what else is there, in plausible sizes, `s x c x P`.
+    """
+    joints = situation.mechanism.joints
+    sizes = torch.tensor([DEVIATION.get(j.unit, 5e-4) for j in joints], dtype=jacobian.dtype)
+    lead = white(jacobian * sizes)
+    # What is the same wherever a joint stands is no bump.
+    left = Remainder(white(target).flatten(), _LOOSE * torch.cat([others, lead], -1).flatten(0, 1))
+    found = []
+    for i, joint in enumerate(joints):
+        track = unit_range(situation.joints[:, i : i + 1])
+        middles = torch.linspace(-1, 1, _ALONG, dtype=track.dtype).unsqueeze(-1)
+        one = slice(i, i + 1)
+        places = _places(middles, _RADII_ALONG)
+        found += _best(f"joint {joint.name}", track, places, jacobian[..., one] * sizes[one], lead[..., one], left)
+    lengths = [k for k, c in enumerate(situation.mechanism.pose) if c.unit == "m"]
+    place = unit_range(situation.pose[:, lengths] if lengths else situation.pose)
+    places = _places(spread_out(place, _WITHIN), _RADII_WITHIN)
+    return found + _best("workspace", place, places, jacobian * sizes, lead, left)
+
+
+def _places(middles: Tensor, radii: tuple[float, ...]) -> Tensor:
+    """Each middle with each radius' logarithm, `g x (d + 1)`."""
+    logs = torch.tensor(radii, dtype=middles.dtype).log()
+    every = middles.repeat(len(logs), 1)
+    return torch.cat([every, logs.repeat_interleave(len(middles))[:, None]], -1)
+
+
+def _bumps(points: Tensor, places: Tensor) -> Tensor:
+    """Gaussian bumps, `s x g`; points: `s x d`, places: `g x (d + 1)`."""
+    return torch.exp(-(torch.cdist(points, places[:, :-1]) / places[:, -1].exp()).square())
+
+
+def _best(driver: str, points: Tensor, places: Tensor, raw: Tensor, lead: Tensor, left: Remainder) -> list[Atom]:
+    """The atom of the bump that explains most; raw, lead: columns that a bump multiplies, plain and whitened."""
+
+    def gain(tried: Tensor) -> Tensor:
+        bumps = _bumps(points, tried)
+        touched = bumps.sum(0)
+        score = left.gain((lead[None] * bumps.mT[:, :, None, None]).flatten(1, 2))
+        return torch.where((touched > _TOUCHED) & (touched < len(points) / 2), score, -torch.inf)
+
+    score = gain(places)
+    place, reached = places[int(score.argmax())], float(score.max())
+    if reached == -math.inf:
+        return []
+    step = place.new_full((len(place),), _STEP)
+    step[:-1] *= place[-1].exp()
+    for _ in range(_STEPS):
+        tried = place + torch.cat([torch.diag(step), -torch.diag(step)])
+        better = gain(tried)
+        if float(better.max()) > reached:
+            place, reached = tried[int(better.argmax())], float(better.max())
+        else:
+            step = step / 2
+    best = _bumps(points, place[None])[:, :, None]
+    columns = torch.cat([raw * best, raw], -1)
+    return [Atom(driver, None, raw.new_zeros(0), columns, LOG_PRIOR - search_charge(score))]
