@@ -23,7 +23,7 @@ def rows(cli: Cli, tmp_path: Path) -> Path:
     words = ("--mechanism", "five_bar", "--effect", "backlash", "--rows", "80", "--noise", "1e-5", "--seed", "4")
     code, _, told = cli("simulate", *words, "--out", tmp_path / "rows.csv", "--quiet")
     assert code == 0, told
-    (tmp_path / "config.yaml").write_text("records: rows.csv\nmechanism: five_bar\nnoise: 1e-5\n", encoding="utf-8")
+    (tmp_path / "config.yaml").write_text("records: rows.csv\nmechanism: five_bar\nnoise: 10um\n", encoding="utf-8")
     return tmp_path / "rows.csv"
 
 
@@ -112,15 +112,19 @@ def test_rows_set_aside_are_called_by_one_name_everywhere(cli: Cli, tmp_path: Pa
         ([], "name the folder to write with --out DIR"),
         (["--out", "x", "--effects", "backlsh"], "did you mean 'backlash'?"),
         (["--out", "x", "--effects", "tool"], "can show none of the candidates: tool needs"),
-        (["--out", "x", "--noise", "abc"], "'abc' is neither a number nor NAME=S"),
-        (["--out", "x", "--noise", "0"], "--noise 0: must be a standard deviation of the pose in SI, a number above 0"),
-        (["--out", "x", "--noise", "-1"], "--noise -1: must be a standard deviation"),
-        (["--out", "x", "--noise", "nan"], "--noise nan: must be a standard deviation"),
-        (["--out", "x", "--noise", "x=1e-5,y=0"], "--noise x=1e-5,y=0: must be a standard deviation"),
-        (["--out", "x", "--noise", "=1"], "'=1' is neither a number nor NAME=S"),
-        (["--out", "x", "noise=0"], "'noise=0': noise: must be a standard deviation of the pose in SI, a number above"),
+        (["--out", "x", "--noise", "abc"], "--noise abc: 'abc' is no number with a unit; write e.g. 0.4 mm"),
+        (["--out", "x", "--noise", "x=1,2"], "'x=1,2' is neither a size nor NAME=SIZE"),
+        (["--out", "x", "--noise", "10 blub"], "--noise 10 blub"),
+        (["--out", "x", "--noise", "10 urad"], "noise.x is in 'urad', an angle, but must be a length"),
+        (["--out", "x", "--noise", "0"], "noise: must be a standard deviation of the pose, a size above 0 (10um"),
+        (["--out", "x", "--noise", "-1"], "noise: must be a standard deviation"),
+        (["--out", "x", "--noise", "nan"], "noise: must be a standard deviation"),
+        (["--out", "x", "--noise", "x=1e-5,y=0"], "noise: must be a standard deviation"),
+        (["--out", "x", "--noise", "=1"], "'=1' is neither a size nor NAME=SIZE"),
+        (["--out", "x", "noise=0"], "'noise=0': noise: must be a standard deviation of the pose, a size above"),
         (["--out", "x", "noise={x: wide}"], "noise: must be a standard deviation"),
-        (["--out", "x", "--noise", "z=1e-5"], "there is no pose coordinate z"),
+        (["--out", "x", "--noise", "z=1e-5"], "noise.z: there is no such name; there are x, y"),
+        (["--out", "x", "--noise", "x=10um"], "noise: gives nothing for y; the pose is x, y"),
     ],
 )
 def test_what_is_wrong_is_one_sentence(

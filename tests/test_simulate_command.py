@@ -46,7 +46,7 @@ def test_records_hold_what_was_injected_and_nothing_else(cli: Cli, tmp_path: Pat
 
 def test_the_noise_is_what_was_asked_for_and_a_machine_as_its_model_has_nothing_else(cli: Cli, tmp_path: Path) -> None:
     out = tmp_path / "r.csv"
-    noise = "y=1e-5,phi=4e-5"
+    noise = "y=10um,phi=40urad"
     code, told, _ = cli("simulate", "--mechanism", "tripod", "--rows", 400, "--noise", noise, "--out", out)
     assert code == 0 and "Nothing was injected" in told
     mechanism = load_mechanism("tripod")
@@ -171,8 +171,8 @@ def test_what_is_told_is_what_acts(cli: Cli, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (("--noise", "much"), "--noise much: write one number in SI"),
-        (("--noise", "z=1e-5"), "there is no pose coordinate 'z'; five_bar has x, y"),
+        (("--noise", "much"), "--noise much: 'much' is no number with a unit"),
+        (("--noise", "z=1e-5"), "noise.z: there is no such name; there are x, y"),
         (("--noise", "-1"), "a standard deviation is a number from 0 up"),
         (("--noise", "0", "--rows", "0"), "--rows: simulate at least 1 row, not 0"),
         (("--noise", "0", "max_condition=1.0001"), "make max_condition larger"),
@@ -212,5 +212,5 @@ def test_the_help_and_the_page_name_every_effect_and_key(cli: Cli, tmp_path: Pat
 def test_python_takes_a_mechanism_and_refuses_an_unknown_coordinate() -> None:
     made = simulate_records(load_mechanism("five_bar"), [], 5, {"x": 1e-5})
     assert len(made.joints) == 5
-    with pytest.raises(InputError, match="no pose coordinate 'phi'"):
+    with pytest.raises(InputError, match=r"noise\.phi: there is no such name; there are x, y"):
         simulate_records("five_bar", [], 5, {"phi": 1e-5})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -26,10 +27,11 @@ def configured(
     network: bool | None = None,
 ) -> DiagnoseConfig:
     """The config file with what the command line says over it."""
-    from ccnn_torch.runs.diagnose import parse_noise
+    from ccnn_torch.runs._noise import read_noise
     from ccnn_torch.runs.diagnose_config import load_diagnose_config
 
-    wanted = load_diagnose_config(config, [*(overrides or []), *([] if noise is None else [parse_noise(noise)])])
+    told = [] if noise is None else [f"noise={json.dumps(read_noise(noise))}"]
+    wanted = load_diagnose_config(config, [*(overrides or []), *told])
     names = None if effects is None else [e.strip() for e in effects.split(",") if e.strip()]
     given = {
         "records": None if records is None else str(records),

@@ -25,7 +25,10 @@ def diagnose(
     mechanism: Annotated[str | None, typer.Option(help="A mechanism's name, file, or path/to/file.py:Name.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write diagnosis.json to.")] = None,
     noise: Annotated[
-        str | None, typer.Option(help="Standard deviation of the pose: S in m and rad alike, or NAME=S,….")
+        str | None,
+        typer.Option(
+            help="Standard deviation of the pose: 1e-5 (m and rad alike), 10um, NAME=S,…, or m=10um,rad=30urad."
+        ),
     ] = None,
     effects: Annotated[str | None, typer.Option(help="Candidates, a,b,…; all when left out.")] = None,
     config: Annotated[Path | None, typer.Option(help="A YAML file with keys as below.")] = None,

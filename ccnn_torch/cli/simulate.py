@@ -16,7 +16,7 @@ def simulate(
     mechanism: Annotated[str, typer.Option(help="A mechanism's name, a geometry file, or path/to/file.py:Name.")],
     rows: Annotated[int, typer.Option(help="How many rows.")],
     noise: Annotated[
-        str, typer.Option(help="Standard deviation of each pose coordinate in SI: 1e-5, or x=1e-5,y=2e-5.")
+        str, typer.Option(help="Standard deviation of the pose: 1e-5 (SI), 10um, x=1e-5,y=20um or m=10um,rad=30urad.")
     ],
     out: Annotated[Path, typer.Option(help="CSV to write.")],
     effect: Annotated[
@@ -44,7 +44,7 @@ def simulate(
     ccnn simulate --mechanism stewart --effect compliance:q1=2e-7,q4=1e-7 --effect thermal:growth=1.2e-5,lag=30min
     --rows 400 --noise 1e-5 --out records.csv
 
-    ccnn simulate --mechanism tripod --effect outlier:share=0.05 --rows 100 --noise y=1e-5,z=1e-5,phi=3e-5 --out r.csv
+    ccnn simulate --mechanism tripod --effect outlier:share=0.05 --rows 100 --noise m=10um,rad=30urad --out r.csv
 
     ccnn simulate --mechanism my_arm.yaml --effect my_effect.py:CableForce --rows 300 --noise 2e-5 --out r.csv
 
@@ -52,9 +52,10 @@ def simulate(
     --out r.csv
     """
     from ccnn_torch.report.table_form import print_table
+    from ccnn_torch.runs._noise import read_noise
     from ccnn_torch.runs.screen import stdout
     from ccnn_torch.runs.simulate_config import load_simulate_config
-    from ccnn_torch.runs.simulating import injected_table, read_noise, simulate_records, write_simulated
+    from ccnn_torch.runs.simulating import injected_table, simulate_records, write_simulated
 
     with if_stopped(NOTHING_WRITTEN):
         wanted = load_simulate_config(config, overrides or [])

@@ -69,6 +69,11 @@ def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Sit
     if isinstance(inner, BlackBox):
         # Each of these would be simulated anew, which may take long.
         return
+    turns = torch.tensor([g.unit == "rad" for g in inner.geometry])
+    if inner is mechanism and bool(turns.any()):
+        mended = torch.where(turns, inner.nominal / _TURN, inner.nominal)
+        words = "the angles of the model seem to be in degrees under rad: look at the units in its file"
+        yield words, replace(situation, parameters=mended), measured
     at = situation.joints
     for i, k in combinations(range(len(joints)), 2):
         if joints[i].unit == joints[k].unit:

@@ -35,6 +35,7 @@ class Check:
         condition: largest condition number of the Jacobian over the rows that count.
         why_aside: the reason for each of the rows in `aside`.
         lines_aside: the line of each of them in the file, the header being line 1; empty for rows of no file.
+        noise_given: whether the noise was given, and not estimated from the rows.
         remarks: what else to know, such as covariates that a simulator takes and the records lack, one sentence each.
         cautions: signs that the rows and the model do not fit each other, one sentence each.
     """
@@ -51,6 +52,7 @@ class Check:
     cautions: list[str] = field(default_factory=list)
     why_aside: list[str] = field(default_factory=list)
     lines_aside: list[int] = field(default_factory=list)
+    noise_given: bool = False
 
 
 def check_rows(
@@ -85,6 +87,7 @@ def check_rows(
         weak=weak,
         confusable=_confusable(spans),
         condition=float(condition.max()),
+        noise_given=noise is not None,
         why_aside=[why[row] for row in sorted(why)],
         remarks=[
             lacking_text(situation.mechanism.name, c) for c in situation.mechanism.lacking([*situation.covariates])

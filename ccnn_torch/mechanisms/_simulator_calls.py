@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ccnn_torch._display import count_text
 from ccnn_torch.batching import leading_shape
 from ccnn_torch.coordinates import Condition
 from ccnn_torch.errors import CcnnError, InputError
@@ -129,14 +130,14 @@ class Calls:
         except Exception as error:  # whatever a user's code may raise
             said = (str(error).strip().splitlines() or [""])[0]
             raise InputError(
-                f"simulator '{simulator.name}': simulate fails{_line(error)} on {len(rows)} rows: "
+                f"simulator '{simulator.name}': simulate fails{_line(error)} on {count_text(len(rows), 'row')}: "
                 f"{type(error).__name__}: {said}"
             ) from error
         wanted = (len(rows), len(simulator.pose))
         if pose.shape != wanted:
             raise InputError(
-                f"simulator '{simulator.name}': simulate returned shape {pose.shape} for {len(rows)} rows, expected "
-                f"{wanted}: a row for each row of commands and a column for each of {_names(simulator)}; wrap a "
+                f"simulator '{simulator.name}': simulate returned shape {pose.shape} for "
+                f"{count_text(len(rows), 'row')}, expected {wanted}: a row for each row of commands and a column for each of {_names(simulator)}; wrap a "
                 "function of one row in rowwise(…)"
             )
         pose[~np.isfinite(pose).all(-1)] = np.nan

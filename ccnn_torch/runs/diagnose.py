@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,45 +17,21 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.diagnosis_report import write_diagnosis_report
+from ccnn_torch.report.display import display_unit, number_text
 from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.table_form import Table
-from ccnn_torch.runs.diagnose_config import WRONG_NOISE, DiagnoseConfig
+from ccnn_torch.runs._noise import noise_of_pose
+from ccnn_torch.runs.diagnose_config import DiagnoseConfig
 
 __all__ = [
     "check_table",
     "check_text",
-    "parse_noise",
     "run_check",
     "run_diagnosis",
     "write_check",
     "write_diagnosis",
     "write_result",
 ]
-
-
-def parse_noise(text: str) -> str:
-    """`--noise` as an override: one number, or `NAME=S,…`.
-
-    Raises:
-        InputError: it is neither, or not above 0.
-    """
-    parts = [p.strip() for p in text.split(",") if p.strip()]
-    pairs = [p.partition("=") for p in parts]
-    alone = len(parts) == 1 and not pairs[0][1]
-    try:
-        values = {n.strip(): float(v) for n, _, v in pairs} if not alone else {"all": float(parts[0])}
-    except ValueError:
-        values = {}
-    if not values or not all(values):
-        raise InputError(
-            f"--noise: '{text}' is neither a number nor NAME=S,NAME=S,… (standard deviation of the pose in SI: "
-            "1e-5 for 10 µm)"
-        )
-    if not all(0 < value < math.inf for value in values.values()):
-        raise InputError(f"--noise {text}: {WRONG_NOISE}")
-    if alone:
-        return f"noise={values['all']!r}"
-    return "noise={" + ", ".join(f"{name}: {value!r}" for name, value in values.items()) + "}"
 
 
 def run_diagnosis(config: DiagnoseConfig) -> Diagnosis:
@@ -66,7 +41,8 @@ def run_diagnosis(config: DiagnoseConfig) -> Diagnosis:
         InputError: something is missing or wrong in the files or keys, or the rows carry no verdict.
     """
     records, mechanism, effects = _loaded(config)
-    return diagnose(records, mechanism, noise=config.noise, effects=effects, gravity=config.gravity, seed=config.seed)
+    noise = _noise(config, mechanism)
+    return diagnose(records, mechanism, noise=noise, effects=effects, gravity=config.gravity, seed=config.seed)
 
 
 def run_check(config: DiagnoseConfig) -> Check:
@@ -74,7 +50,7 @@ def run_check(config: DiagnoseConfig) -> Check:
     records, mechanism, effects = _loaded(config)
     situation = situation_of(records, mechanism, config.gravity)
     with naming(records):
-        found = check_rows(situation, records.pose, noise_of(config.noise, situation), effects)
+        found = check_rows(situation, records.pose, noise_of(_noise(config, mechanism), situation), effects)
     return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside])
 
 
@@ -135,11 +111,11 @@ def _noise_text(diagnosis: Diagnosis) -> str:
 
 def check_text(check: Check) -> list[str]:
     """What the records can and cannot show, one sentence a line."""
-    noise = ", ".join(f"{n} {s:.2g}" for n, s in check.noise.items())
+    noise = ", ".join(f"{n} {_in_unit(s, 'rad' if n.startswith('r') else 'm')}" for n, s in check.noise.items())
     lines = [
         f"{check.rows} rows, {len(check.aside)} of them set aside; Jacobian's condition number up to "
         f"{check.condition:.3g}.",
-        f"Noise (m, rad): {noise}.",
+        f"Noise, {'as given' if check.noise_given else 'estimated'}: {noise}.",
         f"Covariates: {', '.join(check.covariates) or 'none'}.",
     ]
     lines += [aside_text(check.aside, check.why_aside, check.lines_aside)] if check.aside else []
@@ -150,11 +126,20 @@ def check_text(check: Check) -> list[str]:
     return lines
 
 
+def _in_unit(value: float, unit: str) -> str:
+    scale, shown = display_unit(unit, value)
+    return f"{number_text(value / scale, 2)} {shown}"
+
+
 def check_table(check: Check) -> Table:
     """Pairs that these rows do not tell apart."""
     rows = tuple((a, b, f"{share:.3f}") for a, b, share in check.confusable)
     note = "Share of what the first is likely to do that the second can do as well (cosine)."
     return Table("Confusable", ("effect", "taken over by", "share"), rows, note)
+
+
+def _noise(config: DiagnoseConfig, mechanism: Mechanism) -> dict[str, float] | None:
+    return None if config.noise is None else noise_of_pose(config.noise, mechanism.pose)
 
 
 def _loaded(config: DiagnoseConfig) -> tuple[Records, Mechanism, list[Effect] | None]:

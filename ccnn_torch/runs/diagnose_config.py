@@ -9,26 +9,29 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
+from ccnn_torch.errors import InputError
 from ccnn_torch.runs._config_tree import Names, Section, config_from_options
 from ccnn_torch.runs._keys import list_keys
+from ccnn_torch.runs._noise import Noise
+from ccnn_torch.runs._sizes import size
 
-__all__ = ["WRONG_NOISE", "DiagnoseConfig", "describe_diagnose_keys", "load_diagnose_config"]
+__all__ = ["DiagnoseConfig", "describe_diagnose_keys", "load_diagnose_config"]
 
-WRONG_NOISE = (
-    "must be a standard deviation of the pose in SI, a number above 0 or one for each coordinate; leave it out to have "
-    "it estimated"
+_WRONG_NOISE = (
+    "must be a standard deviation of the pose, a size above 0 (10um, or 1e-5 in SI) or one for each coordinate; leave "
+    "it out to have it estimated"
 )
 
 
 def _deviation(value: Any) -> Any:
-    """Noise as it stands in a config: None, a number above 0, or numbers above 0 by name."""
-    numbers = list(value.values()) if isinstance(value, dict) else [value]
+    """Noise as it stands in a config: None, a size above 0, or sizes above 0 by name."""
+    sizes = list(value.values()) if isinstance(value, dict) else [value]
     try:
-        fine = value is None or (numbers and all(0 < float(number) < math.inf for number in numbers))
-    except (TypeError, ValueError):
+        fine = value is None or (sizes and all(0 < size(one, None, "noise") < math.inf for one in sizes))
+    except (TypeError, InputError):
         fine = False
     if not fine or (isinstance(value, dict) and not all(isinstance(name, str) for name in value)):
-        raise ValueError(f"{WRONG_NOISE} (it is {value})")
+        raise ValueError(f"{_WRONG_NOISE} (it is {value})")
     return value
 
 
@@ -43,10 +46,11 @@ class DiagnoseConfig(Section):
         default=None,
         description="covariate columns by name or pattern; null = time, temperature, load_*, direction*, …",
     )
-    noise: Annotated[float | dict[str, float] | None, BeforeValidator(_deviation)] = Field(
+    noise: Annotated[Noise | None, BeforeValidator(_deviation)] = Field(
         default=None,
-        description="standard deviation of the measured pose in SI, one number for every coordinate or by coordinate; "
-        "null = estimated from the records; one number is metres for lengths and radians for angles alike",
+        description="standard deviation of the measured pose, in SI or with a unit (10um), one size for every "
+        "coordinate or by coordinate or unit; null = estimated from the records; one number is metres for lengths and "
+        "radians for angles alike",
     )
     effects: Names | None = Field(default=None, description="candidates, by name or path/to/file.py:Name; null = all")
     gravity: tuple[float, float, float] | None = Field(

@@ -15,7 +15,7 @@ from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import write_table
 from ccnn_torch.report.plan import plan_markdown
 from ccnn_torch.report.plots import plan_plot, save_figure
-from ccnn_torch.runs.identification._sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
+from ccnn_torch.runs._sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
 from ccnn_torch.runs.plan_config import PlanConfig
 
 __all__ = ["make_plan", "write_plan"]

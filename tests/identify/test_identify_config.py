@@ -7,8 +7,8 @@ import torch
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.runs._sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
 from ccnn_torch.runs.identification import identify
-from ccnn_torch.runs.identification._sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
 from ccnn_torch.runs.identify_config import (
     describe_identify_keys,
     dump_identify_config,

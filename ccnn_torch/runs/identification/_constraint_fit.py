@@ -27,8 +27,8 @@ from ccnn_torch.identification import (
 )
 from ccnn_torch.identification.parameters import Selection, select_parameters
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.runs._sizes import size, sizes_by_name
 from ccnn_torch.runs.identification._constraint_rows import ConstraintRows
-from ccnn_torch.runs.identification._sizes import size, sizes_by_name
 from ccnn_torch.runs.identification._solve import choice_of, solver_of
 from ccnn_torch.runs.identify_config import IdentifyConfig
 

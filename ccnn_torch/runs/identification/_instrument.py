@@ -12,7 +12,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.runs.identification._sizes import Size, size
+from ccnn_torch.runs._sizes import Size, size
 
 __all__ = ["Instrument", "PointsView", "make_instrument"]
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
-from ccnn_torch.runs.identification._sizes import Size, size
+from ccnn_torch.runs._sizes import Size, size
 
 __all__ = ["Places"]
 

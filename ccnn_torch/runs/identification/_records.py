@@ -8,9 +8,9 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames
 from ccnn_torch.records import Records, check_rows, load_records
+from ccnn_torch.runs._sizes import size, sizes_by_name, sizes_of_pose
 from ccnn_torch.runs.identification._kinematics import Kinematics
 from ccnn_torch.runs.identification._measured import Measured, Rows
-from ccnn_torch.runs.identification._sizes import size, sizes_by_name, sizes_of_pose
 from ccnn_torch.runs.identify_config import IdentifyConfig
 from ccnn_torch.splits import split_rows
 

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.runs._sizes import size, sizes_by_name, sizes_of_pose
 from ccnn_torch.runs.identification._designs import choose_places, plan_places
 from ccnn_torch.runs.identification._instrument import Instrument, make_instrument
 from ccnn_torch.runs.identification._kinematics import make_kinematics
 from ccnn_torch.runs.identification._measured import Measured, Rows
 from ccnn_torch.runs.identification._places import Places
 from ccnn_torch.runs.identification._random import generator_of, normal_draws
-from ccnn_torch.runs.identification._sizes import size, sizes_by_name, sizes_of_pose
 from ccnn_torch.runs.identify_config import IdentifyConfig, SimulateConfig
 
 __all__ = ["simulate"]

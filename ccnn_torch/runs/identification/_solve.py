@@ -24,8 +24,8 @@ from ccnn_torch.identification import (
 from ccnn_torch.identification.parameters import Selection, select_parameters
 from ccnn_torch.identification.solvers import get_solver
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
+from ccnn_torch.runs._sizes import prior_sizes
 from ccnn_torch.runs.identification._measured import Measured, Rows
-from ccnn_torch.runs.identification._sizes import prior_sizes
 from ccnn_torch.runs.identify_config import PER_LEG, IdentifyConfig, base_method
 
 __all__ = [

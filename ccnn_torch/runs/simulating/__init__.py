@@ -1,7 +1,6 @@
 """Records of a machine with given effects: rows, injection, noise and the file."""
 
 from ccnn_torch.runs.simulating._effects import Injected as Injected
-from ccnn_torch.runs.simulating._effects import read_noise as read_noise
 from ccnn_torch.runs.simulating._records import Simulated as Simulated
 from ccnn_torch.runs.simulating._records import injected_table as injected_table
 from ccnn_torch.runs.simulating._records import simulate_records as simulate_records

@@ -16,7 +16,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.runs.simulating._limits import refuse_impossible
 from ccnn_torch.units import to_si
 
-__all__ = ["Injected", "Wanted", "act", "read_noise", "read_wanted", "units_of"]
+__all__ = ["Injected", "Wanted", "act", "read_wanted", "units_of"]
 
 _FORM = re.compile(r"(?P<name>.+?\.py:[^:]+|[^:]+)(?::(?P<rest>.*))?")
 _VALUE = re.compile(r"(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\s\d].*)?")
@@ -66,21 +66,6 @@ def read_wanted(text: str) -> Wanted:
     if match is None or not all(equals and name.strip() and value.strip() for name, equals, value in pairs):
         raise InputError(f"--effect {text}: write NAME or NAME:parameter=value,parameter=value")
     return Wanted(match["name"].strip(), {name.strip(): value.strip() for name, _, value in pairs})
-
-
-def read_noise(text: str) -> float | dict[str, float]:
-    """One standard deviation for all pose coordinates, `1e-5`, or some by name, `x=1e-5,y=2e-5` [SI].
-
-    Raises:
-        InputError: it is neither.
-    """
-    try:
-        if "=" not in text:
-            return float(text)
-        pairs = (part.partition("=") for part in text.split(",") if part.strip())
-        return {name.strip(): float(value) for name, _, value in pairs}
-    except ValueError:
-        raise InputError(f"--noise {text}: write one number in SI, or NAME=number,NAME=number") from None
 
 
 def act(wanted: Wanted, situation: Situation, generator: torch.Generator) -> Acting:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -18,6 +18,7 @@ from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import name_lines, write_table
 from ccnn_torch.report.table_form import Table
 from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.runs._noise import Noise, noise_of_pose
 from ccnn_torch.runs.simulate_config import SimulateConfig
 from ccnn_torch.runs.simulating._effects import Injected, act, read_wanted, units_of
 from ccnn_torch.runs.simulating._limits import refuse_beyond_bounds
@@ -54,7 +55,7 @@ def simulate_records(
     mechanism: str | Mechanism,
     effects: Sequence[str],
     rows: int,
-    noise: float | Mapping[str, float] = 0.0,
+    noise: Noise = 0.0,
     config: SimulateConfig | None = None,
     seed: int = 0,
 ) -> Simulated:
@@ -64,7 +65,8 @@ def simulate_records(
         mechanism: a name, a file, or a mechanism.
         effects: each `NAME` or `NAME:parameter=value,…`; none = a machine that is as its model says.
         rows: how many.
-        noise: standard deviation of each measured coordinate [SI], one number for all, or by name (others 0).
+        noise: standard deviation of each measured coordinate, in SI or with a unit (`10um`), one for all, or by name or
+            unit (others 0).
         config: defaults when None.
         seed: of everything that is drawn.
 
@@ -189,12 +191,6 @@ def _kept(columns: dict[str, Tensor], wanted: list[str] | None) -> dict[str, Ten
     return {name: v for name, v in columns.items() if any(fnmatchcase(name, pattern) for pattern in wanted)}
 
 
-def _noise(given: float | Mapping[str, float], machine: Mechanism) -> Tensor:
-    names = [c.name for c in machine.pose]
-    by_name = given if isinstance(given, Mapping) else dict.fromkeys(names, given)
-    wrong = [name for name in by_name if name not in names]
-    if wrong:
-        raise InputError(f"--noise: there is no pose coordinate '{wrong[0]}'; {machine.name} has {', '.join(names)}")
-    if any(not 0 <= value < float("inf") for value in by_name.values()):
-        raise InputError("--noise: a standard deviation is a number from 0 up")
-    return torch.tensor([by_name.get(name, 0.0) for name in names], dtype=torch.float64)
+def _noise(given: Noise, machine: Mechanism) -> Tensor:
+    by_name = noise_of_pose(given, machine.pose)
+    return torch.tensor([by_name.get(c.name, 0.0) for c in machine.pose], dtype=torch.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 
@@ -20,6 +21,7 @@ ANGLE_ARM = 0.3
 """An angle found from points this far apart [m] has their noise over it; as in `runs/machines`."""
 
 Size = float | str
+_WITH_UNIT = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?inf|nan)\s*(?P<unit>.*)", re.IGNORECASE)
 _WRITTEN = {"m": "0.4 mm", "rad": "0.03 deg", "1": "0.002"}
 
 
@@ -31,15 +33,14 @@ def size(value: Size, unit: str | None, key: str) -> float:
     """
     if isinstance(value, int | float):
         return float(value)
-    number, _, written = value.strip().partition(" ")
-    try:
-        amount = float(number)
-    except ValueError:
-        raise InputError(f"{key}: '{value}' is no number with a unit; write e.g. 0.4 mm, or a number in SI") from None
-    if not written.strip():
+    match = _WITH_UNIT.fullmatch(value.strip())
+    if match is None:
+        raise InputError(f"{key}: '{value}' is no number with a unit; write e.g. 0.4 mm, or a number in SI")
+    amount = float(match["number"])
+    if not match["unit"]:
         return amount
     hint = f"write e.g. {_WRITTEN.get(unit or '', 'a number')}, or a number in SI"
-    return float(to_si(amount, written.strip(), unit, key, hint=hint))
+    return float(to_si(amount, match["unit"], unit, key, hint=hint))
 
 
 def prior_sizes(given: Mapping[str, Size], geometry: Sequence[Parameter], key: str) -> dict[str, float]:
