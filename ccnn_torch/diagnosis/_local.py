@@ -24,6 +24,8 @@ _ALONG, _WITHIN = 21, 40
 _RADII_ALONG, _RADII_WITHIN = (0.1, 0.17, 0.3), (0.25, 0.4, 0.65)
 # Rows that a bump has to touch: fewer are bad rows.
 _TOUCHED = 4.0
+# From a bell to a flat top, and how flat at most (power of the distance).
+_POWER, _POWERS = 2.0, (1.0, 8.0)
 # A place is then mended by steps of this share of its radius, halved where none is better, so many times.
 _STEP, _STEPS = 0.4, 10
 # What else is there may have so many plausible sizes.
@@ -61,15 +63,15 @@ def local_catch_alls(
 
 
 def _places(middles: Tensor, radii: tuple[float, ...]) -> Tensor:
-    """Each middle with each radius' logarithm, `g x (d + 1)`."""
-    logs = torch.tensor(radii, dtype=middles.dtype).log()
-    every = middles.repeat(len(logs), 1)
-    return torch.cat([every, logs.repeat_interleave(len(middles))[:, None]], -1)
+    """Each middle with each radius' logarithm and that of the power, `g x (d + 2)`."""
+    logs = torch.tensor(radii, dtype=middles.dtype).log().repeat_interleave(len(middles))[:, None]
+    return torch.cat([middles.repeat(len(radii), 1), logs, torch.full_like(logs, math.log(_POWER))], -1)
 
 
 def _bumps(points: Tensor, places: Tensor) -> Tensor:
-    """Gaussian bumps, `s x g`; points: `s x d`, places: `g x (d + 1)`."""
-    return torch.exp(-(torch.cdist(points, places[:, :-1]) / places[:, -1].exp()).square())
+    """exp(-(distance / radius)^power), `s x g`; points: `s x d`, places: `g x (d + 2)`."""
+    far = torch.cdist(points, places[:, :-2]) / places[:, -2].exp()
+    return torch.exp(-(far ** places[:, -1].exp().clamp(*_POWERS)))
 
 
 def _best(driver: str, points: Tensor, places: Tensor, raw: Tensor, lead: Tensor, left: Remainder) -> list[Atom]:
@@ -86,7 +88,7 @@ def _best(driver: str, points: Tensor, places: Tensor, raw: Tensor, lead: Tensor
     if reached == -math.inf:
         return []
     step = place.new_full((len(place),), _STEP)
-    step[:-1] *= place[-1].exp()
+    step[:-2] *= place[-2].exp()
     for _ in range(_STEPS):
         tried = place + torch.cat([torch.diag(step), -torch.diag(step)])
         better = gain(tried)

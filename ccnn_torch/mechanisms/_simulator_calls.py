@@ -137,8 +137,8 @@ class Calls:
         if pose.shape != wanted:
             raise InputError(
                 f"simulator '{simulator.name}': simulate returned shape {pose.shape} for "
-                f"{count_text(len(rows), 'row')}, expected {wanted}: a row for each row of commands and a column for each of {_names(simulator)}; wrap a "
-                "function of one row in rowwise(…)"
+                f"{count_text(len(rows), 'row')}, expected {wanted}: a row for each row of commands and a column for "
+                f"each of {_names(simulator)}; wrap a function of one row in rowwise(…)"
             )
         pose[~np.isfinite(pose).all(-1)] = np.nan
         return pose

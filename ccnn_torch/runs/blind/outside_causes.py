@@ -34,14 +34,17 @@ def _dent(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple[
     middle = low + (high - low) * generator.uniform(0.3, 0.7)
     width = (high - low) * generator.uniform(0.06, 0.15)
     change = torch.zeros_like(at.joints)
-    change[:, i] = _bump((at.joints[:, i] - middle) / width, generator)
+    # One flank is steeper than the other.
+    away = (at.joints[:, i] - middle) / width
+    away = torch.where(away > 0, away * generator.uniform(0.6, 1.6), away)
+    change[:, i] = _bump(away.abs(), generator)
     change[:, i] -= change[:, i].mean()
     return of_joints(machine, change), (f"joint q{i + 1}",)
 
 
 def _bump(distance: Tensor, generator: Generator) -> Tensor:
-    """1 at distance 0 and nearly 0 from 2 on, more pointed or flatter than the bell that a diagnosis looks for."""
-    return torch.exp(-(distance.abs() ** generator.choice([1.3, 3.0, 4.0])))
+    """1 at distance 0 and nearly 0 from 2 on, pointed or flat."""
+    return torch.exp(-(distance ** generator.choice([1.3, 2.0, 4.0])))
 
 
 def _bulge(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple[Deviation, tuple[str, ...]]:
@@ -52,7 +55,9 @@ def _bulge(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple
     place = (at.pose - low) / (high - low)
     lengths = torch.tensor([c.unit == "m" for c in machine.mechanism.pose])
     middle = torch.as_tensor(generator.uniform(0.25, 0.75, place.shape[-1]))
-    square = ((place - middle)[:, lengths] ** 2).sum(-1) / generator.uniform(0.2, 0.3) ** 2
+    # Longer one way than the other.
+    long = torch.as_tensor(generator.uniform(0.7, 1.4, place.shape[-1]))
+    square = (((place - middle) * long)[:, lengths] ** 2).sum(-1) / generator.uniform(0.2, 0.3) ** 2
     size = torch.as_tensor(generator.uniform(0.5, 1.5, at.joints.shape[-1]))
     change = size * _bump(square.sqrt(), generator)[:, None]
     change = change - change.mean(0)

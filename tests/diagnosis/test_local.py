@@ -1,0 +1,69 @@
+"""What happens in one place, and what follows the time and not the temperature."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from diagnosis._machines import NOISE, acting, measured, reached_with, rows_of
+
+from ccnn_torch.diagnosis import diagnose_rows
+from ccnn_torch.effects import EFFECTS, Situation
+
+
+def off(situation: Situation, change: torch.Tensor, seed: int) -> torch.Tensor:
+    """Poses measured where the joints stand off by `change`, `s x n`, in five times the noise, `s x p`."""
+    mechanism = situation.mechanism
+    moved = (situation.jacobian @ change[..., None])[..., 0]
+    size = 5 * NOISE / moved[:, :3].square().sum(-1).mean().sqrt()
+    pose = mechanism.forward_kinematics(situation.joints + size * change, None, situation.guess)
+    drawn = torch.randn(pose.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return pose + NOISE * drawn
+
+
+@pytest.mark.parametrize(("machine", "rows"), [("tripod", 40), ("delta", 60)])
+def test_a_dent_in_a_track_is_no_slow_wave_of_its_gear(machine: str, rows: int) -> None:
+    situation = rows_of(machine, rows, 20)
+    q = situation.joints[:, 1]
+    change = torch.zeros_like(situation.joints)
+    place = (q - q.quantile(0.4)) / (0.12 * (q.max() - q.min()))
+    change[:, 1] = torch.exp(-(place**4))
+    said = diagnose_rows(situation, off(situation, change, 0)).verdict
+    assert said["outside_library"] and said["driver"] == "joint q2" and not said["effects"]
+
+
+@pytest.mark.parametrize("rows", [40, 80])
+def test_a_pull_in_one_corner_of_the_workspace_is_told_from_the_machines_own_errors(rows: int) -> None:
+    situation = rows_of("tripod", rows, 20)
+    low, high = situation.pose.amin(0), situation.pose.amax(0)
+    place = ((situation.pose - low) / (high - low) - 0.4)[:, :2]
+    pull = torch.exp(-((place.square().sum(-1) / 0.25**2) ** 1.5))
+    sign = torch.tensor([1.0, -0.7, 0.5], dtype=torch.float64)
+    said = diagnose_rows(situation, off(situation, pull[:, None] * sign, 0)).verdict
+    assert said["outside_library"] and said["driver"] == "workspace" and not said["effects"]
+
+
+def test_waves_of_several_joints_are_no_other_effect() -> None:
+    situation = rows_of("tripod", 80, 22)
+    low, high = situation.workspace
+    change = torch.sin(2 * torch.pi * 5 * (situation.joints - low) / (high - low))
+    effects = [name for name in EFFECTS if name != "transmission"]
+    said = diagnose_rows(situation, off(situation, change, 2), effects=effects).verdict
+    assert said["outside_library"] and said["driver"].startswith("joint") and not said["effects"]
+
+
+def test_what_wanders_with_the_time_is_not_taken_for_mounts_that_warm() -> None:
+    situation = rows_of("stewart", 60, 0)
+    morning = 293.15 + 6 * (1 - torch.exp(-situation.covariates["time"] / 5000))
+    situation = replace(situation, covariates={**situation.covariates, "temperature": morning})
+    effects = [name for name in EFFECTS if name != "drift"]
+    said = diagnose_rows(situation, measured(situation, {"drift": 8.0}, 1), effects=effects).verdict
+    assert said["outside_library"] and said["driver"] == "time" and "thermal" not in said["effects"]
+
+
+def test_mounts_that_follow_the_temperature_are_thermal() -> None:
+    situation = rows_of("five_bar", 150, 11)
+    cause = acting(situation, "thermal", q1_mount=2e-5, q2_mount=-3e-5)
+    said = diagnose_rows(situation, reached_with(situation, [cause], 12)).verdict
+    assert said["effects"] == ["thermal"] and not said["outside_library"]
