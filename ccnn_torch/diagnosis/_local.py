@@ -28,6 +28,8 @@ _TOUCHED = 4.0
 _POWER, _POWERS = 2.0, (1.0, 8.0)
 # A place is then mended by steps of this share of its radius, halved where none is better, so many times.
 _STEP, _STEPS = 0.4, 10
+# Values of the residual, at most, on which places are looked at.
+_MOST_VALUES = 1800
 # What else is there may have so many plausible sizes.
 _LOOSE = 10.0
 
@@ -47,19 +49,30 @@ def local_catch_alls(
     joints = situation.mechanism.joints
     sizes = torch.tensor([DEVIATION.get(j.unit, 5e-4) for j in joints], dtype=jacobian.dtype)
     lead = white(jacobian * sizes)
+    # A place is found in a part of many rows as well.
+    few = torch.randperm(len(lead), generator=torch.Generator().manual_seed(0))[: _MOST_VALUES // lead.shape[1]]
     # What is the same wherever a joint stands is no bump.
-    left = Remainder(white(target).flatten(), _LOOSE * torch.cat([others, lead], -1).flatten(0, 1))
+    left = Remainder(white(target)[few].flatten(), _LOOSE * torch.cat([others, lead], -1)[few].flatten(0, 1))
+
+    def bump(driver: str, points: Tensor, places: Tensor, moved: slice) -> list[Atom]:
+        place, charge = _searched(points[few], places, lead[few][..., moved], left, len(lead) / len(few))
+        if place is None:
+            return []
+        bump = _bumps(points, place[None])[:, :, None]
+        columns = (jacobian * sizes)[..., moved]
+        # By itself, and about the mean of the rows where the model was fitted to these. A constant of its own would let
+        # it stand for an offset of the joints, which the library knows.
+        both = (columns * bump, columns * (bump - bump.mean(0)))
+        return [Atom(driver, None, sizes.new_zeros(0), one, LOG_PRIOR - charge) for one in both]
+
     found = []
+    middles = torch.linspace(-1, 1, _ALONG, dtype=sizes.dtype).unsqueeze(-1)
     for i, joint in enumerate(joints):
         track = unit_range(situation.joints[:, i : i + 1])
-        middles = torch.linspace(-1, 1, _ALONG, dtype=track.dtype).unsqueeze(-1)
-        one = slice(i, i + 1)
-        places = _places(middles, _RADII_ALONG)
-        found += _best(f"joint {joint.name}", track, places, jacobian[..., one] * sizes[one], lead[..., one], left)
+        found += bump(f"joint {joint.name}", track, _places(middles, _RADII_ALONG), slice(i, i + 1))
     lengths = [k for k, c in enumerate(situation.mechanism.pose) if c.unit == "m"]
     place = unit_range(situation.pose[:, lengths] if lengths else situation.pose)
-    places = _places(spread_out(place, _WITHIN), _RADII_WITHIN)
-    return found + _best("workspace", place, places, jacobian * sizes, lead, left)
+    return found + bump("workspace", place, _places(spread_out(place, _WITHIN), _RADII_WITHIN), slice(None))
 
 
 def _places(middles: Tensor, radii: tuple[float, ...]) -> Tensor:
@@ -74,8 +87,19 @@ def _bumps(points: Tensor, places: Tensor) -> Tensor:
     return torch.exp(-(far ** places[:, -1].exp().clamp(*_POWERS)))
 
 
-def _best(driver: str, points: Tensor, places: Tensor, raw: Tensor, lead: Tensor, left: Remainder) -> list[Atom]:
-    """Atoms of the bump that explains most; raw, lead: columns that a bump multiplies, plain and whitened."""
+def _searched(
+    points: Tensor, places: Tensor, lead: Tensor, left: Remainder, times: float
+) -> tuple[Tensor | None, float]:
+    """The place of the bump that explains most, `d + 2`, None where no bump touches some of the rows only; and what
+    looking for it costs in log odds.
+
+    Args:
+        points: of the rows looked at, `s x d`.
+        places: to begin with, `g x (d + 2)`.
+        lead: whitened columns that a bump multiplies, `s x c x m`.
+        left: what is to be explained.
+        times: how many rows there are for each of these.
+    """
 
     def gain(tried: Tensor) -> Tensor:
         bumps = _bumps(points, tried)
@@ -86,7 +110,7 @@ def _best(driver: str, points: Tensor, places: Tensor, raw: Tensor, lead: Tensor
     score = gain(places)
     place, reached = places[int(score.argmax())], float(score.max())
     if reached == -math.inf:
-        return []
+        return None, 0.0
     step = place.new_full((len(place),), _STEP)
     step[:-2] *= place[-2].exp()
     for _ in range(_STEPS):
@@ -96,8 +120,4 @@ def _best(driver: str, points: Tensor, places: Tensor, raw: Tensor, lead: Tensor
             place, reached = tried[int(better.argmax())], float(better.max())
         else:
             step = step / 2
-    best = _bumps(points, place[None])[:, :, None]
-    # By itself, and about the mean of the rows where the model was fitted to these. A constant of its own would let it
-    # stand for an offset of the joints, which the library knows.
-    log_prior = LOG_PRIOR - search_charge(score)
-    return [Atom(driver, None, raw.new_zeros(0), raw * (best - less), log_prior) for less in (0.0, best.mean(0))]
+    return place, search_charge(times * score)
