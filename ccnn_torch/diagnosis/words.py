@@ -106,7 +106,8 @@ def verdict_text(results: Block) -> str:
         said.append(f"No cause beyond the noise is to be seen ({_probability(verdict)}).")
     else:
         said.append(_cause(results))
-    return " ".join([*said, *(f"But {caution}." for caution in results.get("cautions", ()))])
+    doubts = (f"{'And' if i else 'But'} {caution}." for i, caution in enumerate(results.get("cautions", ())))
+    return " ".join([*said, *doubts])
 
 
 def unseen_text(name: str, why: str) -> str:

@@ -208,3 +208,14 @@ def test_what_is_neither_likely_nor_shown_elsewhere_is_not_named(
     found = diagnose_rows(situation, measured(situation, {}, 41), torch.full((3,), NOISE, dtype=torch.float64))
     assert found.verdict["none"] is none and found.verdict["probability"] == 0.5
     assert found.verdict["effects"] == ([] if none else ["joint_gain"]) and bool(found.cautions) is not none
+
+
+def test_angles_of_the_model_in_degrees_are_named() -> None:
+    arm = load_mechanism(str(Path(__file__).parents[1] / "effects" / "arm.yaml"))
+    turns = torch.tensor([g.unit == "rad" for g in arm.geometry])
+    wrong = arm.with_nominal(torch.where(turns, arm.nominal * 180 / math.pi, arm.nominal))
+    joints = arm.sample_joints(40, torch.Generator().manual_seed(0))
+    pose = arm.forward_kinematics(joints)
+    situation = Situation(wrong, joints, {}, default_gravity(wrong))
+    with pytest.raises(InputError, match="the angles of the model seem to be in degrees under rad"):
+        diagnose_rows(situation, pose)

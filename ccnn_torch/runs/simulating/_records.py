@@ -145,7 +145,9 @@ def injected_table(simulated: Simulated) -> Table:
     if effects:
         alone = "; ".join(f"{one.name} alone {one.gap * 1e6:.3g} µm" for one in effects)
         without = "noise and bad rows" if simulated.outliers else "noise"
-        parts.append(f"RMS error of the position {simulated.gap * 1e6:.3g} µm without {without} ({alone})")
+        parts.append(
+            f"RMS error of the position {simulated.gap * 1e6:.3g} µm over all rows without {without} ({alone})"
+        )
     if simulated.outliers:
         # As the file will have them, below a header.
         lines = np.arange(len(simulated.joints), dtype=np.int64) + 2
