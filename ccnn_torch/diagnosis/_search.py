@@ -17,6 +17,8 @@ __all__ = ["Dictionary", "Found", "scored", "search"]
 _MOST = 4
 # Updates of a fit; after the short one no set that came within 12 of the best in the end was 55 below it, in trials.
 _UPDATES, _SHORT, _HOPELESS = 8, 2, 80.0
+# Catch-alls that are put beside library effects, and how many of these may be of one driver.
+_CATCH_ALLS, _OF_ONE_DRIVER = 4, 2
 # A third cause at once is rarer still than a second one.
 _CROWD = math.log(0.1)
 
@@ -153,7 +155,7 @@ def search(
     tried.update(zip(alone, scored(dictionary, alone), strict=True))
     singles = best(1, len(atoms))
     known = [f.members[0] for f in singles if not atoms[f.members[0]].catch_all]
-    others = [f.members[0] for f in singles if atoms[f.members[0]].catch_all][:4]
+    others = _of_several_drivers([f.members[0] for f in singles if atoms[f.members[0]].catch_all], atoms)
     grams = crossed(grams, x, effects, [groups[i] for i in others])
     dictionary = Dictionary(tuple(atoms), groups, grams, noise_dof)
     look([s for i in known for j in (*known, *others) if (s := _joined((i,), j, atoms))])
@@ -164,6 +166,15 @@ def search(
         if best(size + 1, 1) and best(size + 1, 1)[0].log_posterior < max(f.log_posterior for f in tried.values()):
             break
     return dictionary, sorted(tried.values(), key=lambda f: -f.log_posterior)
+
+
+def _of_several_drivers(ranked: Sequence[int], atoms: Sequence[Atom]) -> list[int]:
+    """The first few catch-alls, no more than some of one driver."""
+    chosen: list[int] = []
+    for i in ranked:
+        if sum(atoms[k].name == atoms[i].name for k in chosen) < _OF_ONE_DRIVER:
+            chosen.append(i)
+    return chosen[:_CATCH_ALLS]
 
 
 def _joined(members: tuple[int, ...], extra: int, atoms: Sequence[Atom]) -> tuple[int, ...]:
