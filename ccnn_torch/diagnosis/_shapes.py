@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -32,6 +32,13 @@ class Shaped(NamedTuple):
     value: Tensor
     used: tuple[int, ...] | None
     charge: float
+
+
+@runtime_checkable
+class _OneByOne(Protocol):
+    """An effect that tells what `basis` tells without its zeros, for long grids."""
+
+    def one_by_one(self, situation: Situation, shape: Tensor) -> Tensor: ...
 
 
 class _Part(NamedTuple):
@@ -78,8 +85,17 @@ class Scan:
 
     def columns(self, candidates: Tensor, rows: Tensor | None) -> list[Tensor]:
         """Of each part, whitened, in plausible sizes, `g x N x m`; candidates: `g x h`; rows: which, None = all."""
+        if self.movers is not None and isinstance(self.effect, _OneByOne):
+            moved = self.effect.one_by_one(self.situation, candidates)
+            return [self._by_movers(moved[..., p.columns], p.columns, rows).flatten(1, 2) for p in self.parts]
         basis = self.effect.basis(self.situation, candidates)
         return [self._whitened(basis, part.columns, rows).flatten(1, 2) for part in self.parts]
+
+    def _by_movers(self, moved: Tensor, columns: list[int], rows: Tensor | None) -> Tensor:
+        """`g x s x c x m`; moved: change of the joint or parameter that each of the columns moves, `g x s x m`."""
+        assert self.lead is not None and self.movers is not None
+        one = torch.nan_to_num(_of(moved, rows, 1) * self.size[columns])
+        return _of(self.lead, rows, 0)[..., self.movers[columns]] * one[..., None, :]
 
     def _whitened(self, basis: Tensor, columns: list[int], rows: Tensor | None) -> Tensor:
         """`g x s x c x m`."""
@@ -87,9 +103,7 @@ class Scan:
             mine = basis[..., columns] * self.size[columns]
             return torch.nan_to_num(torch.stack([_of(self.whiten(b), rows, 0) for b in mine]))
         if self.movers is not None:
-            moved = self.movers[columns]
-            one = torch.nan_to_num(_of(basis[..., moved, columns], rows, 1) * self.size[columns])
-            return _of(self.lead, rows, 0)[..., moved] * one[..., None, :]
+            return self._by_movers(basis[..., self.movers[columns], columns], columns, rows)
         mine = _of(basis, rows, 1)[..., columns] * self.size[columns]
         return torch.nan_to_num(_of(self.lead, rows, 0) @ mine)
 

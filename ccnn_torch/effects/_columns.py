@@ -15,6 +15,7 @@ __all__ = [
     "TWIST",
     "by_joint",
     "caused_by",
+    "one_by_one",
     "own_parameters",
     "parameter_columns",
     "per_force",
@@ -44,6 +45,12 @@ def by_joint(values: Tensor, joints: Sequence[int] | None = None) -> Tensor:
     if joints is not None:
         blocks = blocks[..., list(joints), :]
     return blocks.reshape(*values.shape[:-1], blocks.shape[-2] * m)
+
+
+def one_by_one(values: Tensor, joints: Sequence[int] | None = None) -> Tensor:
+    """`by_joint` without its zeros: of each column the change of the one joint that it moves, `... x s x m`."""
+    chosen = values if joints is None else values[..., list(joints), :]
+    return chosen.flatten(-2)
 
 
 def per_force(unit: str) -> str:

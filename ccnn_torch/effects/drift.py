@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import by_joint
+from ccnn_torch.effects._columns import by_joint, one_by_one
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.effects._time import elapsed
@@ -64,6 +64,13 @@ class Drift:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x 6n`."""
+        return by_joint(self._moves(situation, shape))
+
+    def one_by_one(self, situation: Situation, shape: Tensor) -> Tensor:
+        """The same without its zeros: what each coefficient does to the joint that it moves, `... x s x m`."""
+        return one_by_one(self._moves(situation, shape))
+
+    def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
         time = elapsed(situation.covariates["time"]).expand(situation.joints.shape[:-1])
         whole = _duration(situation)
         share = time / whole
@@ -72,7 +79,7 @@ class Drift:
         turns = [(k + 0.5) * math.pi for k in range(_WALK)]
         parts += [math.sqrt(2) * torch.sin(turn * share) / turn for turn in turns]
         same = torch.stack(torch.broadcast_tensors(*parts), -1)  # type: ignore[no-untyped-call]
-        return by_joint(same.unsqueeze(-2).expand(*same.shape[:-1], situation.joints.shape[-1], -1))
+        return same.unsqueeze(-2).expand(*same.shape[:-1], situation.joints.shape[-1], -1)
 
 
 def _duration(situation: Situation) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import by_joint, per_force
+from ccnn_torch.effects._columns import by_joint, one_by_one, per_force
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.effects.backlash import Backlash
@@ -69,9 +69,16 @@ class Friction:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x m`, joint by joint."""
+        return by_joint(self._moves(situation, shape), situation.directed)
+
+    def one_by_one(self, situation: Situation, shape: Tensor) -> Tensor:
+        """The same without its zeros: what each coefficient does to the joint that it moves, `... x s x m`."""
+        return one_by_one(self._moves(situation, shape), situation.directed)
+
+    def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
         load, weight = situation.load_torque, situation.own_weight_torque
         carried = [(weight * PLATFORM_WEIGHT).abs(), torch.ones_like(weight)]
         if situation.loaded:
             carried[:1] = [load.abs(), carried[0], (load + weight * shape[..., 0, None, None]).abs()]
         columns = torch.stack(torch.broadcast_tensors(*carried), -1)  # type: ignore[no-untyped-call]
-        return by_joint(-situation.direction.unsqueeze(-1) * columns, situation.directed)
+        return -situation.direction.unsqueeze(-1) * columns

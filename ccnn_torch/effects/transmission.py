@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import by_joint
+from ccnn_torch.effects._columns import by_joint, one_by_one
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.mechanisms import Mechanism
@@ -70,9 +70,16 @@ class Transmission:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x 8n`."""
+        return by_joint(self._moves(situation, shape))
+
+    def one_by_one(self, situation: Situation, shape: Tensor) -> Tensor:
+        """The same without its zeros: what each coefficient does to the joint that it moves, `... x s x m`."""
+        return one_by_one(self._moves(situation, shape))
+
+    def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
         angle = situation.joints * shape.unsqueeze(-2)
         waves = [wave(k * angle) for k in range(1, len(_HARMONICS) // 2 + 1) for wave in (torch.sin, torch.cos)]
-        return by_joint(torch.stack(waves, -1))
+        return torch.stack(waves, -1)
 
 
 def _frequencies(unit: str, travel: float) -> tuple[float, ...]:
