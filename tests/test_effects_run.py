@@ -281,7 +281,7 @@ def test_what_does_not_fit_is_one_sentence(
 def test_keys_that_do_not_go_together(played: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="effects: a case is there to compare learners"):
         make_config(case="tripod", effects="from:x.json")
-    with pytest.raises(InputError, match="effects"):
+    with pytest.raises(InputError, match=r"effects: is '.*diagnosis\.json'; write effects=from:"):
         make_config(**keys(played, effects="found/diagnosis.json"))
     with pytest.raises(InputError, match=r"rows\.csv: compliance of .* a column of the load.*not among covariates"):
         prepare(make_config(**keys(played, covariates=["time"])))

@@ -200,7 +200,6 @@ class RunConfig(_Part):
     )
     effects: str = Field(
         default="none",
-        pattern=r"^(none|from:.+)$",
         description="from:DIR/diagnosis.json = take the effects that a diagnosis named, fit their coefficients to the "
         "training rows of records, and let the network learn only what they leave; the model files hold both. none = "
         "the network learns everything",
@@ -257,6 +256,13 @@ class RunConfig(_Part):
             if method in ("all", "auto") and len(methods) > 1:
                 raise ValueError(f"'{method}' stands alone; remove the other names or '{method}'")
         return methods
+
+    @field_validator("effects")
+    @classmethod
+    def _none_or_a_file(cls, effects: str) -> str:
+        if effects != "none" and not effects.startswith("from:"):
+            raise ValueError(f"is '{effects}'; write effects=from:{effects} for such a file, or effects=none")
+        return effects
 
     @model_validator(mode="after")
     def _one_source(self) -> RunConfig:
