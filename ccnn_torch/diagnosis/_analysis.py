@@ -84,7 +84,8 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     residual = torch.where(usable[:, None], residual, 0.0)
 
     atoms = [cleaned(plain_atom(situation, situation, e), usable) for e in effects]
-    rest = [cleaned(a, usable) for a in catch_alls(situation) if bool(torch.isfinite(a.columns[usable]).all())]
+    rest = catch_alls(situation, [e.name for e in effects])
+    rest = [cleaned(a, usable) for a in rest if bool(torch.isfinite(a.columns[usable]).all())]
     fitted = _frame_columns(situation, usable)
     # What does not show at all in these rows is no candidate (latency at rest).
     size = [

@@ -8,6 +8,7 @@ a load may also move the platform as a whole, alike wherever it stands, and fast
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -35,8 +36,12 @@ _PLATFORM = {3: (3e-4, 3e-4, 3e-4), 6: (3e-4, 3e-4, 3e-4, 5e-4, 5e-4, 5e-4)}
 _WAVES = 18
 
 
-def catch_alls(situation: Situation) -> list[Atom]:
-    """One or two atoms for each driver that the records hold."""
+def catch_alls(situation: Situation, beside: Sequence[str]) -> list[Atom]:
+    """One or two atoms for each driver that the records hold; beside: names of the library effects that are candidates.
+
+    Drives of one kind have errors of one kind, each along its own track. A transmission's are of a form that holds
+    elsewhere, too, so where that is a candidate no catch-all of all drives at once takes them from it.
+    """
     mechanism, rows = situation.mechanism, situation.joints.shape[-2]
     place = unit_range(situation.pose)
     one = torch.ones_like(place[:, :1])
@@ -56,8 +61,8 @@ def catch_alls(situation: Situation) -> list[Atom]:
         fine = torch.cat([one, q, _bumps(q, min(_MOST, rows // 6))], -1)
         own.append(_columns(situation, fine, only=i))
         found.append(_made(f"joint {joint.name}", own[-1]))
-    # Drives of one kind have errors of one kind, each along its own track.
-    found.append(_made(f"joint {ANY}", torch.cat(own, -1), most=most))
+    if "transmission" not in beside:
+        found.append(_made(f"joint {ANY}", torch.cat(own, -1), most=most))
     together: dict[str, list[Tensor]] = {}
     for name, value in situation.covariates.items():
         driver = _driver(name)

@@ -54,7 +54,7 @@ def local_catch_alls(
     # What is the same wherever a joint stands is no bump.
     left = Remainder(white(target)[few].flatten(), _LOOSE * torch.cat([others, lead], -1)[few].flatten(0, 1))
 
-    def bump(driver: str, points: Tensor, places: Tensor, moved: slice) -> list[Atom]:
+    def atoms(driver: str, points: Tensor, places: Tensor, moved: slice) -> list[Atom]:
         place, charge = _searched(points[few], places, lead[few][..., moved], left, len(lead) / len(few))
         if place is None:
             return []
@@ -69,10 +69,10 @@ def local_catch_alls(
     middles = torch.linspace(-1, 1, _ALONG, dtype=sizes.dtype).unsqueeze(-1)
     for i, joint in enumerate(joints):
         track = unit_range(situation.joints[:, i : i + 1])
-        found += bump(f"joint {joint.name}", track, _places(middles, _RADII_ALONG), slice(i, i + 1))
+        found += atoms(f"joint {joint.name}", track, _places(middles, _RADII_ALONG), slice(i, i + 1))
     lengths = [k for k, c in enumerate(situation.mechanism.pose) if c.unit == "m"]
     place = unit_range(situation.pose[:, lengths] if lengths else situation.pose)
-    return found + bump("workspace", place, _places(spread_out(place, _WITHIN), _RADII_WITHIN), slice(None))
+    return found + atoms("workspace", place, _places(spread_out(place, _WITHIN), _RADII_WITHIN), slice(None))
 
 
 def _places(middles: Tensor, radii: tuple[float, ...]) -> Tensor:
