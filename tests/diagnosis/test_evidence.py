@@ -6,9 +6,11 @@ import math
 
 import pytest
 import torch
+from diagnosis._machines import rows_of
 from scipy.stats import multivariate_normal
 
 from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
+from ccnn_torch.effects import make_effect
 
 
 def _columns(seed: int, rows: int, width: int) -> torch.Tensor:
@@ -48,3 +50,13 @@ def test_the_noise_that_was_given_counts_more_the_surer_it_is() -> None:
     found = [float(fit_sets(grams_of(x, y), [[]], dof).noise[0]) for dof in (0.0, 200.0, 1e6)]
     assert found[0] == pytest.approx(float(y.square().mean()), rel=1e-6)
     assert found[0] > found[1] > found[2] == pytest.approx(1.0, abs=1e-2)
+
+
+@pytest.mark.parametrize("name", ["transmission", "backlash", "friction", "drift"])
+def test_columns_without_their_zeros_are_the_columns(name: str) -> None:
+    situation, effect = rows_of("tripod", 20, 1), make_effect(name)
+    shape = torch.tensor([[s.grid[0], s.grid[-1]] for s in effect.shapes(situation)], dtype=torch.float64).mT
+    dense = effect.basis(situation, shape)
+    own = effect.one_by_one(situation, shape)  # type: ignore[attr-defined]
+    assert torch.equal(dense.sum(-2), own)
+    assert int((dense != 0).sum(-2).max()) == 1
