@@ -102,7 +102,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     rich = white.sigma
     fixed, starts = first_candidates(situation, atoms, white, residual, usable, fitted)
     jacobian = torch.where(usable[:, None, None], situation.jacobian, 0.0)
-    local = local_catch_alls(situation, jacobian, residual, white, white(fitted))
+    local = [cleaned(a, usable) for a in local_catch_alls(situation, jacobian, residual, white, fitted)]
     result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest, *local], near, rich, fitted)
 
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
@@ -121,8 +121,9 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         target = torch.where(ok[:, None], target, 0.0)
         white = new if bool((ok == usable).all()) else _renewed(result, noise, ok)
         atoms = renewed_candidates(situation, there, measured, target, effects, acting, starts, white, ok, fitted)
-        beside = white(torch.cat([fitted, *(a.columns for a in atoms if a.name in before)], -1))
-        places = [*local, *local_catch_alls(situation, jacobian, target, white, beside)]
+        beside = torch.cat([fitted, *(a.columns for a in atoms if a.name in before)], -1)
+        again = local_catch_alls(situation, jacobian, target, white, beside)
+        places = [*local, *(cleaned(a, ok) for a in again)]
         result = _searched(situation, measured, target, white, [*atoms, *rest, *places], near, rich, fitted)
     return result
 

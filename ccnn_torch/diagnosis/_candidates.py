@@ -19,8 +19,8 @@ from ccnn_torch.effects import Acting, Effect, Situation
 __all__ = ["cleaned", "first_candidates", "plain_atom", "renewed_candidates"]
 
 LOG_PRIOR = math.log(0.1)
-# Effects with so many coefficients are looked for in one joint or leg, too; spread of their log size there.
-_MANY, _SIZE_SPREAD = 8, 4.0
+# Spread of the log size of an effect that is in one joint or leg alone.
+_SIZE_SPREAD = 4.0
 
 
 def plain_atom(situation: Situation, there: Situation, effect: Effect) -> Atom:
@@ -39,7 +39,7 @@ def first_candidates(
     """Effects without shapes, whole and in part; and those with shapes, at what suits the residual.
 
     Shapes are looked for by themselves and with the rest of the library beside them: two ways to start, both stay
-    candidates.
+    candidates, and so do the shapes that are usual where an effect has such.
 
     Args:
         situation: `s` rows.
@@ -57,8 +57,8 @@ def first_candidates(
     for atom in (a for a in atoms if a.shape.numel()):
         assert atom.effect is not None
         scan = Scan(situation, situation, atom.effect, _only(white, usable))
-        for nuisance in (bare, beside):
-            shaped = scan.best(white(residual), nuisance)
+        looked_for = (scan.best(white(residual), nuisance) for nuisance in (bare, beside))
+        for shaped in (*_usual(situation, atom.effect), *looked_for):
             if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
                 starts.append(cleaned(_atom(situation, situation, atom.effect, shaped), usable))
     return fixed, starts
@@ -119,18 +119,26 @@ def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped
     return Atom(effect.name, effect, shaped.value, columns, LOG_PRIOR - shaped.charge, shaped.used)
 
 
+def _usual(situation: Situation, effect: Effect) -> list[Shaped]:
+    """The shapes of the textbook, which nobody has to look for; none where an effect has no usual ones."""
+    usual = [s.usual for s in effect.shapes(situation)]
+    if any(value is None for value in usual):
+        return []
+    return [Shaped(torch.tensor(usual, dtype=situation.joints.dtype), None, 0.0)]
+
+
 def _same_shape(atom: Atom, shaped: Shaped) -> bool:
     return atom.used == shaped.used and torch.allclose(atom.shape, shaped.value, rtol=1e-3)
 
 
 def _best_part(situation: Situation, atom: Atom, white: Whitening, y: Tensor) -> Atom | None:
-    """Of an effect with many coefficients those of the one joint or leg that explains most of `y`, and of others beside
-    it that the evidence is for, up to half of them."""
+    """Of an effect of several joints or legs the coefficients of the one joint or leg that explains most of `y`, and of
+    others beside it that the evidence is for, up to half of them."""
     assert atom.effect is not None
     coefficients = atom.effect.coefficients(situation)
     owners = [c.joint if c.leg is None else c.leg for c in coefficients]
     parts = [[k for k, o in enumerate(owners) if o == owner] for owner in dict.fromkeys(owners) if owner is not None]
-    if len(coefficients) < _MANY or len(parts) < 2:
+    if len(parts) < 2:
         return None
     grams = grams_of(white(atom.columns), white(y))
     charge, lots, reached = math.log(len(parts)), 0, -math.inf

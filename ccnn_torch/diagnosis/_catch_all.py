@@ -17,7 +17,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.effects import Situation
 
-__all__ = ["ANY", "SPEED", "catch_alls"]
+__all__ = ["ANY", "DEVIATION", "LOG_PRIOR", "SPEED", "catch_alls", "platform_moves", "spread_out", "unit_range"]
 
 # A catch-all is that much less probable than no deviation of its kind, before the data are seen.
 LOG_PRIOR = math.log(1e-3)
@@ -179,11 +179,15 @@ def _waves(values: Tensor, count: int) -> Tensor:
     return waves - waves.mean(-2, keepdim=True)
 
 
+def platform_moves(situation: Situation) -> Tensor:
+    """Shifts and turns of the platform as far as they are seen, each as large as is to be expected, `s x c x c`."""
+    visible = situation.visible
+    return visible * torch.tensor(_PLATFORM[visible.shape[-1]], dtype=visible.dtype)
+
+
 def _whole(situation: Situation, driver: str, features: Tensor) -> Atom:
     """features: `s x f`; columns = shifts and turns of the platform, alike in all poses, times the features."""
-    visible = situation.visible
-    sizes = torch.tensor(_PLATFORM[visible.shape[-1]], dtype=features.dtype)
-    columns = ((visible * sizes).unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
+    columns = (platform_moves(situation).unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
     shown = columns.abs().amax((0, 1)) > 0
     return Atom(driver, None, features.new_zeros(0), columns[..., shown], LOG_PRIOR)
 

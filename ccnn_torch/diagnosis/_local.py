@@ -7,12 +7,13 @@ place alone. So that place is looked for, and the search is charged as that for 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import Atom
-from ccnn_torch.diagnosis._catch_all import DEVIATION, LOG_PRIOR, spread_out, unit_range
+from ccnn_torch.diagnosis._catch_all import DEVIATION, LOG_PRIOR, platform_moves, spread_out, unit_range
 from ccnn_torch.diagnosis._remainder import Remainder, search_charge
 from ccnn_torch.diagnosis._whitening import Whitening
 from ccnn_torch.effects import Situation
@@ -30,6 +31,8 @@ _POWER, _POWERS = 2.0, (1.0, 8.0)
 _STEP, _STEPS = 0.4, 10
 # Values of the residual, at most, on which places are looked at.
 _MOST_VALUES = 1800
+# Times the noise up to which a row's residual counts.
+_BELIEVED = 20.0
 # What else is there may have so many plausible sizes.
 _LOOSE = 10.0
 
@@ -44,35 +47,45 @@ def local_catch_alls(
         jacobian: by the joints, where the model is linear, `s x c0 x n`; 0 in rows that are left out.
         target: what a linear model has to explain, `s x c0` [m, rad].
         white: noise and weights.
-        others: whitened columns of what else is there, in plausible sizes, `s x c x P`.
+        others: columns of what else is there, in plausible sizes, `s x c0 x P`.
     """
     joints = situation.mechanism.joints
     sizes = torch.tensor([DEVIATION.get(j.unit, 5e-4) for j in joints], dtype=jacobian.dtype)
-    lead = white(jacobian * sizes)
+    # Rows that were set aside count as well, as far as they can be believed: they may be the middle of a bump.
+    white = replace(white, weight=torch.ones_like(white.weight))
+    moved = jacobian * sizes
+    y = white(target)
+    y = y * (_BELIEVED / torch.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min(_BELIEVED))
     # A place is found in a part of many rows as well.
-    few = torch.randperm(len(lead), generator=torch.Generator().manual_seed(0))[: _MOST_VALUES // lead.shape[1]]
-    # What is the same wherever a joint stands is no bump.
-    left = Remainder(white(target)[few].flatten(), _LOOSE * torch.cat([others, lead], -1)[few].flatten(0, 1))
+    few = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))[: _MOST_VALUES // y.shape[1]]
+    others = white(others)
 
-    def atoms(driver: str, points: Tensor, places: Tensor, moved: slice) -> list[Atom]:
-        place, charge = _searched(points[few], places, lead[few][..., moved], left, len(lead) / len(few))
+    def atoms(driver: str, points: Tensor, places: Tensor, raw: Tensor) -> list[Atom]:
+        """Those of the best bump; raw: the columns that it multiplies, `s x c0 x m`."""
+        lead = white(raw)
+        # What is the same in all places is no bump.
+        left = Remainder(y[few].flatten(), _LOOSE * torch.cat([others, lead], -1)[few].flatten(0, 1))
+        place, charge = _searched(points[few], places, lead[few], left, len(lead) / len(few))
         if place is None:
             return []
         bump = _bumps(points, place[None])[:, :, None]
-        columns = (jacobian * sizes)[..., moved]
         # By itself, and about the mean of the rows where the model was fitted to these. A constant of its own would let
         # it stand for an offset of the joints, which the library knows.
-        both = (columns * bump, columns * (bump - bump.mean(0)))
-        return [Atom(driver, None, sizes.new_zeros(0), one, LOG_PRIOR - charge) for one in both]
+        both = (raw * bump, raw * (bump - bump.mean(0)))
+        return [Atom(driver, None, raw.new_zeros(0), columns, LOG_PRIOR - charge) for columns in both]
 
     found = []
     middles = torch.linspace(-1, 1, _ALONG, dtype=sizes.dtype).unsqueeze(-1)
     for i, joint in enumerate(joints):
         track = unit_range(situation.joints[:, i : i + 1])
-        found += atoms(f"joint {joint.name}", track, _places(middles, _RADII_ALONG), slice(i, i + 1))
+        found += atoms(f"joint {joint.name}", track, _places(middles, _RADII_ALONG), moved[..., i : i + 1])
     lengths = [k for k, c in enumerate(situation.mechanism.pose) if c.unit == "m"]
     place = unit_range(situation.pose[:, lengths] if lengths else situation.pose)
-    return found + atoms("workspace", place, _places(spread_out(place, _WITHIN), _RADII_WITHIN), slice(None))
+    places = _places(spread_out(place, _WITHIN), _RADII_WITHIN)
+    # What pulls the platform acts through the joints; what bends a measurement does not.
+    for raw in (moved, platform_moves(situation)):
+        found += atoms("workspace", place, places, raw)
+    return found
 
 
 def _places(middles: Tensor, radii: tuple[float, ...]) -> Tensor:
