@@ -113,6 +113,7 @@ def test_rows_set_aside_are_called_by_one_name_everywhere(cli: Cli, tmp_path: Pa
         (["--out", "x", "--effects", "backlsh"], "did you mean 'backlash'?"),
         (["--out", "x", "--effects", "tool"], "can show none of the candidates: tool needs"),
         (["--out", "x", "--noise", "abc"], "--noise abc: 'abc' is no number with a unit; write e.g. 0.4 mm"),
+        (["--out", "x", "--noise", "10"], "10 m for x is more than five_bar moves"),
         (["--out", "x", "--noise", "x=1,2"], "'x=1,2' is neither a size nor NAME=SIZE"),
         (["--out", "x", "--noise", "10 blub"], "--noise 10 blub"),
         (["--out", "x", "--noise", "10 urad"], "noise.x is in 'urad', an angle, but must be a length"),

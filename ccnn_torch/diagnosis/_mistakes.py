@@ -19,21 +19,25 @@ __all__ = ["mistake"]
 # A mistake is named where without it so small a share of the distance is left.
 _MENDED = 0.1
 _FEW = 40
+# Mistakes that leave no more than this many times the least are as likely.
+_ALIKE = 1.2
 _TURN = 180 / torch.pi
 
 
 def mistake(situation: Situation, measured: Tensor, size: Size) -> str:
-    """The one mistake, of those often made, without which model and rows would agree, in words; empty for none."""
+    """The mistake, of those often made, without which model and rows would agree, in words; empty for none."""
     rows = torch.linspace(0, len(measured) - 1, min(_FEW, len(measured))).round().long()
     here, poses = picked(situation, rows), measured[rows]
     # A row that the machine does not reach is off by its whole workspace, and more.
     before = float(distance(here, poses, size).nan_to_num(nan=10.0).median())
-    best, said = min(_MENDED * before, USUAL), ""
+    found = []
     for words, other, there in _mistakes(here, poses):
         left = float(distance(replace(other, guess=_guess(other, there)), there, size).nan_to_num(nan=10.0).median())
-        if left < best:
-            best, said = left, words
-    return said
+        if left < min(_MENDED * before, USUAL):
+            found.append((left, words))
+    # On a machine that is its own mirror image two mistakes may come to the same.
+    least = min((left for left, _ in found), default=0.0)
+    return ", or ".join(words for left, words in found if left <= _ALIKE * least)
 
 
 def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Situation, Tensor]]:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis._distance import size_of
 from ccnn_torch.diagnosis._network import with_network
 from ccnn_torch.diagnosis._told import refuse_lost_rows, told
 from ccnn_torch.diagnosis.engine import diagnose_rows
@@ -52,8 +53,8 @@ def diagnose(
     """
     if not isinstance(records, Records) or not isinstance(mechanism, Mechanism):
         raise InputError(
-            "diagnose takes records and a mechanism, not their names: mechanism = load_mechanism(name), then "
-            "diagnose(load_records(path, mechanism), mechanism)"
+            "diagnose takes records as load_records gives them and a mechanism: mechanism = load_mechanism(name), then "
+            "diagnose(load_records(path, mechanism), mechanism); write_simulated(path, made) puts simulated rows there"
         )
     situation = situation_of(records, mechanism, gravity)
     with naming(records):
@@ -103,7 +104,8 @@ def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) ->
     """Standard deviation of each channel of position and rotation vector, `c` [m, rad].
 
     Raises:
-        InputError: a coordinate that the pose does not have, one that is missing, or a value that is not positive.
+        InputError: a coordinate that the pose does not have, one that is missing, or a value that is not positive or
+            more than the machine moves.
     """
     if noise is None:
         return None
@@ -119,6 +121,14 @@ def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) ->
     low = [n for n, v in noise.items() if not 0 < float(v) < float("inf")]
     if low:
         raise InputError(f"noise: must be above 0, not {noise[low[0]]!r} for {low[0]}")
+    spread = float(size_of(situation).place)
+    wide = [c.name for c in situation.mechanism.pose if c.unit == "m" and noise[c.name] > spread]
+    if wide:
+        value = noise[wide[0]]
+        raise InputError(
+            f"noise: {value:.4g} m for {wide[0]} is more than {situation.mechanism.name} moves (its poses are spread "
+            f"over {spread:.3g} m); write the unit, e.g. {value:g}um"
+        )
     lengths = [v for n, v in noise.items() if n in _POSITION]
     angles = [v for n, v in noise.items() if n not in _POSITION]
     values = [max(lengths, default=1.0)] * 3 + [max(angles, default=1.0)] * 3

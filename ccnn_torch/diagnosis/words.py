@@ -69,7 +69,8 @@ def driver_words(driver: str | None) -> str:
     if driver is None:
         return "nothing that was recorded"
     kind, _, name = driver.partition(" ")
-    named = {"joint": f"joint {name}", "load": f"the load {name}", "direction": f"the direction of joint {name}"}
+    load = f"the load along {name}" if name in ("x", "y", "z") else f"the load's moment {name}"
+    named = {"joint": f"joint {name}", "load": load, "direction": f"the direction of joint {name}"}
     return _DRIVERS.get(driver) or (named.get(kind) if name else None) or driver
 
 

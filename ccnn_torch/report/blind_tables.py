@@ -71,7 +71,7 @@ def _targets(found: Mapping[str, Any]) -> Table:
     rows = tuple((name, str(b["count"]), _cell(b)) for name, b in found["targets"].items() if b["of"])
     words = found["definitions"]
     note = f"In brackets: 95 % intervals. Right: {words['right']}. Found: {words['found']}. Claims: {words['claims']}."
-    return Table("Blind check", ("figure", "cases", "share"), rows, note)
+    return Table("Blind check", ("figure", "counted", "share"), rows, note)
 
 
 def _causes(found: Mapping[str, Any]) -> Table:

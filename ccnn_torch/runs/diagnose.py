@@ -78,7 +78,7 @@ def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as reason:
-        raise InputError(f"{folder}: cannot be made: {reason.strerror}") from None
+        raise InputError(f"{folder}: cannot be made ({reason.strerror}); give another place with --out") from None
 
 
 def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str] | None = None, seed: int = 0) -> Path:

@@ -86,7 +86,7 @@ def write_plan(path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as reason:
-        raise InputError(f"{path.parent}: cannot be made: {reason.strerror}") from None
+        raise InputError(f"{path.parent}: cannot be made ({reason.strerror}); give another place with --out") from None
     write_table(path, columns)
     plot = plan_plot(mechanism.pose, plans, least_gain)
     pictures = save_figure(plot.figure, path)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import jsonschema
 import pytest
 import torch
 from diagnosis._machines import NOISE, measured, rows_of
 
-from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
+from ccnn_torch.diagnosis import Diagnosis, diagnose, diagnose_rows
 from ccnn_torch.diagnosis.check import check_rows
-from ccnn_torch.effects import EFFECTS
+from ccnn_torch.effects import EFFECTS, Situation, default_gravity
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.records import load_records
 from ccnn_torch.report.json_files import load_schema, plain
+from ccnn_torch.runs.simulating import simulate_records, write_simulated
 
 
 @pytest.mark.parametrize(
@@ -177,3 +181,25 @@ def test_an_exact_effect_has_no_other_form_that_would_excuse_a_remainder(
     found = diagnose_rows(situation, pose, effects=library)
     assert found.verdict["outside_library"]
     assert found.judgement.found.rss < 0.01 * float(found.analysis.dictionary.grams.yy)
+
+
+def test_one_joint_off_is_an_offset_and_no_gain() -> None:
+    """An arm's gain has a zero of its own for every joint; that of one joint alone is an offset all the same."""
+    arm = load_mechanism(str(Path(__file__).parents[1] / "effects" / "arm.yaml"))
+    joints = arm.sample_joints(100, torch.Generator().manual_seed(1))
+    off = torch.zeros(6, dtype=torch.float64)
+    off[1] = 8e-4
+    pose = arm.forward_kinematics(joints + off)
+    pose = pose + 2e-5 * torch.randn(pose.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    found = diagnose_rows(Situation(arm, joints, {}, default_gravity(arm), None, pose), pose)
+    assert found.verdict["effects"] == ["joint_offset"], found.verdict["text"]
+
+
+def test_plain_play_beside_an_offset_is_play_in_few_rows(tmp_path: Path) -> None:
+    """Its usual form is a candidate whatever the search for a push that lifts the joint finds."""
+    machine, path = load_mechanism("five_bar"), tmp_path / "rows.csv"
+    causes = ["joint_offset:q1=0.02deg,q2=-0.01deg", "backlash:q1=0.3mrad"]
+    write_simulated(path, simulate_records("five_bar", causes, 200, 1e-5, seed=5))
+    path.write_text("".join(path.read_text(encoding="utf-8").splitlines(keepends=True)[:61]), encoding="utf-8")
+    found = diagnose(load_records(path, machine, learns=False), machine, noise=1e-5)
+    assert set(found.verdict["effects"]) == {"joint_offset", "backlash"} and not found.verdict["outside_library"]

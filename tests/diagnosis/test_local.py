@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from diagnosis._machines import NOISE, acting, measured, reached_with, rows_of
 
 from ccnn_torch.diagnosis import diagnose_rows
-from ccnn_torch.effects import EFFECTS, Situation
+from ccnn_torch.effects import EFFECTS, Situation, default_gravity
+from ccnn_torch.mechanisms import load_mechanism
 
 
 def off(situation: Situation, change: torch.Tensor, seed: int) -> torch.Tensor:
@@ -67,3 +69,19 @@ def test_mounts_that_follow_the_temperature_are_thermal() -> None:
     cause = acting(situation, "thermal", q1_mount=2e-5, q2_mount=-3e-5)
     said = diagnose_rows(situation, reached_with(situation, [cause], 12)).verdict
     assert said["effects"] == ["thermal"] and not said["outside_library"]
+
+
+def test_what_pulls_the_platform_itself_in_a_corner_is_no_device() -> None:
+    """Its middle is far off, and no reason to set those rows aside."""
+    arm = load_mechanism(str(Path(__file__).parents[1] / "effects" / "arm.yaml"))
+    joints = arm.sample_joints(200, torch.Generator().manual_seed(1))
+    pose = arm.forward_kinematics(joints)
+    near = ((pose[:, :3] - pose[:, :3].median(0).values) / 0.25).square().sum(-1)
+    pull = 4e-4 * torch.exp(-near / 2)[:, None] * torch.tensor([0.0, -1.0, 0.5], dtype=torch.float64)
+    drawn = torch.randn(pose.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    measured = pose + 1e-5 * drawn
+    measured[:, :3] += pull
+    found = diagnose_rows(
+        Situation(arm, joints, {}, default_gravity(arm), None, pose), measured, torch.full((6,), 1e-5)
+    )
+    assert found.verdict["outside_library"] and found.verdict["driver"] == "workspace" and not found.verdict["effects"]

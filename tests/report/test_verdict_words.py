@@ -80,6 +80,6 @@ def test_gaps_that_cannot_be_put_against_a_floor() -> None:
 def test_words() -> None:
     assert effect_words("my_effect") == "the effect my_effect"
     told = [driver_words(d) for d in ("workspace", "load z", "direction 2", "joint", "odd", None)]
-    assert told[1:3] == ["the load z", "the direction of joint 2"]
+    assert told[1:3] == ["the load along z", "the direction of joint 2"]
     assert told[3:] == ["joint", "odd", "nothing that was recorded"]
     assert [probability_words(p) for p in (1.0, 0.983, 0.004)] == ["above 0.99", "0.98", "below 0.01"]

@@ -129,7 +129,7 @@ def write_simulated(path: Path, simulated: Simulated) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as reason:
-        raise InputError(f"{path.parent}: cannot be made: {reason.strerror}") from None
+        raise InputError(f"{path.parent}: cannot be made ({reason.strerror}); give another place with --out") from None
     write_table(path, columns)
 
 
