@@ -200,3 +200,14 @@ def test_records_of_another_machine_are_refused_in_python(rows: Path) -> None:
     records = load_records(rows, load_mechanism("five_bar"))
     with pytest.raises(InputError, match="records: they have 2 joints and tripod has 3"):
         diagnose(records, load_mechanism("tripod"))
+
+
+def test_columns_by_another_name_are_said(cli: Cli, rows: Path, tmp_path: Path) -> None:
+    text = rows.read_text(encoding="utf-8")
+    rows.write_text(text.replace("load_x[", "force_x[", 1), encoding="utf-8")
+    words = ("--records", rows, "--mechanism", "five_bar", "--no-network", "--out", tmp_path / "found")
+    code, shown, _ = cli("diagnose", *words)
+    assert code == 0
+    notes = json.loads((tmp_path / "found" / "diagnosis.json").read_text(encoding="utf-8"))["notes"]
+    assert any("not looked at: force_x; effects go by time, temperature, load_x" in note for note in notes)
+    assert "force_x" in shown and "force_x" in (tmp_path / "found" / "report.html").read_text(encoding="utf-8")

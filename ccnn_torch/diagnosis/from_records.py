@@ -23,6 +23,8 @@ from ccnn_torch.records import Records
 __all__ = ["diagnose", "naming", "noise_of", "situation_of"]
 
 _POSITION = {"x": 0, "y": 1, "z": 2}
+# Names that a note lists.
+_FEW_NAMES = 6
 _TURN = {"rx": 3, "ry": 4, "rz": 5}
 
 
@@ -59,8 +61,20 @@ def diagnose(
     situation = situation_of(records, mechanism, gravity)
     with naming(records):
         said = diagnose_rows(situation, records.pose, noise_of(noise, situation), effects, seed)
-    said = replace(said, lines=tuple(records.lines.tolist()))
+    said = replace(said, lines=tuple(records.lines.tolist()), notes=[*said.notes, *_unread(records, situation)])
     return with_network(said, seed) if network else said
+
+
+def _unread(records: Records, situation: Situation) -> list[str]:
+    """A note of columns that no effect goes by: one of them may bear another name than it should."""
+    names = [name for name in records.columns if name not in situation.covariates]
+    if not names:
+        return []
+    more = f" and {len(names) - _FEW_NAMES} more" if len(names) > _FEW_NAMES else ""
+    return [
+        f"columns that were not looked at: {', '.join(names[:_FEW_NAMES])}{more}; effects go by time, temperature, "
+        f"load_{situation.mechanism.pose[0].name}, direction1, speed1 and the like"
+    ]
 
 
 @contextmanager
