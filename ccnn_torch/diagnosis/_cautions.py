@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from ccnn_torch._display import number_text
 from ccnn_torch.diagnosis._analysis import Analysis
@@ -26,6 +27,8 @@ _LARGE = 0.1
 # Standard deviation left, of that which was given; heavy tails left 0.7 of it in sealed machines.
 _QUIET, _LOUD = 0.5, 2.0
 _MANY = 0.1
+# So many rows set aside are looked at together, against as many drawn anew so often; the share of these as close.
+_SEVERAL, _DRAWS, _BY_CHANCE = 5, 1000, 0.003
 # A joint that moves less than this share of its workspace stands still. Rows that may be copies of others.
 _STILL, _COPIES = 1e-3, 0.2
 # Effects that only the place of a row tells from one another.
@@ -57,6 +60,7 @@ def cautions(
     """
     return [
         *row_cautions(analysis, rows, judgement.names),
+        *_of_place(analysis, judgement),
         *_of_noise(analysis, judgement),
         *_of_nothing_gained(analysis, judgement, together),
         *_of_sizes(analysis, judgement),
@@ -68,6 +72,30 @@ def cautions(
 def row_cautions(analysis: Analysis, rows: Belonging, names: Sequence[str] = ()) -> list[Caution]:
     """Those of them that need no verdict; names: of one, where there is one."""
     return [*_of_model(analysis, rows), *_of_plan(analysis, names), *_of_temperature(analysis.situation)]
+
+
+def _of_place(analysis: Analysis, judgement: Judgement) -> list[Caution]:
+    """Rows set aside that lie together: bad ones lie anywhere."""
+    aside = (analysis.whitening.weight <= 0) & ~analysis.near_singular
+    count = int(aside.sum())
+    if count < _SEVERAL or judgement.driver is not None:
+        return []
+    place = analysis.situation.pose
+    place = (place - place.mean(0)) / place.std(0).clamp_min(1e-300)
+    drawn = torch.rand(_DRAWS, len(place), generator=torch.Generator().manual_seed(0)).argsort(-1)[:, :count]
+
+    def spread(rows: Tensor) -> Tensor:
+        return (rows - rows.mean(-2, keepdim=True)).square().sum((-2, -1))
+
+    if float((spread(place[drawn]) <= spread(place[aside])).double().mean()) > _BY_CHANCE:
+        return []
+    middle = analysis.situation.pose[aside].mean(0).tolist()
+    named = ", ".join(
+        f"{c.name} = {number_text(v, 3)} {c.unit}"
+        for c, v in zip(analysis.situation.mechanism.pose, middle, strict=True)
+    )
+    words = f"the {count} rows set aside as far off lie together, about {named}: something may act there alone"
+    return [Caution(words, _HOLLOW)]
 
 
 def _of_plan(analysis: Analysis, names: Sequence[str]) -> list[Caution]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from fnmatch import fnmatchcase
 
 import torch
 from torch import Tensor
 
+from ccnn_torch._covariates import DEFAULT_COVARIATES
 from ccnn_torch.diagnosis._distance import size_of
 from ccnn_torch.diagnosis._network import with_network
 from ccnn_torch.diagnosis._told import refuse_lost_rows, told
@@ -67,7 +69,8 @@ def diagnose(
 
 def _unread(records: Records, situation: Situation) -> list[str]:
     """A note of columns that no effect goes by: one of them may bear another name than it should."""
-    names = [name for name in records.columns if name not in situation.covariates]
+    known = [*DEFAULT_COVARIATES, *(condition.name for condition in situation.mechanism.takes)]
+    names = [name for name in records.columns if not any(fnmatchcase(name, pattern) for pattern in known)]
     if not names:
         return []
     more = f" and {len(names) - _FEW_NAMES} more" if len(names) > _FEW_NAMES else ""

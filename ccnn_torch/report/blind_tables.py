@@ -56,7 +56,7 @@ def case_line(machine: str, answer: Mapping[str, Any], withheld: bool) -> str:
         return f"{machine}: {answer['failed']}"
     verdict = answer["verdict"]
     names = " + ".join(verdict["effects"]) or ("" if verdict["outside_library"] else "none")
-    outside = f" outside ({verdict['driver']})" if verdict["outside_library"] else ""
+    outside = f"{' ' if names else ''}outside ({verdict['driver']})" if verdict["outside_library"] else ""
     probability = number_text(verdict["probability"], 3)
     return f"{machine}{' (one effect withheld)' if withheld else ''}: {names}{outside}, {probability}"
 

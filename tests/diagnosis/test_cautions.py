@@ -219,3 +219,16 @@ def test_angles_of_the_model_in_degrees_are_named() -> None:
     situation = Situation(wrong, joints, {}, default_gravity(wrong))
     with pytest.raises(InputError, match="the angles of the model seem to be in degrees under rad"):
         diagnose_rows(situation, pose)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_rows_set_aside_that_lie_together_are_no_bad_rows(together: bool) -> None:
+    situation = rows_of("five_bar", 120, 3)
+    pose = measured(situation, {"joint_offset": 20.0}, 4)
+    corner = (pose - pose.median(0).values).norm(dim=-1).argsort()[:8]
+    scattered = torch.arange(5, 120, 15)
+    pose[corner if together else scattered] += torch.tensor([3e-3, -2e-3], dtype=torch.float64)
+    found = diagnose_rows(situation, pose)
+    said = [text for text in found.cautions if "lie together" in text]
+    assert bool(said) == together and found.verdict["effects"] == ["joint_offset"]
+    assert (found.verdict["probability"] <= 0.5) == together
