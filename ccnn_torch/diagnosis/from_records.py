@@ -69,14 +69,16 @@ def diagnose(
 
 def _unread(records: Records, situation: Situation) -> list[str]:
     """A note of columns that no effect goes by: one of them may bear another name than it should."""
-    known = [*DEFAULT_COVARIATES, *(condition.name for condition in situation.mechanism.takes)]
+    mechanism = situation.mechanism
+    known = [*DEFAULT_COVARIATES, *(condition.name for condition in mechanism.takes)]
+    known += [*mechanism.frame_per, *mechanism.tool_per] if isinstance(mechanism, SerialArm) else []
     names = [name for name in records.columns if not any(fnmatchcase(name, pattern) for pattern in known)]
     if not names:
         return []
     more = f" and {len(names) - _FEW_NAMES} more" if len(names) > _FEW_NAMES else ""
     return [
         f"columns that were not looked at: {', '.join(names[:_FEW_NAMES])}{more}; effects go by time, temperature, "
-        f"load_{situation.mechanism.pose[0].name}, direction1, speed1 and the like"
+        f"load_{mechanism.pose[0].name}, direction1, speed1 and the like"
     ]
 
 
