@@ -17,14 +17,14 @@ from torch import Tensor
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.effects import Situation
 
-__all__ = ["ANY", "DEVIATION", "LOG_PRIOR", "SPEED", "catch_alls", "platform_moves", "spread_out", "unit_range"]
+__all__ = ["ANY", "LOG_PRIOR", "SPEED", "catch_alls", "joint_moves", "platform_moves", "spread_out", "unit_range"]
 
 # A catch-all is that much less probable than no deviation of its kind, before the data are seen.
 LOG_PRIOR = math.log(1e-3)
 # And one that holds most of what a library effect does has to be better than that effect by as much again.
 _NEAR_LIBRARY = math.log(1e-5)
 # A joint may be off by this much for reasons that nobody thought of [m], [rad].
-DEVIATION = {"m": 3e-4, "rad": 5e-4}
+_SCALE = {"m": 3e-4, "rad": 5e-4}
 ANY = "*"
 """Stands in a driver's name for all of its kind; a verdict names the one that explains most by itself."""
 SPEED = "speed"
@@ -179,6 +179,12 @@ def _waves(values: Tensor, count: int) -> Tensor:
     return waves - waves.mean(-2, keepdim=True)
 
 
+def joint_moves(situation: Situation, jacobian: Tensor) -> Tensor:
+    """What the joints' derivatives, `s x c x n`, make of each joint being as far off as is to be expected."""
+    joints = situation.mechanism.joints
+    return jacobian * torch.tensor([_SCALE.get(j.unit, 5e-4) for j in joints], dtype=jacobian.dtype)
+
+
 def platform_moves(situation: Situation) -> Tensor:
     """Shifts and turns of the platform as far as they are seen, each as large as is to be expected, `s x c x c`."""
     visible = situation.visible
@@ -198,8 +204,7 @@ def _atom(situation: Situation, driver: str, features: Tensor, most: int = _MOST
 
 def _columns(situation: Situation, features: Tensor, only: int | None = None) -> Tensor:
     """Joints' Jacobian times the features `s x f`, `s x c x (n f)`; only: of one joint, counted from 0."""
-    sizes = torch.tensor([DEVIATION.get(j.unit, 5e-4) for j in situation.mechanism.joints], dtype=features.dtype)
-    jacobian = situation.jacobian * sizes
+    jacobian = joint_moves(situation, situation.jacobian)
     if only is not None:
         jacobian = jacobian[..., only : only + 1]
     return (jacobian.unsqueeze(-1) * features[:, None, None, :]).flatten(-2)

@@ -82,7 +82,7 @@ def _of_place(analysis: Analysis, judgement: Judgement) -> list[Caution]:
         return []
     place = analysis.situation.pose
     place = (place - place.mean(0)) / place.std(0).clamp_min(1e-300)
-    drawn = torch.rand(_DRAWS, len(place), generator=torch.Generator().manual_seed(0)).argsort(-1)[:, :count]
+    drawn = torch.rand(_DRAWS, len(place), generator=torch.Generator().manual_seed(0)).topk(count).indices
 
     def spread(rows: Tensor) -> Tensor:
         return (rows - rows.mean(-2, keepdim=True)).square().sum((-2, -1))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import Atom
-from ccnn_torch.diagnosis._catch_all import DEVIATION, LOG_PRIOR, platform_moves, spread_out, unit_range
+from ccnn_torch.diagnosis._catch_all import LOG_PRIOR, joint_moves, platform_moves, spread_out, unit_range
 from ccnn_torch.diagnosis._remainder import Remainder, search_charge
 from ccnn_torch.diagnosis._whitening import Whitening
 from ccnn_torch.effects import Situation
@@ -49,11 +49,9 @@ def local_catch_alls(
         white: noise and weights.
         others: columns of what else is there, in plausible sizes, `s x c0 x P`.
     """
-    joints = situation.mechanism.joints
-    sizes = torch.tensor([DEVIATION.get(j.unit, 5e-4) for j in joints], dtype=jacobian.dtype)
     # Rows that were set aside count as well, as far as they can be believed: they may be the middle of a bump.
     white = replace(white, weight=torch.ones_like(white.weight))
-    moved = jacobian * sizes
+    moved = joint_moves(situation, jacobian)
     y = white(target)
     y = y * (_BELIEVED / torch.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min(_BELIEVED))
     # A place is found in a part of many rows as well.
@@ -75,8 +73,8 @@ def local_catch_alls(
         return [Atom(driver, None, raw.new_zeros(0), columns, LOG_PRIOR - charge) for columns in both]
 
     found = []
-    middles = torch.linspace(-1, 1, _ALONG, dtype=sizes.dtype).unsqueeze(-1)
-    for i, joint in enumerate(joints):
+    middles = torch.linspace(-1, 1, _ALONG, dtype=moved.dtype).unsqueeze(-1)
+    for i, joint in enumerate(situation.mechanism.joints):
         track = unit_range(situation.joints[:, i : i + 1])
         found += atoms(f"joint {joint.name}", track, _places(middles, _RADII_ALONG), moved[..., i : i + 1])
     lengths = [k for k, c in enumerate(situation.mechanism.pose) if c.unit == "m"]

@@ -70,7 +70,7 @@ def diagnose(
 def _unread(records: Records, situation: Situation) -> list[str]:
     """A note of columns that no effect goes by: one of them may bear another name than it should."""
     mechanism = situation.mechanism
-    known = [*DEFAULT_COVARIATES, *(condition.name for condition in mechanism.takes)]
+    known = [*DEFAULT_COVARIATES, *situation.covariates, *(condition.name for condition in mechanism.takes)]
     known += [*mechanism.frame_per, *mechanism.tool_per] if isinstance(mechanism, SerialArm) else []
     names = [name for name in records.columns if not any(fnmatchcase(name, pattern) for pattern in known)]
     if not names:
