@@ -38,9 +38,8 @@ class Analysis:
         measured: poses, `s x p`.
         residual: measured less nominal, `s x c0` [m, rad].
         whitening: channels, noise and row weights in the end.
-        dictionary: atoms and Gram matrices in the end.
-        columns: of every atom, whitened, `s x c x P`.
-        y: what they explain, whitened, `s x c`.
+        dictionary: atoms, their columns and Gram matrices in the end.
+        y: what the atoms explain, whitened, `s x c`; rows that count.
         found: sets, most probable first.
         near_singular: `s`, bool.
         floor: mean square of the noise in the units of `y`: 1 where it was given, else that of the richest fit or,
@@ -52,7 +51,6 @@ class Analysis:
     residual: Tensor
     whitening: Whitening
     dictionary: Dictionary
-    columns: Tensor
     y: Tensor
     found: list[Found]
     near_singular: Tensor
@@ -138,8 +136,8 @@ def _settled(result: Analysis, best: Found, new: Whitening, left: Tensor) -> boo
         return False
     linear = result.y
     for i, mean in zip(best.members, best.mean, strict=True):
-        linear = linear - result.columns[..., result.dictionary.groups[i]] @ mean
-    return float((old(torch.nan_to_num(left)) - linear)[old.keep()].square().mean()) < _SAME_FIT
+        linear = linear - result.dictionary.columns[..., result.dictionary.groups[i]] @ mean
+    return float((old(torch.nan_to_num(left))[old.keep()] - linear).square().mean()) < _SAME_FIT
 
 
 def _near_singular(situation: Situation, channels: Tensor) -> Tensor:
@@ -173,36 +171,35 @@ def _searched(
     fitted: Tensor,
 ) -> Analysis:
     keep = white.keep()
-    columns = white(torch.cat([a.columns for a in atoms], -1)) if atoms else white(target)[..., None][..., :0]
-    y = white(target)
+    rows = slice(None) if len(keep) == len(target) else keep
+    columns, y = [white(a.columns)[rows] for a in atoms], white(target)[rows]
     if fitted.shape[-1]:
         # What was fitted before takes its part out of everything.
-        u, s, _ = torch.linalg.svd(white(fitted).flatten(0, 1), full_matrices=False)
+        u, s, _ = torch.linalg.svd(white(fitted)[rows].flatten(0, 1), full_matrices=False)
         q = u[:, s > 1e-9 * s[0]]
         y = (y.flatten() - q @ (q.mT @ y.flatten())).reshape(y.shape)
-        flat = columns.flatten(0, 1)
-        columns = (flat - q @ (q.mT @ flat)).reshape(columns.shape)
+        columns = [(c.flatten(0, 1) - q @ (q.mT @ c.flatten(0, 1))).reshape(c.shape) for c in columns]
     # Noise that was given is right to some per cent, however many rows there are.
-    known = white.known * (1 + y[keep].numel() / 100)
-    dictionary, found = search(atoms, columns[keep], y[keep], known)
+    known = white.known * (1 + y.numel() / 100)
+    dictionary, found = search(atoms, columns, y, known)
     # The richest fit knows no shapes: where these are most of the gap the best set leaves far less.
-    left = found[0].rss / max(y[keep].numel() - found[0].effective, 1.0)
+    left = found[0].rss / max(y.numel() - found[0].effective, 1.0)
     floor = min(float((rich / white.sigma).square().mean()), 1.0)
     floor = left if white.known == 0 and left < _FAR_BELOW * floor else floor
-    return Analysis(situation, measured, target, white, dictionary, columns, y, found, near, floor)
+    return Analysis(situation, measured, target, white, dictionary, y, found, near, floor)
 
 
 def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitening:
     """Noise and weights from what the most probable set of all leaves."""
     best, white = result.found[0], result.whitening
-    theta = torch.zeros(result.columns.shape[-1], dtype=result.columns.dtype)
+    raw = result.residual
     for i, mean in zip(best.members, best.mean, strict=True):
-        theta[result.dictionary.groups[i]] = mean
-    raw = result.residual - torch.cat([a.columns for a in result.dictionary.atoms], -1) @ theta
+        raw = raw - result.dictionary.atoms[i].columns @ mean
+    raw = raw[:, white.channels]
     free = 1 - best.effective / max(result.dictionary.grams.values, 1.0)
     if noise is None:
         rows = (white.weight > 0) & usable
-        spread = raw[rows][:, white.channels].abs().median(0).values * 1.4826 / max(free, 0.1) ** 0.5
+        spread = raw[rows].abs().median(0).values * 1.4826 / max(free, 0.1) ** 0.5
         rms = result.residual[rows][:, white.channels].abs().median(0).values * 1.4826
         white = Whitening(
             white.channels, torch.maximum(spread, 1e-4 * rms).clamp_min(NO_NOISE), white.weight, white.known

@@ -27,9 +27,9 @@ def signatures_apart(analysis: Analysis, judgement: Judgement) -> dict[str, dict
     Returns:
         `{effect: {other: {"angle" [rad], "separation" [1, times the noise]}}}`.
     """
-    atoms, keep = analysis.dictionary.atoms, analysis.whitening.keep()
+    atoms = analysis.dictionary.atoms
     found = judgement.found
-    flat = analysis.columns[keep].flatten(0, 1)
+    flat = analysis.dictionary.columns.flatten(0, 1)
 
     def columns(members: Sequence[int]) -> Tensor:
         return torch.cat([flat[:, :0], *(flat[:, analysis.dictionary.groups[i]] for i in members)], -1)

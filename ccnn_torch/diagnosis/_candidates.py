@@ -9,10 +9,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis._alone import Own, fit_alone, own_products
 from ccnn_torch.diagnosis._atoms import Atom, default_shape
-from ccnn_torch.diagnosis._evidence import alone, grams_of
 from ccnn_torch.diagnosis._linear import remainder, signature_at
-from ccnn_torch.diagnosis._shapes import Scan, Shaped
+from ccnn_torch.diagnosis._shapes import Ground, Scan, Shaped
 from ccnn_torch.diagnosis._whitening import Whitening
 from ccnn_torch.effects import Acting, Effect, Situation
 
@@ -53,11 +53,12 @@ def first_candidates(
     fixed += [part for a in fixed if (part := _best_part(situation, a, white, residual)) is not None]
     bare = white(fitted)
     beside = torch.cat([bare, *(white(a.columns) for a in fixed)], -1)
+    grounds = [Ground(white(residual), nuisance) for nuisance in (bare, beside)]
     starts: list[Atom] = []
     for atom in (a for a in atoms if a.shape.numel()):
         assert atom.effect is not None
         scan = Scan(situation, situation, atom.effect, _only(white, usable))
-        looked_for = (scan.best(white(residual), nuisance) for nuisance in (bare, beside))
+        looked_for = (scan.best(ground) for ground in grounds)
         for shaped in (*_usual(situation, atom.effect), *looked_for):
             if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
                 starts.append(cleaned(_atom(situation, situation, atom.effect, shaped), usable))
@@ -91,8 +92,14 @@ def renewed_candidates(
     def beside(others: Sequence[Acting]) -> Tensor:
         return torch.where(usable[:, None], torch.nan_to_num(remainder(situation, measured, others)), 0.0)
 
+    def ground(others: Sequence[Acting]) -> Ground:
+        columns = [_atom(situation, there, a.effect, Shaped(a.shape, None, 0.0)) for a in others]
+        present = torch.cat([white(fitted), *(white(cleaned(c, usable).columns) for c in columns)], -1)
+        return Ground(white(target), present)
+
     atoms: list[Atom] = []
     all_act = beside(acting)
+    grounds: dict[int, Ground] = {}
     for effect in effects:
         others = [a for a in acting if a.effect is not effect]
         if not effect.shapes(situation):
@@ -101,10 +108,10 @@ def renewed_candidates(
             part = _best_part(situation, atoms[-1], white, left)
             atoms += [part] if part is not None else []
             continue
-        columns = [_atom(situation, there, a.effect, Shaped(a.shape, None, 0.0)) for a in others]
-        present = torch.cat([white(fitted), *(white(cleaned(c, usable).columns) for c in columns)], -1)
+        if len(others) not in grounds or len(others) < len(acting):
+            grounds[len(others)] = ground(others)
         start = next((a.shape for a in acting if a.effect is effect), None)
-        shaped = Scan(situation, there, effect, _only(white, usable)).best(white(target), present, start)
+        shaped = Scan(situation, there, effect, _only(white, usable)).best(grounds[len(others)], start)
         atoms.append(cleaned(_atom(situation, there, effect, shaped), usable))
         for old in (a for a in starts if a.effect is effect and not _same_shape(a, shaped)):
             so = Shaped(old.shape, old.used, LOG_PRIOR - old.log_prior)
@@ -140,12 +147,14 @@ def _best_part(situation: Situation, atom: Atom, white: Whitening, y: Tensor) ->
     parts = [[k for k, o in enumerate(owners) if o == owner] for owner in dict.fromkeys(owners) if owner is not None]
     if len(parts) < 2:
         return None
-    grams = grams_of(white(atom.columns), white(y))
+    target = white(y)
+    whole, squares = own_products(white(atom.columns), target), target.square().sum()
     charge, lots, reached = math.log(len(parts)), 0, -math.inf
     chosen: list[int] = []
     while lots < max(len(parts) // 2, 1):
         wider = [sorted(chosen + p) if not set(p) <= set(chosen) else p for p in parts]
-        evidence = alone(grams, [torch.tensor(p) for p in wider], _SIZE_SPREAD)[0][1:]
+        cut = [Own(whole.xx[p][:, p], whole.xy[p]) for p in wider]
+        evidence = fit_alone(cut, squares, float(target.numel()), 0.0, _SIZE_SPREAD).log_evidence
         best = int(evidence.argmax())
         if float(evidence[best]) < reached + charge or wider[best] == chosen:
             break

@@ -59,10 +59,10 @@ def catch_alls(situation: Situation, beside: Sequence[str]) -> list[Atom]:
         q = unit_range(situation.joints[..., i : i + 1])
         found.append(_atom(situation, f"joint {joint.name}", torch.cat([one, q, _BEND * _bumps(q, few)], -1)))
         fine = torch.cat([one, q, _bumps(q, min(_MOST, rows // 6))], -1)
-        own.append(_columns(situation, fine, only=i))
-        found.append(_made(f"joint {joint.name}", own[-1]))
+        own.append(fine)
+        found.append(_atom(situation, f"joint {joint.name}", fine, only=i))
     if "transmission" not in beside:
-        found.append(_made(f"joint {ANY}", torch.cat(own, -1), most=most))
+        found.append(_atom(situation, f"joint {ANY}", torch.stack(own, 1), most=most))
     together: dict[str, list[Tensor]] = {}
     for name, value in situation.covariates.items():
         driver = _driver(name)
@@ -198,27 +198,46 @@ def _whole(situation: Situation, driver: str, features: Tensor) -> Atom:
     return Atom(driver, None, features.new_zeros(0), columns[..., shown], LOG_PRIOR)
 
 
-def _atom(situation: Situation, driver: str, features: Tensor, most: int = _MOST, log_prior: float = LOG_PRIOR) -> Atom:
-    return _made(driver, _columns(situation, features), most, log_prior)
+def _atom(
+    situation: Situation,
+    driver: str,
+    features: Tensor,
+    most: int = _MOST,
+    log_prior: float = LOG_PRIOR,
+    only: int | None = None,
+) -> Atom:
+    """What the joints do by features that all of them go by, `s x f`, or each by its own, `s x n x f`.
+
+    Reduced to the directions that matter. only: of one joint, counted from 0.
+    """
+    moves = joint_moves(situation, situation.jacobian)
+    moves = moves if only is None else moves[..., only : only + 1]
+    if features.dim() == 2:
+        features = _principal(features, most)[:, None].expand(-1, moves.shape[-1], -1)
+    return Atom(driver, None, features.new_zeros(0), _reduced(moves, features, most), log_prior)
 
 
-def _columns(situation: Situation, features: Tensor, only: int | None = None) -> Tensor:
-    """Joints' Jacobian times the features `s x f`, `s x c x (n f)`; only: of one joint, counted from 0."""
-    jacobian = joint_moves(situation, situation.jacobian)
-    if only is not None:
-        jacobian = jacobian[..., only : only + 1]
-    return (jacobian.unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
+def _principal(features: Tensor, most: int) -> Tensor:
+    """The leading principal features, where there are more than of all that joints make of them will be kept."""
+    if features.shape[-1] <= most:
+        return features
+    _, vectors = torch.linalg.eigh(features.mT @ features)
+    principal: Tensor = features @ vectors[:, -most:]
+    return principal
 
 
-def _made(driver: str, columns: Tensor, most: int = _MOST, log_prior: float = LOG_PRIOR) -> Atom:
-    """Columns reduced to the directions that matter."""
-    return Atom(driver, None, columns.new_zeros(0), _reduced(columns, most), log_prior)
+def _reduced(moves: Tensor, features: Tensor, most: int) -> Tensor:
+    """The leading principal columns of each joint's moves, `s x c x n`, times each of its features, `s x n x f`.
 
-
-def _reduced(columns: Tensor, most: int) -> Tensor:
-    """The leading principal columns: with one prior scale for all, the rest is the least of what the prior allows."""
-    weight = columns.square().mean((0, 2), keepdim=True).sqrt().clamp_min(1e-300)
-    flat = (columns / weight).flatten(0, 1)
-    _, vectors = torch.linalg.eigh(flat.mT @ flat)
-    reduced: Tensor = columns @ vectors[:, -most:]
+    With one prior scale for all, the rest is the least of what the prior allows. The columns themselves, n times f of
+    them, are never made.
+    """
+    n, f = features.shape[1:]
+    square = (moves.square() * features.square().sum(-1)[:, None]).mean((0, 2), keepdim=True) / f
+    scaled = moves / square.sqrt().clamp_min(1e-300)
+    inner = scaled.mT @ scaled
+    gram = [features[:, i].mT @ (inner[:, i, :, None] * features).flatten(1) for i in range(n)]
+    _, vectors = torch.linalg.eigh(torch.cat(gram))
+    kept = vectors[:, -most:].reshape(n, f, -1)
+    reduced: Tensor = moves @ (features.transpose(0, 1) @ kept).transpose(0, 1)
     return reduced

@@ -12,6 +12,7 @@ from ccnn_torch._display import number_text
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._belonging import Belonging
 from ccnn_torch.diagnosis._distance import distance, size_of
+from ccnn_torch.diagnosis._search import covariance
 from ccnn_torch.diagnosis._shrink import Gap
 from ccnn_torch.diagnosis._verdict import Judgement
 from ccnn_torch.effects import EXACT, Situation
@@ -202,7 +203,7 @@ def _of_signs(analysis: Analysis, judgement: Judgement) -> list[Caution]:
         coefficients = atom.coefficients(analysis.situation)
         if atom.name not in judgement.names or not coefficients:
             continue
-        sure = found.covariance.diagonal()[part].clamp_min(1e-300).sqrt() * _SIGNED
+        sure = covariance(analysis.dictionary, found).diagonal()[part].clamp_min(1e-300).sqrt() * _SIGNED
         signed = torch.tensor([c.positive for c in coefficients])
         negative = torch.nonzero(signed & (mean < -sure))[:, 0].tolist()
         if negative and not bool((signed & (mean > sure)).any()):

@@ -13,12 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Fits", "Grams", "alone", "block_grams", "crossed", "fit_sets", "grams_of", "of_like_width", "without"]
+__all__ = ["LIMIT", "SPREAD", "Fits", "Grams", "fit_sets", "grams_of", "of_like_width", "without"]
 
 _BUCKET = 16
 # Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
-_SPREAD = 4.0
-_LIMIT = 25.0
+SPREAD = 4.0
+LIMIT = 25.0
 _DIGITS = 1e-13
 
 
@@ -65,32 +65,6 @@ def grams_of(x: Tensor, y: Tensor) -> Grams:
     return Grams(flat.mT @ flat, flat.mT @ value, value @ value, float(len(value)))
 
 
-def block_grams(x: Tensor, y: Tensor, groups: Sequence[Tensor]) -> Grams:
-    """As `grams_of`, but NaN between columns of different groups: all that fits of one group at a time ask for.
-
-    groups: runs of columns that stand side by side.
-    """
-    flat, value = x.flatten(0, 1), y.reshape(-1)
-    xx = flat.new_full((flat.shape[-1], flat.shape[-1]), torch.nan)
-    for group in groups:
-        first, end = int(group[0]), int(group[-1]) + 1
-        xx[first:end, first:end] = flat[:, first:end].mT @ flat[:, first:end]
-    return Grams(xx, flat.mT @ value, value @ value, float(len(value)))
-
-
-def crossed(grams: Grams, x: Tensor, first: Sequence[Tensor], second: Sequence[Tensor]) -> Grams:
-    """With the inner products between the columns of the first groups and those of the second filled in."""
-    if not first or not second:
-        return grams
-    one, other = torch.cat(list(first)), torch.cat(list(second))
-    flat = x.flatten(0, 1)
-    between = flat[:, one].mT @ flat[:, other]
-    xx = grams.xx.clone()
-    xx[one[:, None], other] = between
-    xx[other[:, None], one] = between.mT
-    return grams._replace(xx=xx)
-
-
 def without(grams: Grams, x: Tensor, y: Tensor, columns: Tensor) -> Grams:
     """Less what some of the rows bring, NaN but for these columns; x: `t x c x P`, y: `t x c`, of those rows."""
     away = grams_of(x[..., columns], y)
@@ -105,7 +79,7 @@ def fit_sets(
     sets: Sequence[Sequence[Tensor]],
     noise_dof: float,
     iterations: int = 8,
-    spread: float = _SPREAD,
+    spread: float = SPREAD,
     start: tuple[Tensor, Tensor] | None = None,
 ) -> Fits:
     """Fit every set of groups.
@@ -130,7 +104,7 @@ def fit_sets(
     there = member.sum(1) > 0
     # Start where the prior of each group could make the whole gap, and the noise is a tenth of it.
     trace = (member * g.diagonal(dim1=-2, dim2=-1)[..., None]).sum(1).clamp_min(1e-300)
-    psi = torch.log((grams.yy.clamp_min(1e-300) / trace).clamp(math.exp(-_LIMIT), math.exp(_LIMIT))) * there
+    psi = torch.log((grams.yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there
     noise = (grams.yy / grams.values / 10).clamp_min(1e-12).expand(len(columns)).clone()
     noise = torch.where(torch.tensor(noise_dof > 0), torch.ones_like(noise), noise)
     if start is not None:
@@ -155,7 +129,7 @@ def fit_sets(
         if k == iterations:
             break
         step = (0.5 * (size - gamma) - psi / spread**2) / (0.5 * gamma + 1 / spread**2)
-        psi = (psi + step.clamp(-2.0, 2.0) * there).clamp(-_LIMIT, _LIMIT)
+        psi = (psi + step.clamp(-2.0, 2.0) * there).clamp(-LIMIT, LIMIT)
         left = (grams.values - gamma.sum(-1)).clamp_min(0.02 * grams.values + 1)
         noise = ((rss + noise_dof) / (left + noise_dof)).clamp_min(1e-12)
     log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -177,26 +151,17 @@ def of_like_width(sets: Sequence[Sequence[Tensor]]) -> list[list[int]]:
     return list(lots.values())
 
 
-def alone(grams: Grams, groups: Sequence[Tensor], spread: float) -> tuple[Tensor, Tensor]:
-    """Log evidence of no group and of each by itself, and the noise that they leave; `1 + groups` each."""
-    sets: list[list[Tensor]] = [[], *([g] for g in groups)]
-    evidence, noise = grams.xy.new_empty(len(sets)), grams.xy.new_empty(len(sets))
-    for lot in of_like_width(sets):
-        fits = fit_sets(grams, [sets[k] for k in lot], 0.0, spread=spread)
-        evidence[lot], noise[lot] = fits.log_evidence, fits.noise
-    return evidence, noise
-
-
 def _padded(sets: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
     """Columns and slots of every set, `b x M`, padded with -1."""
-    longest = max((sum(len(g) for g in s) for s in sets), default=0)
-    columns = torch.full((len(sets), longest), -1)
-    slot = torch.full((len(sets), longest), -1)
-    for i, groups in enumerate(sets):
-        if groups:
-            flat = torch.cat(list(groups))
-            columns[i, : len(flat)] = flat
-            slot[i, : len(flat)] = torch.repeat_interleave(
-                torch.arange(len(groups)), torch.tensor([len(g) for g in groups])
-            )
+    widths = [[len(g) for g in s] for s in sets]
+    totals = torch.tensor([sum(w) for w in widths], dtype=torch.int64)
+    shape = (len(sets), int(totals.max()) if len(sets) else 0)
+    columns, slot = torch.full(shape, -1), torch.full(shape, -1)
+    flat = [g for s in sets for g in s]
+    if flat:
+        row = torch.repeat_interleave(torch.arange(len(sets)), totals)
+        place = torch.arange(len(row)) - (totals.cumsum(0) - totals)[row]
+        number = torch.tensor([k for w in widths for k in range(len(w))])
+        columns[row, place] = torch.cat(flat)
+        slot[row, place] = torch.repeat_interleave(number, torch.tensor([n for w in widths for n in w]))
     return columns, slot

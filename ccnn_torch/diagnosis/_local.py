@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._catch_all import LOG_PRIOR, joint_moves, platform_moves, spread_out, unit_range
-from ccnn_torch.diagnosis._remainder import Remainder, search_charge
+from ccnn_torch.diagnosis._remainder import Remainder, Tried, search_charge
 from ccnn_torch.diagnosis._whitening import Whitening
 from ccnn_torch.effects import Situation
 
@@ -56,13 +56,13 @@ def local_catch_alls(
     y = y * (_BELIEVED / torch.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min(_BELIEVED))
     # A place is found in a part of many rows as well.
     few = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))[: _MOST_VALUES // y.shape[1]]
-    others = white(others)
+    plain = Remainder(y[few], _LOOSE * white(others)[few])
 
     def atoms(driver: str, points: Tensor, places: Tensor, raw: Tensor) -> list[Atom]:
         """Those of the best bump; raw: the columns that it multiplies, `s x c0 x m`."""
         lead = white(raw)
         # What is the same in all places is no bump.
-        left = Remainder(y[few].flatten(), _LOOSE * torch.cat([others, lead], -1)[few].flatten(0, 1))
+        left = plain.beside(_LOOSE * lead[few])
         place, charge = _searched(points[few], places, lead[few], left, len(lead) / len(few))
         if place is None:
             return []
@@ -115,7 +115,7 @@ def _searched(
     def gain(tried: Tensor) -> Tensor:
         bumps = _bumps(points, tried)
         touched = bumps.sum(0)
-        score = left.gain((lead[None] * bumps.mT[:, :, None, None]).flatten(1, 2))
+        score = left.gain(Tried(bumps.mT[..., None], lead))
         return torch.where((touched > _TOUCHED) & (touched < len(points) / 2), score, -torch.inf)
 
     score = gain(places)

@@ -112,7 +112,7 @@ def _left(analysis: Analysis, judgement: Judgement, fold: Tensor) -> Tensor:
     dictionary, white = analysis.dictionary, analysis.whitening
     keep = white.keep()
     chosen = [dictionary.groups[i] for i in judgement.found.members if not dictionary.atoms[i].catch_all]
-    x, y = analysis.columns[keep], analysis.y[keep]
+    x, y = dictionary.columns, analysis.y
     weight = white.weight[keep].sqrt()[:, None]
     used = torch.cat([torch.arange(0), *chosen])
     left = []

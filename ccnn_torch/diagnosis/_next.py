@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._atoms import scaled_signature
-from ccnn_torch.diagnosis._search import Found, scored
+from ccnn_torch.diagnosis._search import Found, covariance, scored
 from ccnn_torch.diagnosis._verdict import Judgement
 from ccnn_torch.effects import Situation
 
@@ -56,15 +56,15 @@ def next_measurements(analysis: Analysis, judgement: Judgement, seed: int) -> li
         return []
     situation = _candidates(analysis, seed)
     first, x = rivals[0][1], _columns(analysis, rivals[0][1], situation)
-    questions = []
+    questions, own = [], covariance(analysis.dictionary, first)
     for weight, other in rivals[1:]:
         both = torch.cat([x, -_columns(analysis, other, situation)], -1)
-        covariance = torch.block_diag(first.covariance, other.covariance)  # type: ignore[no-untyped-call]
+        joint = torch.block_diag(own, covariance(analysis.dictionary, other))  # type: ignore[no-untyped-call]
         names = sorted(_names(analysis, first) ^ _names(analysis, other))
         mean = torch.cat([*first.mean, *other.mean])
-        questions.append(_Question(both, mean, covariance, weight / rivals[1][0], names, _divergence))
+        questions.append(_Question(both, mean, joint, weight / rivals[1][0], names, _divergence))
     if not questions:
-        questions = [_Question(x, torch.cat(first.mean), first.covariance, 1.0, [], _information)]
+        questions = [_Question(x, torch.cat(first.mean), own, 1.0, [], _information)]
     return _chosen(situation, questions)
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-__all__ = ["Remainder", "search_charge"]
+__all__ = ["Remainder", "Tried", "search_charge"]
 
 _DIGITS = 1e-13
 
@@ -17,31 +18,94 @@ def search_charge(gain: Tensor) -> float:
     return math.log(len(gain)) - float(torch.logsumexp((gain - gain.max()) / 2, 0))
 
 
+class Tried(NamedTuple):
+    """Columns of `g` candidates, whitened.
+
+    Attributes:
+        factors: the columns, `g x s x c x m`; or, where there is a lead, what it is multiplied by, `g x s x m`.
+        lead: columns that all candidates share, `s x c x k`, or None. A candidate's own are all products of the two.
+    """
+
+    factors: Tensor
+    lead: Tensor | None = None
+
+    @property
+    def width(self) -> int:
+        """How many columns a candidate has."""
+        return self.factors.shape[-1] * (1 if self.lead is None else self.lead.shape[-1])
+
+    def first(self, count: int) -> Tried:
+        """The first so many candidates."""
+        return Tried(self.factors[:count], self.lead)
+
+    def one(self, number: int) -> Tensor:
+        """Columns of one candidate, `s x c x m`."""
+        mine = self.factors[number]
+        return mine if self.lead is None else (self.lead[..., None] * mine[:, None, None]).flatten(-2)
+
+
 class Remainder:
     """What nuisance columns with their prior leave of `y`, and of whatever is put beside them."""
 
     def __init__(self, y: Tensor, nuisance: Tensor) -> None:
-        """y: `N`; nuisance: `N x P`, whitened, in units of their prior scale."""
-        gram = nuisance.mT @ nuisance
+        """y: `s x c`; nuisance: `s x c x P`, whitened, in units of their prior scale."""
+        self.y = self._whole = y.reshape(-1)
+        self._rows = y.shape
+        self._taken = y.new_zeros(0, y.numel())
+        self._take(nuisance)
+
+    def beside(self, more: Tensor) -> Remainder:
+        """With more nuisance, `s x c x m`."""
+        if not more.shape[-1]:
+            return self
+        other = object.__new__(Remainder)
+        other.y, other._whole, other._rows, other._taken = self.y, self._whole, self._rows, self._taken
+        other._take(more)
+        return other
+
+    def _take(self, more: Tensor) -> None:
+        flat = more.flatten(0, 1)
+        cross = self._taken @ flat
+        gram = flat.mT @ flat - cross.mT @ cross
         diagonal = gram.diagonal()
         # Columns that are the same, far above the noise, would leave no digit of the 1.
         diagonal += 1 + _DIGITS * diagonal.amax(0, keepdim=True) if len(gram) else 0
         factor = torch.linalg.cholesky(gram)
         # Rows whose Gram matrix is what the nuisance takes out: (I + NᵀN)^-1/2 Nᵀ.
-        self.taken = torch.linalg.solve_triangular(factor, nuisance.mT, upper=False)
-        self.y = y - self.taken.mT @ (self.taken @ y)
+        taken = torch.linalg.solve_triangular(factor, flat.mT - cross.mT @ self._taken, upper=False)
+        self._taken = torch.cat([self._taken, taken])
+        self.y = self.y - taken.mT @ (taken @ self._whole)
 
-    def gain(self, z: Tensor) -> Tensor:
-        """Squares that each candidate explains, `g`; z: `g x N x m`."""
-        inner = z.mT @ z
-        if len(self.taken):
-            count, rows, width = z.shape
-            flat = z.transpose(0, 1).reshape(rows, count * width)
-            cross = (self.taken @ flat).reshape(-1, count, width).transpose(0, 1)
-            inner = inner - cross.mT @ cross
-        b = (z.mT @ self.y[:, None])[..., 0]
+    def gain(self, tried: Tried) -> Tensor:
+        """Squares that each candidate explains, `g`."""
+        inner, cross, b = self._products(tried.factors) if tried.lead is None else self._led(tried.lead, tried.factors)
+        inner = inner - cross.mT @ cross
         ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
         inner = inner + torch.diag_embed(ridge[:, None].expand(-1, inner.shape[-1]))
         solved = torch.linalg.solve(inner, b[..., None])[..., 0]
         gain: Tensor = (b * solved).sum(-1)
         return gain
+
+    def _products(self, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Of columns `g x s x c x m` among themselves, with what is taken, and with y: `g x m x m`, `g x P x m`,
+        `g x m`."""
+        z = columns.flatten(1, 2)
+        count, rows, width = z.shape
+        flat = z.transpose(0, 1).reshape(rows, count * width)
+        cross = (self._taken @ flat).reshape(-1, count, width).transpose(0, 1)
+        return z.mT @ z, cross, (z.mT @ self.y[:, None])[..., 0]
+
+    def _led(self, lead: Tensor, factors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As `_products`: summed over the channels once, and not for every candidate."""
+        rows, channels = self._rows
+        count, _, width = factors.shape
+        leads = lead.shape[-1]
+        flat = factors.transpose(0, 1).reshape(rows, count * width)
+        among = (lead.mT @ lead).permute(1, 2, 0)[None, ..., None]
+        inner = factors.mT[:, None, None] @ (among * factors[:, None, None])
+        inner = inner.transpose(2, 3).reshape(count, leads * width, leads * width)
+        taken = (self._taken.reshape(-1, rows, 1, channels) @ lead).permute(0, 3, 2, 1).reshape(-1, rows)
+        cross = (taken @ flat).reshape(-1, leads, count, width).permute(2, 0, 1, 3).reshape(count, -1, leads * width)
+        along = (lead.mT @ self.y.reshape(rows, channels, 1))[..., 0].mT
+        b = (along @ flat).reshape(leads, count, width).transpose(0, 1).reshape(count, leads * width)
+        return inner, cross, b

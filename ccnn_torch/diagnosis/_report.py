@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._apart import signatures_apart
+from ccnn_torch.diagnosis._search import covariance
 from ccnn_torch.diagnosis._shrink import Gap, HeldOut, held_out, shrink_of
 from ccnn_torch.diagnosis._verdict import Judgement
 
@@ -73,9 +74,9 @@ def noise_floor(analysis: Analysis) -> Tensor:
     if white.known > 0 or not analysis.dictionary.grams.values:
         return white.sigma.square()
     keep = white.keep()
-    left = analysis.y[keep]
+    left = analysis.y
     for i, mean in zip(best.members, best.mean, strict=True):
-        left = left - analysis.columns[keep][..., analysis.dictionary.groups[i]] @ mean
+        left = left - analysis.dictionary.columns[..., analysis.dictionary.groups[i]] @ mean
     free = max(1 - best.effective / analysis.dictionary.grams.values, 0.1)
     # No more than the richest fit leaves.
     share = min(analysis.floor / max(float(left.square().mean()) / free, 1e-300), 1.0)
@@ -120,7 +121,9 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
     atom = atoms[own.members[place]]
     assert atom.effect is not None
     start = sum(len(m) for m in own.mean[:place])
-    deviation = own.covariance.diagonal()[start : start + len(own.mean[place])].clamp_min(0).sqrt()
+    deviation = (
+        covariance(analysis.dictionary, own).diagonal()[start : start + len(own.mean[place])].clamp_min(0).sqrt()
+    )
     coefficients = atom.coefficients(analysis.situation)
     found: dict[str, dict[str, Any]] = {
         c.name: {"value": float(v) * c.scale, "sd": float(d) * c.scale, "unit": c.unit}

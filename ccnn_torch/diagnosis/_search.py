@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis._alone import NOTHING, fit_alone, own_products
 from ccnn_torch.diagnosis._atoms import Atom
-from ccnn_torch.diagnosis._evidence import Fits, Grams, block_grams, crossed, fit_sets, of_like_width
+from ccnn_torch.diagnosis._evidence import Fits, Grams, fit_sets, grams_of, of_like_width
 
-__all__ = ["Dictionary", "Found", "scored", "search"]
+__all__ = ["Dictionary", "Found", "covariance", "scored", "search"]
 
 _MOST = 4
 # Updates of a fit; after the short one no set that came within 12 of the best in the end was 55 below it, in trials.
@@ -25,13 +26,20 @@ _CROWD = math.log(0.1)
 
 @dataclass(frozen=True)
 class Dictionary:
-    """Atoms with their columns side by side: `groups[i]` are the columns of atom i in `grams`.
+    """Candidates, and the inner products of those that sets are made of.
 
-    Between a catch-all and any other atom `grams` holds NaN but where a search has asked for sets of both.
+    Attributes:
+        atoms: all candidates.
+        columns: whitened, of the library effects and then of the catch-alls that are put beside them, side by side,
+            `s x c x P`; rows that count.
+        groups: which of the columns are those of an atom, for the atoms that have such.
+        grams: of the columns; NaN between catch-alls, which are in no set together.
+        noise_dof: as for `fit_sets`.
     """
 
     atoms: tuple[Atom, ...]
-    groups: tuple[Tensor, ...]
+    columns: Tensor
+    groups: Mapping[int, Tensor]
     grams: Grams
     noise_dof: float
 
@@ -40,19 +48,29 @@ class Dictionary:
 class Found:
     """A set of atoms with its log posterior (up to a constant), log evidence, and fit.
 
-    `mean` are the coefficients, atom by atom, in units of their plausible sizes; `energy` the squares that each atom's
-    own part makes; `rss` what the set leaves.
+    `mean` are the coefficients, atom by atom, in units of their plausible sizes, and `log_scale` log α² of each atom's;
+    `energy` the squares that each atom's own part makes; `rss` what the set leaves.
     """
 
     members: tuple[int, ...]
     log_posterior: float
     log_evidence: float
     mean: tuple[Tensor, ...]
-    covariance: Tensor
+    log_scale: tuple[float, ...]
     energy: tuple[float, ...]
     rss: float
     noise: float
     effective: float
+
+
+def covariance(dictionary: Dictionary, found: Found) -> Tensor:
+    """Posterior covariance of the coefficients of a set, atom by atom, in units of their plausible sizes, `m x m`."""
+    index = torch.cat([torch.arange(0), *(dictionary.groups[i] for i in found.members)])
+    own = [m.new_full((len(m),), s / 2).exp() for m, s in zip(found.mean, found.log_scale, strict=True)]
+    scale = torch.cat([dictionary.grams.xy[:0], *own])
+    inner = scale[:, None] * dictionary.grams.xx[index][:, index] * scale / found.noise
+    inverse: Tensor = torch.linalg.inv(inner + torch.eye(len(inner), dtype=inner.dtype))
+    return scale[:, None] * inverse * scale
 
 
 def scored(dictionary: Dictionary, sets: Sequence[tuple[int, ...]]) -> list[Found]:
@@ -97,7 +115,7 @@ def _log_prior(dictionary: Dictionary, members: tuple[int, ...]) -> float:
 def _read(dictionary: Dictionary, sets: Sequence[tuple[int, ...]], fits: Fits) -> dict[tuple[int, ...], Found]:
     found = {}
     numbers = zip(*(v.tolist() for v in (fits.log_evidence, fits.rss, fits.noise, fits.effective)), strict=True)
-    energy = fits.energy.tolist()
+    energy, log_scale = fits.energy.tolist(), fits.log_scale.tolist()
     for row, (members, (evidence, rss, noise, effective)) in enumerate(zip(sets, numbers, strict=True)):
         sizes = [len(dictionary.groups[i]) for i in members]
         mean = fits.mean[row, : sum(sizes)]
@@ -107,7 +125,7 @@ def _read(dictionary: Dictionary, sets: Sequence[tuple[int, ...]], fits: Fits) -
             log_posterior=evidence + _log_prior(dictionary, members),
             log_evidence=evidence,
             mean=torch.split(mean, sizes) if sizes else (),
-            covariance=fits.covariance[row, : sum(sizes), : sum(sizes)],
+            log_scale=tuple(log_scale[row][: len(sizes)]),
             energy=tuple(energy[row][: len(sizes)]),
             rss=rss,
             noise=noise,
@@ -117,24 +135,22 @@ def _read(dictionary: Dictionary, sets: Sequence[tuple[int, ...]], fits: Fits) -
 
 
 def search(
-    atoms: Sequence[Atom], x: Tensor, y: Tensor, noise_dof: float, beam: int = 5
+    atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof: float, beam: int = 5
 ) -> tuple[Dictionary, list[Found]]:
     """Sets by log posterior, best first; no set holds a name twice, or two catch-alls.
 
     Args:
         atoms: candidates.
-        x: their whitened columns side by side, `s x c x P`.
+        x: whitened columns of each, `s x c x m`.
         y: what they explain, whitened, `s x c`.
         noise_dof: as for `fit_sets`.
         beam: how many pairs go on to sets of three.
     """
-    ends = torch.tensor([a.columns.shape[-1] for a in atoms]).cumsum(0).tolist()
-    groups = tuple(torch.arange(e - a.columns.shape[-1], e) for a, e in zip(atoms, ends, strict=True))
-    effects = [g for a, g in zip(atoms, groups, strict=True) if not a.catch_all]
-    grams = crossed(block_grams(x, y, [g for g in groups if len(g)]), x, effects, effects)
-    dictionary = Dictionary(tuple(atoms), groups, grams, noise_dof)
-    tried: dict[tuple[int, ...], Found] = {}
-
+    tried = _singles(atoms, x, y, noise_dof)
+    singles = sorted((f for s, f in tried.items() if s), key=lambda f: -f.log_posterior)
+    known = [f.members[0] for f in singles if not atoms[f.members[0]].catch_all]
+    others = _of_several_drivers([f.members[0] for f in singles if atoms[f.members[0]].catch_all], atoms)
+    dictionary = _dictionary(atoms, x, y, others, noise_dof)
     seen: set[tuple[int, ...]] = set()
 
     def look(sets: Sequence[tuple[int, ...]]) -> None:
@@ -151,13 +167,6 @@ def search(
     def best(size: int, count: int) -> list[Found]:
         return sorted((f for s, f in tried.items() if len(s) == size), key=lambda f: -f.log_posterior)[:count]
 
-    alone = [(), *((i,) for i in range(len(atoms)))]
-    tried.update(zip(alone, scored(dictionary, alone), strict=True))
-    singles = best(1, len(atoms))
-    known = [f.members[0] for f in singles if not atoms[f.members[0]].catch_all]
-    others = _of_several_drivers([f.members[0] for f in singles if atoms[f.members[0]].catch_all], atoms)
-    grams = crossed(grams, x, effects, [groups[i] for i in others])
-    dictionary = Dictionary(tuple(atoms), groups, grams, noise_dof)
     look([s for i in known for j in (*known, *others) if (s := _joined((i,), j, atoms))])
     for size in range(2, _MOST):
         candidates = [*known, *others]
@@ -166,6 +175,50 @@ def search(
         if best(size + 1, 1) and best(size + 1, 1)[0].log_posterior < max(f.log_posterior for f in tried.values()):
             break
     return dictionary, sorted(tried.values(), key=lambda f: -f.log_posterior)
+
+
+def _singles(atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof: float) -> dict[tuple[int, ...], Found]:
+    """No atom, and each by itself."""
+    products = [NOTHING, *(own_products(columns, y) for columns in x)]
+    fits = fit_alone(products, y.square().sum(), float(y.numel()), noise_dof)
+    numbers = zip(
+        *(v.tolist() for v in (fits.log_evidence, fits.log_scale, fits.energy, fits.rss, fits.noise, fits.effective)),
+        strict=True,
+    )
+    found: dict[tuple[int, ...], Found] = {}
+    for k, (mean, (evidence, log_scale, energy, rss, noise, effective)) in enumerate(
+        zip(fits.mean, numbers, strict=True)
+    ):
+        members = (k - 1,) if k else ()
+        prior = atoms[k - 1].log_prior if k else 0.0
+        found[members] = Found(
+            members=members,
+            log_posterior=evidence + prior,
+            log_evidence=evidence,
+            mean=(mean,)[: len(members)],
+            log_scale=(log_scale,)[: len(members)],
+            energy=(energy,)[: len(members)],
+            rss=rss,
+            noise=noise,
+            effective=effective,
+        )
+    return found
+
+
+def _dictionary(
+    atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, others: Sequence[int], noise_dof: float
+) -> Dictionary:
+    """Of the library effects and the catch-alls `others`."""
+    library = [i for i, a in enumerate(atoms) if not a.catch_all]
+    columns = torch.cat([y[..., None][..., :0], *(x[i] for i in (*library, *others))], -1)
+    ends = torch.tensor([x[i].shape[-1] for i in (*library, *others)], dtype=torch.int64).cumsum(0).tolist()
+    groups = {i: torch.arange(e - x[i].shape[-1], e) for i, e in zip((*library, *others), ends, strict=True)}
+    grams = grams_of(columns, y)
+    wild = torch.tensor([-1] * (ends[len(library) - 1] if library else 0) + [k for k in others for _ in groups[k]])
+    apart = (wild[:, None] >= 0) & (wild >= 0) & (wild[:, None] != wild)
+    return Dictionary(
+        tuple(atoms), columns, groups, grams._replace(xx=grams.xx.masked_fill_(apart, torch.nan)), noise_dof
+    )
 
 
 def _of_several_drivers(ranked: Sequence[int], atoms: Sequence[Atom]) -> list[int]:

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import default_shape, scales
-from ccnn_torch.diagnosis._remainder import Remainder, search_charge
+from ccnn_torch.diagnosis._remainder import Remainder, Tried, search_charge
 from ccnn_torch.effects import Effect, Shape, Situation
 
-__all__ = ["Scan", "Shaped"]
+__all__ = ["Ground", "Scan", "Shaped"]
 
 # The grid, then twice this many values between the neighbours of the best.
 _FINE, _ROUNDS = 9, 2
@@ -52,8 +52,26 @@ class _Turn(NamedTuple):
     """Candidates `g x h`, the columns of each part there, and how many of them a part looks at: 0 = none this time."""
 
     candidates: Tensor
-    columns: list[Tensor]
+    columns: list[Tried]
     sizes: list[int]
+
+
+class Ground:
+    """What is to be explained, and what else is there, on the rows that grids are looked at on.
+
+    Attributes:
+        rows: looked at for the grids, and between their values; None = all.
+        left: what the others leave there.
+        times: how many values there are for each that is looked at.
+    """
+
+    def __init__(self, y: Tensor, others: Tensor) -> None:
+        """y: whitened residual, `s x c`; others: whitened columns, in units of their prior, `s x c x P`."""
+        drawn = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))
+        few = [max(1, most // max(y.shape[1], 1)) for most in (_COARSE, _CLOSE)]
+        self.rows = [drawn[:count].sort().values if count < len(y) else None for count in few]
+        self.left = [Remainder(_of(y, rows, 0), _LOOSE * _of(others, rows, 0)) for rows in self.rows]
+        self.times = [y.numel() / left.y.numel() for left in self.left]
 
 
 class Scan:
@@ -77,69 +95,62 @@ class Scan:
         self.movers = _movers(first) if self.lead is not None else None
         free = [c for c in range(len(coefficients)) if not any(c in p.columns for p in self.parts)]
         self.unshaped = self._whitened(first[:1], free, None)[0]
-        rows = len(situation.joints)
-        drawn = torch.randperm(rows, generator=torch.Generator().manual_seed(0))
-        few = [max(1, most * rows // max(len(self.unshaped.flatten(0, 1)), 1)) for most in (_COARSE, _CLOSE)]
-        self.rows = [drawn[:count].sort().values if count < rows else None for count in few]
         self.coarse: list[_Turn] | None = None
 
-    def columns(self, candidates: Tensor, rows: Tensor | None) -> list[Tensor]:
-        """Of each part, whitened, in plausible sizes, `g x N x m`; candidates: `g x h`; rows: which, None = all."""
+    def columns(self, candidates: Tensor, rows: Tensor | None) -> list[Tried]:
+        """Of each part, whitened, in plausible sizes; candidates: `g x h`; rows: which, None = all."""
         if self.movers is not None and isinstance(self.effect, _OneByOne):
             moved = self.effect.one_by_one(self.situation, candidates)
-            return [self._by_movers(moved[..., p.columns], p.columns, rows).flatten(1, 2) for p in self.parts]
+            return [self._by_movers(moved[..., p.columns], p.columns, rows) for p in self.parts]
         basis = self.effect.basis(self.situation, candidates)
-        return [self._whitened(basis, part.columns, rows).flatten(1, 2) for part in self.parts]
+        if self.movers is None:
+            return [Tried(self._whitened(basis, part.columns, rows)) for part in self.parts]
+        return [self._by_movers(basis[..., self.movers[p.columns], p.columns], p.columns, rows) for p in self.parts]
 
-    def _by_movers(self, moved: Tensor, columns: list[int], rows: Tensor | None) -> Tensor:
-        """`g x s x c x m`; moved: change of the joint or parameter that each of the columns moves, `g x s x m`."""
+    def _by_movers(self, moved: Tensor, columns: list[int], rows: Tensor | None) -> Tried:
+        """moved: change of the joint or parameter that each of the columns moves, `g x s x m`."""
         assert self.lead is not None and self.movers is not None
         one = torch.nan_to_num(_of(moved, rows, 1) * self.size[columns])
-        return _of(self.lead, rows, 0)[..., self.movers[columns]] * one[..., None, :]
+        lead, movers = _of(self.lead, rows, 0), self.movers[columns]
+        if len(columns) and bool((movers == movers[0]).all()):
+            return Tried(one, lead[..., movers[:1]])
+        return Tried(lead[..., movers] * one[..., None, :])
 
     def _whitened(self, basis: Tensor, columns: list[int], rows: Tensor | None) -> Tensor:
         """`g x s x c x m`."""
         if self.lead is None:
             mine = basis[..., columns] * self.size[columns]
             return torch.nan_to_num(torch.stack([_of(self.whiten(b), rows, 0) for b in mine]))
-        if self.movers is not None:
-            return self._by_movers(basis[..., self.movers[columns], columns], columns, rows)
         mine = _of(basis, rows, 1)[..., columns] * self.size[columns]
         return torch.nan_to_num(_of(self.lead, rows, 0) @ mine)
 
-    def best(self, y: Tensor, others: Tensor, start: Tensor | None = None) -> Shaped:
-        """The shapes that explain most of `y`.
+    def best(self, ground: Ground, start: Tensor | None = None) -> Shaped:
+        """The shapes that explain most.
 
         Args:
-            y: whitened residual, `s x c`.
-            others: whitened columns of what else is there, in units of their prior, `s x c x P`; P may be 0.
+            ground: what is to be explained, and beside what.
             start: shapes found before, when the effect is known to be there: its parts are then looked for beside each
                 other.
         """
         value = self.start if start is None else start
-        beside = _LOOSE * torch.cat([others, self.unshaped], -1)
         gains = [0.0] * len(self.parts)
         charges = [0.0] * len(self.parts)
         for level in range(_ROUNDS + 1):
-            rows = self.rows[min(level, 1)]
+            which = min(level, 1)
             if level < 2:
-                target, fixed = _of(y, rows, 0).flatten(), _of(beside, rows, 0).flatten(0, 1)
-                plain = Remainder(target, fixed)
-            # Squares of all rows, as the part of them that was looked at tells.
-            times = y.numel() / len(target)
-            for candidates, pieces, sizes in self._level(value, level):
+                plain = ground.left[which].beside(_LOOSE * _of(self.unshaped, ground.rows[which], 0))
+            times = ground.times[which]
+            for candidates, pieces, sizes in self._level(value, level, ground.rows[which]):
                 chosen = [self._nearest(candidates, value, part) for part in self.parts]
                 spent = [0.0] * len(self.parts)
                 for sweep in range(2 if start is not None and len(self.parts) > 1 else 1):
-                    for i, z in enumerate(pieces):
+                    for i, piece in enumerate(pieces):
                         if not sizes[i]:
                             continue
-                        left = plain
-                        if sweep:
-                            own = [_LOOSE * p[chosen[j]] for j, p in enumerate(pieces) if j != i]
-                            left = Remainder(target, torch.cat([fixed, *own], -1))
+                        own = [_LOOSE * p.one(chosen[j]) for j, p in enumerate(pieces) if sweep and j != i]
+                        left = plain.beside(torch.cat(own, -1)) if own else plain
                         # What chance explains does not grow with the rows.
-                        score = times * (left.gain(z[: sizes[i]]) - z.shape[-1]) + z.shape[-1]
+                        score = times * (left.gain(piece.first(sizes[i])) - piece.width) + piece.width
                         chosen[i] = int(score.argmax())
                         gains[i] = float(score[chosen[i]])
                         spent[i] = search_charge(score) if level == 0 else 0.0
@@ -149,7 +160,7 @@ class Scan:
                     value[part.shapes] = candidates[chosen[i]][part.shapes]
         return self._worth(value, gains, charges)
 
-    def _level(self, value: Tensor, level: int) -> list[_Turn]:
+    def _level(self, value: Tensor, level: int, rows: Tensor | None) -> list[_Turn]:
         """Candidates with their columns: of every part all its shapes at once where that are few, else one by one."""
         if level == 0 and self.coarse is not None:
             return self.coarse
@@ -166,7 +177,7 @@ class Scan:
                     candidates[: len(table), part.shapes] = table
                     candidates[len(table) :, part.shapes] = table[-1]
             sizes = [len(table) if table.shape[-1] else 0 for table in mine]
-            found.append(_Turn(candidates, self.columns(candidates, self.rows[min(level, 1)]), sizes))
+            found.append(_Turn(candidates, self.columns(candidates, rows), sizes))
         if level == 0:
             self.coarse = found
         return found

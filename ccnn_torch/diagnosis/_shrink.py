@@ -53,7 +53,7 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     Rows are dealt to the folds in runs of neighbours, at random: neighbours in time share more than others do.
     """
     keep = analysis.whitening.keep()
-    x, y = analysis.columns[keep], analysis.y[keep]
+    x, y = analysis.dictionary.columns, analysis.y
     fold = folds(len(keep), seed)
     weight = analysis.whitening.weight[keep].sqrt()[:, None]
     sigma = analysis.whitening.sigma

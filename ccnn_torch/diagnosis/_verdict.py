@@ -169,9 +169,12 @@ def _could_be_another(analysis: Analysis, found: Found) -> bool:
     own = torch.cat([groups[i] for i in found.members])
     inverse = torch.linalg.pinv(grams.xx[own][:, own], rtol=1e-9, hermitian=True)
     gap = float(grams.yy) - analysis.floor * grams.values
-    for atom, group in zip(atoms, groups, strict=True):
+    for i, atom in enumerate(atoms):
+        if atom.catch_all or atom.name in names:
+            continue
+        group = groups[i]
         total = float(grams.xx[group, group].sum())
-        if atom.catch_all or atom.name in names or total <= 0:
+        if total <= 0:
             continue
         cross = grams.xx[own][:, group]
         if gap * (1 - float((cross * (inverse @ cross)).sum()) / total) < _MIMICKED:

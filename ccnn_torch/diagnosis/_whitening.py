@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._evidence import alone, block_grams, fit_sets, grams_of
+from ccnn_torch.diagnosis._alone import NOTHING, Own, fit_alone, own_products
+from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
 from ccnn_torch.effects import Situation
 
 __all__ = ["NO_NOISE", "Whitening", "fitted_whitening", "moving_channels", "reweighted"]
@@ -40,12 +41,12 @@ class Whitening:
 
     def __call__(self, values: Tensor) -> Tensor:
         """`s x c0` or `s x c0 x m` raw to `s x c` or `s x c x m`, in units of the noise, rows weighted."""
-        flat = values.dim() == 2
-        three = values.unsqueeze(-1) if flat else values
-        if len(self.channels) < three.shape[1]:
-            three = three[:, self.channels]
-        three = three * (self.weight.sqrt()[:, None] / self.sigma).unsqueeze(-1)
-        return three.squeeze(-1) if flat else three
+        return self.scaled(values[:, self.channels] if len(self.channels) < values.shape[1] else values)
+
+    def scaled(self, values: Tensor) -> Tensor:
+        """As calling it, of the channels alone: `s x c` or `s x c x m`."""
+        scale = self.weight.sqrt()[:, None] / self.sigma
+        return values * (scale if values.dim() == 2 else scale[..., None])
 
     def keep(self) -> Tensor:
         """Indices of the rows that count."""
@@ -82,47 +83,57 @@ def fitted_whitening(
     rms = rms.clamp_min(NO_NOISE)
     sigma = rms if noise is None else noise[channels]
     white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0)
-    shown = [c / _size(c[usable][:, channels] / sigma[:, None]) for c in columns if c.shape[-1]]
-    unit = torch.cat(shown, -1)
-    ends = torch.tensor([c.shape[-1] for c in shown]).cumsum(0).tolist()
-    groups = [torch.arange(e - c.shape[-1], e) for c, e in zip(shown, ends, strict=True)]
+    units = [c[:, channels] for c in columns if c.shape[-1]]
+    units = [u / _size(u[usable] / sigma[:, None]) for u in units]
+    y = residual[:, channels]
     if noise is None:
-        white = replace(white, sigma=sigma * _noise_share(white(unit), white(residual), groups).sqrt())
-    chosen: list[Tensor] = []
+        white = replace(white, sigma=sigma * _noise_share(units, y, white).sqrt())
+    chosen: list[int] = []
     least = None if noise is not None else (1e-4 * rms).clamp_min(NO_NOISE)
-    left, free = residual, 1.0
+    left, free = y, 1.0
     for _ in range(_RICH):
         if chosen:
-            own = unit[..., torch.cat(chosen)]
-            ends = torch.tensor([len(g) for g in chosen]).cumsum(0).tolist()
-            parts = [torch.arange(e - len(g), e) for e, g in zip(ends, chosen, strict=True)]
-            fit = fit_sets(grams_of(white(own), white(residual)), [parts], 0.0, spread=_ANY_SIZE)
-            left = residual - own @ fit.mean[0]
+            own = torch.cat([units[k] for k in chosen], -1)
+            ends = torch.tensor([units[k].shape[-1] for k in chosen]).cumsum(0).tolist()
+            parts = [torch.arange(e - units[k].shape[-1], e) for e, k in zip(ends, chosen, strict=True)]
+            fit = fit_sets(grams_of(white.scaled(own), white.scaled(y)), [parts], 0.0, spread=_ANY_SIZE)
+            left = y - own @ fit.mean[0]
             free = max(1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), 0.1)
             white = _settled(white, left, usable, free, least)
-        rest = [g for g in groups if not any(g is c for c in chosen)]
-        if not rest:
+        target = white.scaled(left)
+        products = [NOTHING if k in chosen else own_products(white.scaled(u), target) for k, u in enumerate(units)]
+        fits = fit_alone([NOTHING, *products], target.square().sum(), float(target.numel()), 0.0, _ANY_SIZE)
+        best = int(fits.log_evidence[1:].argmax())
+        if not units or float(fits.log_evidence[best + 1] - fits.log_evidence[0]) < _SLIGHT:
             break
-        evidence, _ = alone(block_grams(white(unit), white(left), rest), rest, _ANY_SIZE)
-        best = int(evidence[1:].argmax())
-        if float(evidence[best + 1] - evidence[0]) < _SLIGHT:
-            break
-        chosen.append(rest[best])
+        chosen.append(best)
     white = _settled(white, left, usable, free, least)
     return replace(white, known=0.0 if noise is None else 50.0)
 
 
-def _noise_share(x: Tensor, y: Tensor, groups: Sequence[Tensor]) -> Tensor:
+def _noise_share(units: Sequence[Tensor], y: Tensor, white: Whitening) -> Tensor:
     """Of the squares of each channel what the candidate that explains it best by itself leaves, `c`.
 
     Channel by channel: one that is almost all gap would else be lost in the noise of the others.
+
+    Args:
+        units: columns of each candidate, `s x c x m` [m, rad].
+        y: residual, `s x c` [m, rad].
+        white: noise and weights so far.
     """
+    target = white.scaled(y).mT
+    groups: list[list[Own]] = [[NOTHING] for _ in target]
+    for u in units:
+        x = white.scaled(u).transpose(0, 1)
+        square, along = x.mT @ x, (x.mT @ target[..., None])[..., 0]
+        for mine, xx, xy in zip(groups, square, along, strict=True):
+            mine.append(Own(xx, xy))
     share = []
-    for c in range(y.shape[-1]):
-        evidence, left = alone(block_grams(x[:, c : c + 1], y[:, c : c + 1], groups), groups, _ANY_SIZE)
-        best = int(evidence.argmax())
-        clear = float(evidence[best] - evidence[0]) > _SLIGHT
-        share.append(left[best] / left[0] if clear else torch.ones_like(left[0]))
+    for mine, one in zip(groups, target, strict=True):
+        fits = fit_alone(mine, one.square().sum(), float(len(one)), 0.0, _ANY_SIZE)
+        best = int(fits.log_evidence.argmax())
+        clear = float(fits.log_evidence[best] - fits.log_evidence[0]) > _SLIGHT
+        share.append(fits.noise[best] / fits.noise[0] if clear else torch.ones_like(fits.noise[0]))
     return torch.stack(share).clamp(1e-6, 1.0)
 
 
@@ -131,26 +142,26 @@ def _size(values: Tensor) -> Tensor:
 
 
 def _settled(white: Whitening, left: Tensor, usable: Tensor, free: float, least: Tensor | None) -> Whitening:
-    """Noise (unless it is known: `least` None) and weights from what a fit leaves.
+    """Noise (unless it is known: `least` None) and weights from what a fit leaves, `s x c`.
 
     No channel's noise is below `least`: a perfect fit knows nothing of the noise.
     """
     if least is not None:
         rows = white.weight > 0
-        spread = left[rows][:, white.channels].abs().median(0).values * 1.4826 / free**0.5
+        spread = left[rows].abs().median(0).values * 1.4826 / free**0.5
         white = replace(white, sigma=torch.maximum(spread, least))
     return reweighted(white, left, usable, free)
 
 
 def reweighted(white: Whitening, left: Tensor, usable: Tensor, free: float) -> Whitening:
-    """Weights of rows from what a fit leaves, `s x c0`.
+    """Weights of rows from what a fit leaves, `s x c`.
 
     Rows beyond six times the usual are set aside, no more than a fifth of them. The others count by Student's t only
     where the remainder has heavier tails than a normal one: with normal noise every weight would be thrown away for
     nothing.
     """
     c = len(white.channels)
-    size = (left[:, white.channels] / white.sigma).square().sum(-1) / max(free, 0.1)
+    size = (left / white.sigma).square().sum(-1) / max(free, 0.1)
     # Brought to the median of chi-squared with c degrees (Wilson and Hilferty).
     size = size * (c * (1 - 2 / (9 * c)) ** 3) / size[usable].median().clamp_min(1e-12)
     gross = size > (_GROSS**2) * max(1.0, c / 2)

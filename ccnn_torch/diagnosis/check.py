@@ -67,10 +67,10 @@ def check_rows(
     keep = white.keep()
     spans: dict[str, Tensor] = {}
     weak = {}
-    for atom, group in zip(analysis.dictionary.atoms, analysis.dictionary.groups, strict=True):
+    for i, atom in enumerate(analysis.dictionary.atoms):
         if atom.catch_all or atom.name in spans:
             continue
-        x = analysis.columns[keep][..., group].flatten(0, 1)
+        x = analysis.dictionary.columns[..., analysis.dictionary.groups[i]].flatten(0, 1)
         spans[atom.name] = x
         size = float(x.square().sum(-1).mean().sqrt())
         if size < 1:

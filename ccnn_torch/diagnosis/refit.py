@@ -60,7 +60,7 @@ def refit(
         fit = fit_sets(grams_of(white(every), white(target)), [groups], 0.0)
         mean = fit.mean[0]
         acting = [_acting(k, situation, mean[end - len(k.used) : end]) for k, end in zip(known, ends, strict=False)]
-        left = target - every @ mean
+        left = (target - every @ mean)[:, white.channels]
         free = 1 - float(fit.effective[0]) / max(float(fine.sum()) * len(white.channels), 1.0)
         white = reweighted(white, left, fine, max(free, 0.1))
     return acting

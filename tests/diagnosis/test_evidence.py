@@ -9,7 +9,9 @@ import torch
 from diagnosis._machines import rows_of
 from scipy.stats import multivariate_normal
 
+from ccnn_torch.diagnosis._alone import NOTHING, fit_alone, own_products
 from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
+from ccnn_torch.diagnosis._remainder import Remainder, Tried
 from ccnn_torch.effects import make_effect
 
 
@@ -60,3 +62,35 @@ def test_columns_without_their_zeros_are_the_columns(name: str) -> None:
     own = effect.one_by_one(situation, shape)  # type: ignore[attr-defined]
     assert torch.equal(dense.sum(-2), own)
     assert int((dense != 0).sum(-2).max()) == 1
+
+
+def test_what_is_put_beside_in_parts_takes_what_it_takes_at_once() -> None:
+    y, x = _columns(6, 60, 1).reshape(30, 2), 5 * _columns(7, 60, 9).reshape(30, 2, 9)
+    at_once, in_parts = Remainder(y, x), Remainder(y, x[..., :4]).beside(x[..., 4:])
+    factors, lead = _columns(8, 30, 12).reshape(30, 4, 3).transpose(0, 1), _columns(9, 60, 2).reshape(30, 2, 2)
+    led = Tried(factors, lead)
+    plain = Tried(torch.stack([led.one(k) for k in range(4)]))
+    wanted = at_once.gain(plain)
+    # By the textbook: what M(I + MᵀM)^-1 Mᵀ leaves of y and of the columns.
+    flat, columns = x.flatten(0, 1), plain.factors.flatten(1, 2)
+    leave = torch.linalg.inv(torch.eye(60, dtype=y.dtype) + flat @ flat.mT)
+    along = columns.mT @ leave @ y.flatten()
+    assert wanted == pytest.approx(
+        (along * torch.linalg.solve(columns.mT @ leave @ columns, along)).sum(-1).numpy(), rel=1e-5
+    )
+    for left in (at_once, in_parts):
+        for tried in (led, plain):
+            assert left.gain(tried) == pytest.approx(wanted.numpy(), rel=1e-9)
+
+
+def test_groups_in_their_axes_are_as_sets_of_one() -> None:
+    x, y = _columns(10, 40, 9), _columns(11, 40, 1)[..., 0]
+    x[..., 8] = x[..., 7]
+    groups = [torch.arange(0, 3), torch.arange(3, 7), torch.arange(7, 9)]
+    found = fit_alone([NOTHING, *(own_products(x[..., g], y) for g in groups)], y.square().sum(), 40.0, 5.0)
+    for k, group in enumerate([[], *([g] for g in groups)]):
+        one = fit_sets(grams_of(x, y), [group], 5.0)
+        assert float(found.log_evidence[k]) == pytest.approx(float(one.log_evidence[0]), rel=1e-9)
+        assert found.mean[k] == pytest.approx(one.mean[0].numpy(), rel=1e-6)
+        for name in ("noise", "rss", "effective"):
+            assert float(getattr(found, name)[k]) == pytest.approx(float(getattr(one, name)[0]), rel=1e-9)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
 from ccnn_torch.diagnosis._next import _candidates, _columns, _possible
-from ccnn_torch.diagnosis._search import Found
+from ccnn_torch.diagnosis._search import Found, covariance
 from ccnn_torch.effects import Situation
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.records import read_table, stack_columns
@@ -78,12 +78,13 @@ def test_chosen_rows_say_more_together_than_any_drawn_at_random_would() -> None:
     there = _candidates(analysis, 0)
     x = torch.cat([_columns(analysis, first, there), -_columns(analysis, second, there)], -1)
     mean = torch.cat([*first.mean, *second.mean])
-    covariance = torch.block_diag(first.covariance, second.covariance)  # type: ignore[no-untyped-call]
+    own = [covariance(analysis.dictionary, one) for one in (first, second)]
+    joint = torch.block_diag(*own)  # type: ignore[no-untyped-call]
 
     def said_by(chosen: Tensor) -> float:
         """Half the square of the difference in units of what is open, of all rows at once."""
         flat = x[chosen].flatten(0, 1)
-        open_ = torch.eye(len(flat), dtype=flat.dtype) + flat @ covariance @ flat.mT
+        open_ = torch.eye(len(flat), dtype=flat.dtype) + flat @ joint @ flat.mT
         difference = flat @ mean
         return float(0.5 * difference @ torch.linalg.solve(open_, difference))
 

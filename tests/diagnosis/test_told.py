@@ -50,11 +50,11 @@ def test_why_one_effect_is_not_told_from_another_is_their_angle() -> None:
     pairs = [{"joint_offset", other} for other in effect["signatures"]]
     assert all(set(m["separates"]) in pairs for m in said.next_measurements[:3])
     analysis, found = said.analysis, said.judgement.found
-    keep, dictionary = analysis.whitening.keep(), analysis.dictionary
+    dictionary = analysis.dictionary
 
     def columns(name: str) -> np.ndarray:
         atom = next(i for i, a in enumerate(dictionary.atoms) if a.name == name)
-        return analysis.columns[keep][..., dictionary.groups[atom]].flatten(0, 1).numpy()
+        return dictionary.columns[..., dictionary.groups[atom]].flatten(0, 1).numpy()
 
     q, _ = np.linalg.qr(columns("compliance"))
     place = [dictionary.atoms[i].name for i in found.members].index("joint_offset")

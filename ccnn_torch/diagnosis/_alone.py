@@ -1,0 +1,114 @@
+"""Evidence of many groups of columns, each by itself: as `_evidence.fit_sets`, in the principal axes of every group.
+
+There a group's inner products are numbers, not a matrix: however many groups there are and however wide, one update of
+all of them is a few operations on one table.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis._evidence import LIMIT, SPREAD
+
+__all__ = ["NOTHING", "Alone", "Own", "fit_alone", "own_products"]
+
+_UPDATES = 8
+# Principal axes with less than this share of the largest one's squares are rounding.
+_DIGITS = 1e-14
+
+
+class Own(NamedTuple):
+    """Inner products of one group of columns: `xx` `m x m` with itself, `xy` `m` with what is to be explained."""
+
+    xx: Tensor
+    xy: Tensor
+
+
+NOTHING = Own(torch.zeros(0, 0), torch.zeros(0))
+"""A group of no columns."""
+
+
+class Alone(NamedTuple):
+    """One entry a group, `b` groups.
+
+    Attributes:
+        log_evidence: `b`.
+        noise: σ² in the units of y, `b`.
+        mean: posterior means of the coefficients, `m` each.
+        energy: Σ (X θ)², `b`.
+        rss: remaining sum of squares, `b`.
+        effective: number of coefficients that the data determine, `b`.
+        log_scale: log α², `b`.
+    """
+
+    log_evidence: Tensor
+    noise: Tensor
+    mean: list[Tensor]
+    energy: Tensor
+    rss: Tensor
+    effective: Tensor
+    log_scale: Tensor
+
+
+def own_products(x: Tensor, y: Tensor) -> Own:
+    """x: whitened columns, `... x m`; y: what they explain, `...`."""
+    flat = x.flatten(0, -2)
+    return Own(flat.mT @ flat, flat.mT @ y.reshape(-1))
+
+
+def fit_alone(groups: Sequence[Own], yy: Tensor, values: float, noise_dof: float, spread: float = SPREAD) -> Alone:
+    """Fit every group by itself; `NOTHING` is what there is without any.
+
+    Args:
+        groups: inner products of each.
+        yy: sum of the squares to be explained, 0-dim.
+        values: how many they are.
+        noise_dof: weight of the prior of σ² about 1, in values; 0 = the noise is not known.
+        spread: standard deviation of log α².
+    """
+    square, along, axes = _in_axes(groups, yy)
+    there = torch.tensor([float(len(g.xy) > 0) for g in groups], dtype=square.dtype)
+    trace = square.sum(-1).clamp_min(1e-300)
+    psi = torch.log((yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there
+    noise = torch.ones_like(trace) if noise_dof > 0 else (yy / values / 10).clamp_min(1e-12).expand(len(groups))
+    for k in range(_UPDATES + 1):
+        scale = psi.exp()[:, None]
+        diagonal = 1 + scale * square / noise[:, None]
+        mean = scale * along / noise[:, None] / diagonal
+        gamma = (1 - 1 / diagonal).sum(-1)
+        rss = (yy - 2 * (mean * along).sum(-1) + (square * mean.square()).sum(-1)).clamp_min(0)
+        if k == _UPDATES:
+            break
+        size = (mean.square() / scale).sum(-1)
+        step = (0.5 * (size - gamma) - psi / spread**2) / (0.5 * gamma + 1 / spread**2)
+        psi = (psi + step.clamp(-2.0, 2.0) * there).clamp(-LIMIT, LIMIT)
+        left = (values - gamma).clamp_min(0.02 * values + 1)
+        noise = ((rss + noise_dof) / (left + noise_dof)).clamp_min(1e-12)
+    explained = (mean * along).sum(-1) / noise
+    evidence = 0.5 * (-values * noise.log() - yy / noise + explained - diagonal.log().sum(-1))
+    evidence = evidence - 0.5 * noise_dof * (noise.log() + 1 / noise - 1)
+    evidence = evidence + (-0.5 * psi.square() / spread**2 - 0.5 * torch.log1p(0.5 * gamma * spread**2)) * there
+    back = [v @ m[: v.shape[-1]] for v, m in zip(axes, mean, strict=True)]
+    return Alone(evidence, noise, back, (square * mean.square()).sum(-1), rss, gamma, psi)
+
+
+def _in_axes(groups: Sequence[Own], yy: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+    """Squares and products with y along each group's principal axes, `b x M`, padded with 0; and the axes, `m x m`."""
+    widths = [len(g.xy) for g in groups]
+    square, along = yy.new_zeros(len(groups), max(widths, default=0)), yy.new_zeros(len(groups), max(widths, default=0))
+    axes = [yy.new_zeros(0, 0) for _ in groups]
+    for width in sorted(set(widths) - {0}):
+        mine = [k for k, w in enumerate(widths) if w == width]
+        values, vectors = torch.linalg.eigh(torch.stack([groups[k].xx for k in mine]))
+        products = (vectors.mT @ torch.stack([groups[k].xy for k in mine])[..., None])[..., 0]
+        real = values > _DIGITS * values[:, -1:]
+        square[mine, :width] = torch.where(real, values, 0.0)
+        along[mine, :width] = torch.where(real, products, 0.0)
+        for k, v in zip(mine, vectors, strict=True):
+            axes[k] = v
+    return square, along, axes
