@@ -27,6 +27,8 @@ _GAIN = 3.0
 # a share of the noise's square.
 _SAME_NOISE, _SAME_FIT = 0.1, 0.01
 _FAR_BELOW = 0.5
+# Values of the residual that the search for a set to start from takes, at most.
+_START = 1200
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,10 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     fixed, starts = first_candidates(situation, atoms, white, residual, usable, fitted)
     jacobian = torch.where(usable[:, None, None], situation.jacobian, 0.0)
     local = [cleaned(a, usable) for a in local_catch_alls(situation, jacobian, residual, white, fitted)]
-    result = _searched(situation, measured, residual, white, [*fixed, *starts, *rest, *local], near, rich, fitted)
+    # Only where to start from: a part of the rows will do.
+    few = _drawn(white.keep(), len(channels))
+    every = [*fixed, *starts, *rest, *local]
+    result = _searched(situation, measured, residual, white, every, near, rich, fitted, few)
 
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
     before: tuple[str, ...] | None = None
@@ -118,7 +123,10 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
             there, target, ok = situation, residual, usable
         target = torch.where(ok[:, None], target, 0.0)
         white = new if bool((ok == usable).all()) else _renewed(result, noise, ok)
-        atoms = renewed_candidates(situation, there, measured, target, effects, acting, starts, white, ok, fitted)
+        known = atoms if same else []
+        atoms = renewed_candidates(
+            situation, there, measured, target, effects, acting, starts, known, white, ok, fitted
+        )
         beside = torch.cat([fitted, *(a.columns for a in atoms if a.name in before)], -1)
         again = local_catch_alls(situation, jacobian, target, white, beside)
         places = [*local, *(cleaned(a, ok) for a in again)]
@@ -169,8 +177,10 @@ def _searched(
     near: Tensor,
     rich: Tensor,
     fitted: Tensor,
+    few: Tensor | None = None,
 ) -> Analysis:
-    keep = white.keep()
+    """few: rows for a quick look, `t`; None = all that count, thoroughly."""
+    keep = white.keep() if few is None else few
     rows = slice(None) if len(keep) == len(target) else keep
     columns, y = [white(a.columns)[rows] for a in atoms], white(target)[rows]
     if fitted.shape[-1]:
@@ -181,12 +191,18 @@ def _searched(
         columns = [(c.flatten(0, 1) - q @ (q.mT @ c.flatten(0, 1))).reshape(c.shape) for c in columns]
     # Noise that was given is right to some per cent, however many rows there are.
     known = white.known * (1 + y.numel() / 100)
-    dictionary, found = search(atoms, columns, y, known)
+    dictionary, found = search(atoms, columns, y, known, quick=few is not None)
     # The richest fit knows no shapes: where these are most of the gap the best set leaves far less.
     left = found[0].rss / max(y.numel() - found[0].effective, 1.0)
     floor = min(float((rich / white.sigma).square().mean()), 1.0)
     floor = left if white.known == 0 and left < _FAR_BELOW * floor else floor
     return Analysis(situation, measured, target, white, dictionary, y, found, near, floor)
+
+
+def _drawn(rows: Tensor, channels: int) -> Tensor:
+    """As many of the rows as are enough to start from, in order."""
+    drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[: max(_START // channels, 1)]
+    return rows[drawn.sort().values]
 
 
 def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitening:

@@ -73,6 +73,7 @@ def renewed_candidates(
     effects: Sequence[Effect],
     acting: Sequence[Acting],
     starts: Sequence[Atom],
+    known: Sequence[Atom],
     white: Whitening,
     usable: Tensor,
     fitted: Tensor,
@@ -86,6 +87,7 @@ def renewed_candidates(
         effects: candidates.
         acting: those of the best set.
         starts: shapes found at first: they stay candidates, since what acts now may have hidden the better ones.
+        known: candidates from when the same effects acted last: shapes found beside these are not looked for again.
         white, usable, fitted: as in `first_candidates`.
     """
 
@@ -108,10 +110,14 @@ def renewed_candidates(
             part = _best_part(situation, atoms[-1], white, left)
             atoms += [part] if part is not None else []
             continue
-        if len(others) not in grounds or len(others) < len(acting):
-            grounds[len(others)] = ground(others)
-        start = next((a.shape for a in acting if a.effect is effect), None)
-        shaped = Scan(situation, there, effect, _only(white, usable)).best(grounds[len(others)], start)
+        last = next((a for a in known if a.effect is effect), None)
+        if last is not None and len(others) == len(acting):
+            shaped = Shaped(last.shape, last.used, LOG_PRIOR - last.log_prior)
+        else:
+            if len(others) not in grounds or len(others) < len(acting):
+                grounds[len(others)] = ground(others)
+            start = next((a.shape for a in acting if a.effect is effect), None)
+            shaped = Scan(situation, there, effect, _only(white, usable)).best(grounds[len(others)], start)
         atoms.append(cleaned(_atom(situation, there, effect, shaped), usable))
         for old in (a for a in starts if a.effect is effect and not _same_shape(a, shaped)):
             so = Shaped(old.shape, old.used, LOG_PRIOR - old.log_prior)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -153,7 +152,7 @@ def _configuration(situation: Situation) -> list[Tensor]:
 
 def _under(situation: Situation, load: str) -> Situation:
     """The rows with one load alone."""
-    return replace(situation, covariates={load: situation.covariates[load]})
+    return situation.with_covariates({load: situation.covariates[load]})
 
 
 def _asked(situation: Situation) -> Tensor:

@@ -16,6 +16,8 @@ from torch import Tensor
 __all__ = ["LIMIT", "SPREAD", "Fits", "Grams", "fit_sets", "grams_of", "of_like_width", "without"]
 
 _BUCKET = 16
+# Columns up to which XᵀX is made as a whole.
+_NARROW = 128
 # Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
 SPREAD = 4.0
 LIMIT = 25.0
@@ -62,7 +64,18 @@ class Fits(NamedTuple):
 def grams_of(x: Tensor, y: Tensor) -> Grams:
     """x: `s x c x P` whitened columns; y: `s x c`."""
     flat, value = x.flatten(0, 1), y.reshape(-1)
-    return Grams(flat.mT @ flat, flat.mT @ value, value @ value, float(len(value)))
+    return Grams(_squares(flat), flat.mT @ value, value @ value, float(len(value)))
+
+
+def _squares(flat: Tensor) -> Tensor:
+    """XᵀX, `P x P`; of many columns the half above the diagonal, mirrored."""
+    width = flat.shape[-1]
+    if width <= _NARROW:
+        return flat.mT @ flat
+    first, second = flat[:, : width // 2], flat[:, width // 2 :]
+    across = first.mT @ second
+    rows = [torch.cat([_squares(first), across], -1), torch.cat([across.mT, _squares(second)], -1)]
+    return torch.cat(rows)
 
 
 def without(grams: Grams, x: Tensor, y: Tensor, columns: Tensor) -> Grams:

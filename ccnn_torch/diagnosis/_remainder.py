@@ -44,6 +44,16 @@ class Tried(NamedTuple):
         return mine if self.lead is None else (self.lead[..., None] * mine[:, None, None]).flatten(-2)
 
 
+class _Led(NamedTuple):
+    """Sums over the channels of what a lead `s x c x k` is multiplied with: itself, `k x k x s`; what is taken,
+    `(P k) x s`; and what is left of y, `k x s`."""
+
+    lead: Tensor
+    among: Tensor
+    taken: Tensor
+    along: Tensor
+
+
 class Remainder:
     """What nuisance columns with their prior leave of `y`, and of whatever is put beside them."""
 
@@ -52,6 +62,7 @@ class Remainder:
         self.y = self._whole = y.reshape(-1)
         self._rows = y.shape
         self._taken = y.new_zeros(0, y.numel())
+        self._last: _Led | None = None
         self._take(nuisance)
 
     def beside(self, more: Tensor) -> Remainder:
@@ -59,6 +70,7 @@ class Remainder:
         if not more.shape[-1]:
             return self
         other = object.__new__(Remainder)
+        other._last = None
         other.y, other._whole, other._rows, other._taken = self.y, self._whole, self._rows, self._taken
         other._take(more)
         return other
@@ -78,7 +90,9 @@ class Remainder:
 
     def gain(self, tried: Tried) -> Tensor:
         """Squares that each candidate explains, `g`."""
-        inner, cross, b = self._products(tried.factors) if tried.lead is None else self._led(tried.lead, tried.factors)
+        inner, cross, b = (
+            self._products(tried.factors) if tried.lead is None else self._led_products(tried.lead, tried.factors)
+        )
         inner = inner - cross.mT @ cross
         ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
         inner = inner + torch.diag_embed(ridge[:, None].expand(-1, inner.shape[-1]))
@@ -95,17 +109,25 @@ class Remainder:
         cross = (self._taken @ flat).reshape(-1, count, width).transpose(0, 1)
         return z.mT @ z, cross, (z.mT @ self.y[:, None])[..., 0]
 
-    def _led(self, lead: Tensor, factors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _led(self, lead: Tensor) -> _Led:
+        """Of a lead `s x c x k`, which is mostly the one that was asked for last."""
+        if self._last is None or self._last.lead is not lead:
+            rows, channels = self._rows
+            taken = (self._taken.reshape(-1, rows, 1, channels) @ lead).permute(0, 3, 2, 1).reshape(-1, rows)
+            along = (lead.mT @ self.y.reshape(rows, channels, 1))[..., 0].mT
+            self._last = _Led(lead, (lead.mT @ lead).permute(1, 2, 0), taken, along)
+        return self._last
+
+    def _led_products(self, lead: Tensor, factors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As `_products`: summed over the channels once, and not for every candidate."""
-        rows, channels = self._rows
-        count, _, width = factors.shape
+        count, rows, width = factors.shape
         leads = lead.shape[-1]
         flat = factors.transpose(0, 1).reshape(rows, count * width)
-        among = (lead.mT @ lead).permute(1, 2, 0)[None, ..., None]
-        inner = factors.mT[:, None, None] @ (among * factors[:, None, None])
+        led = self._led(lead)
+        inner = factors.mT[:, None, None] @ (led.among[None, ..., None] * factors[:, None, None])
         inner = inner.transpose(2, 3).reshape(count, leads * width, leads * width)
-        taken = (self._taken.reshape(-1, rows, 1, channels) @ lead).permute(0, 3, 2, 1).reshape(-1, rows)
-        cross = (taken @ flat).reshape(-1, leads, count, width).permute(2, 0, 1, 3).reshape(count, -1, leads * width)
-        along = (lead.mT @ self.y.reshape(rows, channels, 1))[..., 0].mT
-        b = (along @ flat).reshape(leads, count, width).transpose(0, 1).reshape(count, leads * width)
+        cross = (
+            (led.taken @ flat).reshape(-1, leads, count, width).permute(2, 0, 1, 3).reshape(count, -1, leads * width)
+        )
+        b = (led.along @ flat).reshape(leads, count, width).transpose(0, 1).reshape(count, leads * width)
         return inner, cross, b

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -121,6 +121,12 @@ class Situation:
         """Commanded joints less the middle of their workspace, `... x s x n` [joint's unit]."""
         low, high = self.workspace
         return self.joints - (low + high) / 2
+
+    def with_covariates(self, covariates: Mapping[str, Tensor]) -> Situation:
+        """The same rows under other covariates; the nominal pose and its derivatives stay as they were."""
+        other = replace(self, covariates=covariates)
+        other.__dict__.update({"pose": self.pose, "jacobian": self.jacobian, "frame_slope": self.frame_slope})
+        return other
 
     @property
     def loaded(self) -> bool:

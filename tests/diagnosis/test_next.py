@@ -106,12 +106,12 @@ def test_a_cause_without_rival_is_made_sharper() -> None:
     wanted = said.next_measurements
     assert [m["separates"] for m in wanted] == [[]] * 8
     there, found = _candidates(said.analysis, 0), said.judgement.found
-    x = _columns(said.analysis, found, there)
+    x, own = _columns(said.analysis, found, there), covariance(said.analysis.dictionary, found)
 
     def information(chosen: Tensor) -> float:
         """Half the log determinant, of all rows at once."""
         flat = x[chosen].flatten(0, 1)
-        return float(0.5 * torch.linalg.slogdet(torch.eye(len(flat)) + flat @ found.covariance @ flat.mT).logabsdet)
+        return float(0.5 * torch.linalg.slogdet(torch.eye(len(flat)) + flat @ own @ flat.mT).logabsdet)
 
     chosen = torch.cdist(_proposed(said)[0], there.joints).argmin(-1)
     assert wanted[0]["gain"] == pytest.approx(information(chosen[:1]))
