@@ -49,11 +49,11 @@ def first_candidates(
         usable: `s`, bool.
         fitted: columns of what was fitted before, `s x c0 x r`.
     """
-    fixed = [a for a in atoms if a.shape.numel() == 0]
-    fixed += [part for a in fixed if (part := _best_part(situation, a, white, residual)) is not None]
+    whole = [a for a in atoms if a.shape.numel() == 0]
+    parts = [part for a in whole if (part := _best_part(situation, a, white, residual)) is not None]
     bare = white(fitted)
-    beside = torch.cat([bare, *(white(a.columns) for a in fixed)], -1)
-    grounds = [Ground(white(residual), nuisance) for nuisance in (bare, beside)]
+    beside = torch.cat([bare, *(white(a.columns) for a in whole)], -1)
+    grounds = [Ground(white(residual), nuisance, quick=True) for nuisance in (bare, beside)]
     starts: list[Atom] = []
     for atom in (a for a in atoms if a.shape.numel()):
         assert atom.effect is not None
@@ -62,7 +62,7 @@ def first_candidates(
         for shaped in (*_usual(situation, atom.effect), *looked_for):
             if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
                 starts.append(cleaned(_atom(situation, situation, atom.effect, shaped), usable))
-    return fixed, starts
+    return [*whole, *parts], starts
 
 
 def renewed_candidates(

@@ -65,12 +65,17 @@ class Ground:
         times: how many values there are for each that is looked at.
     """
 
-    def __init__(self, y: Tensor, others: Tensor) -> None:
-        """y: whitened residual, `s x c`; others: whitened columns, in units of their prior, `s x c x P`."""
+    def __init__(self, y: Tensor, others: Tensor, quick: bool = False) -> None:
+        """y: whitened residual, `s x c`; others: whitened columns, in units of their prior, `s x c x P`; quick:
+        whether a start is enough, so that no more rows are looked at between the values of the grids."""
         drawn = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))
-        few = [max(1, most // max(y.shape[1], 1)) for most in (_COARSE, _CLOSE)]
+        few = [max(1, most // max(y.shape[1], 1)) for most in (_COARSE, _COARSE if quick else _CLOSE)]
         self.rows = [drawn[:count].sort().values if count < len(y) else None for count in few]
-        self.left = [Remainder(_of(y, rows, 0), _LOOSE * _of(others, rows, 0)) for rows in self.rows]
+        coarse = Remainder(_of(y, self.rows[0], 0), _LOOSE * _of(others, self.rows[0], 0))
+        if len(coarse.y) == y.numel() or quick:
+            self.left = [coarse, coarse]
+        else:
+            self.left = [coarse, Remainder(_of(y, self.rows[1], 0), _LOOSE * _of(others, self.rows[1], 0))]
         self.times = [y.numel() / left.y.numel() for left in self.left]
 
 
@@ -137,7 +142,7 @@ class Scan:
         charges = [0.0] * len(self.parts)
         for level in range(_ROUNDS + 1):
             which = min(level, 1)
-            if level < 2:
+            if level == 0 or (level == 1 and ground.left[0] is not ground.left[1]):
                 plain = ground.left[which].beside(_LOOSE * _of(self.unshaped, ground.rows[which], 0))
             times = ground.times[which]
             for candidates, pieces, sizes in self._level(value, level, ground.rows[which]):
