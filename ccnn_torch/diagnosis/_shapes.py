@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import default_shape, scales
 from ccnn_torch.diagnosis._remainder import Remainder, Tried, search_charge
+from ccnn_torch.diagnosis._whitening import Whitening
 from ccnn_torch.effects import Effect, Shape, Situation
 
 __all__ = ["Ground", "Scan", "Shaped"]
@@ -82,18 +83,16 @@ class Ground:
 class Scan:
     """The columns of one effect over the grids of its shapes; they serve every search of the same rows."""
 
-    def __init__(
-        self, situation: Situation, there: Situation, effect: Effect, whiten: Callable[[Tensor], Tensor]
-    ) -> None:
-        """situation: the rows; there: the machine about which they are linear; whiten: as `Whitening`."""
-        self.situation, self.effect, self.whiten = situation, effect, whiten
+    def __init__(self, situation: Situation, there: Situation, effect: Effect, white: Whitening) -> None:
+        """situation: the rows; there: the machine about which they are linear; white: noise and weights."""
+        self.situation, self.effect, self.white = situation, effect, white
         self.shapes = effect.shapes(situation)
         coefficients = effect.coefficients(situation)
         self.size = scales(coefficients, situation.joints)
         self.parts = _parts(self.shapes, len(coefficients))
         self.start = default_shape(situation, effect)
         kind = {"joints": lambda: there.jacobian, "parameters": lambda: there.parameter_jacobian}.get(effect.kind)
-        self.lead = whiten(torch.nan_to_num(kind())) if kind is not None else None
+        self.lead = white(torch.nan_to_num(kind())) if kind is not None else None
         # Which joint a column moves is a matter of the effect's form: the middle and the ends of its grids show it.
         ends = torch.tensor([[s.grid[0], s.grid[-1]] for s in self.shapes], dtype=self.start.dtype).mT
         first = effect.basis(situation, torch.stack([self.start, *ends]))
@@ -105,29 +104,29 @@ class Scan:
     def columns(self, candidates: Tensor, rows: Tensor | None) -> list[Tried]:
         """Of each part, whitened, in plausible sizes; candidates: `g x h`; rows: which, None = all."""
         if self.movers is not None and isinstance(self.effect, _OneByOne):
-            moved = self.effect.one_by_one(self.situation, candidates)
-            return [self._by_movers(moved[..., p.columns], p.columns, rows) for p in self.parts]
-        basis = self.effect.basis(self.situation, candidates)
+            moved = _of(self.effect.one_by_one(self.situation, candidates), rows, 1)
+            return [self._by_movers(_of_run(moved, p.columns), p.columns, rows) for p in self.parts]
+        basis = _of(self.effect.basis(self.situation, candidates), rows, 1)
         if self.movers is None:
             return [Tried(self._whitened(basis, part.columns, rows)) for part in self.parts]
         return [self._by_movers(basis[..., self.movers[p.columns], p.columns], p.columns, rows) for p in self.parts]
 
     def _by_movers(self, moved: Tensor, columns: list[int], rows: Tensor | None) -> Tried:
-        """moved: change of the joint or parameter that each of the columns moves, `g x s x m`."""
+        """moved: change of the joint or parameter that each of the columns moves, in the rows, `g x s x m`."""
         assert self.lead is not None and self.movers is not None
-        one = torch.nan_to_num(_of(moved, rows, 1) * self.size[columns])
+        one = (moved * self.size[columns]).nan_to_num_()
         lead, movers = _of(self.lead, rows, 0), self.movers[columns]
         if len(columns) and bool((movers == movers[0]).all()):
             return Tried(one, lead[..., movers[:1]])
         return Tried(lead[..., movers] * one[..., None, :])
 
     def _whitened(self, basis: Tensor, columns: list[int], rows: Tensor | None) -> Tensor:
-        """`g x s x c x m`."""
-        if self.lead is None:
-            mine = basis[..., columns] * self.size[columns]
-            return torch.nan_to_num(torch.stack([_of(self.whiten(b), rows, 0) for b in mine]))
-        mine = _of(basis, rows, 1)[..., columns] * self.size[columns]
-        return torch.nan_to_num(_of(self.lead, rows, 0) @ mine)
+        """basis: in the rows, `g x s x ... x m`; `g x s x c x m`."""
+        mine = _of_run(basis, columns)
+        if self.lead is not None:
+            return (_of(self.lead, rows, 0) @ (mine * self.size[columns])).nan_to_num_()
+        mine = mine[:, :, self.white.channels] * self.size[columns]
+        return mine.mul_(_of(self.white.scale, rows, 0)[..., None]).nan_to_num_()
 
     def best(self, ground: Ground, start: Tensor | None = None) -> Shaped:
         """The shapes that explain most.
@@ -235,6 +234,12 @@ def _movers(basis: Tensor) -> Tensor | None:
 
 def _of(values: Tensor, rows: Tensor | None, dim: int) -> Tensor:
     return values if rows is None else values.index_select(dim, rows)
+
+
+def _of_run(values: Tensor, columns: list[int]) -> Tensor:
+    """Some of the columns, without a copy where they stand side by side."""
+    run = range(columns[0], columns[0] + len(columns)) if columns else range(0)
+    return values[..., run.start : run.stop] if list(run) == columns else values[..., columns]
 
 
 def _parts(shapes: tuple[Shape, ...], coefficients: int) -> list[_Part]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -45,8 +46,12 @@ class Whitening:
 
     def scaled(self, values: Tensor) -> Tensor:
         """As calling it, of the channels alone: `s x c` or `s x c x m`."""
-        scale = self.weight.sqrt()[:, None] / self.sigma
-        return values * (scale if values.dim() == 2 else scale[..., None])
+        return values * (self.scale if values.dim() == 2 else self.scale[..., None])
+
+    @cached_property
+    def scale(self) -> Tensor:
+        """What a value of the channels is multiplied by, `s x c` [1/m], [1/rad]."""
+        return self.weight.sqrt()[:, None] / self.sigma
 
     def keep(self) -> Tensor:
         """Indices of the rows that count."""

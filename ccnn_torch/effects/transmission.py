@@ -78,7 +78,12 @@ class Transmission:
 
     def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
         angle = situation.joints * shape.unsqueeze(-2)
-        waves = [wave(k * angle) for k in range(1, len(_HARMONICS) // 2 + 1) for wave in (torch.sin, torch.cos)]
+        sine, cosine = torch.sin(angle), torch.cos(angle)
+        waves = [sine, cosine]
+        # The next harmonic by the sum of angles: sines are what a grid of hundreds of frequencies takes its time for.
+        for _ in range(len(_HARMONICS) // 2 - 1):
+            s, c = waves[-2:]
+            waves += [s * cosine + c * sine, c * cosine - s * sine]
         return torch.stack(waves, -1)
 
 
