@@ -44,6 +44,7 @@ class Alone(NamedTuple):
         rss: remaining sum of squares, `b`.
         effective: number of coefficients that the data determine, `b`.
         log_scale: log α², `b`.
+        axes: principal axes of each group, `m x m` each.
     """
 
     log_evidence: Tensor
@@ -53,6 +54,7 @@ class Alone(NamedTuple):
     rss: Tensor
     effective: Tensor
     log_scale: Tensor
+    axes: list[Tensor]
 
 
 def own_products(x: Tensor, y: Tensor) -> Own:
@@ -94,7 +96,7 @@ def fit_alone(groups: Sequence[Own], yy: Tensor, values: float, noise_dof: float
     evidence = evidence - 0.5 * noise_dof * (noise.log() + 1 / noise - 1)
     evidence = evidence + (-0.5 * psi.square() / spread**2 - 0.5 * torch.log1p(0.5 * gamma * spread**2)) * there
     back = [v @ m[: v.shape[-1]] for v, m in zip(axes, mean, strict=True)]
-    return Alone(evidence, noise, back, (square * mean.square()).sum(-1), rss, gamma, psi)
+    return Alone(evidence, noise, back, (square * mean.square()).sum(-1), rss, gamma, psi, axes)
 
 
 def _in_axes(groups: Sequence[Own], yy: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:

@@ -13,9 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["LIMIT", "SPREAD", "Fits", "Grams", "fit_sets", "grams_of", "of_like_width", "without"]
+__all__ = ["LIMIT", "SPREAD", "Fits", "Grams", "fit_sets", "grams_of", "padded", "without"]
 
-_BUCKET = 16
 # Columns up to which XᵀX is made as a whole.
 _NARROW = 128
 # Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
@@ -93,7 +92,6 @@ def fit_sets(
     noise_dof: float,
     iterations: int = 8,
     spread: float = SPREAD,
-    start: tuple[Tensor, Tensor] | None = None,
 ) -> Fits:
     """Fit every set of groups.
 
@@ -103,9 +101,8 @@ def fit_sets(
         noise_dof: weight of the prior of σ² about 1, in values; 0 = the noise is not known.
         iterations: MacKay updates.
         spread: standard deviation of log α².
-        start: `log_scale` and `noise` of a fit of the same sets, to go on from there.
     """
-    columns, slot = _padded(sets)
+    columns, slot = padded(sets)
     columns, slot = columns.to(grams.xy.device), slot.to(grams.xy.device)
     groups = max(max(map(len, sets), default=0), 1)
     safe = columns.clamp_min(0)
@@ -120,8 +117,6 @@ def fit_sets(
     psi = torch.log((grams.yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there
     noise = (grams.yy / grams.values / 10).clamp_min(1e-12).expand(len(columns)).clone()
     noise = torch.where(torch.tensor(noise_dof > 0), torch.ones_like(noise), noise)
-    if start is not None:
-        psi, noise = start
     width = columns.shape[1]
     for k in range(iterations + 1):
         scale = (member @ (psi / 2).exp()[..., None])[..., 0]
@@ -156,15 +151,7 @@ def fit_sets(
     return Fits(log_evidence, noise, columns, slot, mean, covariance, energy, rss, gamma.sum(-1), psi)
 
 
-def of_like_width(sets: Sequence[Sequence[Tensor]]) -> list[list[int]]:
-    """Numbers of the sets in lots of about as many columns: those are fitted side by side."""
-    lots: dict[int, list[int]] = {}
-    for k, groups in enumerate(sets):
-        lots.setdefault(-(-sum(map(len, groups)) // _BUCKET), []).append(k)
-    return list(lots.values())
-
-
-def _padded(sets: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
+def padded(sets: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
     """Columns and slots of every set, `b x M`, padded with -1."""
     widths = [[len(g) for g in s] for s in sets]
     totals = torch.tensor([sum(w) for w in widths], dtype=torch.int64)
