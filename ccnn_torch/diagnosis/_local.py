@@ -115,7 +115,7 @@ def _searched(
     def gain(tried: Tensor) -> Tensor:
         bumps = _bumps(points, tried)
         touched = bumps.sum(0)
-        score = left.gain(Tried(bumps.mT[..., None], lead))
+        score = left.gain(Tried(bumps.mT[..., None, None], lead))
         return torch.where((touched > _TOUCHED) & (touched < len(points) / 2), score, -torch.inf)
 
     score = gain(places)

@@ -22,8 +22,9 @@ class Tried(NamedTuple):
     """Columns of `g` candidates, whitened.
 
     Attributes:
-        factors: the columns, `g x s x c x m`; or, where there is a lead, what it is multiplied by, `g x s x m`.
-        lead: columns that all candidates share, `s x c x k`, or None. A candidate's own are all products of the two.
+        factors: the columns, `g x s x c x m`; or, where there is a lead, what it is multiplied by: each of its columns
+            by its own, `g x s x k x f`, or all by the same, `g x s x 1 x f`.
+        lead: columns that all candidates share, `s x c x k`, or None.
     """
 
     factors: Tensor
@@ -41,12 +42,12 @@ class Tried(NamedTuple):
     def one(self, number: int) -> Tensor:
         """Columns of one candidate, `s x c x m`."""
         mine = self.factors[number]
-        return mine if self.lead is None else (self.lead[..., None] * mine[:, None, None]).flatten(-2)
+        return mine if self.lead is None else (self.lead[..., None] * mine[:, None]).flatten(-2)
 
 
 class _Led(NamedTuple):
     """Sums over the channels of what a lead `s x c x k` is multiplied with: itself, `k x k x s`; what is taken,
-    `(P k) x s`; and what is left of y, `k x s`."""
+    `k x P x s`; and what is left of y, `k x 1 x s`."""
 
     lead: Tensor
     among: Tensor
@@ -113,21 +114,26 @@ class Remainder:
         """Of a lead `s x c x k`, which is mostly the one that was asked for last."""
         if self._last is None or self._last.lead is not lead:
             rows, channels = self._rows
-            taken = (self._taken.reshape(-1, rows, 1, channels) @ lead).permute(0, 3, 2, 1).reshape(-1, rows)
-            along = (lead.mT @ self.y.reshape(rows, channels, 1))[..., 0].mT
-            self._last = _Led(lead, (lead.mT @ lead).permute(1, 2, 0), taken, along)
+            taken = (self._taken.reshape(-1, rows, channels).transpose(0, 1) @ lead).permute(2, 1, 0)
+            along = (lead.mT @ self.y.reshape(rows, channels, 1)).permute(1, 2, 0)
+            self._last = _Led(lead, (lead.mT @ lead).permute(1, 2, 0), taken.contiguous(), along)
         return self._last
 
     def _led_products(self, lead: Tensor, factors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As `_products`: summed over the channels once, and not for every candidate."""
-        count, rows, width = factors.shape
-        leads = lead.shape[-1]
-        flat = factors.transpose(0, 1).reshape(rows, count * width)
         led = self._led(lead)
-        inner = factors.mT[:, None, None] @ (led.among[None, ..., None] * factors[:, None, None])
-        inner = inner.transpose(2, 3).reshape(count, leads * width, leads * width)
+        count, rows, own, width = factors.shape
+        leads = lead.shape[-1]
+        if own > 1:
+            # Thousands of tiny products take longer than a few large ones.
+            z = (lead[None, ..., None] * factors[:, :, None]).reshape(count, -1, leads * width)
+            inner = z.mT @ z
+        else:
+            inner = factors.permute(0, 2, 3, 1)[:, None] @ (led.among[..., None] * factors.transpose(1, 2)[:, None])
+            inner = inner.transpose(2, 3).reshape(count, leads * width, leads * width)
+        flat = factors.permute(2, 1, 0, 3).reshape(own, rows, count * width)
         cross = (
-            (led.taken @ flat).reshape(-1, leads, count, width).permute(2, 0, 1, 3).reshape(count, -1, leads * width)
+            (led.taken @ flat).reshape(leads, -1, count, width).permute(2, 1, 0, 3).reshape(count, -1, leads * width)
         )
         b = (led.along @ flat).reshape(leads, count, width).transpose(0, 1).reshape(count, leads * width)
         return inner, cross, b

@@ -17,7 +17,7 @@ from ccnn_torch.diagnosis._joined import Joined, fit_joined
 __all__ = ["Dictionary", "Found", "covariance", "scored", "search"]
 
 _MOST = 4
-# Updates of a fit; after the short one no set that came within 12 of the best in the end was 55 below it, in trials.
+# Updates of a fit; after the short one no set that came within 12 of the best in the end was 85 below it, in trials.
 _UPDATES, _SHORT, _HOPELESS = 8, 1, 100.0
 # Sets are fitted side by side where their widths differ by less than this.
 _ALIKE = 16

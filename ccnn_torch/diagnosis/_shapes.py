@@ -116,8 +116,9 @@ class Scan:
         assert self.lead is not None and self.movers is not None
         one = (moved * self.size[columns]).nan_to_num_()
         lead, movers = _of(self.lead, rows, 0), self.movers[columns]
-        if len(columns) and bool((movers == movers[0]).all()):
-            return Tried(one, lead[..., movers[:1]])
+        which, each = torch.unique_consecutive(movers, return_counts=True)
+        if len(columns) and bool((each == each[0]).all()):
+            return Tried(one.reshape(*one.shape[:-1], len(which), -1), lead[..., which])
         return Tried(lead[..., movers] * one[..., None, :])
 
     def _whitened(self, basis: Tensor, columns: list[int], rows: Tensor | None) -> Tensor:

@@ -68,9 +68,10 @@ def test_what_is_put_beside_in_parts_takes_what_it_takes_at_once() -> None:
     y, x = _columns(6, 60, 1).reshape(30, 2), 5 * _columns(7, 60, 9).reshape(30, 2, 9)
     at_once, in_parts = Remainder(y, x), Remainder(y, x[..., :4]).beside(x[..., 4:])
     factors, lead = _columns(8, 30, 12).reshape(30, 4, 3).transpose(0, 1), _columns(9, 60, 2).reshape(30, 2, 2)
-    led = Tried(factors, lead)
-    plain = Tried(torch.stack([led.one(k) for k in range(4)]))
+    led, each = Tried(factors[..., None, :], lead), Tried(factors[..., :2, None], lead)
+    plain, apart = (Tried(torch.stack([t.one(k) for k in range(4)])) for t in (led, each))
     wanted = at_once.gain(plain)
+    assert at_once.gain(each) == pytest.approx(at_once.gain(apart).numpy(), rel=1e-9)
     # By the textbook: what M(I + MᵀM)^-1 Mᵀ leaves of y and of the columns.
     flat, columns = x.flatten(0, 1), plain.factors.flatten(1, 2)
     leave = torch.linalg.inv(torch.eye(60, dtype=y.dtype) + flat @ flat.mT)
