@@ -85,7 +85,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
 
     atoms = [cleaned(plain_atom(situation, situation, e), usable) for e in effects]
     rest = catch_alls(situation, [e.name for e in effects])
-    rest = [cleaned(a, usable) for a in rest if bool(torch.isfinite(a.columns[usable]).all())]
+    rest = [cleaned(a, usable) for a in rest if bool((torch.isfinite(a.columns).flatten(1).all(-1) | ~usable).all())]
     fitted = _frame_columns(situation, usable)
     # What does not show at all in these rows is no candidate (latency at rest).
     size = [

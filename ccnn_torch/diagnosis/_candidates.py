@@ -30,7 +30,7 @@ def plain_atom(situation: Situation, there: Situation, effect: Effect) -> Atom:
 
 def cleaned(atom: Atom, usable: Tensor) -> Atom:
     """With rows that are left out set to zero."""
-    return replace(atom, columns=torch.where(usable[:, None, None], atom.columns, 0.0))
+    return atom if bool(usable.all()) else replace(atom, columns=atom.columns.where(usable[:, None, None], 0.0))
 
 
 def first_candidates(

@@ -9,7 +9,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._apart import signatures_apart
 from ccnn_torch.diagnosis._search import covariance
-from ccnn_torch.diagnosis._shrink import Gap, HeldOut, held_out, shrink_of
+from ccnn_torch.diagnosis._shrink import Gap, HeldOut, draws, held_out, shrink_of
 from ccnn_torch.diagnosis._verdict import Judgement
 
 __all__ = ["Blocks", "blocks", "in_order", "noise_floor"]
@@ -21,7 +21,7 @@ class Blocks:
     def __init__(self, analysis: Analysis, judgement: Judgement, residual: Tensor, seed: int) -> None:
         """residual: nominal, `s x c0` [m, rad]; seed: of folds and draws."""
         white = analysis.whitening
-        self.analysis, self.judgement, self.seed = analysis, judgement, seed
+        self.analysis, self.judgement = analysis, judgement
         self.before = residual[white.keep()][:, white.channels]
         self.floor = noise_floor(analysis)
         self.position = white.channels < 3
@@ -32,6 +32,7 @@ class Blocks:
         # The verdict's effects one after the other, the largest first; the last has them all.
         place = {atoms[i].name: i for i in members if not atoms[i].catch_all}
         steps = [[place[n] for n in judgement.names[:k]] for k in range(len(judgement.names) + 1)]
+        self.draws = draws(len(self.before), seed)
         held = held_out(analysis, [*steps, *alone], seed)
         self.steps, self.together = held[1 : len(steps)], held[len(steps) - 1]
         self.alone: dict[str, HeldOut] = dict(zip(self.candidates, held[len(steps) :], strict=True))
@@ -43,7 +44,7 @@ class Blocks:
         channels = self.position if position else ~self.position
         exact = white.known > 0
         dof = 0.0 if exact else max(self.analysis.dictionary.grams.values - self.judgement.found.effective, 1.0)
-        return shrink_of(self.before, held, self.floor, channels, dof, self.seed)
+        return shrink_of(self.before, held, self.floor, channels, dof, self.draws)
 
     def main(self, held: HeldOut) -> Gap:
         """In position where the machine has one, else in rotation."""

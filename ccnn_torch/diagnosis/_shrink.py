@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._evidence import fit_sets, without
 
-__all__ = ["Gap", "HeldOut", "folds", "held_out", "resampled", "shrink_of"]
+__all__ = ["Draws", "Gap", "HeldOut", "draws", "folds", "held_out", "resampled", "shrink_of"]
 
 _FOLDS = 5
 _REPEATS = 400
@@ -31,6 +32,14 @@ class HeldOut:
 
     left: Tensor
     uncertain: Tensor
+
+
+class Draws(NamedTuple):
+    """Rows drawn in runs with replacement, `repeats`: how often each row, `repeats x s`, and a standard normal number
+    for the noise within what is known of it, `repeats`."""
+
+    counts: Tensor
+    normal: Tensor
 
 
 @dataclass(frozen=True)
@@ -79,7 +88,7 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     ]
 
 
-def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, floor_dof: float, seed: int) -> Gap:
+def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, floor_dof: float, draws: Draws) -> Gap:
     """Before and after on the channels of one unit.
 
     What is left above the noise is corrected for what the noise of four fifths of the rows does to the fit: it
@@ -92,7 +101,7 @@ def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, fl
         floor: variance of the noise, `c`.
         channels: `c`, bool.
         floor_dof: on how many values the noise's variance rests; 0 = exactly known.
-        seed: of the draws.
+        draws: of the rows.
     """
     old = before[:, channels].square().sum(-1)
     new = held.left[:, channels].square().sum(-1)
@@ -102,20 +111,25 @@ def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, fl
     if b2 <= noise:
         return Gap(math.sqrt(b2), math.sqrt(a2), math.sqrt(noise), None, None)
     plain = min(max(1 - (a2 - noise) / (b2 - noise), 0.0), 1.0)
-    generator = torch.Generator().manual_seed(seed)
-    rows = resampled(len(old), generator)
-    drawn = torch.full((_REPEATS,), noise, dtype=old.dtype)
-    if floor_dof > 0:
-        drawn = noise * (1 + math.sqrt(2 / floor_dof) * torch.randn(_REPEATS, generator=generator, dtype=old.dtype))
-    excess = (new - unsure)[rows].mean(-1) - drawn
-    gap = (old[rows].mean(-1) - drawn).clamp_min(1e-3 * (b2 - noise))
-    share = 1 - excess / gap
+    drawn = noise * (1 + (math.sqrt(2 / floor_dof) if floor_dof > 0 else 0.0) * draws.normal)
+    rest, gap = (draws.counts @ torch.stack([new - unsure, old], -1) / len(old) - drawn[:, None]).unbind(-1)
+    share = 1 - rest / gap.clamp_min(1e-3 * (b2 - noise))
     # Less than the noise that was told is left: no cause takes away more than all, and the spread of the draws stays.
     share = (share - (share.mean() - 1).clamp_min(0.0)).clamp(0.0, 1.0)
     # Where draws reach 1, all of the gap, the interval ends there and leaves out draws on the lower side alone.
     above = 0.0 if float((share >= 1).to(share.dtype).mean()) > _TAIL / 2 else _TAIL / 2
     low, high = torch.quantile(share, torch.tensor([_TAIL - above, 1 - above], dtype=share.dtype)).tolist()
     return Gap(math.sqrt(b2), math.sqrt(a2), math.sqrt(noise), plain, (min(low, plain), max(high, plain)))
+
+
+def draws(rows: int, seed: int) -> Draws:
+    """Of so many rows."""
+    generator = torch.Generator().manual_seed(seed)
+    chosen = resampled(rows, generator)
+    counts = torch.zeros(chosen.shape, dtype=torch.float64).scatter_add_(
+        1, chosen, torch.ones(chosen.shape, dtype=torch.float64)
+    )
+    return Draws(counts, torch.randn(_REPEATS, generator=generator, dtype=torch.float64))
 
 
 def folds(rows: int, seed: int) -> Tensor:

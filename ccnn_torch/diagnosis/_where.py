@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis
-from ccnn_torch.diagnosis._shrink import resampled
+from ccnn_torch.diagnosis._shrink import draws
 
 __all__ = ["where"]
 
@@ -33,18 +33,16 @@ class _Shares(NamedTuple):
     interval: list[list[float]]
 
 
-class _Draws:
-    """Rows drawn in runs with replacement, and the noise within what is known of it."""
+class _Drawn:
+    """Rows drawn with replacement, and the noise within what is known of it."""
 
     def __init__(self, analysis: Analysis, seed: int) -> None:
-        generator = torch.Generator().manual_seed(seed)
-        rows = resampled(len(analysis.whitening.keep()), generator)
-        self.counts = torch.zeros(rows.shape, dtype=analysis.y.dtype)
-        self.counts.scatter_add_(1, rows, torch.ones_like(self.counts))
+        drawn = draws(len(analysis.whitening.keep()), seed)
+        self.counts = drawn.counts
         values, effective = analysis.dictionary.grams.values, analysis.found[0].effective
         spread = 0.0 if analysis.whitening.known > 0 else math.sqrt(2 / max(values - effective, 1.0))
-        drawn = torch.randn(len(rows), 1, generator=generator, dtype=self.counts.dtype)
-        self.floor, self.floors = analysis.floor, (analysis.floor * (1 + spread * drawn)).clamp_min(0.0)
+        self.floor = analysis.floor
+        self.floors = (analysis.floor * (1 + spread * drawn.normal[:, None])).clamp_min(0.0)
 
     def shares(self, parts: _Parts) -> _Shares:
         """Of the energy above the noise."""
@@ -66,18 +64,18 @@ def where(analysis: Analysis, residual: Tensor, seed: int = 0) -> tuple[dict[str
     keep = white.keep()
     y = (residual[:, white.channels] / white.sigma)[keep]
     rows = _Parts(y.square().sum(-1, keepdim=True), torch.full_like(y[:, :1], y.shape[-1]))
-    draws = _Draws(analysis, seed)
-    outputs = draws.shares(_Parts(y.square(), torch.ones_like(y)))
-    joints = draws.shares(_joints(analysis, y, keep))
+    drawn = _Drawn(analysis, seed)
+    outputs = drawn.shares(_Parts(y.square(), torch.ones_like(y)))
+    joints = drawn.shares(_joints(analysis, y, keep))
     axes, names = [_AXES[int(c)] for c in white.channels], [j.name for j in situation.mechanism.joints]
     legged = any(g.leg is not None for g in situation.mechanism.geometry)
     legs = [f"leg {i + 1}" for i in range(len(names))] if legged else []
     places, inside = _regions(analysis, keep)
-    regions = draws.shares(_split(rows, inside))
+    regions = drawn.shares(_split(rows, inside))
     edges = {
         name: _bins(value[keep]) for name, value in situation.covariates.items() if float(value.max() - value.min()) > 0
     }
-    covariates = {name: draws.shares(_split(rows, member)) for name, (_, member) in edges.items()}
+    covariates = {name: drawn.shares(_split(rows, member)) for name, (_, member) in edges.items()}
     told = {
         "outputs": dict(zip(axes, outputs.plain, strict=True)),
         "joints": dict(zip(names, joints.plain, strict=True)),
