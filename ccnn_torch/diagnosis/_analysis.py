@@ -109,11 +109,11 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     result = _searched(situation, measured, residual, white, every, near, rich, fitted, few)
 
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
-    before: tuple[str, ...] | None = None
+    before: frozenset[str] | None = None
     for _ in range(2):
         best = next(f for f in result.found if not any(result.dictionary.atoms[i].catch_all for i in f.members))
         acting = result.acting(best)
-        same = before == (before := tuple(a.effect.name for a in acting))
+        same = before == (before := frozenset(a.effect.name for a in acting))
         new = _renewed(result, noise, usable)
         if same and _settled(result, best, new, remainder(situation, measured, acting)):
             break
