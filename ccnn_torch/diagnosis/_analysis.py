@@ -28,7 +28,7 @@ _GAIN = 3.0
 _SAME_NOISE, _SAME_FIT = 0.1, 0.01
 _FAR_BELOW = 0.5
 # Values of the residual that the search for a set to start from takes, at most.
-_START = 1200
+_START = 900
 
 
 @dataclass(frozen=True)

@@ -92,6 +92,7 @@ def fit_sets(
     noise_dof: float,
     iterations: int = 8,
     spread: float = SPREAD,
+    start: tuple[Tensor, Tensor] | None = None,
 ) -> Fits:
     """Fit every set of groups.
 
@@ -101,6 +102,7 @@ def fit_sets(
         noise_dof: weight of the prior of σ² about 1, in values; 0 = the noise is not known.
         iterations: MacKay updates.
         spread: standard deviation of log α².
+        start: log α² of each group, `b x g`, and σ², `b`, to begin with.
     """
     columns, slot = padded(sets)
     columns, slot = columns.to(grams.xy.device), slot.to(grams.xy.device)
@@ -117,6 +119,8 @@ def fit_sets(
     psi = torch.log((grams.yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there
     noise = (grams.yy / grams.values / 10).clamp_min(1e-12).expand(len(columns)).clone()
     noise = torch.where(torch.tensor(noise_dof > 0), torch.ones_like(noise), noise)
+    if start is not None:
+        psi, noise = start
     width = columns.shape[1]
     for k in range(iterations + 1):
         scale = (member @ (psi / 2).exp()[..., None])[..., 0]

@@ -21,7 +21,7 @@ _FINE, _ROUNDS = 9, 2
 # Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
 _LOOSE = 10.0
 # Values of the residual, at most, that the grids are looked at on, and that count between their values.
-_COARSE, _CLOSE = 1200, 4800
+_COARSE, _CLOSE = 900, 4800
 # Shapes that share coefficients are looked for together where that are no more values.
 _TOGETHER = 150
 

@@ -16,6 +16,8 @@ from ccnn_torch.diagnosis._evidence import fit_sets, without
 __all__ = ["Draws", "Gap", "HeldOut", "draws", "folds", "held_out", "resampled", "shrink_of"]
 
 _FOLDS = 5
+# Updates of a fit to the first fold, and to the others.
+_UPDATES, _MORE = 6, 2
 _REPEATS = 400
 # What a 95 % interval leaves out.
 _TAIL = 0.05
@@ -70,13 +72,18 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     uncertain = [torch.zeros_like(y) for _ in sets]
     groups = [[analysis.dictionary.groups[i] for i in s] for s in sets]
     used = torch.cat([torch.arange(0), *(analysis.dictionary.groups[i] for i in sorted({i for s in sets for i in s}))])
+    order = sorted(range(len(sets)), key=lambda i: sum(map(len, groups[i])))
+    parts = [order[i : i + 8] for i in range(0, len(order), 8)]
+    reached: dict[int, tuple[Tensor, Tensor]] = {}
     for k in range(_FOLDS):
         there = fold == k
         mine = x[there]
         rest = without(analysis.dictionary.grams, mine, y[there], used)
-        order = sorted(range(len(sets)), key=lambda i: sum(map(len, groups[i])))
-        for part in (order[i : i + 8] for i in range(0, len(order), 8)):
-            fits = fit_sets(rest, [groups[i] for i in part], analysis.dictionary.noise_dof, 6)
+        for part in parts:
+            # Folds differ little: the later ones go on from where the one before ended.
+            start, updates = reached.get(part[0]), _UPDATES if k == 0 else _MORE
+            fits = fit_sets(rest, [groups[i] for i in part], analysis.dictionary.noise_dof, updates, start=start)
+            reached[part[0]] = fits.log_scale, fits.noise
             for row, i in enumerate(part):
                 columns = fits.columns[row][fits.columns[row] >= 0]
                 m = len(columns)
