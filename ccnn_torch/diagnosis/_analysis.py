@@ -11,9 +11,10 @@ from torch import Tensor
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._candidates import cleaned, first_candidates, plain_atom, renewed_candidates
 from ccnn_torch.diagnosis._catch_all import catch_alls
+from ccnn_torch.diagnosis._dictionary import Dictionary, Found
 from ccnn_torch.diagnosis._linear import remainder, tangent
 from ccnn_torch.diagnosis._local import local_catch_alls
-from ccnn_torch.diagnosis._search import Dictionary, Found, search
+from ccnn_torch.diagnosis._search import search
 from ccnn_torch.diagnosis._whitening import NO_NOISE, Whitening, fitted_whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 

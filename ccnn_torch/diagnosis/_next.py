@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._atoms import scaled_signature
-from ccnn_torch.diagnosis._search import Found, covariance, scored
+from ccnn_torch.diagnosis._dictionary import Found, covariance
+from ccnn_torch.diagnosis._sets import scored
 from ccnn_torch.diagnosis._verdict import Judgement
 from ccnn_torch.effects import Situation
 
@@ -89,7 +90,10 @@ def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Found
         if a.name == name
     }
     known = [_names(analysis, one) for _, one in plain]
-    for one in sorted(scored(analysis.dictionary, sorted(like)), key=lambda f: -f.log_posterior):
+    for one in sorted(
+        scored(analysis.dictionary, sorted(like), {f.members: f for f in analysis.found}),
+        key=lambda f: -f.log_posterior,
+    ):
         if _names(analysis, one) not in known:
             known.append(_names(analysis, one))
             plain.append((plain[0][0] * math.exp(min(one.log_posterior - own.log_posterior, 0.0)), one))

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._apart import signatures_apart
-from ccnn_torch.diagnosis._search import covariance
+from ccnn_torch.diagnosis._dictionary import covariance
 from ccnn_torch.diagnosis._shrink import Gap, HeldOut, draws, held_out, shrink_of
 from ccnn_torch.diagnosis._verdict import Judgement
 

@@ -11,7 +11,8 @@ import torch
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._catch_all import ANY
-from ccnn_torch.diagnosis._search import Found, scored
+from ccnn_torch.diagnosis._dictionary import Found
+from ccnn_torch.diagnosis._sets import scored
 from ccnn_torch.effects import EXACT
 
 __all__ = ["Judgement", "judge", "withdrawn"]
@@ -97,7 +98,7 @@ def judge(analysis: Analysis) -> Judgement:
     for members, _, p, _ in leading:
         for name in members:
             marginal[name] += p
-    classes = {} if outside else _classes(analysis, found, names)
+    classes = {} if outside else _classes(analysis, found, names, tried)
     if not outside:
         same = [p for members, drive, p, _ in leading if drive is None and _equals(members, names, classes)]
         probability = sum(same)
@@ -188,9 +189,15 @@ def _net(
     """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
     gap = max(float(analysis.dictionary.grams.yy) - analysis.floor * analysis.dictionary.grams.values, 1e-300)
     fewer = {i: tuple(m for m in found.members if m != i) for i in found.members}
-    fresh = [s for s in fewer.values() if s not in tried]
-    tried.update(zip(fresh, scored(analysis.dictionary, fresh), strict=True))
-    return {i: ((tried[s].rss - found.rss) / gap, s) for i, s in fewer.items()}
+    without = _fits(analysis, list(fewer.values()), tried)
+    return {i: ((f.rss - found.rss) / gap, f.members) for i, f in zip(fewer, without, strict=True)}
+
+
+def _fits(analysis: Analysis, sets: Sequence[tuple[int, ...]], tried: dict[tuple[int, ...], Found]) -> list[Found]:
+    """The sets, those fitted that are not among the tried, where they then are."""
+    fresh = [s for s in dict.fromkeys(sets) if s not in tried]
+    tried.update(zip(fresh, scored(analysis.dictionary, fresh, tried), strict=True))
+    return [tried[s] for s in sets]
 
 
 def _smallest(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]) -> float:
@@ -292,7 +299,9 @@ def _driver_alone(analysis: Analysis) -> str | None:
     return next((_named(analysis, f)[1] for f in alone), None)
 
 
-def _classes(analysis: Analysis, found: Found, names: frozenset[str]) -> dict[str, tuple[str, ...]]:
+def _classes(
+    analysis: Analysis, found: Found, names: frozenset[str], tried: dict[tuple[int, ...], Found]
+) -> dict[str, tuple[str, ...]]:
     """For each name of the set those that can stand in its place, as far as these rows can tell."""
     atoms = analysis.dictionary.atoms
     library = [i for i, a in enumerate(atoms) if not a.catch_all]
@@ -302,7 +311,7 @@ def _classes(analysis: Analysis, found: Found, names: frozenset[str]) -> dict[st
             continue
         others = [j for j in library if atoms[j].name not in names]
         sets = [tuple(sorted(j if m == i else m for m in found.members)) for j in others]
-        trials = scored(analysis.dictionary, sets)
+        trials = _fits(analysis, sets, tried)
         like = {
             atoms[j].name: t.log_posterior
             for j, t in zip(others, trials, strict=True)

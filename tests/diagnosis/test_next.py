@@ -13,8 +13,8 @@ from _machines import NOISE, acting, cramped, measured, reached_with, rows_of
 from torch import Tensor
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
+from ccnn_torch.diagnosis._dictionary import Found, covariance
 from ccnn_torch.diagnosis._next import _candidates, _columns, _possible
-from ccnn_torch.diagnosis._search import Found, covariance
 from ccnn_torch.effects import Situation
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.records import read_table, stack_columns

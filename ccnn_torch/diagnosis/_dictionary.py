@@ -1,0 +1,143 @@
+"""Candidates with the inner products of their columns: all that fits of sets of them ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis._alone import NOTHING, fit_alone, own_products
+from ccnn_torch.diagnosis._atoms import Atom
+from ccnn_torch.diagnosis._evidence import Grams, grams_of
+
+__all__ = ["Dictionary", "Found", "covariance", "dictionary_of", "singles_of"]
+
+
+@dataclass(frozen=True)
+class Found:
+    """A set of atoms with its log posterior (up to a constant), log evidence, and fit.
+
+    `mean` are the coefficients, atom by atom, in units of their plausible sizes, and `log_scale` log α² of each atom's;
+    `energy` the squares that each atom's own part makes; `rss` what the set leaves.
+    """
+
+    members: tuple[int, ...]
+    log_posterior: float
+    log_evidence: float
+    mean: tuple[Tensor, ...]
+    log_scale: tuple[float, ...]
+    energy: tuple[float, ...]
+    rss: float
+    noise: float
+    effective: float
+
+
+@dataclass(frozen=True)
+class Dictionary:
+    """Candidates, and the inner products of those that sets are made of.
+
+    Attributes:
+        atoms: all candidates.
+        columns: whitened, of the library effects and then of the catch-alls that are put beside them, side by side,
+            `s x c x P`; rows that count.
+        groups: which of the columns are those of an atom, for the atoms that have such.
+        grams: of the columns; NaN between catch-alls, which are in no set together.
+        axes: principal axes of the columns of each of these atoms, `m x m`.
+        turned: `grams` with every group in its axes.
+        alone: no atom, and each by itself.
+        noise_dof: as for `fit_sets`.
+    """
+
+    atoms: tuple[Atom, ...]
+    columns: Tensor
+    groups: Mapping[int, Tensor]
+    grams: Grams
+    axes: Mapping[int, Tensor]
+    turned: Grams
+    alone: Mapping[tuple[int, ...], Found]
+    noise_dof: float
+
+
+def covariance(dictionary: Dictionary, found: Found) -> Tensor:
+    """Posterior covariance of the coefficients of a set, atom by atom, in units of their plausible sizes, `m x m`."""
+    index = torch.cat([torch.arange(0), *(dictionary.groups[i] for i in found.members)])
+    own = [m.new_full((len(m),), s / 2).exp() for m, s in zip(found.mean, found.log_scale, strict=True)]
+    scale = torch.cat([dictionary.grams.xy[:0], *own])
+    inner = scale[:, None] * dictionary.grams.xx[index][:, index] * scale / found.noise
+    inverse: Tensor = torch.linalg.inv(inner + torch.eye(len(inner), dtype=inner.dtype))
+    return scale[:, None] * inverse * scale
+
+
+def singles_of(
+    atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof: float
+) -> tuple[dict[tuple[int, ...], Found], list[Tensor]]:
+    """No atom, and each by itself; and the principal axes of each.
+
+    Args:
+        atoms: candidates.
+        x: whitened columns of each, `s x c x m`.
+        y: what they explain, whitened, `s x c`.
+        noise_dof: weight of the prior of the noise, in values; 0 = it is not known.
+    """
+    products = [NOTHING, *(own_products(columns, y) for columns in x)]
+    fits = fit_alone(products, y.square().sum(), float(y.numel()), noise_dof)
+    numbers = zip(
+        *(v.tolist() for v in (fits.log_evidence, fits.log_scale, fits.energy, fits.rss, fits.noise, fits.effective)),
+        strict=True,
+    )
+    found: dict[tuple[int, ...], Found] = {}
+    for k, (mean, (evidence, log_scale, energy, rss, noise, effective)) in enumerate(
+        zip(fits.mean, numbers, strict=True)
+    ):
+        members = (k - 1,) if k else ()
+        prior = atoms[k - 1].log_prior if k else 0.0
+        found[members] = Found(
+            members=members,
+            log_posterior=evidence + prior,
+            log_evidence=evidence,
+            mean=(mean,)[: len(members)],
+            log_scale=(log_scale,)[: len(members)],
+            energy=(energy,)[: len(members)],
+            rss=rss,
+            noise=noise,
+            effective=effective,
+        )
+    return found, fits.axes[1:]
+
+
+def dictionary_of(
+    atoms: Sequence[Atom],
+    x: Sequence[Tensor],
+    y: Tensor,
+    others: Sequence[int],
+    axes: Sequence[Tensor],
+    alone: Mapping[tuple[int, ...], Found],
+    noise_dof: float,
+) -> Dictionary:
+    """Of the library effects and the catch-alls `others`; axes and alone: as `singles_of` gives them."""
+    library = [i for i, a in enumerate(atoms) if not a.catch_all]
+    columns = torch.cat([y[..., None][..., :0], *(x[i] for i in (*library, *others))], -1)
+    ends = torch.tensor([x[i].shape[-1] for i in (*library, *others)], dtype=torch.int64).cumsum(0).tolist()
+    groups = {i: torch.arange(e - x[i].shape[-1], e) for i, e in zip((*library, *others), ends, strict=True)}
+    grams = grams_of(columns, y)
+    wild = torch.tensor(
+        [-1] * (ends[len(library) - 1] if library else 0) + [k for k in others for _ in range(x[k].shape[-1])]
+    )
+    apart = (wild[:, None] >= 0) & (wild >= 0) & (wild[:, None] != wild)
+    grams = grams._replace(xx=grams.xx.masked_fill_(apart, torch.nan))
+    own = {i: axes[i] for i in groups}
+    return Dictionary(tuple(atoms), columns, groups, grams, own, _turned(grams, groups, own), alone, noise_dof)
+
+
+def _turned(grams: Grams, groups: Mapping[int, Tensor], axes: Mapping[int, Tensor]) -> Grams:
+    """Every group in its principal axes."""
+    xx, xy = torch.empty_like(grams.xx), torch.empty_like(grams.xy)
+    for i, group in groups.items():
+        place = slice(int(group[0]), int(group[-1]) + 1)
+        xx[place], xy[place] = axes[i].mT @ grams.xx[place], axes[i].mT @ grams.xy[place]
+    for i, group in groups.items():
+        place = slice(int(group[0]), int(group[-1]) + 1)
+        xx[:, place] = xx[:, place] @ axes[i]
+    return grams._replace(xx=xx, xy=xy)
