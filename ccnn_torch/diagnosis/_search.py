@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from torch import Tensor
 
@@ -45,23 +45,31 @@ def search(
         # Each kind by itself: what the library can do at best is asked for, too, however far a catch-all is ahead.
         for wild in (False, True):
             mine = [s for s in fresh if _has_catch_all(s, atoms) == wild]
-            top = max(
-                (f.log_posterior for s, f in tried.items() if _has_catch_all(s, atoms) == wild), default=-math.inf
-            )
+            top = _top(f for s, f in tried.items() if _has_catch_all(s, atoms) == wild)
             tried.update((f.members, f) for f in promising(dictionary, mine, top, tried))
 
     def best(size: int, count: int) -> list[Found]:
         return sorted((f for s, f in tried.items() if len(s) == size), key=lambda f: -f.log_posterior)[:count]
 
+    def better(size: int) -> bool:
+        """Whether a set of this size beats the smaller ones, among all or among those of the library."""
+        return any(
+            _top(f for s, f in mine.items() if len(s) == size) > _top(f for s, f in mine.items() if len(s) < size)
+            for mine in (tried, {s: f for s, f in tried.items() if not _has_catch_all(s, atoms)})
+        )
+
     firsts, beam = (known[:_LIKELIEST], 2) if quick else (known, _BEAM)
     look([s for i in firsts for j in (*known, *others) if (s := _joined((i,), j, atoms))])
     for size in range(2, _MOST):
-        candidates = [*known, *others]
-        wide = beam if size == 2 else max(2, beam // 2)
-        look([s for f in best(size, wide) for j in candidates if (s := _joined(f.members, j, atoms))])
-        if best(size + 1, 1) and best(size + 1, 1)[0].log_posterior < max(f.log_posterior for f in tried.values()):
+        if not better(size) or (size > 2 and best(size, 1)[0].log_posterior < _top(tried.values())):
             break
+        wide = beam if size == 2 else max(2, beam // 2)
+        look([s for f in best(size, wide) for j in (*known, *others) if (s := _joined(f.members, j, atoms))])
     return dictionary, sorted(tried.values(), key=lambda f: -f.log_posterior)
+
+
+def _top(found: Iterable[Found]) -> float:
+    return max((f.log_posterior for f in found), default=-math.inf)
 
 
 def _of_several_drivers(ranked: Sequence[int], atoms: Sequence[Atom]) -> list[int]:
