@@ -1,4 +1,4 @@
-"""Catch-alls that are found rather than given: a bump in one place of a joint's track, or of the workspace.
+"""Catch-alls that are found rather than given: a bump in one place of a joint's track, or of the workspace; a sway.
 
 Bumps of every place at once share one prior scale, and the evidence charges each of them; a dent or a table is in one
 place alone. So that place is looked for, and the search is charged as that for a period is.
@@ -15,6 +15,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._catch_all import LOG_PRIOR, joint_moves, platform_moves, spread_out, unit_range
 from ccnn_torch.diagnosis._remainder import Remainder, Tried, search_charge
+from ccnn_torch.diagnosis._sway import sway
 from ccnn_torch.diagnosis._whitening import Whitening
 from ccnn_torch.effects import Situation
 
@@ -40,7 +41,7 @@ _LOOSE = 10.0
 def local_catch_alls(
     situation: Situation, jacobian: Tensor, target: Tensor, white: Whitening, others: Tensor
 ) -> list[Atom]:
-    """The best bump of each joint's track, and that of the workspace.
+    """The best bump of each joint's track, and that of the workspace; and the best sine of time.
 
     Args:
         situation: `s` rows.
@@ -81,8 +82,12 @@ def local_catch_alls(
     place = unit_range(situation.pose[:, lengths] if lengths else situation.pose)
     places = _places(spread_out(place, _WITHIN), _RADII_WITHIN)
     # What pulls the platform acts through the joints; what bends a measurement does not.
-    for raw in (moved, platform_moves(situation)):
+    platform = platform_moves(situation)
+    for raw in (moved, platform):
         found += atoms("workspace", place, places, raw)
+    if "time" in situation.covariates:
+        lead = white(platform)
+        found += sway(situation.covariates["time"], platform, lead, few, plain.beside(_LOOSE * lead[few]))
     return found
 
 

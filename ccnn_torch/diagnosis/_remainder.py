@@ -129,8 +129,15 @@ class Remainder:
             z = (lead[None, ..., None] * factors[:, :, None]).reshape(count, -1, leads * width)
             inner = z.mT @ z
         else:
-            inner = factors.permute(0, 2, 3, 1)[:, None] @ (led.among[..., None] * factors.transpose(1, 2)[:, None])
-            inner = inner.transpose(2, 3).reshape(count, leads * width, leads * width)
+            # By pairs of factors where these are few, else by candidates.
+            alike = factors[:, :, 0]
+            if width < leads:
+                pairs = (alike[..., None] * alike[..., None, :]).transpose(0, 1).reshape(rows, -1)
+                inner = (led.among.flatten(0, 1) @ pairs).reshape(leads, leads, count, width, width)
+                inner = inner.permute(2, 0, 3, 1, 4)
+            else:
+                inner = (alike.mT[:, None, None] @ (led.among[..., None] * alike[:, None, None])).transpose(2, 3)
+            inner = inner.reshape(count, leads * width, leads * width)
         flat = factors.permute(2, 1, 0, 3).reshape(own, rows, count * width)
         cross = (
             (led.taken @ flat).reshape(leads, -1, count, width).permute(2, 1, 0, 3).reshape(count, -1, leads * width)

@@ -55,6 +55,17 @@ def test_waves_of_several_joints_are_no_other_effect() -> None:
     assert said["outside_library"] and said["driver"].startswith("joint") and not said["effects"]
 
 
+@pytest.mark.parametrize(("machine", "periods"), [("five_bar", 18.7), ("stewart", 11.3), ("tripod", 40.2)])
+def test_a_quick_sway_follows_the_time_and_is_no_noise(machine: str, periods: float) -> None:
+    situation = rows_of(machine, 150, 20)
+    time = situation.covariates["time"]
+    wave = torch.sin(2 * torch.pi * periods * (time - time.min()) / (time.max() - time.min()))
+    way = torch.tensor([1.0 if c.unit == "m" else 0.0 for c in situation.mechanism.pose], dtype=torch.float64)
+    drawn = torch.randn(situation.pose.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    said = diagnose_rows(situation, situation.pose + NOISE * (5 * wave[:, None] * way + drawn)).verdict
+    assert said["outside_library"] and said["driver"] == "time" and not said["effects"]
+
+
 def test_what_wanders_with_the_time_is_not_taken_for_mounts_that_warm() -> None:
     situation = rows_of("stewart", 60, 0)
     morning = 293.15 + 6 * (1 - torch.exp(-situation.covariates["time"] / 5000))

@@ -94,8 +94,9 @@ def _twitch(machine: BlindMachine, at: Conditions, generator: Generator) -> tupl
 
 
 def _hum(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple[Deviation, tuple[str, ...]]:
-    """A pump or a tide that sways the machine with a period of its own."""
-    period = float(at.time[-1]) / generator.uniform(2.5, 7.0)
+    """A pump or a tide that sways the machine with a period of its own, of at least four rows."""
+    most = min(len(at.time) / 4, 40.0)
+    period = float(at.time[-1]) / np.exp(generator.uniform(np.log(2.5), np.log(most)))
     wave = torch.sin(2 * torch.pi * at.time / period + generator.uniform(0, 2 * np.pi))
     return _moved(machine, at, wave, generator), ("time",)
 
