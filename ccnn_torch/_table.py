@@ -187,6 +187,8 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
 def _read_text(file: str) -> str:
     try:
         return Path(file).read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{file}: there is no such file; give the path of a CSV file") from None
     except UnicodeDecodeError:
         raise InputError(f"{file}: the file is not UTF-8 text; save it as 'CSV UTF-8'") from None
     except OSError as reason:

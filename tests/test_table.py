@@ -119,7 +119,7 @@ def test_missing_column_names_the_nearest(tmp_path: Path) -> None:
 
 
 def test_unreadable_files(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"nowhere\.csv: cannot be read: No such file"):
+    with pytest.raises(InputError, match=r"nowhere\.csv: there is no such file; give the path"):
         read_table(tmp_path / "nowhere.csv")
     with pytest.raises(InputError, match="cannot be read"):
         read_table(tmp_path)

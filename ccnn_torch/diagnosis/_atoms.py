@@ -20,7 +20,7 @@ class Atom:
     Attributes:
         name: of the effect, or the driver of a catch-all (`workspace`, `joint q1`, `load z`, …).
         effect: None for a catch-all.
-        shape: values of the effect's shapes, `h` [SI].
+        shape: values of the effect's shapes, `h` [SI]; of a catch-all that sways its period [s], of others none.
         columns: first-order change of the pose per plausible size of each coefficient, `s x c x m` [m, rad].
         log_prior: log prior odds, the search over shapes charged.
         used: the coefficients that the columns belong to; None = all, in order.

@@ -22,7 +22,8 @@ _FINE, _ROUNDS = 9, 3
 
 
 def sway(time: Tensor, raw: Tensor, lead: Tensor, few: Tensor, left: Remainder) -> list[Atom]:
-    """The sine of time that explains most, its search charged; none where there are too few rows for any.
+    """The sine of time that explains most, its search charged, with its period [s] as `shape`; none where there are too
+    few rows for any.
 
     Args:
         time: of each row, `s` [s].
@@ -52,7 +53,7 @@ def sway(time: Tensor, raw: Tensor, lead: Tensor, few: Tensor, left: Remainder) 
         step *= 2 / (_FINE - 1)
     charge = search_charge(len(lead) / len(few) * score)
     columns = (raw[..., None] * _waves(share, best[None])[0][:, None, None]).flatten(-2)
-    return [Atom("time", None, raw.new_zeros(0), columns, LOG_PRIOR - charge)]
+    return [Atom("time", None, span / best[None], columns, LOG_PRIOR - charge)]
 
 
 def _waves(share: Tensor, periods: Tensor) -> Tensor:

@@ -156,6 +156,9 @@ def _notes(
     notes = [unseen_text(name, reason) for name, reason in lacking.items()]
     notes += [lacking_text(mechanism.name, condition) for condition in mechanism.lacking(covariates)]
     notes += not_held_notes(judgement.names)
+    for atom in (analysis.dictionary.atoms[i] for i in judgement.found.members):
+        if atom.catch_all and len(atom.shape):
+            notes.append(f"what follows the time is a sway with a period of {float(atom.shape):.3g} s")
     if len(analysis.measured) < int(rows.fine.sum()):
         notes.append(f"{len(analysis.measured)} of {len(rows.fine)} rows, drawn at random, were looked at")
     if not judgement.names and not judgement.outside and analysis.whitening.known == 0 and missing:
