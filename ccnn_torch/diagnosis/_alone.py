@@ -57,10 +57,10 @@ class Alone(NamedTuple):
     axes: list[Tensor]
 
 
-def own_products(x: Tensor, y: Tensor) -> Own:
-    """x: whitened columns, `... x m`; y: what they explain, `...`."""
+def own_products(x: Tensor, y: Tensor, size: Tensor | float = 1.0) -> Own:
+    """x: whitened columns, `... x m`, which count divided by `size`; y: what they explain, `...`."""
     flat = x.flatten(0, -2)
-    return Own(flat.mT @ flat, flat.mT @ y.reshape(-1))
+    return Own(flat.mT @ flat / size**2, flat.mT @ y.reshape(-1) / size)
 
 
 def fit_alone(groups: Sequence[Own], yy: Tensor, values: float, noise_dof: float, spread: float = SPREAD) -> Alone:

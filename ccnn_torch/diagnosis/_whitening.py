@@ -88,49 +88,55 @@ def fitted_whitening(
     rms = rms.clamp_min(NO_NOISE)
     sigma = rms if noise is None else noise[channels]
     white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0)
-    units = [c[:, channels] for c in columns if c.shape[-1]]
-    units = [u / _size(u[usable] / sigma[:, None]) for u in units]
+    shown = [c if len(channels) == c.shape[1] else c[:, channels] for c in columns if c.shape[-1]]
+    # Columns count by what they tell, whatever their size: all have the same mean square.
+    size = [(c.square().sum(-1)[usable] / sigma.square()).mean() / c.shape[-1] for c in shown]
+    size = [s.sqrt().clamp_min(1e-300) for s in size]
     y = residual[:, channels]
     if noise is None:
-        white = replace(white, sigma=sigma * _noise_share(units, y, white).sqrt())
+        white = replace(white, sigma=sigma * _noise_share(shown, size, y, white).sqrt())
     chosen: list[int] = []
     least = None if noise is not None else (1e-4 * rms).clamp_min(NO_NOISE)
     left, free = y, 1.0
     for _ in range(_RICH):
         if chosen:
-            own = torch.cat([units[k] for k in chosen], -1)
-            ends = torch.tensor([units[k].shape[-1] for k in chosen]).cumsum(0).tolist()
-            parts = [torch.arange(e - units[k].shape[-1], e) for e, k in zip(ends, chosen, strict=True)]
+            own = torch.cat([shown[k] / size[k] for k in chosen], -1)
+            ends = torch.tensor([shown[k].shape[-1] for k in chosen]).cumsum(0).tolist()
+            parts = [torch.arange(e - shown[k].shape[-1], e) for e, k in zip(ends, chosen, strict=True)]
             fit = fit_sets(grams_of(white.scaled(own), white.scaled(y)), [parts], 0.0, spread=_ANY_SIZE)
             left = y - own @ fit.mean[0]
             free = max(1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), 0.1)
             white = _settled(white, left, usable, free, least)
         target = white.scaled(left)
-        products = [NOTHING if k in chosen else own_products(white.scaled(u), target) for k, u in enumerate(units)]
+        products = [
+            NOTHING if k in chosen else own_products(white.scaled(c), target, s)
+            for k, (c, s) in enumerate(zip(shown, size, strict=True))
+        ]
         fits = fit_alone([NOTHING, *products], target.square().sum(), float(target.numel()), 0.0, _ANY_SIZE)
         best = int(fits.log_evidence[1:].argmax())
-        if not units or float(fits.log_evidence[best + 1] - fits.log_evidence[0]) < _SLIGHT:
+        if not shown or float(fits.log_evidence[best + 1] - fits.log_evidence[0]) < _SLIGHT:
             break
         chosen.append(best)
     white = _settled(white, left, usable, free, least)
     return replace(white, known=0.0 if noise is None else 50.0)
 
 
-def _noise_share(units: Sequence[Tensor], y: Tensor, white: Whitening) -> Tensor:
+def _noise_share(shown: Sequence[Tensor], size: Sequence[Tensor], y: Tensor, white: Whitening) -> Tensor:
     """Of the squares of each channel what the candidate that explains it best by itself leaves, `c`.
 
     Channel by channel: one that is almost all gap would else be lost in the noise of the others.
 
     Args:
-        units: columns of each candidate, `s x c x m` [m, rad].
+        shown: columns of each candidate, `s x c x m` [m, rad].
+        size: what they are divided by.
         y: residual, `s x c` [m, rad].
         white: noise and weights so far.
     """
     target = white.scaled(y).mT
     groups: list[list[Own]] = [[NOTHING] for _ in target]
-    for u in units:
-        x = white.scaled(u).transpose(0, 1)
-        square, along = x.mT @ x, (x.mT @ target[..., None])[..., 0]
+    for c, s in zip(shown, size, strict=True):
+        x = white.scaled(c).transpose(0, 1)
+        square, along = x.mT @ x / s.square(), (x.mT @ target[..., None])[..., 0] / s
         for mine, xx, xy in zip(groups, square, along, strict=True):
             mine.append(Own(xx, xy))
     share = []
@@ -140,10 +146,6 @@ def _noise_share(units: Sequence[Tensor], y: Tensor, white: Whitening) -> Tensor
         clear = float(fits.log_evidence[best] - fits.log_evidence[0]) > _SLIGHT
         share.append(fits.noise[best] / fits.noise[0] if clear else torch.ones_like(fits.noise[0]))
     return torch.stack(share).clamp(1e-6, 1.0)
-
-
-def _size(values: Tensor) -> Tensor:
-    return values.square().mean().sqrt().clamp_min(1e-300)
 
 
 def _settled(white: Whitening, left: Tensor, usable: Tensor, free: float, least: Tensor | None) -> Whitening:
