@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis._alone import Own, fit_alone
+
 __all__ = ["Remainder", "Tried", "search_charge"]
 
 _DIGITS = 1e-13
@@ -35,9 +37,9 @@ class Tried(NamedTuple):
         """How many columns a candidate has."""
         return self.factors.shape[-1] * (1 if self.lead is None else self.lead.shape[-1])
 
-    def first(self, count: int) -> Tried:
-        """The first so many candidates."""
-        return Tried(self.factors[:count], self.lead)
+    def some(self, which: slice | Tensor) -> Tried:
+        """Some of the candidates."""
+        return Tried(self.factors[which], self.lead)
 
     def one(self, number: int) -> Tensor:
         """Columns of one candidate, `s x c x m`."""
@@ -91,15 +93,25 @@ class Remainder:
 
     def gain(self, tried: Tried) -> Tensor:
         """Squares that each candidate explains, `g`."""
-        inner, cross, b = (
-            self._products(tried.factors) if tried.lead is None else self._led_products(tried.lead, tried.factors)
-        )
-        inner = inner - cross.mT @ cross
+        inner, b = self._beside(tried)
         ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
         inner = inner + torch.diag_embed(ridge[:, None].expand(-1, inner.shape[-1]))
         solved = torch.linalg.solve(inner, b[..., None])[..., 0]
         gain: Tensor = (b * solved).sum(-1)
         return gain
+
+    def log_evidence(self, tried: Tried) -> Tensor:
+        """Of each candidate, with one scale of its coefficients about their plausible sizes, `g`."""
+        inner, b = self._beside(tried)
+        groups = [Own(xx, xy) for xx, xy in zip(inner, b, strict=True)]
+        return fit_alone(groups, self._whole @ self.y, float(len(self.y)), 0.0).log_evidence
+
+    def _beside(self, tried: Tried) -> tuple[Tensor, Tensor]:
+        """Of the columns, the nuisance taken out of them, among themselves and with y: `g x m x m`, `g x m`."""
+        inner, cross, b = (
+            self._products(tried.factors) if tried.lead is None else self._led_products(tried.lead, tried.factors)
+        )
+        return inner - cross.mT @ cross, b
 
     def _products(self, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Of columns `g x s x c x m` among themselves, with what is taken, and with y: `g x m x m`, `g x P x m`,

@@ -22,6 +22,8 @@ _FINE, _ROUNDS = 9, 2
 _LOOSE = 10.0
 # Values of the residual, at most, that the grids are looked at on, and that count between their values.
 _COARSE, _CLOSE = 900, 4800
+# Values of a grid that explain so little less than the best may be meant, a few of them, where it is more than chance.
+_AS_WELL, _FEW, _THERE = 60.0, 16, 100.0
 # Shapes that share coefficients are looked for together where that are no more values.
 _TOGETHER = 150
 
@@ -155,15 +157,16 @@ class Scan:
                         own = [_LOOSE * p.one(chosen[j]) for j, p in enumerate(pieces) if sweep and j != i]
                         left = plain.beside(torch.cat(own, -1)) if own else plain
                         # What chance explains does not grow with the rows.
-                        score = times * (left.gain(piece.first(sizes[i])) - piece.width) + piece.width
-                        chosen[i] = int(score.argmax())
+                        tried = piece.some(slice(sizes[i]))
+                        score = times * (left.gain(tried) - piece.width) + piece.width
+                        chosen[i] = _likeliest(left, tried, score) if level == 0 else int(score.argmax())
                         gains[i] = float(score[chosen[i]])
                         spent[i] = search_charge(score) if level == 0 else 0.0
                 charges = [c + s for c, s in zip(charges, spent, strict=True)]
                 value = value.clone()
                 for i, part in enumerate(self.parts):
                     value[part.shapes] = candidates[chosen[i]][part.shapes]
-        return self._worth(value, gains, charges)
+        return self._worth(value, gains, charges, ground.times[1])
 
     def _level(self, value: Tensor, level: int, rows: Tensor | None) -> list[_Turn]:
         """Candidates with their columns: of every part all its shapes at once where that are few, else one by one."""
@@ -193,6 +196,9 @@ class Scan:
         if len(grids) > 1 and level == 0 and math.prod(map(len, grids)) <= _TOGETHER:
             return [torch.cartesian_prod(*grids)]
         found = []
+        if level == 1 and not any(self.shapes[h].refined for h in part.shapes):
+            # Nothing is between the values, but on more rows it is seen what the best is worth.
+            return [value[part.shapes][None]]
         for k, grid in enumerate(grids):
             if level and not self.shapes[part.shapes[k]].refined:
                 continue
@@ -214,16 +220,32 @@ class Scan:
     def _nearest(self, candidates: Tensor, value: Tensor, part: _Part) -> int:
         return int((candidates[:, part.shapes] - value[part.shapes]).abs().sum(-1).argmin())
 
-    def _worth(self, value: Tensor, gains: Sequence[float], charges: Sequence[float]) -> Shaped:
-        """Only the parts that pay for their search and half a unit of log evidence a coefficient; at least the best."""
+    def _worth(self, value: Tensor, gains: Sequence[float], charges: Sequence[float], times: float) -> Shaped:
+        """Only the parts that pay for their search and half a unit of log evidence a coefficient; at least the best.
+
+        times: how much more than it is worth chance counts in the gains.
+        """
         net = [g / 2 - c for g, c in zip(gains, charges, strict=True)]
         best = max(range(len(net)), key=lambda i: net[i])
-        kept = [i for i, p in enumerate(self.parts) if i == best or net[i] > 1.5 * len(p.columns)]
+        kept = [i for i, p in enumerate(self.parts) if i == best or net[i] > 1.5 * times * len(p.columns)]
         charge = sum(charges[i] for i in kept)
         if len(kept) == len(self.parts):
             return Shaped(value, None, charge)
         unshaped = set(range(len(self.size))) - {c for p in self.parts for c in p.columns}
         return Shaped(value, tuple(sorted(unshaped | {c for i in kept for c in self.parts[i].columns})), charge)
+
+
+def _likeliest(left: Remainder, tried: Tried, score: Tensor) -> int:
+    """Of values that explain about as much the one that does so with coefficients of the likeliest sizes.
+
+    Eight waves of the wrong, low frequency can be bent to any other over a short travel.
+    """
+    best = int(score.argmax())
+    near = torch.nonzero(score > score[best] - _AS_WELL).squeeze(-1)
+    if len(near) < 2 or float(score[best]) < _THERE:
+        return best
+    near = near[score[near].argsort(descending=True)[:_FEW]]
+    return int(near[left.log_evidence(tried.some(near)).argmax()])
 
 
 def _movers(basis: Tensor) -> Tensor | None:
