@@ -16,7 +16,7 @@ __all__ = ["promising", "scored"]
 # Updates of a fit; after the short one no set that came within 12 of the best in the end was 85 below it, in trials.
 _UPDATES, _SHORT, _HOPELESS = 8, 1, 100.0
 # Sets are fitted side by side where their widths differ by less than this.
-_ALIKE = 16
+_ALIKE = 24
 # A third cause at once is rarer still than a second one.
 _CROWD = math.log(0.1)
 

@@ -74,11 +74,13 @@ def judge(analysis: Analysis) -> Judgement:
     groups: dict[tuple[frozenset[str], str | None], list[Found]] = {}
     top = analysis.found[0].log_posterior
     tried = {f.members: f for f in analysis.found}
-    for found in analysis.found:
-        if found.log_posterior > top - _FAR:
-            essential = _essential(analysis, found, tried)
-            groups.setdefault(_named(analysis, essential), []).extend([found, essential])
-            tried[essential.members] = essential
+    near = [f for f in analysis.found if f.log_posterior > top - _FAR]
+    # What is asked for one by one below is fitted side by side first.
+    _fits(analysis, [s for f in near if len(f.members) > 1 for s in _fewer(f).values()], tried)
+    for found in near:
+        essential = _essential(analysis, found, tried)
+        groups.setdefault(_named(analysis, essential), []).extend([found, essential])
+        tried[essential.members] = essential
     weights = {key: math.exp(max(f.log_posterior for f in fs) - top) for key, fs in groups.items()}
     total = sum(weights.values())
     leading = sorted(((k[0], k[1], w / total, _plainest(groups[k])) for k, w in weights.items()), key=lambda x: -x[2])
@@ -188,9 +190,14 @@ def _net(
 ) -> dict[int, tuple[float, tuple[int, ...]]]:
     """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
     gap = max(float(analysis.dictionary.grams.yy) - analysis.floor * analysis.dictionary.grams.values, 1e-300)
-    fewer = {i: tuple(m for m in found.members if m != i) for i in found.members}
+    fewer = _fewer(found)
     without = _fits(analysis, list(fewer.values()), tried)
     return {i: ((f.rss - found.rss) / gap, f.members) for i, f in zip(fewer, without, strict=True)}
+
+
+def _fewer(found: Found) -> dict[int, tuple[int, ...]]:
+    """The set without each of its members."""
+    return {i: tuple(m for m in found.members if m != i) for i in found.members}
 
 
 def _fits(analysis: Analysis, sets: Sequence[tuple[int, ...]], tried: dict[tuple[int, ...], Found]) -> list[Found]:
