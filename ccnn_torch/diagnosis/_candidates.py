@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -94,14 +95,14 @@ def renewed_candidates(
     def beside(others: Sequence[Acting]) -> Tensor:
         return torch.where(usable[:, None], torch.nan_to_num(remainder(situation, measured, others)), 0.0)
 
-    def ground(others: Sequence[Acting]) -> Ground:
+    @lru_cache
+    def ground(others: tuple[Acting, ...]) -> Ground:
         columns = [_atom(situation, there, a.effect, Shaped(a.shape, None, 0.0)) for a in others]
         present = torch.cat([white(fitted), *(white(cleaned(c, usable).columns) for c in columns)], -1)
         return Ground(white(target), present)
 
     atoms: list[Atom] = []
     all_act = beside(acting)
-    grounds: dict[int, Ground] = {}
     for effect in effects:
         others = [a for a in acting if a.effect is not effect]
         if not effect.shapes(situation):
@@ -110,18 +111,21 @@ def renewed_candidates(
             part = _best_part(situation, atoms[-1], white, left)
             atoms += [part] if part is not None else []
             continue
+        start = next((a.shape for a in acting if a.effect is effect), None)
         last = next((a for a in known if a.effect is effect), None)
-        if last is not None and len(others) == len(acting):
-            shaped = Shaped(last.shape, last.used, LOG_PRIOR - last.log_prior)
+        if start is None and last is not None:
+            shapes = [Shaped(last.shape, last.used, LOG_PRIOR - last.log_prior)]
         else:
-            if len(others) not in grounds or len(others) < len(acting):
-                grounds[len(others)] = ground(others)
-            start = next((a.shape for a in acting if a.effect is effect), None)
-            shaped = Scan(situation, there, effect, _only(white, usable)).best(grounds[len(others)], start)
-        atoms.append(cleaned(_atom(situation, there, effect, shaped), usable))
-        for old in (a for a in starts if a.effect is effect and not _same_shape(a, shaped)):
-            so = Shaped(old.shape, old.used, LOG_PRIOR - old.log_prior)
-            atoms.append(cleaned(_atom(situation, there, effect, so), usable))
+            # What acts beside an effect may be there to mend a wrong shape: the right one needs nothing beside it.
+            beside_what = [others] if start is None or not others else [others, []]
+            scan = Scan(situation, there, effect, _only(white, usable))
+            shapes = [scan.best(ground(tuple(them)), start) for them in beside_what]
+        shapes += [Shaped(a.shape, a.used, LOG_PRIOR - a.log_prior) for a in starts if a.effect is effect]
+        own: list[Atom] = []
+        for shaped in shapes:
+            if not any(_same_shape(a, shaped) for a in own):
+                own.append(cleaned(_atom(situation, there, effect, shaped), usable))
+        atoms += own
     return atoms
 
 

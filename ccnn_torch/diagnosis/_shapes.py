@@ -20,10 +20,10 @@ __all__ = ["Ground", "Scan", "Shaped"]
 _FINE, _ROUNDS = 9, 2
 # Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
 _LOOSE = 10.0
-# Values of the residual, at most, that the grids are looked at on, and that count between their values.
-_COARSE, _CLOSE = 900, 4800
+# Values of the residual, at most, that the grids are looked at on, for a start and then.
+_START, _MOST = 900, 4800
 # Values of a grid that explain so little less than the best may be meant, a few of them, where it is more than chance.
-_AS_WELL, _FEW, _THERE = 60.0, 16, 100.0
+_AS_WELL, _FEW, _THERE = 20.0, 16, 100.0
 # Shapes that share coefficients are looked for together where that are no more values.
 _TOGETHER = 150
 
@@ -63,23 +63,19 @@ class Ground:
     """What is to be explained, and what else is there, on the rows that grids are looked at on.
 
     Attributes:
-        rows: looked at for the grids, and between their values; None = all.
+        rows: looked at, `t`; None = all.
         left: what the others leave there.
         times: how many values there are for each that is looked at.
     """
 
     def __init__(self, y: Tensor, others: Tensor, quick: bool = False) -> None:
         """y: whitened residual, `s x c`; others: whitened columns, in units of their prior, `s x c x P`; quick:
-        whether a start is enough, so that no more rows are looked at between the values of the grids."""
+        whether a start is enough."""
         drawn = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))
-        few = [max(1, most // max(y.shape[1], 1)) for most in (_COARSE, _COARSE if quick else _CLOSE)]
-        self.rows = [drawn[:count].sort().values if count < len(y) else None for count in few]
-        coarse = Remainder(_of(y, self.rows[0], 0), _LOOSE * _of(others, self.rows[0], 0))
-        if len(coarse.y) == y.numel() or quick:
-            self.left = [coarse, coarse]
-        else:
-            self.left = [coarse, Remainder(_of(y, self.rows[1], 0), _LOOSE * _of(others, self.rows[1], 0))]
-        self.times = [y.numel() / left.y.numel() for left in self.left]
+        count = max(1, (_START if quick else _MOST) // max(y.shape[1], 1))
+        self.rows = drawn[:count].sort().values if count < len(y) else None
+        self.left = Remainder(_of(y, self.rows, 0), _LOOSE * _of(others, self.rows, 0))
+        self.times = y.numel() / self.left.y.numel()
 
 
 class Scan:
@@ -142,12 +138,9 @@ class Scan:
         value = self.start if start is None else start
         gains = [0.0] * len(self.parts)
         charges = [0.0] * len(self.parts)
+        plain, times = ground.left.beside(_LOOSE * _of(self.unshaped, ground.rows, 0)), ground.times
         for level in range(_ROUNDS + 1):
-            which = min(level, 1)
-            if level == 0 or (level == 1 and ground.left[0] is not ground.left[1]):
-                plain = ground.left[which].beside(_LOOSE * _of(self.unshaped, ground.rows[which], 0))
-            times = ground.times[which]
-            for candidates, pieces, sizes in self._level(value, level, ground.rows[which]):
+            for candidates, pieces, sizes in self._level(value, level, ground.rows):
                 chosen = [self._nearest(candidates, value, part) for part in self.parts]
                 spent = [0.0] * len(self.parts)
                 for sweep in range(2 if start is not None and len(self.parts) > 1 else 1):
@@ -166,7 +159,7 @@ class Scan:
                 value = value.clone()
                 for i, part in enumerate(self.parts):
                     value[part.shapes] = candidates[chosen[i]][part.shapes]
-        return self._worth(value, gains, charges, ground.times[1])
+        return self._worth(value, gains, charges, times)
 
     def _level(self, value: Tensor, level: int, rows: Tensor | None) -> list[_Turn]:
         """Candidates with their columns: of every part all its shapes at once where that are few, else one by one."""
@@ -196,9 +189,6 @@ class Scan:
         if len(grids) > 1 and level == 0 and math.prod(map(len, grids)) <= _TOGETHER:
             return [torch.cartesian_prod(*grids)]
         found = []
-        if level == 1 and not any(self.shapes[h].refined for h in part.shapes):
-            # Nothing is between the values, but on more rows it is seen what the best is worth.
-            return [value[part.shapes][None]]
         for k, grid in enumerate(grids):
             if level and not self.shapes[part.shapes[k]].refined:
                 continue
