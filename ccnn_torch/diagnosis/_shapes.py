@@ -20,8 +20,8 @@ __all__ = ["Ground", "Scan", "Shaped"]
 _FINE, _ROUNDS = 9, 2
 # Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
 _LOOSE = 10.0
-# Values of the residual, at most, that the grids are looked at on, for a start and then.
-_START, _MOST = 900, 4800
+# Values of the residual, at most, that the grids are looked at on, for a start (or one value in so many) and then.
+_START, _SHARE, _MOST = 900, 4, 4800
 # Values of a grid that explain so little less than the best may be meant, a few of them, where it is more than chance.
 _AS_WELL, _FEW, _THERE = 20.0, 16, 100.0
 # Shapes that share coefficients are looked for together where that are no more values.
@@ -72,7 +72,8 @@ class Ground:
         """y: whitened residual, `s x c`; others: whitened columns, in units of their prior, `s x c x P`; quick:
         whether a start is enough."""
         drawn = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))
-        count = max(1, (_START if quick else _MOST) // max(y.shape[1], 1))
+        most = max(_START, y.numel() // _SHARE) if quick else _MOST
+        count = max(1, most // max(y.shape[1], 1))
         self.rows = drawn[:count].sort().values if count < len(y) else None
         self.left = Remainder(_of(y, self.rows, 0), _LOOSE * _of(others, self.rows, 0))
         self.times = y.numel() / self.left.y.numel()
