@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from typing import NamedTuple
 
 import torch
@@ -72,9 +73,8 @@ class Remainder:
         """With more nuisance, `s x c x m`."""
         if not more.shape[-1]:
             return self
-        other = object.__new__(Remainder)
+        other = copy(self)
         other._last = None
-        other.y, other._whole, other._rows, other._taken = self.y, self._whole, self._rows, self._taken
         other._take(more)
         return other
 
