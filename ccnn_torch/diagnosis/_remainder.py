@@ -81,10 +81,10 @@ class Remainder:
     def _take(self, more: Tensor) -> None:
         flat = more.flatten(0, 1)
         cross = self._taken @ flat
-        gram = flat.mT @ flat - cross.mT @ cross
-        diagonal = gram.diagonal()
+        gram = flat.mT @ flat
         # Columns that are the same, far above the noise, would leave no digit of the 1.
-        diagonal += 1 + _DIGITS * diagonal.amax(0, keepdim=True) if len(gram) else 0
+        ones = 1 + _DIGITS * gram.diagonal().amax(0, keepdim=True) if len(gram) else gram.diagonal()
+        gram = gram - cross.mT @ cross + torch.diag(ones.expand(len(gram)))
         factor = torch.linalg.cholesky(gram)
         # Rows whose Gram matrix is what the nuisance takes out: (I + NᵀN)^-1/2 Nᵀ.
         taken = torch.linalg.solve_triangular(factor, flat.mT - cross.mT @ self._taken, upper=False)

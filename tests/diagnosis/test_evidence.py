@@ -84,6 +84,13 @@ def test_what_is_put_beside_in_parts_takes_what_it_takes_at_once() -> None:
             assert left.gain(tried) == pytest.approx(wanted.numpy(), rel=1e-9)
 
 
+def test_nearly_the_same_columns_far_above_the_noise_can_be_taken_out_twice() -> None:
+    y, x = _columns(12, 60, 1).reshape(30, 2), 1e7 * _columns(13, 60, 5).reshape(30, 2, 5)
+    twice = Remainder(y, x).beside(x * (1 + 1e-12 * torch.arange(5))).beside(x)
+    assert twice.y == pytest.approx(Remainder(y, x).y.numpy(), abs=0.05)
+    assert bool(torch.isfinite(twice.gain(Tried(_columns(14, 240, 3).reshape(4, 30, 2, 3)))).all())
+
+
 def test_groups_in_their_axes_are_as_sets_of_one() -> None:
     x, y = _columns(10, 40, 9), _columns(11, 40, 1)[..., 0]
     x[..., 8] = x[..., 7]
