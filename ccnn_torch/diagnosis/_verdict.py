@@ -166,10 +166,13 @@ def _best_without(analysis: Analysis, names: frozenset[str], tried: dict[tuple[i
 
 
 def _could_be_another(analysis: Analysis, found: Found) -> bool:
-    """Whether what a set can do holds what some candidate beside it is likely to do, to within the noise."""
+    """Whether what the effects of a set can do holds what some candidate beside it is likely to do, up to the noise.
+
+    All that they can do, in whatever joints or legs: the one leg that explains most was picked from all of them.
+    """
     atoms, groups, grams = analysis.dictionary.atoms, analysis.dictionary.groups, analysis.dictionary.grams
     names = {atoms[i].name for i in found.members}
-    own = torch.cat([groups[i] for i in found.members])
+    own = torch.cat([groups[_whole(analysis, i)] for i in found.members])
     inverse = torch.linalg.pinv(grams.xx[own][:, own], rtol=1e-9, hermitian=True)
     gap = float(grams.yy) - analysis.floor * grams.values
     for i, atom in enumerate(atoms):
@@ -183,6 +186,14 @@ def _could_be_another(analysis: Analysis, found: Found) -> bool:
         if gap * (1 - float((cross * (inverse @ cross)).sum()) / total) < _MIMICKED:
             return True
     return False
+
+
+def _whole(analysis: Analysis, member: int) -> int:
+    """The atom with all coefficients of an effect of which one has some; itself where there is none of its shapes."""
+    atoms = analysis.dictionary.atoms
+    mine = atoms[member]
+    alike = (i for i, a in enumerate(atoms) if a.effect is mine.effect and a.used is None)
+    return next((i for i in alike if not mine.catch_all and torch.equal(atoms[i].shape, mine.shape)), member)
 
 
 def _net(
