@@ -68,7 +68,7 @@ def fit_alone(groups: Sequence[Own], yy: Tensor, values: float, noise_dof: float
 
     Args:
         groups: inner products of each.
-        yy: sum of the squares to be explained, 0-dim.
+        yy: sum of the squares to be explained, 0-dim, or of each group, `b`.
         values: how many they are.
         noise_dof: weight of the prior of σ² about 1, in values; 0 = the noise is not known.
         spread: standard deviation of log α².

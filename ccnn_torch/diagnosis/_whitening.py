@@ -133,19 +133,17 @@ def _noise_share(shown: Sequence[Tensor], size: Sequence[Tensor], y: Tensor, whi
         white: noise and weights so far.
     """
     target = white.scaled(y).mT
-    groups: list[list[Own]] = [[NOTHING] for _ in target]
+    groups = [NOTHING] * len(target)
     for c, s in zip(shown, size, strict=True):
         x = white.scaled(c).transpose(0, 1)
         square, along = x.mT @ x / s.square(), (x.mT @ target[..., None])[..., 0] / s
-        for mine, xx, xy in zip(groups, square, along, strict=True):
-            mine.append(Own(xx, xy))
-    share = []
-    for mine, one in zip(groups, target, strict=True):
-        fits = fit_alone(mine, one.square().sum(), float(len(one)), 0.0, _ANY_SIZE)
-        best = int(fits.log_evidence.argmax())
-        clear = float(fits.log_evidence[best] - fits.log_evidence[0]) > _SLIGHT
-        share.append(fits.noise[best] / fits.noise[0] if clear else torch.ones_like(fits.noise[0]))
-    return torch.stack(share).clamp(1e-6, 1.0)
+        groups += [Own(xx, xy) for xx, xy in zip(square, along, strict=True)]
+    squares = target.square().sum(-1).repeat(1 + len(shown))
+    fits = fit_alone(groups, squares, float(target.shape[-1]), 0.0, _ANY_SIZE)
+    evidence, noise = fits.log_evidence.reshape(-1, len(target)), fits.noise.reshape(-1, len(target))
+    best = evidence.max(0)
+    left = noise.gather(0, best.indices[None])[0] / noise[0]
+    return torch.where(best.values - evidence[0] > _SLIGHT, left, 1.0).clamp(1e-6, 1.0)
 
 
 def _settled(white: Whitening, left: Tensor, usable: Tensor, free: float, least: Tensor | None) -> Whitening:

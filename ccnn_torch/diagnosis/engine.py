@@ -208,4 +208,6 @@ def thinned(situation: Situation, measured: Tensor, fine: Tensor, seed: int) -> 
     if len(chosen) > most:
         drawn = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(seed))[:most]
         chosen = chosen[drawn.sort().values]
+    if len(chosen) == len(fine):
+        return situation, measured, chosen
     return picked(situation, chosen), measured[chosen], chosen
