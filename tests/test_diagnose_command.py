@@ -155,7 +155,7 @@ def _moved_away(rows: Path) -> None:
         (_first_rows, "5 rows are too few for a diagnosis; measure at least 20"),
         (_moved_away, "80 of 80 rows are outside the reach of five_bar"),
         (lambda rows: rows.write_text(""), "the file is empty; line 1 must be the header"),
-        (Path.unlink, "cannot be read: No such file or directory"),
+        (Path.unlink, "there is no such file; give the path of a CSV file"),
         (lambda rows: (rows.unlink(), rows.mkdir()), "cannot be read: Is a directory"),
     ],
 )

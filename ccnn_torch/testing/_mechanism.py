@@ -17,7 +17,7 @@ __all__ = ["check_mechanism"]
 _BATCHES: tuple[tuple[int, ...], ...] = ((), (2,), (2, 3))
 # A root is settled to about 1e-12; a pose closes to this [m, rad].
 _CLOSES = 1e-8
-_STEP = 1e-6
+_STEP = 1e-5
 _SLOPE_TOLERANCE = 2e-5
 # Differences of nearly singular configurations say nothing about the derivative.
 _REGULAR = 200.0
