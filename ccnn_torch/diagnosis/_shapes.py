@@ -17,7 +17,7 @@ from ccnn_torch.effects import Effect, Shape, Situation
 __all__ = ["Ground", "Scan", "Shaped"]
 
 # The grid, then twice this many values between the neighbours of the best.
-_FINE, _ROUNDS = 9, 2
+_FINE, _ROUNDS = 9, 3
 # Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
 _LOOSE = 10.0
 # Values of the residual, at most, that the grids are looked at on, for a start (or one value in so many) and then.
