@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._evidence import LIMIT, SPREAD
+from ccnn_torch.diagnosis._scales import LIMIT, SPREAD, Scales
 
 __all__ = ["NOTHING", "Alone", "Own", "fit_alone", "own_products"]
 
@@ -74,12 +74,13 @@ def fit_alone(groups: Sequence[Own], yy: Tensor, values: float, noise_dof: float
         spread: standard deviation of log α².
     """
     square, along, axes = _in_axes(groups, yy)
-    there = torch.tensor([float(len(g.xy) > 0) for g in groups], dtype=square.dtype)
+    there = torch.tensor([[len(g.xy) > 0] for g in groups])
     trace = square.sum(-1).clamp_min(1e-300)
-    psi = torch.log((yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there
+    psi = torch.log((yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there[:, 0]
+    psi, scales = psi[:, None], Scales(values, noise_dof, there, spread)
     noise = torch.ones_like(trace) if noise_dof > 0 else (yy / values / 10).clamp_min(1e-12).expand(len(groups))
     for k in range(_UPDATES + 1):
-        scale = psi.exp()[:, None]
+        scale = psi.exp()
         diagonal = 1 + scale * square / noise[:, None]
         mean = scale * along / noise[:, None] / diagonal
         gamma = (1 - 1 / diagonal).sum(-1)
@@ -87,16 +88,12 @@ def fit_alone(groups: Sequence[Own], yy: Tensor, values: float, noise_dof: float
         if k == _UPDATES:
             break
         size = (mean.square() / scale).sum(-1)
-        step = (0.5 * (size - gamma) - psi / spread**2) / (0.5 * gamma + 1 / spread**2)
-        psi = (psi + step.clamp(-2.0, 2.0) * there).clamp(-LIMIT, LIMIT)
-        left = (values - gamma).clamp_min(0.02 * values + 1)
-        noise = ((rss + noise_dof) / (left + noise_dof)).clamp_min(1e-12)
+        psi, noise = scales.updated(psi, size[:, None], gamma[:, None], rss)
     explained = (mean * along).sum(-1) / noise
-    evidence = 0.5 * (-values * noise.log() - yy / noise + explained - diagonal.log().sum(-1))
-    evidence = evidence - 0.5 * noise_dof * (noise.log() + 1 / noise - 1)
-    evidence = evidence + (-0.5 * psi.square() / spread**2 - 0.5 * torch.log1p(0.5 * gamma * spread**2)) * there
+    squares, log_det = yy / noise - explained, diagonal.log().sum(-1)
+    evidence = scales.log_evidence(psi, gamma[:, None], noise, squares, log_det)
     back = [v @ m[: v.shape[-1]] for v, m in zip(axes, mean, strict=True)]
-    return Alone(evidence, noise, back, (square * mean.square()).sum(-1), rss, gamma, psi, axes)
+    return Alone(evidence, noise, back, (square * mean.square()).sum(-1), rss, gamma, psi[:, 0], axes)
 
 
 def _in_axes(groups: Sequence[Own], yy: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:

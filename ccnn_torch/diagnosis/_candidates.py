@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -95,13 +94,19 @@ def renewed_candidates(
     def beside(others: Sequence[Acting]) -> Tensor:
         return torch.where(usable[:, None], torch.nan_to_num(remainder(situation, measured, others)), 0.0)
 
-    @lru_cache
-    def ground(others: tuple[Acting, ...]) -> Ground:
+    def ground(others: Sequence[Acting]) -> Ground:
+        names = tuple(a.effect.name for a in others)
+        if names not in grounds:
+            grounds[names] = made(others)
+        return grounds[names]
+
+    def made(others: Sequence[Acting]) -> Ground:
         columns = [_atom(situation, there, a.effect, Shaped(a.shape, None, 0.0)) for a in others]
         present = torch.cat([white(fitted), *(white(cleaned(c, usable).columns) for c in columns)], -1)
         return Ground(white(target), present)
 
     atoms: list[Atom] = []
+    grounds: dict[tuple[str, ...], Ground] = {}
     all_act = beside(acting)
     for effect in effects:
         others = [a for a in acting if a.effect is not effect]
@@ -119,7 +124,7 @@ def renewed_candidates(
             # What acts beside an effect may be there to mend a wrong shape: the right one needs nothing beside it.
             beside_what = [others] if start is None or not others else [others, []]
             scan = Scan(situation, there, effect, _only(white, usable))
-            shapes = [scan.best(ground(tuple(them)), start) for them in beside_what]
+            shapes = [scan.best(ground(them), start) for them in beside_what]
         shapes += [Shaped(a.shape, a.used, LOG_PRIOR - a.log_prior) for a in starts if a.effect is effect]
         own: list[Atom] = []
         for shaped in shapes:

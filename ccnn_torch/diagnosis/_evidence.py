@@ -1,8 +1,5 @@
-"""Evidence of many sets of groups of columns at once, from Gram matrices that are computed once.
-
-Model of a set: y ~ N(X θ, σ² I), θ of group g ~ N(0, α_g² I), log α_g² ~ N(0, s²), and log σ² flat, or about 0 where
-the noise was given. α and σ are brought to their most probable values by MacKay's updates (1992) and integrated there.
-"""
+"""Evidence of many sets of groups of columns at once, from Gram matrices that are computed once; the model is that of
+`_scales`."""
 
 from __future__ import annotations
 
@@ -13,13 +10,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["LIMIT", "SPREAD", "Fits", "Grams", "fit_sets", "grams_of", "padded", "without"]
+from ccnn_torch.diagnosis._scales import LIMIT, SPREAD, Scales
+
+__all__ = ["Fits", "Grams", "fit_sets", "grams_of", "padded", "without"]
 
 # Columns up to which XᵀX is made as a whole.
 _NARROW = 128
-# Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
-SPREAD = 4.0
-LIMIT = 25.0
 _DIGITS = 1e-13
 
 
@@ -41,7 +37,7 @@ class Fits(NamedTuple):
         columns: index of each column, `b x M`; -1 = padding.
         slot: which group of its set a column belongs to, `b x M`.
         mean: posterior mean of the coefficients, `b x M`.
-        factor: F with F Fᵀ = posterior covariance / σ-free, `b x M x M`; None unless asked for.
+        covariance: posterior covariance of the coefficients, `b x M x M`.
         energy: Σ (X_g θ_g)² of each group by itself, `b x g`.
         rss: remaining sum of squares, `b`.
         effective: number of coefficients that the data determine, `b`.
@@ -114,6 +110,7 @@ def fit_sets(
     b = torch.where(real, grams.xy[safe], 0.0)
     member = torch.nn.functional.one_hot(slot.clamp_min(0), groups).to(g.dtype) * real[..., None]  # b x M x groups
     there = member.sum(1) > 0
+    scales = Scales(grams.values, noise_dof, there, spread)
     # Start where the prior of each group could make the whole gap, and the noise is a tenth of it.
     trace = (member * g.diagonal(dim1=-2, dim2=-1)[..., None]).sum(1).clamp_min(1e-300)
     psi = torch.log((grams.yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there
@@ -140,15 +137,10 @@ def fit_sets(
         rss = (grams.yy - 2 * (mean * b).sum(-1) + ((g @ mean[..., None])[..., 0] * mean).sum(-1)).clamp_min(0)
         if k == iterations:
             break
-        step = (0.5 * (size - gamma) - psi / spread**2) / (0.5 * gamma + 1 / spread**2)
-        psi = (psi + step.clamp(-2.0, 2.0) * there).clamp(-LIMIT, LIMIT)
-        left = (grams.values - gamma.sum(-1)).clamp_min(0.02 * grams.values + 1)
-        noise = ((rss + noise_dof) / (left + noise_dof)).clamp_min(1e-12)
+        psi, noise = scales.updated(psi, size, gamma, rss)
     log_det = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    log_evidence = 0.5 * (-grams.values * noise.log() - grams.yy / noise + (c * u).sum(-1) - log_det)
-    log_evidence = log_evidence - 0.5 * noise_dof * (noise.log() + 1 / noise - 1)
-    hyper = -0.5 * psi.square() / spread**2 - 0.5 * torch.log1p(0.5 * gamma * spread**2)
-    log_evidence = log_evidence + (hyper * there).sum(-1)
+    squares = grams.yy / noise - (c * u).sum(-1)
+    log_evidence = scales.log_evidence(psi, gamma, noise, squares, log_det)
     part = mean[..., None] * member
     energy = (part * (g @ part)).sum(1)
     covariance = scale[:, :, None] * inverse * scale[:, None, :]

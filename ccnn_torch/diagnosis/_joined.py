@@ -12,7 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._evidence import LIMIT, SPREAD, Grams, padded
+from ccnn_torch.diagnosis._evidence import Grams, padded
+from ccnn_torch.diagnosis._scales import Scales
 
 __all__ = ["Joined", "fit_joined"]
 
@@ -72,6 +73,7 @@ def fit_joined(
     member = torch.nn.functional.one_hot(slot.clamp_min(0), max(psi.shape[1] - 1, 1)).to(own.dtype) * there[..., None]
     member = member[..., : psi.shape[1] - 1]
     used = torch.cat([real.any(1, keepdim=True), (member > 0).any(1)], 1)
+    scales = Scales(turned.values, noise_dof, used)
 
     def by_group(first: Tensor, rest: Tensor) -> Tensor:
         """Sums over each group's columns, `b x g`."""
@@ -105,14 +107,9 @@ def fit_joined(
         if k == updates:
             break
         size = by_group(u_first.square(), u_rest.square())
-        step = (0.5 * (size - gamma) - psi / SPREAD**2) / (0.5 * gamma + 1 / SPREAD**2)
-        psi = (psi + step.clamp(-2.0, 2.0) * used).clamp(-LIMIT, LIMIT)
-        left = (turned.values - gamma.sum(-1)).clamp_min(0.02 * turned.values + 1)
-        noise = ((rss + noise_dof) / (left + noise_dof)).clamp_min(1e-12)
+        psi, noise = scales.updated(psi, size, gamma, rss)
     log_det = diagonal.log().sum(-1) + 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    evidence = 0.5 * (-turned.values * noise.log() - (turned.yy - explained) / noise - log_det)
-    evidence = evidence - 0.5 * noise_dof * (noise.log() + 1 / noise - 1)
-    hyper = -0.5 * psi.square() / SPREAD**2 - 0.5 * torch.log1p(0.5 * gamma * SPREAD**2)
+    evidence = scales.log_evidence(psi, gamma, noise, (turned.yy - explained) / noise, log_det)
     parts = mean[..., None] * member
     energy = torch.cat([(square * first.square()).sum(-1, keepdim=True), (parts * (own @ parts)).sum(1)], -1)
-    return Joined(evidence + (hyper * used).sum(-1), noise, first, mean, energy, rss, gamma.sum(-1), psi)
+    return Joined(evidence, noise, first, mean, energy, rss, gamma.sum(-1), psi)
