@@ -34,7 +34,9 @@ class Solution:
     message: str
 
 
-def jacobian_of(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Tensor, Tensor]:
+def jacobian_of(
+    function: Callable[[Tensor], Tensor], point: Tensor, combined: Callable[[Tensor], Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
     """Value and Jacobian of a function that treats its leading dims independently.
 
     One backward pass per output, or one double-backward pass (the transpose of the transpose) per input, whichever is
@@ -44,19 +46,21 @@ def jacobian_of(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Te
     Args:
         function: `... x k` -> `... x c`.
         point: `... x k`.
+        combined: of the value, which combinations of the outputs are asked for, `... x r x c`; None = each output.
 
     Returns:
-        value `... x c` and Jacobian `... x c x k`.
+        value `... x c` and Jacobian `... x c x k`, or that of the combinations, `... x r x k`.
     """
     value, pull = torch.func.vjp(function, point.detach())[:2]
     c, k = value.shape[-1], point.shape[-1]
-    if c <= 2 * k:
-        outputs = torch.eye(c, dtype=value.dtype, device=value.device)
-        rows = [pull(e.expand_as(value))[0] for e in outputs]
+    outputs = torch.eye(c, dtype=value.dtype, device=value.device) if combined is None else combined(value.detach())
+    if outputs.shape[-2] <= 2 * k:
+        rows = [pull(e.expand_as(value))[0] for e in outputs.unbind(-2)]
         return value.detach(), torch.stack(rows, dim=-2) if rows else value.new_zeros(*value.shape, k)
     push = torch.func.vjp(lambda cotangent: pull(cotangent)[0], torch.zeros_like(value))[1]
     columns = [push(e.expand_as(point))[0] for e in torch.eye(k, dtype=point.dtype, device=point.device)]
-    return value.detach(), torch.stack(columns, dim=-1)
+    slope = torch.stack(columns, dim=-1)
+    return value.detach(), slope if combined is None else outputs @ slope
 
 
 def levenberg_marquardt(

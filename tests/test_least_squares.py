@@ -91,3 +91,17 @@ def test_jacobian_of_broadcasts_captured_data():
     expected = torch.autograd.functional.jacobian(lambda x: 2.0 * torch.stack([x.prod(), x.sum()]), point[1, 1])
     torch.testing.assert_close(slope[1, 1], expected)
     assert value.shape == (4, 2, 2) and slope.shape == (4, 2, 2, 3)
+
+
+@pytest.mark.parametrize("inputs", [1, 3])
+def test_jacobian_of_combinations_is_that_of_all_outputs_combined(inputs):
+    point = torch.randn(5, inputs, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def outputs(x):
+        return torch.cat([x.sin(), x.prod(-1, keepdim=True), x.square()], dim=-1)
+
+    def combined(value):
+        return torch.stack([value, 1 + value.square(), value.cos()], dim=-2)
+
+    value, whole = jacobian_of(outputs, point)
+    torch.testing.assert_close(jacobian_of(outputs, point, combined)[1], combined(value) @ whole)

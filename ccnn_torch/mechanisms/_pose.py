@@ -11,7 +11,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.least_squares import jacobian_of
-from ccnn_torch.rotations import geodesic_angle, rotation_vector_to_matrix, vee
+from ccnn_torch.rotations import geodesic_angle, rotation_vector_to_matrix, skew
 
 __all__ = ["Frame", "PoseError", "frame_from_coordinates", "frame_jacobian", "pose_error"]
 
@@ -68,12 +68,19 @@ def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor) -> Tensor
         position, rotation = function(x)
         return position if rotation is None else torch.cat([position, rotation.flatten(-2)], dim=-1)
 
-    value, slope = jacobian_of(flat, point)
-    slope = torch.where(torch.isfinite(value).all(-1)[..., None, None], slope, torch.nan)
+    value, slope = jacobian_of(flat, point, _twist)
+    return torch.where(torch.isfinite(value).all(-1)[..., None, None], slope, torch.nan)
+
+
+def _twist(value: Tensor) -> Tensor:
+    """What of the changes of position and rotation matrix side by side, `... x 3` or `... x 12`, is the change of the
+    position and the rotation vector: `... x 3 x 3` or `... x 6 x 12`."""
+    shift = torch.eye(3, dtype=value.dtype, device=value.device).expand(*value.shape[:-1], 3, 3)
     if value.shape[-1] == 3:
-        return slope
-    rotation = value[..., 3:].reshape(*value.shape[:-1], 3, 3)
-    # dR Rᵀ is the skew matrix of the rotation vector's rate.
-    turning = slope[..., 3:, :].mT
-    rate = turning.reshape(*turning.shape[:-1], 3, 3) @ rotation.mT.unsqueeze(-3)
-    return torch.cat([slope[..., :3, :], vee(rate).mT], dim=-2)
+        return shift
+    # dR = [ω]x R, so that ω_k is half the sum of the products of dR's entries with those of [e_k]x R.
+    rotation = value[..., 3:].reshape(*value.shape[:-1], 1, 3, 3)
+    turn = (skew(torch.eye(3, dtype=value.dtype, device=value.device)) @ rotation).flatten(-2) / 2
+    return torch.cat(
+        [torch.cat([shift, torch.zeros_like(turn)], -1), torch.cat([torch.zeros_like(shift), turn], -1)], -2
+    )
