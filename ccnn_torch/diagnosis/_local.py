@@ -7,6 +7,7 @@ place alone. So that place is looked for, and the search is charged as that for 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -59,32 +60,35 @@ def local_catch_alls(
     few = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))[: _MOST_VALUES // y.shape[1]]
     plain = Remainder(y[few], _LOOSE * white(others)[few])
 
-    def atoms(driver: str, points: Tensor, places: Tensor, raw: Tensor) -> list[Atom]:
-        """Those of the best bump; raw: the columns that it multiplies, `s x c0 x m`."""
-        lead = white(raw)
+    def atoms(drivers: Sequence[str], points: Tensor, places: Tensor, raw: Tensor) -> list[Atom]:
+        """Those of the best bump for each driver; points: `n x s x d`; raw: the columns that its bumps multiply,
+        `n x s x c0 x m`."""
+        lead = torch.stack([white(r) for r in raw])
         # What is the same in all places is no bump.
-        left = plain.beside(_LOOSE * lead[few])
-        place, charge = _searched(points[few], places, lead[few], left, len(lead) / len(few))
-        if place is None:
-            return []
-        bump = _bumps(points, place[None])[:, :, None]
-        # By itself, and about the mean of the rows where the model was fitted to these. A constant of its own would let
-        # it stand for an offset of the joints, which the library knows.
-        both = (raw * bump, raw * (bump - bump.mean(0)))
-        return [Atom(driver, None, raw.new_zeros(0), columns, LOG_PRIOR - charge) for columns in both]
+        left = plain.beside(_LOOSE * lead[:, few])
+        best = _searched(points[:, few], places, lead[:, few], left, len(y) / len(few))
+        made = []
+        for driver, where, columns, place, charge in zip(drivers, points, raw, *best, strict=True):
+            if place.isnan().any():
+                continue
+            bump = _bumps(where, place[None])[:, :, None]
+            # By itself, and about the mean of the rows where the model was fitted to these. A constant of its own would
+            # let it stand for an offset of the joints, which the library knows.
+            for shift in (0.0, bump.mean(0)):
+                made.append(Atom(driver, None, raw.new_zeros(0), columns * (bump - shift), LOG_PRIOR - float(charge)))
+        return made
 
-    found = []
     middles = torch.linspace(-1, 1, _ALONG, dtype=moved.dtype).unsqueeze(-1)
-    for i, joint in enumerate(situation.mechanism.joints):
-        track = unit_range(situation.joints[:, i : i + 1])
-        found += atoms(f"joint {joint.name}", track, _places(middles, _RADII_ALONG), moved[..., i : i + 1])
+    drivers = [f"joint {joint.name}" for joint in situation.mechanism.joints]
+    tracks = unit_range(situation.joints).mT[..., None]
+    found = atoms(drivers, tracks, _places(middles, _RADII_ALONG), moved.movedim(-1, 0)[..., None])
     lengths = [k for k, c in enumerate(situation.mechanism.pose) if c.unit == "m"]
     place = unit_range(situation.pose[:, lengths] if lengths else situation.pose)
     places = _places(spread_out(place, _WITHIN), _RADII_WITHIN)
     # What pulls the platform acts through the joints; what bends a measurement does not.
     platform = platform_moves(situation)
     for raw in (moved, platform):
-        found += atoms("workspace", place, places, raw)
+        found += atoms(["workspace"], place[None], places, raw[None])
     if "time" in situation.covariates:
         lead = white(platform)
         found += sway(situation.covariates["time"], platform, lead, few, plain.beside(_LOOSE * lead[few]))
@@ -98,42 +102,41 @@ def _places(middles: Tensor, radii: tuple[float, ...]) -> Tensor:
 
 
 def _bumps(points: Tensor, places: Tensor) -> Tensor:
-    """exp(-(distance / radius)^power), `s x g`; points: `s x d`, places: `g x (d + 2)`."""
-    far = torch.cdist(points, places[:, :-2]) / places[:, -2].exp()
-    return torch.exp(-(far ** places[:, -1].exp().clamp(*_POWERS)))
+    """exp(-(distance / radius)^power), `... x s x g`; points: `... x s x d`, places: `... x g x (d + 2)`."""
+    far = torch.cdist(points, places[..., :-2]) / places[..., None, :, -2].exp()
+    return torch.exp(-(far ** places[..., None, :, -1].exp().clamp(*_POWERS)))
 
 
-def _searched(
-    points: Tensor, places: Tensor, lead: Tensor, left: Remainder, times: float
-) -> tuple[Tensor | None, float]:
-    """The place of the bump that explains most, `d + 2`, None where no bump touches some of the rows only; and what
-    looking for it costs in log odds.
+def _searched(points: Tensor, places: Tensor, lead: Tensor, left: Remainder, times: float) -> tuple[Tensor, Tensor]:
+    """The place of the bump that explains most, `n x (d + 2)`, NaN where no bump touches some of the rows only; and
+    what looking for it costs in log odds, `n`.
 
     Args:
-        points: of the rows looked at, `s x d`.
+        points: of the rows looked at, `n x s x d`.
         places: to begin with, `g x (d + 2)`.
-        lead: whitened columns that a bump multiplies, `s x c x m`.
-        left: what is to be explained.
+        lead: whitened columns that a bump multiplies, `n x s x c x m`.
+        left: what is to be explained, `n`.
         times: how many rows there are for each of these.
     """
 
     def gain(tried: Tensor) -> Tensor:
         bumps = _bumps(points, tried)
-        touched = bumps.sum(0)
+        touched = bumps.sum(-2)
         score = left.gain(Tried(bumps.mT[..., None, None], lead))
-        return torch.where((touched > _TOUCHED) & (touched < len(points) / 2), score, -torch.inf)
+        return torch.where((touched > _TOUCHED) & (touched < points.shape[-2] / 2), score, -torch.inf)
 
-    score = gain(places)
-    place, reached = places[int(score.argmax())], float(score.max())
-    if reached == -math.inf:
-        return None, 0.0
-    step = place.new_full((len(place),), _STEP)
-    step[:-2] *= place[-2].exp()
+    score = gain(places.expand(len(points), -1, -1))
+    reached, first = score.max(-1)
+    place = places[first]
+    step = torch.full_like(place, _STEP)
+    step[:, :-2] *= place[:, -2:-1].exp()
+    each = torch.arange(len(place))
     for _ in range(_STEPS):
-        tried = place + torch.cat([torch.diag(step), -torch.diag(step)])
-        better = gain(tried)
-        if float(better.max()) > reached:
-            place, reached = tried[int(better.argmax())], float(better.max())
-        else:
-            step = step / 2
-    return place, search_charge(times * score)
+        tried = place[:, None] + torch.cat([torch.diag_embed(step), -torch.diag_embed(step)], -2)
+        most, which = gain(tried).max(-1)
+        better = (most > reached)[:, None]
+        place = torch.where(better, tried[each, which], place)
+        step = torch.where(better, step, step / 2)
+        reached = torch.maximum(most, reached)
+    charge = torch.tensor([search_charge(times * s) for s in score], dtype=score.dtype)
+    return torch.where(reached[:, None] > -torch.inf, place, torch.nan), charge

@@ -7,7 +7,7 @@ from copy import copy
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, unflatten
 
 from ccnn_torch.diagnosis._alone import Own, fit_alone
 
@@ -25,9 +25,9 @@ class Tried(NamedTuple):
     """Columns of `g` candidates, whitened.
 
     Attributes:
-        factors: the columns, `g x s x c x m`; or, where there is a lead, what it is multiplied by: each of its columns
-            by its own, `g x s x k x f`, or all by the same, `g x s x 1 x f`.
-        lead: columns that all candidates share, `s x c x k`, or None.
+        factors: the columns, `... x g x s x c x m`; or, where there is a lead, what it is multiplied by: each of its
+            columns by its own, `... x g x s x k x f`, or all by the same, `... x g x s x 1 x f`.
+        lead: columns that all candidates share, `... x s x c x k`, or None.
     """
 
     factors: Tensor
@@ -39,18 +39,18 @@ class Tried(NamedTuple):
         return self.factors.shape[-1] * (1 if self.lead is None else self.lead.shape[-1])
 
     def some(self, which: slice | Tensor) -> Tried:
-        """Some of the candidates."""
+        """Some of the candidates; no leading dimensions."""
         return Tried(self.factors[which], self.lead)
 
     def one(self, number: int) -> Tensor:
-        """Columns of one candidate, `s x c x m`."""
+        """Columns of one candidate, `s x c x m`; no leading dimensions."""
         mine = self.factors[number]
         return mine if self.lead is None else (self.lead[..., None] * mine[:, None]).flatten(-2)
 
 
 class _Led(NamedTuple):
-    """Sums over the channels of what a lead `s x c x k` is multiplied with: itself, `k x k x s`; what is taken,
-    `k x P x s`; and what is left of y, `k x 1 x s`."""
+    """Sums over the channels of what a lead `... x s x c x k` is multiplied with: itself, `... x k x k x s`; what is
+    taken, `... x k x P x s`; and what is left of y, `... x k x 1 x s`."""
 
     lead: Tensor
     among: Tensor
@@ -70,7 +70,7 @@ class Remainder:
         self._take(nuisance)
 
     def beside(self, more: Tensor) -> Remainder:
-        """With more nuisance, `s x c x m`."""
+        """With more nuisance, `... x s x c x m`: leading dimensions are those of as many remainders."""
         if not more.shape[-1]:
             return self
         other = copy(self)
@@ -79,80 +79,90 @@ class Remainder:
         return other
 
     def _take(self, more: Tensor) -> None:
-        flat = more.flatten(0, 1)
+        flat = more.flatten(-3, -2)
         cross = self._taken @ flat
         gram = flat.mT @ flat
-        # Columns that are the same, far above the noise, would leave no digit of the 1.
-        ones = 1 + _DIGITS * gram.diagonal().amax(0, keepdim=True) if len(gram) else gram.diagonal()
-        gram = gram - cross.mT @ cross + torch.diag(ones.expand(len(gram)))
+        if gram.shape[-1]:
+            # Columns that are the same, far above the noise, would leave no digit of the 1.
+            ones = 1 + _DIGITS * gram.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
+            gram = gram - cross.mT @ cross + torch.diag_embed(ones.expand(*gram.shape[:-1]))
         factor = torch.linalg.cholesky(gram)
         # Rows whose Gram matrix is what the nuisance takes out: (I + NᵀN)^-1/2 Nᵀ.
         taken = torch.linalg.solve_triangular(factor, flat.mT - cross.mT @ self._taken, upper=False)
-        self._taken = torch.cat([self._taken, taken])
-        self.y = self.y - taken.mT @ (taken @ self._whole)
+        before = self._taken.expand(*taken.shape[:-2], -1, -1)
+        self._taken = torch.cat([before, taken], -2)
+        self.y = self.y - (taken.mT @ (taken @ self._whole[..., None]))[..., 0]
 
     def gain(self, tried: Tried) -> Tensor:
-        """Squares that each candidate explains, `g`."""
+        """Squares that each candidate explains, `... x g`."""
         inner, b = self._beside(tried)
         ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
-        inner = inner + torch.diag_embed(ridge[:, None].expand(-1, inner.shape[-1]))
+        inner = inner + torch.diag_embed(ridge[..., None].expand(*inner.shape[:-1]))
         solved = torch.linalg.solve(inner, b[..., None])[..., 0]
         gain: Tensor = (b * solved).sum(-1)
         return gain
 
     def log_evidence(self, tried: Tried) -> Tensor:
-        """Of each candidate, with one scale of its coefficients about their plausible sizes, `g`."""
+        """Of each candidate, with one scale of its coefficients about their plausible sizes, `g`; no leading
+        dimensions."""
         inner, b = self._beside(tried)
         groups = [Own(xx, xy) for xx, xy in zip(inner, b, strict=True)]
         return fit_alone(groups, self._whole @ self.y, float(len(self.y)), 0.0).log_evidence
 
     def _beside(self, tried: Tried) -> tuple[Tensor, Tensor]:
-        """Of the columns, the nuisance taken out of them, among themselves and with y: `g x m x m`, `g x m`."""
+        """Of the columns, the nuisance taken out of them, among themselves and with y: `... x g x m x m`,
+        `... x g x m`."""
         inner, cross, b = (
             self._products(tried.factors) if tried.lead is None else self._led_products(tried.lead, tried.factors)
         )
         return inner - cross.mT @ cross, b
 
     def _products(self, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Of columns `g x s x c x m` among themselves, with what is taken, and with y: `g x m x m`, `g x P x m`,
-        `g x m`."""
-        z = columns.flatten(1, 2)
-        count, rows, width = z.shape
-        flat = z.transpose(0, 1).reshape(rows, count * width)
-        cross = (self._taken @ flat).reshape(-1, count, width).transpose(0, 1)
-        return z.mT @ z, cross, (z.mT @ self.y[:, None])[..., 0]
+        """Of columns `... x g x s x c x m` among themselves, with what is taken, and with y: `... x g x m x m`,
+        `... x g x P x m`, `... x g x m`."""
+        z = columns.flatten(-3, -2)
+        flat = z.transpose(-3, -2).flatten(-2)
+        cross = unflatten(self._taken @ flat, -1, (z.shape[-3], z.shape[-1])).transpose(-3, -2)
+        return z.mT @ z, cross, (z.mT @ self.y[..., None, :, None])[..., 0]
 
     def _led(self, lead: Tensor) -> _Led:
-        """Of a lead `s x c x k`, which is mostly the one that was asked for last."""
+        """Of a lead `... x s x c x k`, which is mostly the one that was asked for last."""
         if self._last is None or self._last.lead is not lead:
-            rows, channels = self._rows
-            taken = (self._taken.reshape(-1, rows, channels).transpose(0, 1) @ lead).permute(2, 1, 0)
-            along = (lead.mT @ self.y.reshape(rows, channels, 1)).permute(1, 2, 0)
-            self._last = _Led(lead, (lead.mT @ lead).permute(1, 2, 0), taken.contiguous(), along)
+            taken = unflatten(self._taken, -1, self._rows).transpose(-3, -2) @ lead
+            along = lead.mT @ unflatten(self.y, -1, self._rows)[..., None]
+            among = (lead.mT @ lead).movedim(-3, -1)
+            self._last = _Led(lead, among, taken.movedim(-1, -3).mT.contiguous(), along.movedim(-3, -1))
         return self._last
 
     def _led_products(self, lead: Tensor, factors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As `_products`: summed over the channels once, and not for every candidate."""
         led = self._led(lead)
-        count, rows, own, width = factors.shape
+        count, _, own, width = factors.shape[-4:]
         leads = lead.shape[-1]
         if own > 1:
             # Thousands of tiny products take longer than a few large ones.
-            z = (lead[None, ..., None] * factors[:, :, None]).reshape(count, -1, leads * width)
+            z = (lead[..., None, :, :, :, None] * factors[..., None, :, :]).flatten(-4, -3).flatten(-2)
             inner = z.mT @ z
         else:
             # By pairs of factors where these are few, else by candidates.
-            alike = factors[:, :, 0]
+            alike = factors[..., 0, :]
             if width < leads:
-                pairs = (alike[..., None] * alike[..., None, :]).transpose(0, 1).reshape(rows, -1)
-                inner = (led.among.flatten(0, 1) @ pairs).reshape(leads, leads, count, width, width)
-                inner = inner.permute(2, 0, 3, 1, 4)
+                pairs = (alike[..., None] * alike[..., None, :]).transpose(-4, -3).flatten(-3)
+                inner = unflatten(led.among.flatten(-3, -2) @ pairs, -1, (count, width, width))
+                inner = unflatten(inner, -4, (leads, leads)).movedim(-3, -5).transpose(-3, -2)
             else:
-                inner = (alike.mT[:, None, None] @ (led.among[..., None] * alike[:, None, None])).transpose(2, 3)
-            inner = inner.reshape(count, leads * width, leads * width)
-        flat = factors.permute(2, 1, 0, 3).reshape(own, rows, count * width)
-        cross = (
-            (led.taken @ flat).reshape(leads, -1, count, width).permute(2, 1, 0, 3).reshape(count, -1, leads * width)
-        )
-        b = (led.along @ flat).reshape(leads, count, width).transpose(0, 1).reshape(count, leads * width)
+                between = led.among[..., None, :, :, :, None] * alike[..., None, None, :, :]
+                inner = (alike.mT[..., None, None, :, :] @ between).transpose(-3, -2)
+            inner = inner.flatten(-4, -3).flatten(-2)
+        flat = factors.movedim(-4, -2).transpose(-4, -3).flatten(-2)
+        if own > 1:
+            taken, along = led.taken @ flat, led.along @ flat
+        else:
+            # One product where all columns have the same factors.
+            taken, along = (
+                unflatten(led_by.flatten(-3, -2) @ flat[..., 0, :, :], -2, led_by.shape[-3:-1])
+                for led_by in (led.taken, led.along)
+            )
+        cross = unflatten(taken, -1, (count, width)).movedim(-2, -4).transpose(-3, -2).flatten(-2)
+        b = unflatten(along[..., 0, :], -1, (count, width)).transpose(-3, -2).flatten(-2)
         return inner, cross, b

@@ -84,6 +84,18 @@ def test_what_is_put_beside_in_parts_takes_what_it_takes_at_once() -> None:
             assert left.gain(tried) == pytest.approx(wanted.numpy(), rel=1e-9)
 
 
+@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("width", [1, 4])
+def test_several_remainders_at_once_are_as_one_by_one(own: bool, width: int) -> None:
+    y, x = _columns(20, 60, 1).reshape(30, 2), _columns(21, 60, 3).reshape(30, 2, 3)
+    more, lead = _columns(22, 180, 2).reshape(3, 30, 2, 2), _columns(23, 180, 3).reshape(3, 30, 2, 3)
+    factors = _columns(24, 3 * 5 * 30 * 3, width).reshape(3, 5, 30, 3, width)[..., : 3 if own else 1, :]
+    left = Remainder(y, x)
+    together = left.beside(more).gain(Tried(factors, lead))
+    for mine, m, f, k in zip(together, more, factors, lead, strict=True):
+        assert mine == pytest.approx(left.beside(m).gain(Tried(f, k)).numpy(), rel=1e-9)
+
+
 def test_nearly_the_same_columns_far_above_the_noise_can_be_taken_out_twice() -> None:
     y, x = _columns(12, 60, 1).reshape(30, 2), 1e7 * _columns(13, 60, 5).reshape(30, 2, 5)
     twice = Remainder(y, x).beside(x * (1 + 1e-12 * torch.arange(5))).beside(x)
