@@ -115,10 +115,10 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         best = next(f for f in result.found if not any(result.dictionary.atoms[i].catch_all for i in f.members))
         acting = result.acting(best)
         same = before == (before := frozenset(a.effect.name for a in acting))
-        new = _renewed(result, noise, usable)
-        if same and _settled(result, best, new, remainder(situation, measured, acting)):
+        new, left = _renewed(result, noise, usable), remainder(situation, measured, acting)
+        if same and _settled(result, best, new, left):
             break
-        there, target = tangent(situation, measured, acting)
+        there, target = tangent(situation, left, acting)
         ok = usable & torch.isfinite(target).all(-1) & torch.isfinite(there.jacobian).flatten(1).all(-1)
         if int(ok.sum()) < 0.9 * int(usable.sum()):
             there, target, ok = situation, residual, usable

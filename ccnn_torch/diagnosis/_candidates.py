@@ -9,9 +9,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._alone import Own, fit_alone, own_products
 from ccnn_torch.diagnosis._atoms import Atom, default_shape
 from ccnn_torch.diagnosis._linear import remainder, signature_at
+from ccnn_torch.diagnosis._part import best_parts
 from ccnn_torch.diagnosis._shapes import Ground, Scan, Shaped
 from ccnn_torch.diagnosis._whitening import Whitening
 from ccnn_torch.effects import Acting, Effect, Situation
@@ -19,8 +19,6 @@ from ccnn_torch.effects import Acting, Effect, Situation
 __all__ = ["cleaned", "first_candidates", "plain_atom", "renewed_candidates"]
 
 LOG_PRIOR = math.log(0.1)
-# Spread of the log size of an effect that is in one joint or leg alone.
-_SIZE_SPREAD = 4.0
 
 
 def plain_atom(situation: Situation, there: Situation, effect: Effect) -> Atom:
@@ -50,7 +48,7 @@ def first_candidates(
         fitted: columns of what was fitted before, `s x c0 x r`.
     """
     whole = [a for a in atoms if a.shape.numel() == 0]
-    parts = [part for a in whole if (part := _best_part(situation, a, white, residual)) is not None]
+    parts = [p for p in best_parts(situation, whole, white, [residual] * len(whole)) if p is not None]
     bare = white(fitted)
     beside = torch.cat([bare, *(white(a.columns) for a in whole)], -1)
     grounds = [Ground(white(residual), nuisance, quick=True) for nuisance in (bare, beside)]
@@ -105,17 +103,17 @@ def renewed_candidates(
         present = torch.cat([white(fitted), *(white(cleaned(c, usable).columns) for c in columns)], -1)
         return Ground(white(target), present)
 
-    atoms: list[Atom] = []
     grounds: dict[tuple[str, ...], Ground] = {}
+    rigid = [e for e in effects if not e.shapes(situation)]
+    whole = [cleaned(plain_atom(situation, there, e), usable) for e in rigid]
     all_act = beside(acting)
-    for effect in effects:
+    left = []
+    for effect in rigid:
         others = [a for a in acting if a.effect is not effect]
-        if not effect.shapes(situation):
-            atoms.append(cleaned(plain_atom(situation, there, effect), usable))
-            left = all_act if len(others) == len(acting) else beside(others)
-            part = _best_part(situation, atoms[-1], white, left)
-            atoms += [part] if part is not None else []
-            continue
+        left.append(all_act if len(others) == len(acting) else beside(others))
+    atoms = [*whole, *(p for p in best_parts(situation, whole, white, left) if p is not None)]
+    for effect in (e for e in effects if e.shapes(situation)):
+        others = [a for a in acting if a.effect is not effect]
         start = next((a.shape for a in acting if a.effect is effect), None)
         last = next((a for a in known if a.effect is effect), None)
         if start is None and last is not None:
@@ -151,33 +149,6 @@ def _usual(situation: Situation, effect: Effect) -> list[Shaped]:
 
 def _same_shape(atom: Atom, shaped: Shaped) -> bool:
     return atom.used == shaped.used and torch.allclose(atom.shape, shaped.value, rtol=1e-3)
-
-
-def _best_part(situation: Situation, atom: Atom, white: Whitening, y: Tensor) -> Atom | None:
-    """Of an effect of several joints or legs the coefficients of the one joint or leg that explains most of `y`, and of
-    others beside it that the evidence is for, up to half of them."""
-    assert atom.effect is not None
-    coefficients = atom.effect.coefficients(situation)
-    owners = [c.joint if c.leg is None else c.leg for c in coefficients]
-    parts = [[k for k, o in enumerate(owners) if o == owner] for owner in dict.fromkeys(owners) if owner is not None]
-    if len(parts) < 2:
-        return None
-    target = white(y)
-    whole, squares = own_products(white(atom.columns), target), target.square().sum()
-    charge, lots, reached = math.log(len(parts)), 0, -math.inf
-    chosen: list[int] = []
-    while lots < max(len(parts) // 2, 1):
-        wider = [sorted(chosen + p) if not set(p) <= set(chosen) else p for p in parts]
-        cut = [Own(whole.xx[p][:, p], whole.xy[p]) for p in wider]
-        evidence = fit_alone(cut, squares, float(target.numel()), 0.0, _SIZE_SPREAD).log_evidence
-        best = int(evidence.argmax())
-        if float(evidence[best]) < reached + charge or wider[best] == chosen:
-            break
-        chosen, reached = wider[best], float(evidence[best])
-        lots += 1
-    return replace(
-        atom, columns=atom.columns[..., chosen], log_prior=atom.log_prior - lots * charge, used=tuple(chosen)
-    )
 
 
 def _only(white: Whitening, usable: Tensor) -> Whitening:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -58,6 +59,11 @@ class Dictionary:
     turned: Grams
     alone: Mapping[tuple[int, ...], Found]
     noise_dof: float
+
+    @cached_property
+    def widths(self) -> dict[int, int]:
+        """How many columns each of these atoms has."""
+        return {i: group.numel() for i, group in self.groups.items()}
 
 
 def covariance(dictionary: Dictionary, found: Found) -> Tensor:

@@ -149,7 +149,7 @@ def fit_sets(
 
 def padded(sets: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor]:
     """Columns and slots of every set, `b x M`, padded with -1."""
-    widths = [[len(g) for g in s] for s in sets]
+    widths = [[g.numel() for g in s] for s in sets]
     totals = torch.tensor([sum(w) for w in widths], dtype=torch.int64)
     shape = (len(sets), int(totals.max()) if len(sets) else 0)
     columns, slot = torch.full(shape, -1), torch.full(shape, -1)

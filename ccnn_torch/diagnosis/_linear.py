@@ -49,13 +49,12 @@ def signature_at(situation: Situation, there: Situation, effect: Effect, shape: 
     return basis
 
 
-def tangent(situation: Situation, measured: Tensor, acting: Sequence[Acting]) -> tuple[Situation, Tensor]:
+def tangent(situation: Situation, left: Tensor, acting: Sequence[Acting]) -> tuple[Situation, Tensor]:
     """Where the effects bring the machine, and the residual that a linear model about there has to explain, `s x c`.
 
-    Rows that the machine with the effects cannot reach come back as NaN.
+    left: the effects' `remainder`; rows that the machine with the effects cannot reach are NaN there and come back so.
     """
     there = moved(situation, acting)
-    left = remainder(situation, measured, acting)
     for one in acting:
         size = scales(one.effect.coefficients(situation), situation.joints)
         columns = signature_at(situation, there, one.effect, one.shape)

@@ -14,7 +14,7 @@ from ccnn_torch.diagnosis._sets import promising
 __all__ = ["search"]
 
 _MOST = 4
-# Pairs that go on to sets of three; in a quick search, atoms that pairs are made of.
+# Pairs that go on to sets of three; in a quick search, which ends with pairs, the atoms that these are made of.
 _BEAM, _LIKELIEST = 5, 8
 # Catch-alls that are put beside library effects, and how many of these may be of one driver.
 _CATCH_ALLS, _OF_ONE_DRIVER = 4, 2
@@ -30,12 +30,13 @@ def search(
         x: whitened columns of each, `s x c x m`.
         y: what they explain, whitened, `s x c`.
         noise_dof: as for `fit_sets`.
-        quick: whether to look at sets of the likeliest atoms only, for a start.
+        quick: whether to look at pairs with the likeliest atoms only, for a start.
     """
     tried, axes = singles_of(atoms, x, y, noise_dof)
     singles = sorted((f for s, f in tried.items() if s), key=lambda f: -f.log_posterior)
-    known = [f.members[0] for f in singles if not atoms[f.members[0]].catch_all]
-    others = _of_several_drivers([f.members[0] for f in singles if atoms[f.members[0]].catch_all], atoms)
+    catch_alls = {i for i, a in enumerate(atoms) if a.catch_all}
+    known = [f.members[0] for f in singles if f.members[0] not in catch_alls]
+    others = _of_several_drivers([f.members[0] for f in singles if f.members[0] in catch_alls], atoms)
     dictionary = dictionary_of(atoms, x, y, others, axes, dict(tried), noise_dof)
     seen: set[tuple[int, ...]] = set()
 
@@ -44,8 +45,8 @@ def search(
         seen.update(fresh)
         # Each kind by itself: what the library can do at best is asked for, too, however far a catch-all is ahead.
         for wild in (False, True):
-            mine = [s for s in fresh if _has_catch_all(s, atoms) == wild]
-            top = _top(f for s, f in tried.items() if _has_catch_all(s, atoms) == wild)
+            mine = [s for s in fresh if catch_alls.isdisjoint(s) != wild]
+            top = _top(f for s, f in tried.items() if catch_alls.isdisjoint(s) != wild)
             tried.update((f.members, f) for f in promising(dictionary, mine, top, tried))
 
     def best(size: int, count: int) -> list[Found]:
@@ -55,15 +56,15 @@ def search(
         """Whether a set of this size beats the smaller ones, among all or among those of the library."""
         return any(
             _top(f for s, f in mine.items() if len(s) == size) > _top(f for s, f in mine.items() if len(s) < size)
-            for mine in (tried, {s: f for s, f in tried.items() if not _has_catch_all(s, atoms)})
+            for mine in (tried, {s: f for s, f in tried.items() if catch_alls.isdisjoint(s)})
         )
 
-    firsts, beam = (known[:_LIKELIEST], 2) if quick else (known, _BEAM)
+    firsts, most = (known[:_LIKELIEST], 2) if quick else (known, _MOST)
     look([s for i in firsts for j in (*known, *others) if (s := _joined((i,), j, atoms))])
-    for size in range(2, _MOST):
+    for size in range(2, most):
         if not better(size) or (size > 2 and best(size, 1)[0].log_posterior < _top(tried.values())):
             break
-        wide = beam if size == 2 else max(2, beam // 2)
+        wide = _BEAM if size == 2 else _BEAM // 2
         look([s for f in best(size, wide) for j in (*known, *others) if (s := _joined(f.members, j, atoms))])
     return dictionary, sorted(tried.values(), key=lambda f: -f.log_posterior)
 
@@ -85,10 +86,6 @@ def _joined(members: tuple[int, ...], extra: int, atoms: Sequence[Atom]) -> tupl
     """The set with one more, in order; () where that would say something twice."""
     if extra in members or atoms[extra].name in {atoms[i].name for i in members}:
         return ()
-    if atoms[extra].catch_all and _has_catch_all(members, atoms):
+    if atoms[extra].catch_all and any(atoms[i].catch_all for i in members):
         return ()
     return tuple(sorted((*members, extra)))
-
-
-def _has_catch_all(members: tuple[int, ...], atoms: Sequence[Atom]) -> bool:
-    return any(atoms[i].catch_all for i in members)

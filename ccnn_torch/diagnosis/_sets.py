@@ -82,14 +82,14 @@ def _started(
 
 
 def _widest_first(dictionary: Dictionary, members: tuple[int, ...]) -> list[int]:
-    return sorted(members, key=lambda i: (-len(dictionary.groups[i]), i))
+    return sorted(members, key=lambda i: (-dictionary.widths[i], i))
 
 
 def _lots(dictionary: Dictionary, sets: Sequence[tuple[int, ...]]) -> list[list[tuple[int, ...]]]:
     """Sets whose widest groups are about as wide, and the others together as well."""
     lots: dict[tuple[int, int], list[tuple[int, ...]]] = {}
     for members in sets:
-        widths = [len(dictionary.groups[i]) for i in members]
+        widths = [dictionary.widths[i] for i in members]
         first = max(widths, default=0)
         lots.setdefault((-(-first // _ALIKE), -(-(sum(widths) - first) // _ALIKE)), []).append(members)
     return list(lots.values())
@@ -105,7 +105,7 @@ def _read(dictionary: Dictionary, sets: Sequence[tuple[int, ...]], fits: Joined)
     energy, log_scale = fits.energy.tolist(), fits.log_scale.tolist()
     for row, (members, (evidence, rss, noise, effective)) in enumerate(zip(sets, numbers, strict=True)):
         ordered = _widest_first(dictionary, members)
-        widths = [len(dictionary.groups[i]) for i in ordered]
+        widths = [dictionary.widths[i] for i in ordered]
         means = fits.first[row, : widths[0]], *torch.split(fits.rest[row, : sum(widths[1:])], widths[1:])
         place = [ordered.index(i) for i in members]
         evidence = evidence if math.isfinite(evidence) else -math.inf

@@ -66,6 +66,7 @@ class Ground:
         rows: looked at, `t`; None = all.
         left: what the others leave there.
         times: how many values there are for each that is looked at.
+        rounds: how often values between the neighbours of the best are looked at.
     """
 
     def __init__(self, y: Tensor, others: Tensor, quick: bool = False) -> None:
@@ -77,6 +78,7 @@ class Ground:
         self.rows = drawn[:count].sort().values if count < len(y) else None
         self.left = Remainder(_of(y, self.rows, 0), _LOOSE * _of(others, self.rows, 0))
         self.times = y.numel() / self.left.y.numel()
+        self.rounds = 1 if quick else _ROUNDS
 
 
 class Scan:
@@ -140,7 +142,7 @@ class Scan:
         gains = [0.0] * len(self.parts)
         charges = [0.0] * len(self.parts)
         plain, times = ground.left.beside(_LOOSE * _of(self.unshaped, ground.rows, 0)), ground.times
-        for level in range(_ROUNDS + 1):
+        for level in range(ground.rounds + 1):
             for candidates, pieces, sizes in self._level(value, level, ground.rows):
                 chosen = [self._nearest(candidates, value, part) for part in self.parts]
                 spent = [0.0] * len(self.parts)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import scales
 from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
-from ccnn_torch.diagnosis._linear import signature_at, tangent
+from ccnn_torch.diagnosis._linear import remainder, signature_at, tangent
 from ccnn_torch.diagnosis._whitening import Whitening, fitted_whitening, moving_channels, reweighted
 from ccnn_torch.diagnosis.from_file import Known
 from ccnn_torch.effects import Acting, Situation
@@ -43,7 +43,7 @@ def refit(
     acting = [Acting(k.effect, k.shape, torch.zeros_like(k.coefficients)) for k in known]
     white: Whitening | None = None
     for _ in range(_ROUNDS):
-        there, target = tangent(situation, measured, acting)
+        there, target = tangent(situation, remainder(situation, measured, acting), acting)
         columns = [signature_at(situation, there, k.effect, k.shape)[..., list(k.used)] for k in known]
         columns += [] if beside is None else [beside]
         every = torch.cat(columns, -1)
