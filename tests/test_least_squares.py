@@ -1,6 +1,7 @@
 """Batched Levenberg-Marquardt against scipy, one problem at a time."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
