@@ -18,7 +18,7 @@ from ccnn_torch.diagnosis._search import search
 from ccnn_torch.diagnosis._whitening import NO_NOISE, Whitening, fitted_whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 
-__all__ = ["Analysis", "analyse"]
+__all__ = ["Analysis", "analyse", "frame_columns"]
 
 # Rows are left out where the Jacobian is worse conditioned than this and than ten times the usual.
 _CONDITION = 50.0
@@ -87,7 +87,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     atoms = [cleaned(plain_atom(situation, situation, e), usable) for e in effects]
     rest = catch_alls(situation, [e.name for e in effects])
     rest = [cleaned(a, usable) for a in rest if bool((torch.isfinite(a.columns).flatten(1).all(-1) | ~usable).all())]
-    fitted = _frame_columns(situation, usable)
+    fitted = frame_columns(situation, usable)
     # What does not show at all in these rows is no candidate (latency at rest).
     size = [
         float(
@@ -161,7 +161,7 @@ def _near_singular(situation: Situation, channels: Tensor) -> Tensor:
     return far
 
 
-def _frame_columns(situation: Situation, usable: Tensor) -> Tensor:
+def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
     """What frames that were fitted to these rows can do, `s x c0 x r`, in sizes that no evidence holds back."""
     unknown = getattr(situation.mechanism, "unknown_frames", ())
     index = [k for k, g in enumerate(situation.mechanism.geometry) if g.name.partition("_")[0] in unknown]

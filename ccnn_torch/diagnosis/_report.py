@@ -38,17 +38,17 @@ class Blocks:
         self.alone: dict[str, HeldOut] = dict(zip(self.candidates, held[len(steps) :], strict=True))
         self.apart = signatures_apart(analysis, judgement)
 
-    def gap(self, held: HeldOut, position: bool) -> Gap:
-        """In position [m] or rotation [rad]."""
+    def gap(self, held: HeldOut, position: bool, before: Tensor | None = None) -> Gap:
+        """In position [m] or rotation [rad]; before: `s x c` [m, rad], None = the nominal residual."""
         white = self.analysis.whitening
         channels = self.position if position else ~self.position
         exact = white.known > 0
         dof = 0.0 if exact else max(self.analysis.dictionary.grams.values - self.judgement.found.effective, 1.0)
-        return shrink_of(self.before, held, self.floor, channels, dof, self.draws)
+        return shrink_of(self.before if before is None else before, held, self.floor, channels, dof, self.draws)
 
-    def main(self, held: HeldOut) -> Gap:
-        """In position where the machine has one, else in rotation."""
-        return self.gap(held, bool(self.position.any()))
+    def main(self, held: HeldOut, before: Tensor | None = None) -> Gap:
+        """In position where the machine has one, else in rotation; before: as for `gap`."""
+        return self.gap(held, bool(self.position.any()), before)
 
 
 def blocks(made: Blocks) -> tuple[dict[str, Any], dict[str, Any] | None, list[dict[str, Any]]]:

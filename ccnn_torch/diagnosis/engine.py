@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import Analysis, analyse
 from ccnn_torch.diagnosis._belonging import Belonging, belonging
+from ccnn_torch.diagnosis._by_block import by_block
 from ccnn_torch.diagnosis._catch_all import SPEED
 from ccnn_torch.diagnosis._cautions import cautions
 from ccnn_torch.diagnosis._missing import missing_covariates
@@ -129,6 +130,7 @@ def diagnose_rows(
         where_ci95=intervals,
         effects=listed,
         in_order=in_order(made),
+        by_block=by_block(made, residual),
         network=None,
         verdict=verdict,
         next_measurements=next_measurements(analysis, judgement, seed),

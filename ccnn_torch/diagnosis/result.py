@@ -26,6 +26,8 @@ class Diagnosis:
         where_ci95: the same with `[low, high]` in the place of each share, regions and regimes as lists of them.
         effects: every candidate, most probable first; `signatures` says why one cannot be told from another.
         in_order: the verdict's effects added one after the other, the largest first.
+        by_block: gap and shrink where rows are held out in blocks, along the direction in which the joints vary most;
+            None where the verdict names nothing.
         network: what a network on the remainder would still gain; None where nobody asked.
         verdict: what is stood by.
         next_measurements: rows that would tell the leading explanations apart.
@@ -47,6 +49,7 @@ class Diagnosis:
     where_ci95: dict[str, Any]
     effects: list[dict[str, Any]]
     in_order: list[dict[str, Any]]
+    by_block: dict[str, Any] | None
     network: dict[str, Any] | None
     verdict: dict[str, Any]
     next_measurements: list[dict[str, Any]]

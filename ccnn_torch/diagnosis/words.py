@@ -15,6 +15,7 @@ from ccnn_torch.coordinates import Condition
 __all__ = [
     "SURE",
     "aside_text",
+    "block_text",
     "driver_words",
     "effect_words",
     "gap_words",
@@ -146,6 +147,19 @@ def aside_text(rows: Sequence[int], why: Sequence[str], lines: Sequence[int] = (
             named = f"row{'s' if len(those) > 1 else ''} {numbers} (counted from 1){more}"
         parts.append(f"{_capital(reason)}: {len(those)}, at {named}.")
     return f"{count_text(len(rows), 'row')} set aside. {' '.join(parts)}"
+
+
+def block_text(results: Block) -> str:
+    """How far the effects go where no row was fitted, in one sentence; empty where the verdict names none."""
+    far = results.get("by_block")
+    if far is None:
+        return ""
+    before, after = (_size(far[key], far) for key in ("before", "after"))
+    return (
+        f"Held out in {len(far['blocks'])} blocks along the direction in which the joints vary most, each judged by a "
+        "fit to the other rows with the names and shapes of all rows, the effects take the gap from "
+        f"{before} to {after}."
+    )
 
 
 def network_text(results: Block) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccnn_torch._display import display_unit, number_text
-from ccnn_torch.diagnosis.words import effect_words, listed, network_text, probability_words
+from ccnn_torch.diagnosis.words import block_text, effect_words, listed, network_text, probability_words
 from ccnn_torch.report.diagnosis_data import About, gaps_of
 from ccnn_torch.report.table_form import Table
 
@@ -98,7 +98,8 @@ def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
 
 
 def order_table(results: Block) -> Table | None:
-    """The verdict's effects added to the model one after the other, and what a network would still gain."""
+    """The verdict's effects added to the model one after the other, all of them on blocks of rows, and what a network
+    would still gain."""
     added, network = results.get("in_order") or [], results.get("network") or {}
     if not added and network.get("gap_after") is None:
         return None
@@ -108,11 +109,16 @@ def order_table(results: Block) -> Table | None:
     for entry in added:
         size = number_text(_over(entry["gap_after"], scale), 4)
         rows.append((f"+ {entry['name']}", size, percent(entry["shrink"]), percent_interval(entry["shrink_ci95"])))
+    far = results.get("by_block")
+    if far is not None:
+        size = number_text(_over(far["after"], scale), 4)
+        rows.append(("all of them, by block", size, percent(far["shrink"]), percent_interval(far["shrink_ci95"])))
     if network.get("gap_after") is not None:
         rows.append(("+ a network on the remainder", number_text(network["gap_after"] / scale, 4), "–", "–"))
     rows.append(("noise floor", number_text(_over(gap["noise_floor"], scale), 4), "–", "–"))
     columns = ("added to the model", f"gap on held-out rows [{unit}]", "removed in all [%]", "95 % interval [%]")
-    return Table("How far does it shrink?", columns, tuple(rows), f"{_REMOVED} {network_text(results)}".rstrip())
+    notes = (_REMOVED, block_text(results), network_text(results))
+    return Table("How far does it shrink?", columns, tuple(rows), " ".join(n for n in notes if n))
 
 
 def parameter_table(results: Block, most: int = 24) -> Table | None:

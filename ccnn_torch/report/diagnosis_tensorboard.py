@@ -40,6 +40,9 @@ def write_diagnosis_events(
                     writer.add_scalar(f"{key}/{part}", value, 0)
         for step, entry in enumerate(results.get("in_order", []), 1):
             writer.add_scalar("gap/in_order", entry["gap_after"], step)
+        for part in ("before", "after"):
+            if (far := results.get("by_block")) is not None:
+                writer.add_scalar(f"gap/by_block_{part}", far[part], 0)
         network = results.get("network") or {}
         if network.get("gap_after") is not None:
             writer.add_scalar("gap/after_network", network["gap_after"], 0)

@@ -127,6 +127,8 @@ def test_what_a_network_would_still_gain_is_one_sentence() -> None:
     )
     order = order_table(results)
     assert order is not None and order.rows[-2] == ("+ a network on the remainder", "60.00", "–", "–")
+    assert order.rows[-3] == ("all of them, by block", "131.0", "91.0", "88.0 to 94.0")
+    assert "Held out in 5 blocks" in order.note and "take the gap from 410 µm to 131 µm." in order.note
     results["gap"]["noise_floor"] = 9e-5
     assert network_text(results).endswith("less than the noise was taken for: part of that is no noise but repeats.")
     results["network"]["gain_ci95"] = [-1e-6, 3e-6]
@@ -136,7 +138,7 @@ def test_what_a_network_would_still_gain_is_one_sentence() -> None:
     assert network_text(results) == (
         "A network has nothing left to learn: what the effects leave is no more than the noise."
     )
-    results["in_order"] = []
+    results["in_order"], results["by_block"] = [], None
     assert order_table(results) is None
     assert network_text(two_effects()[0]) == ""
 
@@ -243,6 +245,7 @@ def test_tensorboard_gets_the_same_figures_once(folder: Path) -> None:
     events = EventAccumulator(str(folder / "tensorboard")).Reload()
     stems = ("gap", "probabilities", "signatures", "map", "where")
     assert [e.value for e in events.Scalars("gap/in_order")] == pytest.approx([1.13e-4])
+    assert events.Scalars("gap/by_block_after")[0].value == pytest.approx(1.31e-4)
     assert events.Scalars("gap/after_network")[0].value == pytest.approx(6e-5)
     assert set(events.Tags()["images"]) == {f"diagnosis/{stem}" for stem in stems}
     assert events.Scalars("gap/before")[0].value == pytest.approx(4.2e-4)
