@@ -27,8 +27,8 @@ def blind_check(
     that every single cause is diagnosed once more by a library that lacks it. The folder holds blind.json, blind.csv
     and blind.md: right answers by cause, strength and machine, the confusion table, false alarms, how reliable the
     probabilities are, and how often the intervals of the shrink hold the truth, each with a 95 % interval. A second
-    call goes on where the first was stopped. Mechanisms: five_bar, tripod, machine_tool, stewart, delta, arm, and
-    mujoco_five_bar (a simulator of others, pip install 'ccnn-torch[mujoco]').
+    call goes on where the first was stopped. Mechanisms: five_bar, tripod, machine_tool, stewart, delta, delta_linear,
+    arm, and mujoco_five_bar (a simulator of others, pip install 'ccnn-torch[mujoco]').
 
     Examples:
 

@@ -22,6 +22,7 @@ _DRIVES = {
     "machine_tool": ("u_0",),
     "stewart": ("offset", "gain"),
     "delta": ("offset",),
+    "delta_linear": ("offset",),
     "arm": ("base_", "tool_", "theta"),
 }
 """How parameters begin that belong to the drives or to where the machine stands: their errors are other causes."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.least_squares import jacobian_of
-from ccnn_torch.mechanisms import Delta, FiveBar, MachineTool, Mechanism, Stewart, Tripod
+from ccnn_torch.mechanisms import Delta, DeltaLinear, FiveBar, MachineTool, Mechanism, Stewart, Tripod
 from ccnn_torch.rotations import matrix_to_rotation_vector
 from ccnn_torch.runs.machines.arm import ArmStructure
 
@@ -128,6 +128,7 @@ _MAKERS: dict[str, Callable[[], BlindMachine]] = {
     "machine_tool": lambda: _platform(MachineTool(per_leg=True), 200.0, 400.0),
     "stewart": lambda: _platform(Stewart(), 100.0, 300.0),
     "delta": lambda: _platform(Delta(), 20.0, 15.0),
+    "delta_linear": lambda: _platform(DeltaLinear(), 40.0, 30.0),
     "arm": _arm,
     # Bodies with inertia and soft servos leave their assembly mode near its edge.
     "mujoco_five_bar": lambda: _platform(FiveBar(), 50.0, 30.0, 6.0),

@@ -114,7 +114,7 @@ def causes_of(machine: str) -> tuple[str, ...]:
     if machine == "mujoco_five_bar":
         return MUJOCO_CAUSES
     # Without orientation a target elsewhere on the platform is the same as a device elsewhere.
-    return tuple(c for c in CAUSES if not (c == "tool" and machine in ("five_bar", "delta")))
+    return tuple(c for c in CAUSES if not (c == "tool" and machine in ("five_bar", "delta", "delta_linear")))
 
 
 class _Deck:
