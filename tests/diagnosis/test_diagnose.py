@@ -79,6 +79,17 @@ def test_play_and_springs_that_cancel_are_not_taken_for_friction() -> None:
     assert said.verdict["effects"] == []
 
 
+@pytest.mark.parametrize("seed", [0, 3])
+def test_cranks_heavier_than_the_machine_are_no_sag(seed: int) -> None:
+    """The weights of a delta's cranks, thirty times as large as plausible, come near a gain of its drives."""
+    situation = rows_of("delta", 200, seed)
+    sags = diagnose_rows(situation, measured(situation, {"gravity": 10.0}, seed + 50)).verdict
+    assert sags["effects"] == ["gravity"] and not sags["outside_library"] and sags["probability"] > 0.9
+    effects = [name for name in EFFECTS if name != "joint_gain"]
+    said = diagnose_rows(situation, measured(situation, {"joint_gain": 10.0}, seed + 50), effects=effects).verdict
+    assert said["outside_library"] and "gravity" not in said["effects"]
+
+
 def test_bad_rows_are_set_aside_and_do_not_hide_the_cause() -> None:
     situation = rows_of("five_bar", 200, 9)
     pose = measured(situation, {"backlash": 10.0}, 10)
