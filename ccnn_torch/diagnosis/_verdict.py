@@ -21,6 +21,9 @@ __all__ = ["Judgement", "judge", "withdrawn"]
 # form of the others differs from the textbook; so is a catch-all beside library effects, and so are library effects
 # beside a catch-all, which stands for whatever was not thought of. Exact effects leave no more than the second order.
 _FORM, _FORM_CATCH_ALL, _FORM_EXACT, _BESIDE_CATCH_ALL = 0.004, 0.002, 1e-4, 0.1
+# A library effect whose own part is more than this share of the gap is no form of other ones, however well these could
+# do without it.
+_CARRIES = 0.5
 # Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is stood by.
 _VETO, _MUCH = 0.005, 1.5
 # Or times the noise's energy, whatever the gap.
@@ -200,10 +203,15 @@ def _net(
     analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]
 ) -> dict[int, tuple[float, tuple[int, ...]]]:
     """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
-    gap = max(float(analysis.dictionary.grams.yy) - analysis.floor * analysis.dictionary.grams.values, 1e-300)
+    gap = _gap(analysis)
     fewer = _fewer(found)
     without = _fits(analysis, list(fewer.values()), tried)
     return {i: ((f.rss - found.rss) / gap, f.members) for i, f in zip(fewer, without, strict=True)}
+
+
+def _gap(analysis: Analysis) -> float:
+    """Squares above the noise."""
+    return max(float(analysis.dictionary.grams.yy) - analysis.floor * analysis.dictionary.grams.values, 1e-300)
 
 
 def _fewer(found: Found) -> dict[int, tuple[int, ...]]:
@@ -236,12 +244,15 @@ def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fo
             wide = _FORM_CATCH_ALL if atoms[i].catch_all else _FORM
             form = _FORM_EXACT if _exact(analysis, [m for m in found.members if m != i]) else wide
             limits[i] = form if atoms[i].catch_all else max(form, beside)
+        alone = not any(atoms[i].catch_all for i in found.members)
+        large = _CARRIES * _gap(analysis)
+        carries = {i for i, e in zip(found.members, found.energy, strict=True) if alone and e > large}
         # What leaves more than the noise when it goes is missed, however small it is.
         missed = _unexplained(analysis, found)
         idle = [
             i
             for i, (share, fewer) in shares.items()
-            if share < limits[i] and (missed or not _unexplained(analysis, tried[fewer]))
+            if i not in carries and share < limits[i] and (missed or not _unexplained(analysis, tried[fewer]))
         ]
         if not idle:
             break

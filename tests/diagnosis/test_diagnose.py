@@ -8,7 +8,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 import torch
-from diagnosis._machines import NOISE, measured, rows_of
+from diagnosis._machines import NOISE, acting, measured, reached_with, rows_of
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, diagnose_rows
 from ccnn_torch.diagnosis.check import check_rows
@@ -88,6 +88,15 @@ def test_cranks_heavier_than_the_machine_are_no_sag(seed: int) -> None:
     effects = [name for name in EFFECTS if name != "joint_gain"]
     said = diagnose_rows(situation, measured(situation, {"joint_gain": 10.0}, seed + 50), effects=effects).verdict
     assert said["outside_library"] and "gravity" not in said["effects"]
+
+
+def test_the_larger_of_two_causes_is_named_though_the_other_could_copy_it() -> None:
+    """Over a short travel the weights of a delta's cranks do what offsets of its drives do."""
+    situation = rows_of("delta", 200, 1)
+    offset = acting(situation, "joint_offset", q1=1e-3, q2=-5e-4, q3=2e-4)
+    sag = acting(situation, "gravity", q1=1e-3, q2=1e-3, q3=1e-3)
+    said = diagnose_rows(situation, reached_with(situation, [offset, sag], 2, 1e-5)).verdict
+    assert set(said["effects"]) == {"joint_offset", "gravity"} and not said["outside_library"]
 
 
 def test_bad_rows_are_set_aside_and_do_not_hide_the_cause() -> None:
