@@ -174,6 +174,7 @@ def test_what_is_told_is_what_acts(cli: Cli, tmp_path: Path) -> None:
         (("--noise", "much"), "--noise much: 'much' is no number with a unit"),
         (("--noise", "z=1e-5"), "noise.z: there is no such name; there are x, y"),
         (("--noise", "-1"), "a standard deviation is a number from 0 up"),
+        (("--noise", "nan"), "nan is no standard deviation; write a size from 0 up"),
         (("--noise", "0", "--rows", "0"), "--rows: simulate at least 1 row, not 0"),
         (("--noise", "0", "max_condition=1.0001"), "make max_condition larger"),
         (("--noise", "0", "laod=3"), "there is no key 'laod'; did you mean 'load'?"),

@@ -24,7 +24,9 @@ def check(
             help="Standard deviation of the pose: 1e-5 (m and rad alike), 10um, NAME=S,…, or m=10um,rad=30urad."
         ),
     ] = None,
-    effects: Annotated[str | None, typer.Option(help="Candidates, a,b,…; all when left out.")] = None,
+    effects: Annotated[
+        str | None, typer.Option(help="Candidates, a,b,…; all for the whole library, as when left out.")
+    ] = None,
     config: Annotated[Path | None, typer.Option(help="A YAML file with keys as for ccnn diagnose.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Nothing but the exit code.")] = False,

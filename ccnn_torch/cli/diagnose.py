@@ -30,7 +30,9 @@ def diagnose(
             help="Standard deviation of the pose: 1e-5 (m and rad alike), 10um, NAME=S,…, or m=10um,rad=30urad."
         ),
     ] = None,
-    effects: Annotated[str | None, typer.Option(help="Candidates, a,b,…; all when left out.")] = None,
+    effects: Annotated[
+        str | None, typer.Option(help="Candidates, a,b,…; all for the whole library, as when left out.")
+    ] = None,
     config: Annotated[Path | None, typer.Option(help="A YAML file with keys as below.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
     network: Annotated[
@@ -51,7 +53,7 @@ def diagnose(
 
     ccnn diagnose --records measured.csv --mechanism arm.yaml --out runs/arm --noise x=1e-5,y=1e-5,z=2e-5
 
-    ccnn diagnose --records measured.csv --mechanism stewart --out runs/s --effects backlash,friction,my_effect.py:Mine
+    ccnn diagnose --records measured.csv --mechanism stewart --out runs/s --effects all,my_effect.py:Mine
 
     ccnn diagnose --records measured.csv --mechanism my_simulator.py:PRESS --out runs/press
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -47,6 +47,7 @@ class Analysis:
         near_singular: `s`, bool.
         floor: mean square of the noise in the units of `y`: 1 where it was given, else that of the richest fit or,
             where that is far less, of the most probable set.
+        idle: effects that change no pose in these rows, and were no candidates.
     """
 
     situation: Situation
@@ -58,6 +59,7 @@ class Analysis:
     found: list[Found]
     near_singular: Tensor
     floor: float
+    idle: tuple[str, ...] = ()
 
     def acting(self, found: Found) -> list[Acting]:
         """The effects of a set with their most probable numbers; catch-alls are left out."""
@@ -95,7 +97,8 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         )
         for a in atoms
     ]
-    effects = [e for e, s in zip(effects, size, strict=True) if s > 1e-9]
+    idle = tuple(e.name for e, s in zip(effects, size, strict=True) if s <= 1e-9)
+    effects = [e for e in effects if e.name not in idle]
     atoms = [a for a, s in zip(atoms, size, strict=True) if s > 1e-9]
     everything = [a.columns for a in (*atoms, *rest) if not (a.catch_all and a.name.startswith("joint"))]
     white = fitted_whitening(residual, [fitted, *everything], channels, noise, usable)
@@ -132,7 +135,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         again = local_catch_alls(situation, jacobian, target, white, beside)
         places = [*local, *(cleaned(a, ok) for a in again)]
         result = _searched(situation, measured, target, white, [*atoms, *rest, *places], near, rich, fitted)
-    return result
+    return replace(result, idle=idle)
 
 
 def _settled(result: Analysis, best: Found, new: Whitening, left: Tensor) -> bool:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._analysis import analyse
 from ccnn_torch.diagnosis._cautions import row_cautions
-from ccnn_torch.diagnosis.engine import candidates, thinned, usable_rows, why_set_aside
+from ccnn_torch.diagnosis.engine import UNSHOWN, candidates, thinned, usable_rows, why_set_aside
 from ccnn_torch.diagnosis.words import lacking_text
 from ccnn_torch.effects import Effect, Situation
 
@@ -83,7 +83,7 @@ def check_rows(
         aside=sorted(why),
         noise={names[int(c)]: float(s) for c, s in zip(white.channels, white.sigma, strict=True)},
         covariates=[n for n, v in situation.covariates.items() if float(v.max() - v.min()) > 0],
-        missing=lacking,
+        missing=lacking | dict.fromkeys(analysis.idle, UNSHOWN),
         weak=weak,
         confusable=_confusable(spans),
         condition=float(condition.max()),

@@ -34,12 +34,13 @@ from ccnn_torch.effects import (
 )
 from ccnn_torch.errors import InputError, RowsError
 
-__all__ = ["OUTLIER", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows", "why_set_aside"]
+__all__ = ["OUTLIER", "UNSHOWN", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows", "why_set_aside"]
 
 OUTLIER = "outlier"
 # More rows, and more measured values, than this name a cause no better: so many are drawn.
 _MOST_ROWS, _MOST_VALUES = 2000, 9000
 _FEWEST_ROWS = 20
+UNSHOWN = "rows in which it shows: in these it changes no pose"
 # Names below this probability are stood by only where rows not used for fitting show what they take away.
 _LIKELY = 0.8
 # Times the noise from which a row is bad and not unlucky: by itself; and where more than so many rows in a hundred, one
@@ -66,7 +67,10 @@ def candidates(
 
 def _made(situation: Situation, effects: Sequence[Effect | str] | None) -> list[Effect]:
     """Candidates, those of the library and of the mechanism when None."""
-    named = effect_names(situation.mechanism) if effects is None else effects
+    whole = effect_names(situation.mechanism)
+    if isinstance(effects, str):
+        raise InputError(f"effects: '{effects}' is one name and not a list of names; write ['{effects}']")
+    named = [n for e in (["all"] if effects is None else effects) for n in (whole if e == "all" else [e])]
     return [make_effect(e, situation.mechanism) if isinstance(e, str) else owned(e) for e in named]
 
 
@@ -83,7 +87,7 @@ def diagnose_rows(
         situation: `s` rows without further leading dims, in the order measured, with what was measured beside them.
         measured: poses, `s x p` [SI].
         noise: standard deviation of each channel of position and rotation vector, `c` [m, rad]; estimated when None.
-        effects: candidates, or their names; the whole library when None.
+        effects: candidates, or their names, "all" for those of the library; the whole library when None.
         seed: of folds and resampling.
 
     Raises:
@@ -95,6 +99,7 @@ def diagnose_rows(
     every = _made(situation, effects)
     usable, lacking = candidates(situation, every)
     analysis = analyse(situation, measured, usable, noise)
+    lacking |= dict.fromkeys(analysis.idle, UNSHOWN)
     judgement = judge(analysis)
     made = Blocks(analysis, judgement, residual, seed)
     together = made.main(made.together)
@@ -123,6 +128,7 @@ def diagnose_rows(
     told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": texts}
     verdict["text"] = verdict_text(told | {"rows_set_aside": sorted(why)})
     places, intervals = where(analysis, residual, seed)
+    proposed = next_measurements(analysis, judgement, seed)
     return Diagnosis(
         gap=gap,
         gap_rotation=gap_rotation,
@@ -133,13 +139,13 @@ def diagnose_rows(
         by_block=by_block(made, residual),
         network=None,
         verdict=verdict,
-        next_measurements=next_measurements(analysis, judgement, seed),
+        next_measurements=proposed,
         missing_covariates=missing,
         not_seen=lacking,
         rows_set_aside=sorted(why),
         why_set_aside=[why[row] for row in sorted(why)],
         cautions=texts,
-        notes=_notes(analysis, judgement, rows, lacking, missing),
+        notes=_notes(analysis, judgement, rows, lacking, missing, proposed),
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,
         judgement=judgement,
@@ -152,6 +158,7 @@ def _notes(
     rows: Belonging,
     lacking: Mapping[str, str],
     missing: Sequence[Mapping[str, Any]],
+    proposed: Sequence[Mapping[str, Any]],
 ) -> list[str]:
     """What was left out and why, one sentence each without a full stop; arguments as in `diagnose_rows`."""
     mechanism, covariates = analysis.situation.mechanism, [*analysis.situation.covariates]
@@ -163,6 +170,10 @@ def _notes(
             notes.append(f"what follows the time is a sway with a period of {float(atom.shape):.3g} s")
     if len(analysis.measured) < int(rows.fine.sum()):
         notes.append(f"{len(analysis.measured)} of {len(rows.fine)} rows, drawn at random, were looked at")
+    if judgement.outside and not proposed:
+        notes.append(
+            "no measurement is proposed: no effect says what would be measured of what lies outside of the library"
+        )
     if not judgement.names and not judgement.outside and analysis.whitening.known == 0 and missing:
         columns = ", ".join(column for entry in missing for column in entry["columns"])
         notes.append(

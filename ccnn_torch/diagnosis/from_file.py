@@ -42,12 +42,14 @@ class Verdict:
         gravity: `3` [m/s²] as it was diagnosed with, or None where the file does not say.
         parameters: of each effect of the verdict, in its order: name -> value [SI].
         outside: whether something is there beside them that no effect describes.
+        covariates: those that varied in the rows that were diagnosed.
     """
 
     path: str
     gravity: Tensor | None
     parameters: dict[str, dict[str, float]]
     outside: bool = False
+    covariates: tuple[str, ...] = ()
 
     def on(self, situation: Situation) -> tuple[list[Known], list[str]]:
         """The effects on a machine and rows, for a controller that knows one row and not what was before it.
@@ -85,7 +87,8 @@ class Verdict:
             if strange:
                 raise InputError(
                     f"{key}, parameters: '{strange[0]}' is no parameter of {name} on {situation.mechanism.name} with "
-                    "the covariates of this run; give the mechanism and covariates that were diagnosed"
+                    f"the covariates of this run; give the mechanism and covariates that were diagnosed"
+                    + (f" ({', '.join(self.covariates)})" if self.covariates else "")
                 )
             known = _known(effect, alone, values)
             left = [n for n in values if n not in _named([*effect.coefficients(alone), *effect.shapes(alone)])]
@@ -133,6 +136,7 @@ def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Ver
         machine = told.get("mechanism") or {}
         gravity = None if machine.get("gravity") is None else [_number(g) for g in machine["gravity"]]
         theirs = [str(j) for j in machine.get("joints") or joints]
+        covariates = tuple(str(c) for c in told.get("where", {}).get("covariates", {}))
     except (KeyError, TypeError, AttributeError, ValueError):
         raise InputError(f"{path}: is no diagnosis; give the diagnosis.json that ccnn diagnose wrote") from None
     if machine and (machine.get("name") != mechanism or theirs != [*joints]):
@@ -146,6 +150,7 @@ def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Ver
         None if gravity is None else torch.tensor(gravity, dtype=torch.float64),
         {name: listed[name] for name in names},
         outside,
+        covariates,
     )
 
 

@@ -47,7 +47,7 @@ def diagnose(
         mechanism: the nominal machine.
         noise: standard deviation of the measured pose [SI]: one number for every channel, or by pose coordinate;
             estimated from the rows when None.
-        effects: candidates, or their names; the whole library when None.
+        effects: candidates, or their names, "all" for those of the library; the whole library when None.
         gravity: `3` [m/s²] in the base frame; down along -z (planar machines: -y) when None.
         seed: of folds and resampling.
         network: whether to train networks on what the verdict's effects leave, which takes seconds.
@@ -130,6 +130,10 @@ def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) ->
         return None
     count = situation.jacobian.shape[-2]
     names = [c.name for c in situation.mechanism.pose]
+    if isinstance(noise, str):
+        raise InputError(
+            f"noise: '{noise}' is a text; give a number in SI (1e-5), or one for each of {', '.join(names)}"
+        )
     if not isinstance(noise, Mapping):
         noise = dict.fromkeys(names, float(noise))
     wrong = [n for n in noise if n not in names]

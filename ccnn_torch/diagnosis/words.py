@@ -50,6 +50,8 @@ _EFFECTS = {
     "instrument": "an error of the measuring device",
     "outlier": "a few bad rows",
 }
+# Of so many effects that were tried in vain each is named.
+_FEW_TRIED = 3
 _DRIVERS = {"workspace": "the place in the workspace", "temperature": "the temperature", "time": "the time"}
 
 
@@ -181,6 +183,14 @@ def network_text(results: Block) -> str:
     return f"{text}."
 
 
+def _none_of(results: Block) -> str:
+    """What was tried in vain: a few names are told, for the library has more."""
+    tried = sorted(e["name"] for e in results["effects"])
+    if len(tried) > _FEW_TRIED:
+        return "No effect of the library" if not results.get("not_seen") else "No effect that these records can show"
+    return f"None of the effects that were tried ({', '.join(tried)})" if tried else "Nothing that was tried"
+
+
 def _cause(results: Block) -> str:
     verdict = results["verdict"]
     names = list(verdict["effects"])
@@ -190,7 +200,7 @@ def _cause(results: Block) -> str:
     if verdict["outside_library"] or not names:
         follows = f"follows {driver_words(verdict['driver'])}" if verdict["driver"] else "has no known driver"
         if not names:
-            return f"No effect of the library explains it: the residual {follows} ({_probability(verdict)})."
+            return f"{_none_of(results)} explains it: the residual {follows} ({_probability(verdict)})."
         verb = "explains" if len(names) == 1 else "together explain"
         text = f"{_capital(listed([effect_words(n) for n in names]))} {verb} part of it{_removed(results, ', ')}; "
         return f"{text}the rest {follows} in a way that no effect of the library describes ({_probability(verdict)})."

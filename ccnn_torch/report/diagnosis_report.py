@@ -164,7 +164,7 @@ def print_diagnosis(results: Block, console: Console, about: About | None = None
     told = aside_text(aside, why, about.lines)
     for sentence in ([told] if told else []) + _notes(results, about):
         console.print(escape(sentence), style="yellow")
-    if text := network_text(results):
+    if order_table(results) is None and (text := network_text(results)):
         console.print(escape(text))
     if verdict:
         console.print(escape(verdict_text(results)), style="bold")

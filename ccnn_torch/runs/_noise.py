@@ -56,6 +56,8 @@ def noise_of_pose(given: Noise, coordinates: Sequence[Coordinate], key: str = "n
         given = dict.fromkeys((c.name for c in coordinates), given)
     values = sizes_by_name(given, coordinates, key, [math.nan] * len(coordinates)).tolist()
     found = {c.name: value for c, value in zip(coordinates, values, strict=True) if not math.isnan(value)}
+    if any(isinstance(v, float | str) and math.isnan(size(v, None, key)) for v in given.values()):
+        raise InputError(f"{key}: nan is no standard deviation; write a size from 0 up, e.g. 10um")
     low = next((name for name, value in found.items() if not 0 <= value < math.inf), None)
     if low is not None:
         raise InputError(f"{key}: a standard deviation is a number from 0 up, not {found[low]:g} for {low}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -11,7 +11,6 @@ from ccnn_torch.diagnosis.check import Check, check_rows
 from ccnn_torch.diagnosis.from_records import naming
 from ccnn_torch.diagnosis.pictures import picture_arrays
 from ccnn_torch.diagnosis.words import aside_text
-from ccnn_torch.effects import Effect, make_effect
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
@@ -142,11 +141,10 @@ def _noise(config: DiagnoseConfig, mechanism: Mechanism) -> dict[str, float] | N
     return None if config.noise is None else noise_of_pose(config.noise, mechanism.pose)
 
 
-def _loaded(config: DiagnoseConfig) -> tuple[Records, Mechanism, list[Effect] | None]:
+def _loaded(config: DiagnoseConfig) -> tuple[Records, Mechanism, Sequence[str] | None]:
     for key in ("records", "mechanism"):
         if getattr(config, key) is None:
             raise InputError(f"{key}: is missing; give --{key}, or the key in a config")
     mechanism = load_mechanism(str(config.mechanism), **config.mechanism_keys)
     records = load_records(str(config.records), mechanism, config.covariates, learns=False)
-    effects = None if config.effects is None else [make_effect(name, mechanism) for name in config.effects]
-    return records, mechanism, effects
+    return records, mechanism, config.effects

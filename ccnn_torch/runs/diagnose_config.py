@@ -52,7 +52,9 @@ class DiagnoseConfig(Section):
         "coordinate or by coordinate or unit; null = estimated from the records; one number is metres for lengths and "
         "radians for angles alike",
     )
-    effects: Names | None = Field(default=None, description="candidates, by name or path/to/file.py:Name; null = all")
+    effects: Names | None = Field(
+        default=None, description="candidates, by name or path/to/file.py:Name, all for the library; null = all"
+    )
     gravity: tuple[float, float, float] | None = Field(
         default=None, description="gravity in the base frame in m/s²; null = down along -z (planar machines: -y)"
     )

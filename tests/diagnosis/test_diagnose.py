@@ -12,7 +12,8 @@ from diagnosis._machines import NOISE, acting, measured, reached_with, rows_of
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, diagnose_rows
 from ccnn_torch.diagnosis.check import check_rows
-from ccnn_torch.effects import EFFECTS, Situation, default_gravity
+from ccnn_torch.diagnosis.engine import candidates
+from ccnn_torch.effects import EFFECTS, Situation, default_gravity, make_effect
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records
@@ -141,6 +142,36 @@ def test_what_the_records_lack_is_said_and_not_a_candidate() -> None:
     assert "joint_offset" in said.verdict["effects"]
     assert not {"compliance", "backlash", "thermal"} & {e["name"] for e in said.effects}
     assert any("compliance" in n and "load" in n for n in said.notes)
+
+
+def test_what_cannot_show_in_these_rows_is_said_and_not_a_candidate() -> None:
+    situation = rows_of("five_bar", 60, 3)
+    rested = situation.with_covariates(
+        {**situation.covariates, **{f"speed{i}": torch.zeros(60, dtype=torch.float64) for i in (1, 2)}}
+    )
+    pose = measured(situation, {"joint_gain": 20.0}, 4)
+    said = diagnose_rows(rested, pose, effects=["joint_gain", "latency"])
+    assert said.not_seen == {"latency": "rows in which it shows: in these it changes no pose"}
+    assert said.not_seen == check_rows(rested, pose, None, ["joint_gain", "latency"]).missing
+    assert [e["name"] for e in said.effects] == ["joint_gain"]
+
+
+def test_an_effect_of_ones_own_stands_beside_all_of_the_library() -> None:
+    situation = rows_of("five_bar", 60, 3)
+    usable, lacking = candidates(situation, ["all"])
+    own = make_effect(f"{Path(__file__).parents[2] / 'experiments' / 'my_effect.py'}:HosePull")
+    both, _ = candidates(situation, ["all", own])
+    assert [e.name for e in both] == [*(e.name for e in usable), own.name] and lacking
+    with pytest.raises(InputError, match=r"'backlash' is one name and not a list of names"):
+        candidates(situation, "backlash")
+
+
+def test_a_verdict_after_few_candidates_tells_which_and_why_nothing_is_proposed() -> None:
+    situation = rows_of("five_bar", 200, 7)
+    said = diagnose_rows(situation, measured(situation, {"compliance": 15.0}, 8), effects=["frame", "joint_offset"])
+    assert said.verdict["outside_library"] and not said.verdict["effects"] and said.next_measurements == []
+    assert "None of the effects that were tried (frame, joint_offset) explains it" in said.verdict["text"]
+    assert any("no measurement is proposed" in note for note in said.notes)
 
 
 def test_the_seed_decides_and_nothing_else() -> None:

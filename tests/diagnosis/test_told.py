@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +12,12 @@ import torch
 from _machines import NOISE, acting, cramped, measured, reached_with, rows_of
 from scipy.linalg import subspace_angles
 
-from ccnn_torch.diagnosis import diagnose_rows
+from ccnn_torch.diagnosis import diagnose, diagnose_rows
 from ccnn_torch.effects import Situation
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.records import load_records
+from ccnn_torch.runs.simulating import simulate_records, write_simulated
 
 EXACT = torch.full((3,), NOISE, dtype=torch.float64)
 
@@ -124,3 +129,10 @@ def test_every_row_set_aside_has_its_reason() -> None:
     looked_at = torch.tensor([row for row in range(120) if row != 50])
     near = looked_at[said.analysis.near_singular].tolist()
     assert {row for row, reason in why.items() if reason == "next to a singularity"} == set(near)
+
+
+def test_noise_in_words_is_refused_where_numbers_are_asked_for(tmp_path: Path) -> None:
+    write_simulated(tmp_path / "rows.csv", simulate_records("five_bar", ["backlash"], 40, 1e-5))
+    records = load_records(tmp_path / "rows.csv", load_mechanism("five_bar"), learns=False)
+    with pytest.raises(InputError, match=r"noise: '10um' is a text; give a number in SI"):
+        diagnose(records, load_mechanism("five_bar"), noise="10um")  # type: ignore[arg-type]

@@ -54,6 +54,10 @@ def test_the_verdict_of_each_kind() -> None:
     assert verdict_text(results).endswith(
         "No effect of the library explains it: the residual follows joint q2 (probability 0.97)."
     )
+    results["not_seen"] = {"latency": "the time of each row: time[s]"}
+    assert "No effect that these records can show explains it" in verdict_text(results)
+    results["effects"] = results["effects"][:1]
+    assert f"None of the effects that were tried ({results['effects'][0]['name']}) explains it" in verdict_text(results)
     results["verdict"]["driver"] = None
     assert "has no known driver" in verdict_text(results)
     unsure = one_effect()[0]

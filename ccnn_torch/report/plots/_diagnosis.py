@@ -46,7 +46,8 @@ def gap_plot(results: Block) -> Plot | None:
         axes.set_title(f"{name.capitalize()} gap")
     caption = (
         "How far the model is from the machine on rows not used for fitting: as it is, with one effect alone, and "
-        "with all effects of the verdict. Whiskers: 95 % intervals. No model can get below the dashed line, the noise."
+        "with all effects of the verdict. Whiskers: 95 % intervals. Dashed: the noise as given, below which no model "
+        "can get, or else what the most probable explanation leaves."
     )
     return Plot("gap", figure, caption)
 
