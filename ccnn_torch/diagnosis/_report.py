@@ -111,10 +111,10 @@ def _effect(made: Blocks, name: str) -> dict[str, Any]:
 
 
 def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
-    """Value and standard deviation in the most probable set that has it, else by itself."""
+    """Value and standard deviation in the verdict's set, beside what mends its form; else by itself."""
     analysis = made.analysis
     atoms = analysis.dictionary.atoms
-    own = made.judgement.found
+    own = made.judgement.fullest
     if not any(atoms[i].name == name for i in own.members):
         alone = made.candidates[name]
         own = next(f for f in analysis.found if f.members == (alone,))

@@ -15,7 +15,7 @@ from ccnn_torch.diagnosis._dictionary import Found
 from ccnn_torch.diagnosis._sets import scored
 from ccnn_torch.effects import EXACT
 
-__all__ = ["Judgement", "judge", "withdrawn"]
+__all__ = ["Judgement", "gap_squares", "judge", "withdrawn"]
 
 # Share of the gap's energy that goes with a member of a set and not without it: below this a library effect is how the
 # form of the others differs from the textbook; so is a catch-all beside library effects, and so are library effects
@@ -53,6 +53,8 @@ class Judgement:
 
     Attributes:
         found: the set that speaks for the verdict.
+        fullest: the most probable set with the same members and with what mends their form, whose coefficients are
+            told; `found` itself where nothing mends it.
         names: library effects, the favourite of each class.
         classes: for each of them the names that cannot be told from it.
         probability: that the verdict, classes taken as one, is right.
@@ -63,6 +65,7 @@ class Judgement:
     """
 
     found: Found
+    fullest: Found
     names: tuple[str, ...]
     classes: dict[str, tuple[str, ...]]
     probability: float
@@ -88,6 +91,8 @@ def judge(analysis: Analysis) -> Judgement:
     total = sum(weights.values())
     leading = sorted(((k[0], k[1], w / total, _plainest(groups[k])) for k, w in weights.items()), key=lambda x: -x[2])
     names, driver, probability, found = leading[0]
+    alike = [f for f in groups[names, driver] if set(found.members) <= set(f.members)]
+    fullest = max(alike, key=lambda f: f.log_posterior)
     outside = driver is not None
     if not outside and _unexplained(analysis, found):
         outside = True
@@ -95,7 +100,7 @@ def judge(analysis: Analysis) -> Judgement:
     borrowed = _borrowed(analysis, found, tried)
     if borrowed:
         # Something is there that looks like a part of these effects, and nothing of what makes them what they are.
-        found = _best_without(analysis, borrowed, tried) or found
+        found = fullest = _best_without(analysis, borrowed, tried) or found
         names, driver = _named(analysis, found)
         names, outside = names - borrowed, True
         driver = driver or _driver_alone(analysis)
@@ -116,13 +121,13 @@ def judge(analysis: Analysis) -> Judgement:
     if names and not outside and _could_be_another(analysis, found):
         probability = min(probability, _MIMIC)
     ordered = tuple(sorted(names, key=lambda n: -_energy(analysis, found, n)))
-    return Judgement(found, ordered, classes, min(probability, 1.0), outside, driver, marginal, leading)
+    return Judgement(found, fullest, ordered, classes, min(probability, 1.0), outside, driver, marginal, leading)
 
 
 def withdrawn(analysis: Analysis, judgement: Judgement) -> Judgement:
     """None in the place of names that are not likely and that no row outside the fit shows."""
     empty = next(f for f in analysis.found if not f.members)
-    return replace(judgement, found=empty, names=(), classes={}, probability=0.5)
+    return replace(judgement, found=empty, fullest=empty, names=(), classes={}, probability=0.5)
 
 
 def _borrowed(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]) -> frozenset[str]:
@@ -203,13 +208,13 @@ def _net(
     analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]
 ) -> dict[int, tuple[float, tuple[int, ...]]]:
     """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
-    gap = _gap(analysis)
+    gap = gap_squares(analysis)
     fewer = _fewer(found)
     without = _fits(analysis, list(fewer.values()), tried)
     return {i: ((f.rss - found.rss) / gap, f.members) for i, f in zip(fewer, without, strict=True)}
 
 
-def _gap(analysis: Analysis) -> float:
+def gap_squares(analysis: Analysis) -> float:
     """Squares above the noise."""
     return max(float(analysis.dictionary.grams.yy) - analysis.floor * analysis.dictionary.grams.values, 1e-300)
 
@@ -245,7 +250,7 @@ def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fo
             form = _FORM_EXACT if _exact(analysis, [m for m in found.members if m != i]) else wide
             limits[i] = form if atoms[i].catch_all else max(form, beside)
         alone = not any(atoms[i].catch_all for i in found.members)
-        large = _CARRIES * _gap(analysis)
+        large = _CARRIES * gap_squares(analysis)
         carries = {i for i, e in zip(found.members, found.energy, strict=True) if alone and e > large}
         # What leaves more than the noise when it goes is missed, however small it is.
         missed = _unexplained(analysis, found)

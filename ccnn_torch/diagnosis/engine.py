@@ -17,7 +17,7 @@ from ccnn_torch.diagnosis._missing import missing_covariates
 from ccnn_torch.diagnosis._next import next_measurements
 from ccnn_torch.diagnosis._report import Blocks, blocks, in_order
 from ccnn_torch.diagnosis._rows import picked
-from ccnn_torch.diagnosis._verdict import Judgement, judge, withdrawn
+from ccnn_torch.diagnosis._verdict import Judgement, gap_squares, judge, withdrawn
 from ccnn_torch.diagnosis._where import where
 from ccnn_torch.diagnosis.from_file import not_held_notes
 from ccnn_torch.diagnosis.result import Diagnosis
@@ -170,6 +170,14 @@ def _notes(
             notes.append(f"what follows the time is a sway with a period of {float(atom.shape):.3g} s")
     if len(analysis.measured) < int(rows.fine.sum()):
         notes.append(f"{len(analysis.measured)} of {len(rows.fine)} rows, drawn at random, were looked at")
+    atoms = analysis.dictionary.atoms
+    beside = [atoms[i] for i in judgement.fullest.members if i not in judgement.found.members]
+    if mends := [a.name for a in beside if not a.catch_all]:
+        share = (judgement.found.rss - judgement.fullest.rss) / gap_squares(analysis)
+        notes.append(
+            f"the numbers of {' and '.join(judgement.names)} are told beside {' and '.join(mends)}, which would take "
+            f"{100 * share:.2g} % of the gap more, too little to be told from another form of what is named"
+        )
     if judgement.outside and not proposed:
         notes.append(
             "no measurement is proposed: no effect says what would be measured of what lies outside of the library"

@@ -42,6 +42,19 @@ def test_effects_are_added_in_order_the_largest_first() -> None:
     assert diagnose_rows(rows, measured(rows, {}, 5), None, ["geometry", "compliance"]).in_order == []
 
 
+def test_numbers_are_told_beside_what_is_too_little_to_be_named() -> None:
+    situation = rows_of("delta", 200, 1)
+    offset = {"q1": 2e-3, "q2": -2e-3, "q3": 2.5e-3}
+    sag = acting(situation, "gravity", q1=2e-4, q2=2e-4, q3=3e-4)
+    poses = reached_with(situation, [acting(situation, "joint_offset", **offset), sag], 2, 1e-5)
+    said = diagnose_rows(situation, poses)
+    assert said.verdict["effects"] == ["joint_offset"]
+    told = next(e for e in said.effects if e["name"] == "joint_offset")["parameters"]
+    for name, value in offset.items():
+        assert abs(told[name]["value"] - value) < 3 * told[name]["sd"] < 3e-4
+    assert any("the numbers of joint_offset are told beside gravity, which would take" in n for n in said.notes)
+
+
 def test_why_one_effect_is_not_told_from_another_is_their_angle() -> None:
     rows = cramped("five_bar", 60, 0)
     said = diagnose_rows(rows, measured(rows, {"joint_offset": 8.0, "compliance": 8.0}, 50), EXACT)
