@@ -90,7 +90,7 @@ def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
     except CcnnError:
         raise
     # What a user's code raises nobody knows beforehand.
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(f"{spec}: {file} {failure(error, spec)}") from error
     found = getattr(module, name, None)
     if not callable(found) and not isinstance(found, also):

@@ -106,6 +106,15 @@ def test_rows_set_aside_are_called_by_one_name_everywhere(cli: Cli, tmp_path: Pa
         assert f"<td>{line}</td><td>{row}</td>" in page
 
 
+def test_a_direction_that_is_no_sign_is_named(cli: Cli, rows: Path) -> None:
+    lines = rows.read_text(encoding="utf-8").splitlines()
+    assert lines[0].endswith(",direction2[1]")
+    lines[5] = lines[5].rpartition(",")[0] + ",0.5"
+    (rows.parent / "odd.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    code, _, told = cli("check", "--records", rows.parent / "odd.csv", "--mechanism", "five_bar")
+    assert code == 2 and "column 'direction2', line 6: 0.5 is no direction; write 1 or -1" in told
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

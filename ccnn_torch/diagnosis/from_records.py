@@ -95,7 +95,8 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
     """Rows of records on the nominal machine; unknown frames of an arm are fitted to them.
 
     Raises:
-        InputError: records of another machine, gravity of another length, or too many rows out of reach.
+        InputError: records of another machine, gravity of another length, a direction that is no sign, or too many rows
+            out of reach.
     """
     if records.joints.shape[-1] != len(mechanism.joints):
         raise InputError(
@@ -111,12 +112,26 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
     if down.shape != (3,):
         raise InputError(f"gravity: needs three numbers (x, y, z in m/s²), not {len(down)}")
     covariates = {c.name: records.covariates[:, i] for i, c in enumerate(records.covariate_coordinates)}
+    _refuse_no_sign(records, covariates)
     mechanism, more = told(records, mechanism, covariates)
     covariates |= more
     guess = records.pose if records.pose.shape[-1] == len(mechanism.pose) else None
     situation = Situation(mechanism, records.joints, covariates, down, parameters, guess)
     refuse_lost_rows(records, situation)
     return situation
+
+
+def _refuse_no_sign(records: Records, covariates: Mapping[str, Tensor]) -> None:
+    """Raise InputError where a direction is none."""
+    for name, values in covariates.items():
+        if not name.startswith("direction"):
+            continue
+        wrong = torch.nonzero((values.abs() != 1) & (values != 0)).squeeze(-1)
+        if len(wrong):
+            raise InputError(
+                f"{records.path}: column '{name}', line {int(records.lines[wrong[0]])}: {float(values[wrong[0]]):g} is "
+                "no direction; write 1 or -1, the sign of the joint's last motion, or 0 where it is not known"
+            )
 
 
 def noise_of(noise: float | Mapping[str, float] | None, situation: Situation) -> Tensor | None:

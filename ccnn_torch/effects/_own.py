@@ -88,7 +88,7 @@ class OwnEffect:
             return getattr(self.own, verb)(*given)
         except CcnnError:
             raise
-        except Exception as error:  # whatever a user's code may raise
+        except (Exception, SystemExit) as error:  # whatever a user's code may raise
             raise InputError(f"{self.label}: {verb}() {failure(error, self.label)}{_hint(error, given[0])}") from error
 
     def _listed(self, verb: str, kind: type[_Part], situation: Situation) -> tuple[_Part, ...]:

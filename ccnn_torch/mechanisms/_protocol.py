@@ -49,7 +49,7 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
             wrong = _wrong_kinematics(mechanism) or jump_sentence(mechanism)
     except CcnnError:
         raise
-    except Exception as error:  # whatever a user's code may raise
+    except (Exception, SystemExit) as error:  # whatever a user's code may raise
         said = str(error).strip().splitlines() or [""]
         raise InputError(f"{spec}{_line(spec, error)}: {type(error).__name__}: {said[0]}") from error
     if wrong:

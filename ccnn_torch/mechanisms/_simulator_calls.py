@@ -127,7 +127,7 @@ class Calls:
             pose = np.array(plain, dtype=np.float64)
         except CcnnError:
             raise
-        except Exception as error:  # whatever a user's code may raise
+        except (Exception, SystemExit) as error:  # whatever a user's code may raise
             said = (str(error).strip().splitlines() or [""])[0]
             raise InputError(
                 f"simulator '{simulator.name}': simulate fails{_line(error)} on {count_text(len(rows), 'row')}: "
