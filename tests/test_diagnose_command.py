@@ -71,6 +71,8 @@ def test_check_says_what_rows_can_show_without_a_verdict(cli: Cli, rows: Path) -
     code, shown, _ = cli("check", "--records", rows, "--mechanism", "five_bar")
     assert code == 0
     assert "80 rows" in shown and "tool cannot be seen without" in shown
+    # One line an effect, with the closest few of those that could take it over.
+    assert shown.count("│ joint_offset │") == 1 and "geometry 1.000" in shown and " more " in shown
     assert list(rows.parent.glob("*.json")) == []
 
 

@@ -33,6 +33,10 @@ __all__ = [
 ]
 
 
+# Effects shown that could take over another one.
+_LIKEST = 3
+
+
 def run_diagnosis(config: DiagnoseConfig) -> Diagnosis:
     """Load and diagnose.
 
@@ -131,10 +135,19 @@ def _in_unit(value: float, unit: str) -> str:
 
 
 def check_table(check: Check) -> Table:
-    """Pairs that these rows do not tell apart."""
-    rows = tuple((a, b, f"{share:.3f}") for a, b, share in check.confusable)
-    note = "Share of what the first is likely to do that the second can do as well (cosine)."
-    return Table("Confusable", ("effect", "taken over by", "share"), rows, note)
+    """What could take over each effect on these rows, the closest first."""
+    found: dict[str, list[str]] = {}
+    for first, second, share in check.confusable:
+        found.setdefault(first, []).append(f"{second} {share:.3f}")
+    rows = tuple(
+        (name, ", ".join(others[:_LIKEST]) + (f" and {more} more" if (more := len(others) - _LIKEST) > 0 else ""))
+        for name, others in found.items()
+    )
+    note = (
+        "Share of what the effect is likely to do that another can do as well (cosine). A diagnosis still tells them "
+        "apart where the other one would need unlikely numbers, or more of them; all pairs stand in check.json (--out)."
+    )
+    return Table("Confusable", ("effect", "taken over by"), rows, note, ("taken over by",))
 
 
 def _noise(config: DiagnoseConfig, mechanism: Mechanism) -> dict[str, float] | None:
