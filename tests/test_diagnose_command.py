@@ -195,6 +195,12 @@ def test_stopped_before_the_verdict_it_says_that_nothing_was_written(
     assert not (tmp_path / "found").exists()
 
 
+def test_a_stopped_blind_check_says_how_to_go_on(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ccnn_torch.runs.blind.check.run_blind_check", _stop)
+    sentence = f"interrupted; what is done is kept in {tmp_path / 'b'}, and the same command goes on from there\n"
+    assert cli("blind-check", "--cases", 6, "--out", tmp_path / "b") == (130, "", sentence)
+
+
 def test_stopped_after_the_verdict_it_says_where_that_is(
     cli: Cli, rows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from ccnn_torch.cli._stopped import if_stopped
+
 __all__ = ["blind_check"]
 
 
@@ -14,7 +16,9 @@ def blind_check(
     cases: Annotated[int, typer.Option(help="How many machines.")],
     out: Annotated[Path, typer.Option(help="Folder to write.")],
     seed: Annotated[int, typer.Option(help="Of the machines, their poses and noise.")] = 0,
-    mechanism: Annotated[str | None, typer.Option(help="Names with commas; all when not given.")] = None,
+    mechanism: Annotated[
+        str | None, typer.Option(help="Names with commas; when not given all but mujoco_five_bar.")
+    ] = None,
     kinds: Annotated[
         str, typer.Option(help="Of single, pair, none, outside, with commas.")
     ] = "single,pair,none,outside",
@@ -40,12 +44,13 @@ def blind_check(
     from ccnn_torch.runs.blind.check import run_blind_check
     from ccnn_torch.runs.blind.machines import MACHINES
 
-    run_blind_check(
-        cases,
-        out,
-        diagnose,
-        seed=seed,
-        machines=MACHINES if mechanism is None else tuple(mechanism.split(",")),
-        kinds=tuple(kinds.split(",")),
-        quiet=quiet,
-    )
+    with if_stopped(f"interrupted; what is done is kept in {out}, and the same command goes on from there"):
+        run_blind_check(
+            cases,
+            out,
+            diagnose,
+            seed=seed,
+            machines=MACHINES if mechanism is None else tuple(mechanism.split(",")),
+            kinds=tuple(kinds.split(",")),
+            quiet=quiet,
+        )
