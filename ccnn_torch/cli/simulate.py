@@ -48,7 +48,7 @@ def simulate(
 
     ccnn simulate --mechanism my_arm.yaml --effect my_effect.py:CableForce --rows 300 --noise 2e-5 --out r.csv
 
-    ccnn simulate --mechanism my_simulator.py:PRESS --effect "parameter spring:spring=-60" --rows 200 --noise 1e-5
+    ccnn simulate --mechanism my_simulator.py:PRESS --effect "parameter spring1:spring1=-6000" --rows 200 --noise 1e-5
     --out r.csv
     """
     from ccnn_torch.report.table_form import print_table
