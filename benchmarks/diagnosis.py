@@ -1,10 +1,11 @@
 """Seconds of a diagnosis, and its evidence against scikit-learn's: `python benchmarks/diagnosis.py [ROWS ...]`.
 
-First, machine by machine, how long a verdict takes with all that is told beside it (where the gap lies, what to measure
-next, every interval; not the network), for a single cause, two and none, from records in memory. Then what most of the
-search is made of: the evidence of every candidate by itself, by `BayesianRidge` with its score (the same model: one
-scale of the coefficients, one of the noise), one candidate after the other, and by ours, all side by side. Both get the
-same whitened columns and one thread, and both must find the same candidate the most probable.
+First, machine by machine, how long the verdict and its shrink take, and how long with all that is told beside them
+(where the gap lies, blocks of rows, what to measure next; not the network), for a single cause, two and none, from
+records in memory. Then what most of the search is made of: the evidence of every candidate by itself, by
+`BayesianRidge` with its score (the same model: one scale of the coefficients, one of the noise), one candidate after
+the other, and by ours, all side by side. Both get the same whitened columns and one thread, and both must find the same
+candidate the most probable.
 """
 
 from __future__ import annotations
@@ -12,17 +13,21 @@ from __future__ import annotations
 import statistics
 import sys
 import time
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from sklearn.linear_model import BayesianRidge
 
-from ccnn_torch.diagnosis import diagnose_rows
+from ccnn_torch.diagnosis import diagnose_rows, engine
 from ccnn_torch.diagnosis._alone import fit_alone, own_products
 from ccnn_torch.effects import Situation, default_gravity
 from ccnn_torch.runs.simulating import simulate_records
 
 _MACHINES = ("five_bar", "delta", "tripod", "stewart")
 _CAUSES = ((), ("thermal",), ("compliance",), ("backlash", "joint_gain"), ("frame", "friction"))
+# What is told beside the verdict and its shrink.
+_BESIDE = ("where", "by_block", "next_measurements")
 _NOISE = 1e-5
 _REPEATS = 3
 
@@ -36,18 +41,37 @@ def rows_of(machine: str, causes: tuple[str, ...], rows: int) -> tuple[Situation
     return situation, made.pose
 
 
-def seconds(machine: str, rows: int) -> list[float]:
-    """Of a diagnosis, cause by cause, each the best of a few."""
+def seconds(machine: str, rows: int) -> tuple[list[float], list[float]]:
+    """Of the verdict with its shrink, and of the whole diagnosis, cause by cause, each the best of a few."""
     found = []
     for causes in _CAUSES:
         taken = []
         for _ in range(_REPEATS):
             situation, pose = rows_of(machine, causes, rows)
+            spent.clear()
             start = time.perf_counter()
             diagnose_rows(situation, pose)
-            taken.append(time.perf_counter() - start)
+            whole = time.perf_counter() - start
+            taken.append((whole - sum(spent), whole))
         found.append(min(taken))
-    return found
+    verdicts, wholes = zip(*found, strict=True)
+    return [*verdicts], [*wholes]
+
+
+spent: list[float] = []
+
+
+def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same, its seconds added to `spent`."""
+
+    def call(*given: Any) -> Any:
+        start = time.perf_counter()
+        try:
+            return function(*given)
+        finally:
+            spent.append(time.perf_counter() - start)
+
+    return call
 
 
 def against_ridge(machine: str, rows: int) -> None:
@@ -77,12 +101,14 @@ def against_ridge(machine: str, rows: int) -> None:
 def main(counts: list[int]) -> None:
     """Measure and print."""
     torch.set_num_threads(1)
+    for name in _BESIDE:
+        setattr(engine, name, timed(getattr(engine, name)))
     seconds("five_bar", 60)
-    print(f"seconds of a diagnosis: median [least, most] of {len(_CAUSES)} causes")
+    print(f"seconds of verdict and shrink, and of all that is told: median [least, most] of {len(_CAUSES)} causes")
     for rows in counts:
         for machine in _MACHINES:
-            found = seconds(machine, rows)
-            print(f"  {rows:6d} rows  {machine:9s} {statistics.median(found):.2f} [{min(found):.2f}, {max(found):.2f}]")
+            told = (f"{statistics.median(t):.2f} [{min(t):.2f}, {max(t):.2f}]" for t in seconds(machine, rows))
+            print(f"  {rows:6d} rows  {machine:9s} {'   '.join(told)}")
     for machine in ("five_bar", "stewart"):
         against_ridge(machine, counts[0])
 
