@@ -18,6 +18,8 @@ __all__ = ["Ground", "Scan", "Shaped"]
 
 # The grid, then twice this many values between the neighbours of the best.
 _FINE, _ROUNDS = 9, 3
+# Log odds, less than these being chance, for which values between those of the grid are looked at.
+_CHANCE = 5.0
 # Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
 _LOOSE = 10.0
 # Values of the residual, at most, that the grids are looked at on, for a start (or one value in so many) and then.
@@ -143,6 +145,8 @@ class Scan:
         charges = [0.0] * len(self.parts)
         plain, times = ground.left.beside(_LOOSE * _of(self.unshaped, ground.rows, 0)), ground.times
         for level in range(ground.rounds + 1):
+            if level == 1 and not self._promising(gains, charges):
+                break
             for candidates, pieces, sizes in self._level(value, level, ground.rows):
                 chosen = [self._nearest(candidates, value, part) for part in self.parts]
                 spent = [0.0] * len(self.parts)
@@ -163,6 +167,11 @@ class Scan:
                 for i, part in enumerate(self.parts):
                     value[part.shapes] = candidates[chosen[i]][part.shapes]
         return self._worth(value, gains, charges, times)
+
+    def _promising(self, gains: Sequence[float], charges: Sequence[float]) -> bool:
+        """Whether any part explains more than chance at the best value of its grid."""
+        parts = zip(self.parts, gains, charges, strict=True)
+        return any((gain - len(part.columns)) / 2 - charge > _CHANCE for part, gain, charge in parts)
 
     def _level(self, value: Tensor, level: int, rows: Tensor | None) -> list[_Turn]:
         """Candidates with their columns: of every part all its shapes at once where that are few, else one by one."""
