@@ -114,7 +114,7 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
     """Value and standard deviation in the verdict's set, beside what mends its form; else by itself."""
     analysis = made.analysis
     atoms = analysis.dictionary.atoms
-    own = made.judgement.fullest
+    own = made.judgement.fullest if name in made.judgement.names else made.judgement.found
     if not any(atoms[i].name == name for i in own.members):
         alone = made.candidates[name]
         own = next(f for f in analysis.found if f.members == (alone,))

@@ -182,7 +182,7 @@ def _could_be_another(analysis: Analysis, found: Found) -> bool:
     names = {atoms[i].name for i in found.members}
     own = torch.cat([groups[_whole(analysis, i)] for i in found.members])
     inverse = torch.linalg.pinv(grams.xx[own][:, own], rtol=1e-9, hermitian=True)
-    gap = float(grams.yy) - analysis.floor * grams.values
+    gap = gap_squares(analysis)
     for i, atom in enumerate(atoms):
         if atom.catch_all or atom.name in names:
             continue

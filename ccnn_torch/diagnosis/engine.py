@@ -99,7 +99,8 @@ def diagnose_rows(
     every = _made(situation, effects)
     usable, lacking = candidates(situation, every)
     analysis = analyse(situation, measured, usable, noise)
-    lacking |= dict.fromkeys(analysis.idle, UNSHOWN)
+    # What no column would bring into sight is no reason to record one.
+    unseen = lacking | dict.fromkeys(analysis.idle, UNSHOWN)
     judgement = judge(analysis)
     made = Blocks(analysis, judgement, residual, seed)
     together = made.main(made.together)
@@ -141,11 +142,11 @@ def diagnose_rows(
         verdict=verdict,
         next_measurements=proposed,
         missing_covariates=missing,
-        not_seen=lacking,
+        not_seen=unseen,
         rows_set_aside=sorted(why),
         why_set_aside=[why[row] for row in sorted(why)],
         cautions=texts,
-        notes=_notes(analysis, judgement, rows, lacking, missing, proposed),
+        notes=_notes(analysis, judgement, rows, unseen, missing, proposed),
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,
         judgement=judgement,
@@ -172,7 +173,8 @@ def _notes(
         notes.append(f"{len(analysis.measured)} of {len(rows.fine)} rows, drawn at random, were looked at")
     atoms = analysis.dictionary.atoms
     beside = [atoms[i] for i in judgement.fullest.members if i not in judgement.found.members]
-    if mends := [a.name for a in beside if not a.catch_all]:
+    mends = [a.name for a in beside if not a.catch_all]
+    if judgement.names and mends:
         share = (judgement.found.rss - judgement.fullest.rss) / gap_squares(analysis)
         notes.append(
             f"the numbers of {' and '.join(judgement.names)} are told beside {' and '.join(mends)}, which would take "

@@ -55,6 +55,17 @@ def test_numbers_are_told_beside_what_is_too_little_to_be_named() -> None:
     assert any("the numbers of joint_offset are told beside gravity, which would take" in n for n in said.notes)
 
 
+def test_what_no_name_stands_for_is_told_beside_nothing() -> None:
+    situation = rows_of("five_bar", 200, 1)
+    change = 2e-3 * torch.exp(-(((situation.joints[:, 1] - situation.joints[:, 1].median()) / 0.15) ** 4))
+    moved = (situation.jacobian[..., 1] * change[:, None])[:, :2]
+    offset = reached_with(situation, [acting(situation, "joint_offset", q1=3e-5)], 2)
+    said = diagnose_rows(situation, offset + moved)
+    mends = set(said.judgement.fullest.members) - set(said.judgement.found.members)
+    assert said.verdict["outside_library"] and not said.verdict["effects"] and mends
+    assert not any("told beside" in note for note in said.notes)
+
+
 def test_why_one_effect_is_not_told_from_another_is_their_angle() -> None:
     rows = cramped("five_bar", 60, 0)
     said = diagnose_rows(rows, measured(rows, {"joint_offset": 8.0, "compliance": 8.0}, 50), EXACT)
