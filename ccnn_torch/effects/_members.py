@@ -31,13 +31,15 @@ def members(mechanism: Mechanism) -> list[Member]:
         parameter = mechanism.geometry[k]
         if parameter.unit != "m":
             continue
-        member = Member(parameter.name, [], None, None)
+        name, leg, joint = parameter.name, None, None
         if isinstance(mechanism, SerialArm):
             i = place * len(mechanism.joints) // len(own)
-            member = Member(f"link {i + 1}", [], None, mechanism.joints[i].name)
+            name, joint = f"link {i + 1}", mechanism.joints[i].name
         elif parameter.leg is not None:
-            member = Member(f"leg {parameter.leg}", [], parameter.leg, None)
-        found.setdefault(member.name, member).lengths.append(k)
+            name, leg = f"leg {parameter.leg}", parameter.leg
+        if name not in found:
+            found[name] = Member(name, [], leg, joint)
+        found[name].lengths.append(k)
     return list(found.values())
 
 

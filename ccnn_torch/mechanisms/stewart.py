@@ -89,6 +89,24 @@ class Stewart(Mechanism):
         rows = torch.where(known, self._joint_rates(pose, values), torch.eye(6, dtype=pose.dtype))
         return torch.where(known, torch.linalg.inv(rows), torch.nan)
 
+    def parameter_jacobian(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """Closed form, -∂X/∂q ∂q/∂θ at the pose of the joints; see `Mechanism.parameter_jacobian`."""
+        values = self.resolve(parameters)
+        pose = self.forward_kinematics(joints, values, guess)
+        known = torch.isfinite(pose).all(-1)[..., None, None]
+        leg = self._arms_and_legs(pose, values)[1]
+        direction = leg / torch.linalg.vector_norm(leg, dim=-1, keepdim=True)
+        on_platform = direction @ rotation_vector_to_matrix(pose[..., 3:])
+        gain = values.reshape(*values.shape[:-1], 6, 8)[..., 7, None]
+        length = joints.unsqueeze(-1).expand(*direction.shape[:-1], 1)
+        # By the joint on the base and on the platform, offset and gain of a leg: what its own joint's value goes by.
+        own = torch.cat([-direction, on_platform, -torch.ones_like(length), -length], -1) / gain
+        rows = torch.where(known, self._joint_rates(pose, values), torch.eye(6, dtype=pose.dtype))
+        slope = -(torch.linalg.inv(rows)[..., None] * own.unsqueeze(-3)).flatten(-2)
+        return torch.where(known, slope, torch.nan)
+
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """The assembly mode: det(∂q/∂X) has the sign that it has in the middle of the workspace; `...`, bool."""
         values = self.resolve(parameters)

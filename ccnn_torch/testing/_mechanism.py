@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -178,7 +178,7 @@ def _check_derivatives(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
             _require(
                 gap <= _SLOPE_TOLERANCE, m, f"the derivative of {name} in its {_ARGUMENT[place]} is off by {gap:.2g}"
             )
-    _check_jacobian(m, joints, pose)
+    _check_jacobians(m, joints, pose)
 
 
 def _weighted(call: _Call, point: tuple[Tensor, Tensor, Tensor], place: int, weights: Tensor) -> _RowFunction:
@@ -198,21 +198,38 @@ def _differences(function: _RowFunction, point: Tensor) -> Tensor:
     return ((function(point + steps) - function(point - steps)) / (2 * _STEP)).movedim(0, -1)
 
 
-def _check_jacobian(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
-    jacobian = m.jacobian(joints, guess=pose)
+def _check_jacobians(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
+    """By the joints and by the parameters, against central differences of the forward kinematics."""
+
+    def by_joints(step: Tensor) -> Tensor:
+        return m.forward_kinematics(joints + step, guess=pose)
+
+    def by_parameters(step: Tensor) -> Tensor:
+        return m.forward_kinematics(joints, m.nominal + step, guess=pose)
+
+    jacobian, of_parameters = m.jacobian(joints, guess=pose), m.parameter_jacobian(joints, guess=pose)
+    _check_slopes(m, "jacobian", jacobian, by_joints, [f"joint {j.name}" for j in m.joints], pose)
+    _check_slopes(
+        m, "parameter_jacobian", of_parameters, by_parameters, [f"parameter {g.name}" for g in m.geometry], pose
+    )
+
+
+def _check_slopes(
+    m: Mechanism, name: str, slopes: Tensor, pose_at: Callable[[Tensor], Tensor], along: Sequence[str], pose: Tensor
+) -> None:
+    """slopes: `s x c x k`, what `name` returned; pose_at: poses `s x p` at a step `k`; along: names of the k."""
     rows = 3 if m.frame(pose)[1] is None else 6
-    expected_shape = (len(joints), rows, len(m.joints))
-    _require(jacobian.shape == expected_shape, m, f"jacobian has shape {tuple(jacobian.shape)}, not {expected_shape}")
-    for i in range(len(m.joints)):
-        step = torch.zeros(len(m.joints), dtype=torch.float64)
+    expected = (len(pose), rows, len(along))
+    _require(slopes.shape == expected, m, f"{name} has shape {tuple(slopes.shape)}, not {expected}")
+    for i, what in enumerate(along):
+        step = torch.zeros(len(along), dtype=torch.float64)
         step[i] = _STEP
-        ahead = m.frame(m.forward_kinematics(joints + step, guess=pose))
-        behind = m.frame(m.forward_kinematics(joints - step, guess=pose))
+        ahead, behind = m.frame(pose_at(step)), m.frame(pose_at(-step))
         slope = (ahead[0] - behind[0]) / (2 * _STEP)
         if ahead[1] is not None and behind[1] is not None:
             slope = torch.cat([slope, vee(ahead[1] @ behind[1].mT) / (2 * _STEP)], dim=-1)
-        gap = float(((jacobian[..., i] - slope).abs() / (1 + slope.abs())).max())
-        _require(gap <= _SLOPE_TOLERANCE, m, f"jacobian is off by {gap:.2g} for joint {m.joints[i].name}")
+        gap = float(((slopes[..., i] - slope).abs() / (1 + slope.abs())).max())
+        _require(gap <= _SLOPE_TOLERANCE, m, f"{name} is off by {gap:.2g} for {what}")
 
 
 def _check_hooks(m: Mechanism, joints: Tensor, pose: Tensor) -> None:

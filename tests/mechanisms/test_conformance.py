@@ -6,7 +6,7 @@ from catalogue import FIVE_BAR, NAMES, make
 from five_bar import FiveBar
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import MachineTool, Mechanism, Tripod
+from ccnn_torch.mechanisms import MachineTool, Mechanism, Stewart, Tripod
 from ccnn_torch.testing import check_mechanism
 
 
@@ -18,6 +18,13 @@ def test_conforms(name, tmp_path):
 class _WrongJacobian(Tripod):
     def jacobian(self, joints, parameters=None, guess=None):
         return 1.001 * super().jacobian(joints, parameters, guess)
+
+
+class _WrongParameterJacobian(Stewart):
+    def parameter_jacobian(self, joints, parameters=None, guess=None):
+        slope = super().parameter_jacobian(joints, parameters, guess).clone()
+        slope[..., 6] *= 1.001
+        return slope
 
 
 class _WrongForward(MachineTool):
@@ -57,6 +64,7 @@ class _LosesParameters(Tripod):
     ("wrong", "sentence"),
     [
         (_WrongJacobian, "jacobian is off by"),
+        (_WrongParameterJacobian, "parameter_jacobian is off by .* for parameter offset1"),
         (_WrongForward, "misses the pose by"),
         (_NotBatched, "solve_inverse of batch shape"),
         (_IgnoresParameters, "of parameters"),
