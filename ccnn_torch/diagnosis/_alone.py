@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._scales import LIMIT, SPREAD, Scales
 
-__all__ = ["NOTHING", "Alone", "Own", "fit_alone", "own_products"]
+__all__ = ["NOTHING", "Alone", "Own", "fit_alone", "fit_in_axes", "own_products"]
 
 _UPDATES = 8
 # Principal axes with less than this share of the largest one's squares are rounding.
@@ -39,22 +39,26 @@ class Alone(NamedTuple):
     Attributes:
         log_evidence: `b`.
         noise: σ² in the units of y, `b`.
-        mean: posterior means of the coefficients, `m` each.
+        mean: posterior means of the coefficients along the principal axes, `b x M`.
         energy: Σ (X θ)², `b`.
         rss: remaining sum of squares, `b`.
         effective: number of coefficients that the data determine, `b`.
         log_scale: log α², `b`.
-        axes: principal axes of each group, `m x m` each.
+        axes: principal axes of each group, `m x m` each, where they are known.
     """
 
     log_evidence: Tensor
     noise: Tensor
-    mean: list[Tensor]
+    mean: Tensor
     energy: Tensor
     rss: Tensor
     effective: Tensor
     log_scale: Tensor
-    axes: list[Tensor]
+    axes: Sequence[Tensor] = ()
+
+    def coefficients(self) -> list[Tensor]:
+        """Posterior means of the coefficients themselves, `m` each."""
+        return [v @ m[: v.shape[-1]] for v, m in zip(self.axes, self.mean, strict=True)]
 
 
 def own_products(x: Tensor, y: Tensor, size: Tensor | float = 1.0) -> Own:
@@ -74,11 +78,26 @@ def fit_alone(groups: Sequence[Own], yy: Tensor, values: float, noise_dof: float
         spread: standard deviation of log α².
     """
     square, along, axes = _in_axes(groups, yy)
-    there = torch.tensor([[len(g.xy) > 0] for g in groups])
+    there = torch.tensor([g.xy.numel() > 0 for g in groups])
+    fits = fit_in_axes(square, along, there, yy, values, noise_dof, spread)
+    return fits._replace(axes=axes)
+
+
+def fit_in_axes(
+    square: Tensor, along: Tensor, there: Tensor, yy: Tensor, values: float, noise_dof: float, spread: float = SPREAD
+) -> Alone:
+    """Fit every group by itself.
+
+    Args:
+        square, along: inner products along each group's principal axes with themselves and with y, `b x M`, padded
+            with 0.
+        there: False for a group of no columns, `b`.
+        yy, values, noise_dof, spread: as for `fit_alone`.
+    """
     trace = square.sum(-1).clamp_min(1e-300)
-    psi = torch.log((yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there[:, 0]
-    psi, scales = psi[:, None], Scales(values, noise_dof, there, spread)
-    noise = torch.ones_like(trace) if noise_dof > 0 else (yy / values / 10).clamp_min(1e-12).expand(len(groups))
+    psi = torch.log((yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there
+    psi, scales = psi[:, None], Scales(values, noise_dof, there[:, None], spread)
+    noise = torch.ones_like(trace) if noise_dof > 0 else (yy / values / 10).clamp_min(1e-12).expand(len(trace))
     for k in range(_UPDATES + 1):
         scale = psi.exp()
         diagonal = 1 + scale * square / noise[:, None]
@@ -92,13 +111,12 @@ def fit_alone(groups: Sequence[Own], yy: Tensor, values: float, noise_dof: float
     explained = (mean * along).sum(-1) / noise
     squares, log_det = yy / noise - explained, diagonal.log().sum(-1)
     evidence = scales.log_evidence(psi, gamma[:, None], noise, squares, log_det)
-    back = [v @ m[: v.shape[-1]] for v, m in zip(axes, mean, strict=True)]
-    return Alone(evidence, noise, back, (square * mean.square()).sum(-1), rss, gamma, psi[:, 0], axes)
+    return Alone(evidence, noise, mean, (square * mean.square()).sum(-1), rss, gamma, psi[:, 0])
 
 
 def _in_axes(groups: Sequence[Own], yy: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
     """Squares and products with y along each group's principal axes, `b x M`, padded with 0; and the axes, `m x m`."""
-    widths = [len(g.xy) for g in groups]
+    widths = [g.xy.numel() for g in groups]
     square, along = yy.new_zeros(len(groups), max(widths, default=0)), yy.new_zeros(len(groups), max(widths, default=0))
     axes = [yy.new_zeros(0, 0) for _ in groups]
     for width in sorted(set(widths) - {0}):

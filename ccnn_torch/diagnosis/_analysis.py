@@ -14,8 +14,9 @@ from ccnn_torch.diagnosis._catch_all import catch_alls
 from ccnn_torch.diagnosis._dictionary import Dictionary, Found
 from ccnn_torch.diagnosis._linear import remainder, tangent
 from ccnn_torch.diagnosis._local import local_catch_alls
+from ccnn_torch.diagnosis._richest import fitted_whitening
 from ccnn_torch.diagnosis._search import search
-from ccnn_torch.diagnosis._whitening import NO_NOISE, Whitening, fitted_whitening, moving_channels, reweighted
+from ccnn_torch.diagnosis._whitening import NO_NOISE, Whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 
 __all__ = ["Analysis", "analyse", "frame_columns"]
@@ -28,6 +29,8 @@ _GAIN = 3.0
 # a share of the noise's square.
 _SAME_NOISE, _SAME_FIT = 0.1, 0.01
 _FAR_BELOW = 0.5
+# And where, with its shapes looked for beside its best, the library is so far behind (log odds).
+_FAR_BEHIND = 20.0
 # Values of the residual that the search for a set to start from takes, at most.
 _START = 900
 
@@ -116,6 +119,8 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     before: frozenset[str] | None = None
     for _ in range(2):
         best = next(f for f in result.found if not any(result.dictionary.atoms[i].catch_all for i in f.members))
+        if before is not None and result.found[0].log_posterior - best.log_posterior > _FAR_BEHIND:
+            break
         acting = result.acting(best)
         same = before == (before := frozenset(a.effect.name for a in acting))
         new, left = _renewed(result, noise, usable), remainder(situation, measured, acting)
@@ -131,7 +136,9 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         atoms = renewed_candidates(
             situation, there, measured, target, effects, acting, starts, known, white, ok, fitted
         )
-        beside = torch.cat([fitted, *(a.columns for a in atoms if a.name in before)], -1)
+        # The first of a name is the whole effect at the shapes found now; the others say no more.
+        first = {a.name: a.columns for a in reversed(atoms)}
+        beside = torch.cat([fitted, *(first[name] for name in sorted(before))], -1)
         again = local_catch_alls(situation, jacobian, target, white, beside)
         places = [*local, *(cleaned(a, ok) for a in again)]
         result = _searched(situation, measured, target, white, [*atoms, *rest, *places], near, rich, fitted)

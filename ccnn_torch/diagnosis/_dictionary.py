@@ -95,7 +95,7 @@ def singles_of(
     )
     found: dict[tuple[int, ...], Found] = {}
     for k, (mean, (evidence, log_scale, energy, rss, noise, effective)) in enumerate(
-        zip(fits.mean, numbers, strict=True)
+        zip(fits.coefficients(), numbers, strict=True)
     ):
         members = (k - 1,) if k else ()
         prior = atoms[k - 1].log_prior if k else 0.0
@@ -110,7 +110,7 @@ def singles_of(
             noise=noise,
             effective=effective,
         )
-    return found, fits.axes[1:]
+    return found, [*fits.axes[1:]]
 
 
 def dictionary_of(

@@ -18,7 +18,8 @@ __all__ = ["LIMIT", "SPREAD", "Scales"]
 SPREAD = 4.0
 LIMIT = 25.0
 # No update changes log α² by more.
-_STEP = 2.0
+_STEP = 3.0
+_TINY = 1e-12
 
 
 class Scales(NamedTuple):
@@ -39,14 +40,19 @@ class Scales(NamedTuple):
     def updated(self, psi: Tensor, size: Tensor, gamma: Tensor, rss: Tensor) -> tuple[Tensor, Tensor]:
         """The next log α² `b x g` and σ² `b`.
 
+        MacKay's update, which takes coefficients and γ for fixed, and one of Newton's steps from there for the prior.
+
         Args:
             psi: log α², `b x g`.
             size: sum of the squares of each group's coefficients in units of α, `b x g`.
             gamma: number of coefficients of each group that the data determine, `b x g`.
             rss: remaining sum of squares, `b`.
         """
-        step = (0.5 * (size - gamma) - psi / self.spread**2) / (0.5 * gamma + 1 / self.spread**2)
-        psi = (psi + step.clamp(-_STEP, _STEP) * self.there).clamp(-LIMIT, LIMIT)
+        prior = 1 / self.spread**2
+        step = torch.log(size.clamp_min(_TINY) / gamma.clamp_min(_TINY)).clamp(-_STEP, _STEP)
+        half = 0.5 * size * torch.exp(-step)
+        step = step + (half - 0.5 * gamma - (psi + step) * prior) / (half + prior)
+        psi = (psi + step.clamp_(-_STEP, _STEP).mul_(self.there)).clamp_(-LIMIT, LIMIT)
         left = (self.values - gamma.sum(-1)).clamp_min(0.02 * self.values + 1)
         return psi, ((rss + self.noise_dof) / (left + self.noise_dof)).clamp_min(1e-12)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from torch import Tensor
@@ -18,6 +19,8 @@ _MOST = 4
 _BEAM, _LIKELIEST = 5, 8
 # Catch-alls that are put beside library effects, and how many of these may be of one driver.
 _CATCH_ALLS, _OF_ONE_DRIVER = 4, 2
+# Sets of the same names at other shapes that go on to larger ones.
+_ALIKE = 2
 
 
 def search(
@@ -50,7 +53,14 @@ def search(
             tried.update((f.members, f) for f in promising(dictionary, mine, top, tried))
 
     def best(size: int, count: int) -> list[Found]:
-        return sorted((f for s, f in tried.items() if len(s) == size), key=lambda f: -f.log_posterior)[:count]
+        ranked = sorted((f for s, f in tried.items() if len(s) == size), key=lambda f: -f.log_posterior)
+        chosen: list[Found] = []
+        same: Counter[tuple[str, ...]] = Counter()
+        for found in ranked:
+            names = tuple(sorted(atoms[i].name for i in found.members))
+            same[names] += 1
+            chosen += [found] * (same[names] <= _ALIKE)
+        return chosen[:count]
 
     def better(size: int) -> bool:
         """Whether a set of this size beats the smaller ones, among all or among those of the library."""

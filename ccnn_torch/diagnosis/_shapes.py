@@ -23,7 +23,7 @@ _CHANCE = 5.0
 # Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
 _LOOSE = 10.0
 # Values of the residual, at most, that the grids are looked at on, for a start (or one value in so many) and then.
-_START, _SHARE, _MOST = 900, 4, 4800
+_START, _SHARE, _MOST = 900, 4, 1500
 # Values of a grid that explain so little less than the best may be meant, a few of them, where it is more than chance.
 _AS_WELL, _FEW, _THERE = 20.0, 16, 100.0
 # Shapes that share coefficients are looked for together where that are no more values.
@@ -150,7 +150,9 @@ class Scan:
             for candidates, pieces, sizes in self._level(value, level, ground.rows):
                 chosen = [self._nearest(candidates, value, part) for part in self.parts]
                 spent = [0.0] * len(self.parts)
-                for sweep in range(2 if start is not None and len(self.parts) > 1 else 1):
+                # Beside each other: over the grid once each by itself before, and then about what that has found.
+                both = start is not None and len(self.parts) > 1
+                for sweep in ((0, 1) if level == 0 else (1,)) if both else (0,):
                     for i, piece in enumerate(pieces):
                         if not sizes[i]:
                             continue

@@ -17,7 +17,7 @@ __all__ = ["Draws", "Gap", "HeldOut", "draws", "folds", "held_out", "resampled",
 
 _FOLDS = 5
 # Updates of a fit to the first fold, and to the others.
-_UPDATES, _MORE = 6, 2
+_UPDATES, _MORE = 5, 4
 _REPEATS = 400
 # What a 95 % interval leaves out.
 _TAIL = 0.05

@@ -10,8 +10,11 @@ from diagnosis._machines import rows_of
 from scipy.stats import multivariate_normal
 
 from ccnn_torch.diagnosis._alone import NOTHING, fit_alone, own_products
+from ccnn_torch.diagnosis._atoms import Atom
+from ccnn_torch.diagnosis._dictionary import Dictionary, dictionary_of, singles_of
 from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
 from ccnn_torch.diagnosis._remainder import Remainder, Tried
+from ccnn_torch.diagnosis._sets import promising, scored
 from ccnn_torch.effects import make_effect
 
 
@@ -111,6 +114,39 @@ def test_groups_in_their_axes_are_as_sets_of_one() -> None:
     for k, group in enumerate([[], *([g] for g in groups)]):
         one = fit_sets(grams_of(x, y), [group], 5.0)
         assert float(found.log_evidence[k]) == pytest.approx(float(one.log_evidence[0]), rel=1e-9)
-        assert found.mean[k] == pytest.approx(one.mean[0].numpy(), rel=1e-6)
+        assert found.coefficients()[k] == pytest.approx(one.mean[0].numpy(), rel=1e-6)
         for name in ("noise", "rss", "effective"):
             assert float(getattr(found, name)[k]) == pytest.approx(float(getattr(one, name)[0]), rel=1e-9)
+
+
+def _dictionary(seed: int, noise_dof: float, opposed: float) -> Dictionary:
+    """Four groups, of which the first two make the data; opposed: how far they cancel each other."""
+    x = _columns(seed, 80, 14)
+    x[..., 5:8] = opposed * x[..., :3] + (1 - opposed**2) ** 0.5 * x[..., 5:8]
+    y = 10 * (x[..., 0] - x[..., 5]) + 2 * x[..., 8] + _columns(seed + 1, 80, 1)[..., 0]
+    columns = [x[..., k] for k in (slice(0, 5), slice(5, 8), slice(8, 12), slice(12, 14))]
+    atoms = [Atom(f"group {k}", make_effect("tool"), y.new_zeros(0), c, -2.0) for k, c in enumerate(columns)]
+    alone, axes = singles_of(atoms, columns, y, noise_dof)
+    return dictionary_of(atoms, columns, y, [], axes, alone, noise_dof)
+
+
+@pytest.mark.parametrize("opposed", [0.0, 0.7])
+@pytest.mark.parametrize("noise_dof", [0.0, 40.0])
+def test_sets_are_fitted_to_the_end(noise_dof: float, opposed: float) -> None:
+    dictionary = _dictionary(40, noise_dof, opposed)
+    sets = [(), (1,), (0, 1), (0, 2), (1, 2), (0, 1, 2), (0, 1, 2, 3)]
+    for members, found in zip(sets, scored(dictionary, sets, {}), strict=True):
+        fit = fit_sets(dictionary.grams, [[dictionary.groups[i] for i in members]], noise_dof, 200)
+        assert found.members == members
+        assert found.log_evidence == pytest.approx(float(fit.log_evidence[0]), abs=0.3)
+        assert torch.cat([dictionary.grams.xy[:0], *found.mean]).numpy() == pytest.approx(fit.mean[0].numpy(), abs=0.1)
+
+
+def test_what_is_far_behind_is_left_out_and_the_best_is_not() -> None:
+    dictionary = _dictionary(50, 0.0, 0.7)
+    pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
+    every = {f.members: f.log_posterior for f in scored(dictionary, pairs, {})}
+    kept = {f.members: f.log_posterior for f in promising(dictionary, pairs, -math.inf, {})}
+    assert max(every, key=lambda s: every[s]) == (0, 1)
+    assert kept[0, 1] == pytest.approx(every[0, 1], abs=0.1)
+    assert every[2, 3] < every[0, 1] - 60 and (2, 3) not in kept

@@ -1,0 +1,145 @@
+"""Noise and row weights before anything is named: what the richest fit leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis._alone import NOTHING, Own, fit_alone
+from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
+from ccnn_torch.diagnosis._whitening import NO_NOISE, Whitening, reweighted
+
+__all__ = ["fitted_whitening"]
+
+# The richest fit: at most so many candidates, the log evidence from which one is taken in, the spread of its log size.
+_RICH, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
+
+
+def fitted_whitening(
+    residual: Tensor, columns: Sequence[Tensor], channels: Tensor, noise: Tensor | None, usable: Tensor
+) -> Whitening:
+    """Noise and row weights from the richest fit: of everything that may be there, one by one what explains most of
+    what is left, as long as the evidence for it is more than slight.
+
+    Args:
+        residual: `s x c0` [m, rad].
+        columns: of everything that may be there, `s x c0 x P` each.
+        channels: `c`.
+        noise: known standard deviation of each of the c0 channels, or None.
+        usable: `s`, False where a row is left out from the start.
+    """
+    rms = residual[usable][:, channels].abs().median(0).values * 1.4826
+    rms = rms.clamp_min(NO_NOISE)
+    sigma = rms if noise is None else noise[channels]
+    white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0)
+    shown = [c if len(channels) == c.shape[1] else c[:, channels] for c in columns if c.shape[-1]]
+    shown = [c.to(residual.dtype) for c in shown]
+    every = _Everything(shown, white)
+    y = residual[:, channels]
+    if noise is None:
+        white = replace(white, sigma=sigma * _noise_share(every, y, white).sqrt())
+    chosen: list[int] = []
+    least = None if noise is not None else (1e-4 * rms).clamp_min(NO_NOISE)
+    left, free = y, 1.0
+    for _ in range(_RICH):
+        if chosen:
+            own = torch.cat([shown[k] / every.size[k] for k in chosen], -1)
+            ends = torch.tensor([shown[k].shape[-1] for k in chosen]).cumsum(0).tolist()
+            parts = [torch.arange(e - shown[k].shape[-1], e) for e, k in zip(ends, chosen, strict=True)]
+            fit = fit_sets(grams_of(white.scaled(own), white.scaled(y)), [parts], 0.0, spread=_ANY_SIZE)
+            left = y - own @ fit.mean[0]
+            free = max(1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), 0.1)
+            white = _settled(white, left, usable, free, least)
+        products = [NOTHING if k in chosen else own for k, own in enumerate(every.products(white, left))]
+        squares = white.scaled(left).square().sum()
+        fits = fit_alone([NOTHING, *products], squares, float(left.numel()), 0.0, _ANY_SIZE)
+        best = int(fits.log_evidence[1:].argmax())
+        if not shown or float(fits.log_evidence[best + 1] - fits.log_evidence[0]) < _SLIGHT:
+            break
+        chosen.append(best)
+    white = _settled(white, left, usable, free, least)
+    return replace(white, known=0.0 if noise is None else 50.0)
+
+
+class _Everything:
+    """All that may be there, and its inner products channel by channel: these stay when only the noise changes.
+
+    Columns count by what they tell, whatever their size: all have the same mean square.
+
+    Attributes:
+        columns: of each candidate, `s x c x m` [m, rad].
+        size: what they are divided by.
+    """
+
+    def __init__(self, columns: Sequence[Tensor], white: Whitening) -> None:
+        self.columns = columns
+        self._weight = white.weight
+        self._among = [self._by_channel(c, c) for c in columns]
+        # Weights are 1 or 0 at first.
+        count = white.weight.sum() * len(white.channels)
+        per = white.sigma[:, None] ** -2
+        squares = [(g.diagonal(dim1=-2, dim2=-1) * per).sum() / g.shape[-1] for g in self._among]
+        self.size = [(s / count).sqrt().clamp_min(1e-300) for s in squares]
+
+    def _by_channel(self, one: Tensor, other: Tensor) -> Tensor:
+        """Inner products `c x m x k` of `s x c x m` and `s x c x k`."""
+        plain = bool((self._weight == 1).all())
+        weighted = one if plain else one * self._weight[:, None, None]
+        return weighted.permute(1, 2, 0) @ other.transpose(0, 1)
+
+    def by_channel(self, y: Tensor, white: Whitening) -> list[list[Own]]:
+        """Of every candidate those of each channel, in units of the noise; y: residual, `s x c`."""
+        per = white.sigma**-2
+        found = []
+        for columns, among, size in zip(self.columns, self._among, self.size, strict=True):
+            square = among * per[:, None, None] / size**2
+            along = self._by_channel(columns, y[..., None])[..., 0] * per[:, None] / size
+            found.append([Own(xx, xy) for xx, xy in zip(square, along, strict=True)])
+        return found
+
+    def products(self, white: Whitening, left: Tensor) -> list[Own]:
+        """Of every candidate with itself and with what a fit leaves, `s x c`, in units of the noise."""
+        if not torch.equal(white.weight, self._weight):
+            self._weight = white.weight
+            self._among = [self._by_channel(c, c) for c in self.columns]
+        per = white.sigma**-2
+        target = (left * white.weight[:, None] * per).reshape(-1)
+        return [
+            Own((among * per[:, None, None]).sum(0) / size**2, columns.flatten(0, 1).mT @ target / size)
+            for columns, among, size in zip(self.columns, self._among, self.size, strict=True)
+        ]
+
+
+def _noise_share(every: _Everything, y: Tensor, white: Whitening) -> Tensor:
+    """Of the squares of each channel what the candidate that explains it best by itself leaves, `c`.
+
+    Channel by channel: one that is almost all gap would else be lost in the noise of the others.
+
+    Args:
+        every: candidates.
+        y: residual, `s x c` [m, rad].
+        white: noise and weights so far.
+    """
+    target = white.scaled(y).mT
+    groups = [NOTHING] * len(target) + [own for each in every.by_channel(y, white) for own in each]
+    squares = target.square().sum(-1).repeat(1 + len(every.columns))
+    fits = fit_alone(groups, squares, float(target.shape[-1]), 0.0, _ANY_SIZE)
+    evidence, noise = fits.log_evidence.reshape(-1, len(target)), fits.noise.reshape(-1, len(target))
+    best = evidence.max(0)
+    left = noise.gather(0, best.indices[None])[0] / noise[0]
+    return torch.where(best.values - evidence[0] > _SLIGHT, left, 1.0).clamp(1e-6, 1.0)
+
+
+def _settled(white: Whitening, left: Tensor, usable: Tensor, free: float, least: Tensor | None) -> Whitening:
+    """Noise (unless it is known: `least` None) and weights from what a fit leaves, `s x c`.
+
+    No channel's noise is below `least`: a perfect fit knows nothing of the noise.
+    """
+    if least is not None:
+        rows = white.weight > 0
+        spread = left[rows].abs().median(0).values * 1.4826 / free**0.5
+        white = replace(white, sigma=torch.maximum(spread, least))
+    return reweighted(white, left, usable, free)
