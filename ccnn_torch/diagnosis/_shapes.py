@@ -22,8 +22,9 @@ _FINE, _ROUNDS = 9, 3
 _CHANCE = 5.0
 # Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
 _LOOSE = 10.0
-# Values of the residual, at most, that the grids are looked at on, for a start (or one value in so many) and then.
-_START, _SHARE, _MOST = 900, 4, 1500
+# Values of the residual that the grids are looked at on, for a start and then: so many or one in so many, whichever is
+# more, but no more than the last.
+_START, _THEN, _MOST = (900, 4), (1500, 2), 4800
 # Values of a grid that explain so little less than the best may be meant, a few of them, where it is more than chance.
 _AS_WELL, _FEW, _THERE = 20.0, 16, 100.0
 # Shapes that share coefficients are looked for together where that are no more values.
@@ -75,7 +76,8 @@ class Ground:
         """y: whitened residual, `s x c`; others: whitened columns, in units of their prior, `s x c x P`; quick:
         whether a start is enough."""
         drawn = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))
-        most = max(_START, y.numel() // _SHARE) if quick else _MOST
+        fewest, share = _START if quick else _THEN
+        most = min(max(fewest, y.numel() // share), _MOST)
         count = max(1, most // max(y.shape[1], 1))
         self.rows = drawn[:count].sort().values if count < len(y) else None
         self.left = Remainder(_of(y, self.rows, 0), _LOOSE * _of(others, self.rows, 0))
