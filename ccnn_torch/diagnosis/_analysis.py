@@ -136,7 +136,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         atoms = renewed_candidates(
             situation, there, measured, target, effects, acting, starts, known, white, ok, fitted
         )
-        # The first of a name is the whole effect at the shapes found now; the others say no more.
+        # The first of a name has the shapes found now; its parts and earlier shapes add next to nothing.
         first = {a.name: a.columns for a in reversed(atoms)}
         beside = torch.cat([fitted, *(first[name] for name in sorted(before))], -1)
         again = local_catch_alls(situation, jacobian, target, white, beside)

@@ -72,8 +72,7 @@ def _fitted(
     lots = _lots(dictionary, _starts(dictionary, sets, tried))
     fits, likely = [], []
     for starts, begin in lots:
-        groups = [[dictionary.groups[i] for i in _widest_first(dictionary, s.members)] for s in starts]
-        fits.append(fit_joined(dictionary.turned, groups, dictionary.noise_dof, begin, _SHORT))
+        fits.append(_updated(dictionary, [s.members for s in starts], begin, _SHORT))
         prior = torch.tensor([_log_prior(dictionary, s.members) for s in starts], dtype=torch.float64)
         likely.append((torch.nan_to_num(fits[-1].log_evidence, nan=-math.inf) + prior).tolist())
     reached: dict[tuple[int, ...], float] = {}
@@ -87,11 +86,16 @@ def _fitted(
         if not rows:
             continue
         kept = [starts[k].members for k in rows]
-        groups = [[dictionary.groups[i] for i in _widest_first(dictionary, members)] for members in kept]
         begin = first.log_scale[rows], first.noise[rows]
-        fit = fit_joined(dictionary.turned, groups, dictionary.noise_dof, begin, _UPDATES - _SHORT)
-        found |= _read(dictionary, kept, fit)
+        found |= _read(dictionary, kept, _updated(dictionary, kept, begin, _UPDATES - _SHORT))
     return found
+
+
+def _updated(
+    dictionary: Dictionary, sets: Sequence[tuple[int, ...]], begin: tuple[Tensor, Tensor], updates: int
+) -> Joined:
+    groups = [[dictionary.groups[i] for i in _widest_first(dictionary, members)] for members in sets]
+    return fit_joined(dictionary.turned, groups, dictionary.noise_dof, begin, updates)
 
 
 def _starts(

@@ -86,7 +86,7 @@ class Stewart(Mechanism):
         values = self.resolve(parameters)
         pose = self.forward_kinematics(joints, values, guess)
         known = torch.isfinite(pose).all(-1)[..., None, None]
-        rows = torch.where(known, self._joint_rates(pose, values), torch.eye(6, dtype=pose.dtype))
+        rows = torch.where(known, self._joint_rates(pose, values), torch.eye(6, dtype=pose.dtype, device=pose.device))
         return torch.where(known, torch.linalg.inv(rows), torch.nan)
 
     def parameter_jacobian(
@@ -103,7 +103,7 @@ class Stewart(Mechanism):
         length = joints.unsqueeze(-1).expand(*direction.shape[:-1], 1)
         # By the joint on the base and on the platform, offset and gain of a leg: what its own joint's value goes by.
         own = torch.cat([-direction, on_platform, -torch.ones_like(length), -length], -1) / gain
-        rows = torch.where(known, self._joint_rates(pose, values), torch.eye(6, dtype=pose.dtype))
+        rows = torch.where(known, self._joint_rates(pose, values), torch.eye(6, dtype=pose.dtype, device=pose.device))
         slope = -(torch.linalg.inv(rows)[..., None] * own.unsqueeze(-3)).flatten(-2)
         return torch.where(known, slope, torch.nan)
 
