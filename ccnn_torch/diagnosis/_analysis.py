@@ -16,6 +16,7 @@ from ccnn_torch.diagnosis._linear import remainder, tangent
 from ccnn_torch.diagnosis._local import local_catch_alls
 from ccnn_torch.diagnosis._richest import fitted_whitening
 from ccnn_torch.diagnosis._search import search
+from ccnn_torch.diagnosis._straight import straight_catch_alls
 from ccnn_torch.diagnosis._whitening import NO_NOISE, Whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 
@@ -90,7 +91,8 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     residual = torch.where(usable[:, None], residual, 0.0)
 
     atoms = [cleaned(plain_atom(situation, situation, e), usable) for e in effects]
-    rest = catch_alls(situation, [e.name for e in effects])
+    names = [e.name for e in effects]
+    rest = [*catch_alls(situation, names), *straight_catch_alls(situation, names)]
     rest = [cleaned(a, usable) for a in rest if bool((torch.isfinite(a.columns).flatten(1).all(-1) | ~usable).all())]
     fitted = frame_columns(situation, usable)
     # What does not show at all in these rows is no candidate (latency at rest).

@@ -16,7 +16,18 @@ from torch import Tensor
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.effects import Situation
 
-__all__ = ["ANY", "LOG_PRIOR", "SPEED", "catch_alls", "joint_moves", "platform_moves", "spread_out", "unit_range"]
+__all__ = [
+    "ANY",
+    "LOG_PRIOR",
+    "SPEED",
+    "catch_alls",
+    "joint_moves",
+    "platform_moves",
+    "products",
+    "reduced",
+    "spread_out",
+    "unit_range",
+]
 
 # A catch-all is that much less probable than no deviation of its kind, before the data are seen.
 LOG_PRIOR = math.log(1e-3)
@@ -78,7 +89,7 @@ def catch_alls(situation: Situation, beside: Sequence[str]) -> list[Atom]:
             found.append(_whole(situation, driver, _waves(d, max(4, min(_WAVES, 2 * rows // 5)))))
         if driver.startswith("load"):
             # What a load asks of a joint goes with the slope of the kinematics, which is no plane over the workspace.
-            features.append(_BEND * d * _products(place))
+            features.append(_BEND * d * products(place))
             found.append(_atom(situation, driver, _asked(_under(situation, name)), most=most, log_prior=_NEAR_LIBRARY))
         if driver == "temperature" and "time" in situation.covariates:
             features += [_lagged(value, situation.covariates["time"], k) for k in (0.05, 0.2)]
@@ -110,7 +121,7 @@ def unit_range(values: Tensor) -> Tensor:
     return (2 * values - low - high) / (high - low).clamp_min(1e-300)
 
 
-def _products(place: Tensor) -> Tensor:
+def products(place: Tensor) -> Tensor:
     """Squares and products of the coordinates, `s x (p + 1) p / 2`."""
     first, second = torch.triu_indices(place.shape[-1], place.shape[-1])
     return place[:, first] * place[:, second]
@@ -213,7 +224,7 @@ def _atom(
     moves = moves if only is None else moves[..., only : only + 1]
     if features.dim() == 2:
         features = _principal(features, most)[:, None].expand(-1, moves.shape[-1], -1)
-    return Atom(driver, None, features.new_zeros(0), _reduced(moves, features, most), log_prior)
+    return Atom(driver, None, features.new_zeros(0), reduced(moves, features, most), log_prior)
 
 
 def _principal(features: Tensor, most: int) -> Tensor:
@@ -225,7 +236,7 @@ def _principal(features: Tensor, most: int) -> Tensor:
     return principal
 
 
-def _reduced(moves: Tensor, features: Tensor, most: int) -> Tensor:
+def reduced(moves: Tensor, features: Tensor, most: int) -> Tensor:
     """The leading principal columns of each joint's moves, `s x c x n`, times each of its features, `s x n x f`.
 
     With one prior scale for all, the rest is the least of what the prior allows. The columns themselves, n times f of
@@ -238,5 +249,5 @@ def _reduced(moves: Tensor, features: Tensor, most: int) -> Tensor:
     gram = [features[:, i].mT @ (inner[:, i, :, None] * features).flatten(1) for i in range(n)]
     _, vectors = torch.linalg.eigh(torch.cat(gram))
     kept = vectors[:, -most:].reshape(n, f, -1)
-    reduced: Tensor = moves @ (features.transpose(0, 1) @ kept).transpose(0, 1)
-    return reduced
+    columns: Tensor = moves @ (features.transpose(0, 1) @ kept).transpose(0, 1)
+    return columns

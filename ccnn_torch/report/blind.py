@@ -32,6 +32,8 @@ DEFINITIONS = {
     "class": "names that explain the true gap as well as the true cause does",
     "claims": "verdicts with a probability of 0.95 or more that are right",
     "wrong_name": "a name with a probability above 0.9 that does not explain the gap",
+    "hidden": "the names leave less than two standard deviations of the noise's own squares, which no test sees that "
+    "does not know the cause",
     "shrink": "95 % intervals of the shrink that hold the one that noise-free data show for the same names",
 }
 
@@ -71,6 +73,9 @@ def summary(cases: Sequence[Case]) -> Block:
             "outside, said": share(bool(c["answer"].get("outside")) for c in kinds["outside"]),
             "withheld with a driver of its own, right": _kept(withheld, lambda w: w["own_driver"], "right"),
             "withheld without, right": _kept(withheld, lambda w: not w["own_driver"], "right"),
+            "withheld without, right or hidden": share(
+                w["right"] or w.get("hidden", False) for c in withheld if not (w := c["withheld"])["own_driver"]
+            ),
             "withheld, wrong name": _kept(withheld, lambda w: True, "wrong_name"),
             "claims": share(_is(c, "right") for c in cases if _probability(c) >= _CONFIDENT),
             "shrink": share(c["answer"]["shrink"]["holds"] for c in cases if c["answer"].get("shrink")),

@@ -70,7 +70,8 @@ def _cell(block: Mapping[str, Any] | None) -> str:
 def _targets(found: Mapping[str, Any]) -> Table:
     rows = tuple((name, str(b["count"]), _cell(b)) for name, b in found["targets"].items() if b["of"])
     words = found["definitions"]
-    note = f"In brackets: 95 % intervals. Right: {words['right']}. Found: {words['found']}. Claims: {words['claims']}."
+    defined = (f"{name.capitalize()}: {words[name]}." for name in ("right", "found", "hidden", "claims"))
+    note = " ".join(["In brackets: 95 % intervals.", *defined])
     return Table("Blind check", ("figure", "counted", "share"), rows, note)
 
 

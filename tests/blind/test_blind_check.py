@@ -166,9 +166,13 @@ def test_answers_are_judged() -> None:
     assert not judged(outside, Said(("drift",)).to_json(), None)["answer"]["right"]
 
     (single,) = simulate([planned("five_bar", "single", "drift")], 0)
-    for answer, right, wrong in ((Said(driver="time"), True, False), (Said(("backlash",)), False, True)):
+    for answer, right, wrong, hidden in (
+        (Said(driver="time"), True, False, False),
+        (Said(("backlash",)), False, True, False),
+        (Said(("drift",)), True, False, True),
+    ):
         found = judged(single, Said(("drift",)).to_json(), answer.to_json())["withheld"]
-        assert (found["right"], found["wrong_name"]) == (right, wrong)
+        assert (found["right"], found["wrong_name"], found["hidden"]) == (right, wrong, hidden)
     assert judged(single, {"failed": "no."}, None)["answer"] == {"failed": "no."}
 
 

@@ -7,6 +7,7 @@ one name for a pair. What lies outside the library is right where the answer say
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,6 +20,10 @@ _OUTLIER = "outlier"
 _CLEAR = 1.0
 """What the library leaves of a cause at best, in units of the noise's squares, from which on "and something outside of
 it" is no mistake."""
+
+_HIDDEN = 2.0
+"""Standard deviations of the noise's sum of squares up to which something left is seen by no test that does not know
+what it looks for."""
 
 
 def judged(case: BlindCase, answer: Mapping[str, Any] | None, withheld: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -118,4 +123,5 @@ def _withheld(case: BlindCase, judge: Judge, causes: Sequence[str], answer: Mapp
         "own_driver": bool(own),
         "right": explains or (outside and (not own or driver in own)),
         "wrong_name": bool(named) and not explains and not outside and verdict["probability"] > 0.9,
+        "hidden": bool(named) and judge.explained(named).left <= _HIDDEN * math.sqrt(2 * judge.numbers),
     }

@@ -1,0 +1,30 @@
+"""A plain cause that the library lacks is not put together from two others; one that it has is named."""
+
+from __future__ import annotations
+
+import pytest
+from diagnosis._machines import measured, rows_of
+
+from ccnn_torch.diagnosis import diagnose_rows
+from ccnn_torch.effects import EFFECTS
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    ("machine", "cause", "size", "driver"),
+    [
+        ("stewart", "instrument", 30.0, "workspace"),
+        ("stewart", "frame", 30.0, "workspace"),
+        ("tripod", "tool", 30.0, "workspace"),
+        ("delta", "joint_gain", 10.0, "joint"),
+    ],
+)
+def test_a_plain_cause_is_outside_a_library_that_lacks_it(
+    machine: str, cause: str, size: float, driver: str, seed: int
+) -> None:
+    situation = rows_of(machine, 150, 30)
+    poses = measured(situation, {cause: size}, seed)
+    without = diagnose_rows(situation, poses, effects=[name for name in EFFECTS if name != cause]).verdict
+    assert without["outside_library"] and without["driver"].startswith(driver) and not without["effects"]
+    told = diagnose_rows(situation, poses).verdict
+    assert told["effects"] == [cause] and not told["outside_library"]
