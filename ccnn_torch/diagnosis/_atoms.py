@@ -24,6 +24,7 @@ class Atom:
         columns: first-order change of the pose per plausible size of each coefficient, `s x c x m` [m, rad].
         log_prior: log prior odds, the search over shapes charged.
         used: the coefficients that the columns belong to; None = all, in order.
+        plain: whether a catch-all has straight lines, planes or gentle curves only.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Atom:
     columns: Tensor
     log_prior: float
     used: tuple[int, ...] | None = None
+    plain: bool = False
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Those that the columns belong to; () for a catch-all."""

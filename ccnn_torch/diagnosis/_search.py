@@ -17,8 +17,9 @@ __all__ = ["search"]
 _MOST = 4
 # Pairs that go on to sets of three; in a quick search, which ends with pairs, the atoms that these are made of.
 _BEAM, _LIKELIEST = 5, 8
-# Catch-alls that are put beside library effects, and how many of these may be of one driver.
-_CATCH_ALLS, _OF_ONE_DRIVER = 4, 2
+# Catch-alls that are put beside library effects, how many of these may be of one driver, and how many plain ones are
+# put there, too: nearly of the library's own forms, these often do most by themselves and least beside it.
+_CATCH_ALLS, _OF_ONE_DRIVER, _PLAIN = 4, 2, 1
 # Sets of the same names at other shapes that go on to larger ones.
 _ALIKE = 2
 
@@ -84,12 +85,12 @@ def _top(found: Iterable[Found]) -> float:
 
 
 def _of_several_drivers(ranked: Sequence[int], atoms: Sequence[Atom]) -> list[int]:
-    """The first few catch-alls, no more than some of one driver."""
+    """The first few catch-alls, no more than some of one driver, and the first of the plain ones."""
     chosen: list[int] = []
-    for i in ranked:
+    for i in (i for i in ranked if not atoms[i].plain):
         if sum(atoms[k].name == atoms[i].name for k in chosen) < _OF_ONE_DRIVER:
             chosen.append(i)
-    return chosen[:_CATCH_ALLS]
+    return chosen[:_CATCH_ALLS] + [i for i in ranked if atoms[i].plain][:_PLAIN]
 
 
 def _joined(members: tuple[int, ...], extra: int, atoms: Sequence[Atom]) -> tuple[int, ...]:

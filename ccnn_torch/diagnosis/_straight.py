@@ -62,7 +62,7 @@ def _by_all(features: Tensor, joints: Tensor) -> Tensor:
 def _driven(situation: Situation, driver: str, features: Tensor) -> Atom:
     """Joints that are off by features of their own, `s x n x f`."""
     columns = reduced(joint_moves(situation, situation.jacobian), features, _MOST)
-    return Atom(driver, None, features.new_zeros(0), columns, LOG_PRIOR)
+    return Atom(driver, None, features.new_zeros(0), columns, LOG_PRIOR, plain=True)
 
 
 def _carried(situation: Situation, axes: Tensor) -> Atom:
@@ -75,4 +75,4 @@ def _carried(situation: Situation, axes: Tensor) -> Atom:
     turns = moves[..., 3:] @ axes if moves.shape[-1] == 6 else moves[..., :0]
     columns = torch.cat([shifts, turns], -1)
     shown = columns.abs().amax((0, 1)) > 1e-9 * columns.abs().max().clamp_min(1e-300)
-    return Atom("workspace", None, place.new_zeros(0), columns[..., shown], LOG_PRIOR)
+    return Atom("workspace", None, place.new_zeros(0), columns[..., shown], LOG_PRIOR, plain=True)
