@@ -72,6 +72,7 @@ def levenberg_marquardt(
     max_iterations: int = 60,
     tolerance: float = 1e-12,
     damping: float = 1e-4,
+    both: Callable[..., tuple[Tensor, Tensor]] | None = None,
 ) -> Solution:
     """Minimise |residual(x)|² / 2 for every leading index at once.
 
@@ -89,6 +90,8 @@ def levenberg_marquardt(
         tolerance: a problem is done when its step is below `tolerance * (1 + |x|)`, or when the decrease that the
             linear model promises is below rounding.
         damping: first λ, relative.
+        both: `(x, *data)` -> residual and Jacobian at once, in the place of both functions, where they share most of
+            their work; needs data.
 
     Returns:
         Solution; no gradient flows through it.
@@ -115,20 +118,26 @@ def levenberg_marquardt(
 
         return call(by_autodiff, values, active)
 
+    def evaluate(values: Tensor, active: Tensor) -> tuple[Tensor, Tensor | None]:
+        if both is None:
+            return call(residual, values, active).detach(), None
+        value, slope = both(values, *(d[active] for d in rows))
+        return value.detach(), slope.detach()
+
     active = torch.arange(count, device=x.device)
-    r = call(residual, x, active).detach()
+    r, slope = evaluate(x, active)
     cost = r.square().sum(-1) / 2
     converged = torch.zeros(count, dtype=torch.bool, device=x.device)
     active = torch.nonzero(torch.isfinite(cost)).squeeze(-1)
-    r = r[active]
+    r, slope = r[active], None if slope is None else slope[active]
     lam = torch.full((len(active),), damping, dtype=x.dtype, device=x.device)
     iterations = 0
     while len(active) and iterations < max_iterations:
         iterations += 1
         here = x[active]
-        step, promised = _damped_step(differentiate(here, active).detach(), r, lam)
+        step, promised = _damped_step(differentiate(here, active).detach() if slope is None else slope, r, lam)
         trial = here + step
-        trial_r = call(residual, trial, active).detach()
+        trial_r, trial_slope = evaluate(trial, active)
         trial_cost = trial_r.square().sum(-1) / 2
         # A rise within rounding counts as no rise: at the minimum the cost cannot be told apart from its neighbours.
         better = trial_cost <= cost[active] * (1 + 4 * _EPS)
@@ -138,6 +147,8 @@ def levenberg_marquardt(
         x[active] = torch.where(better[:, None], trial, here)
         cost[active] = torch.where(better, trial_cost, cost[active])
         r = torch.where(better[:, None], trial_r, r)
+        if slope is not None and trial_slope is not None:
+            slope = torch.where(better[:, None, None], trial_slope, slope)[~done]
         lam = torch.where(better, lam / 20, lam * 8).clamp(_DAMPING_FLOOR, _DAMPING_CEILING)
         converged[active] = done
         active, r, lam = active[~done], r[~done], lam[~done]

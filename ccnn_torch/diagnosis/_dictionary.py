@@ -20,19 +20,25 @@ __all__ = ["Dictionary", "Found", "covariance", "dictionary_of", "singles_of"]
 class Found:
     """A set of atoms with its log posterior (up to a constant), log evidence, and fit.
 
-    `mean` are the coefficients, atom by atom, in units of their plausible sizes, and `log_scale` log α² of each atom's;
-    `energy` the squares that each atom's own part makes; `rss` what the set leaves.
+    `along` are the coefficients along the principal `axes` of each atom, and `log_scale` log α² of each atom's; `energy`
+    the squares that each atom's own part makes; `rss` what the set leaves.
     """
 
     members: tuple[int, ...]
     log_posterior: float
     log_evidence: float
-    mean: tuple[Tensor, ...]
+    along: tuple[Tensor, ...]
+    axes: tuple[Tensor, ...]
     log_scale: tuple[float, ...]
     energy: tuple[float, ...]
     rss: float
     noise: float
     effective: float
+
+    @cached_property
+    def mean(self) -> tuple[Tensor, ...]:
+        """The coefficients, atom by atom, in units of their plausible sizes."""
+        return tuple(axes @ along for axes, along in zip(self.axes, self.along, strict=True))
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ class Dictionary:
         groups: which of the columns are those of an atom, for the atoms that have such.
         grams: of the columns; NaN between catch-alls, which are in no set together.
         axes: principal axes of the columns of each of these atoms, `m x m`.
-        turned: `grams` with every group in its axes.
+        turned: `grams` with every group in its axes, and with a last column of zeros.
         alone: no atom, and each by itself.
         noise_dof: as for `fit_sets`.
     """
@@ -61,9 +67,19 @@ class Dictionary:
     noise_dof: float
 
     @cached_property
-    def widths(self) -> dict[int, int]:
-        """How many columns each of these atoms has."""
-        return {i: group.numel() for i, group in self.groups.items()}
+    def widths(self) -> Tensor:
+        """How many columns each of the atoms has, `a`; 0 for those that no sets are made of."""
+        return torch.tensor([len(self.groups[i]) if i in self.groups else 0 for i in range(len(self.atoms))])
+
+    @cached_property
+    def begins(self) -> Tensor:
+        """The first of them, `a`: they stand side by side."""
+        return torch.tensor([int(self.groups[i][0]) if i in self.groups else 0 for i in range(len(self.atoms))])
+
+    @cached_property
+    def log_prior(self) -> Tensor:
+        """Log prior odds of each of the atoms, `a`."""
+        return torch.tensor([a.log_prior for a in self.atoms], dtype=self.grams.yy.dtype)
 
 
 def covariance(dictionary: Dictionary, found: Found) -> Tensor:
@@ -94,16 +110,15 @@ def singles_of(
         strict=True,
     )
     found: dict[tuple[int, ...], Found] = {}
-    for k, (mean, (evidence, log_scale, energy, rss, noise, effective)) in enumerate(
-        zip(fits.coefficients(), numbers, strict=True)
-    ):
+    for k, (evidence, log_scale, energy, rss, noise, effective) in enumerate(numbers):
         members = (k - 1,) if k else ()
         prior = atoms[k - 1].log_prior if k else 0.0
         found[members] = Found(
             members=members,
             log_posterior=evidence + prior,
             log_evidence=evidence,
-            mean=(mean,)[: len(members)],
+            along=tuple(fits.mean[k, : len(fits.axes[k])] for _ in members),
+            axes=tuple(fits.axes[k] for _ in members),
             log_scale=(log_scale,)[: len(members)],
             energy=(energy,)[: len(members)],
             rss=rss,
@@ -138,12 +153,13 @@ def dictionary_of(
 
 
 def _turned(grams: Grams, groups: Mapping[int, Tensor], axes: Mapping[int, Tensor]) -> Grams:
-    """Every group in its principal axes."""
-    xx, xy = torch.empty_like(grams.xx), torch.empty_like(grams.xy)
+    """Every group in its principal axes, and one more column, of zeros, in the place of those that are not there."""
+    width = len(grams.xy)
+    xx, xy = grams.xx.new_zeros(width + 1, width + 1), grams.xy.new_zeros(width + 1)
     for i, group in groups.items():
         place = slice(int(group[0]), int(group[-1]) + 1)
-        xx[place], xy[place] = axes[i].mT @ grams.xx[place], axes[i].mT @ grams.xy[place]
+        xx[place, :width], xy[place] = axes[i].mT @ grams.xx[place], axes[i].mT @ grams.xy[place]
     for i, group in groups.items():
         place = slice(int(group[0]), int(group[-1]) + 1)
-        xx[:, place] = xx[:, place] @ axes[i]
+        xx[:width, place] = xx[:width, place] @ axes[i]
     return grams._replace(xx=xx, xy=xy)

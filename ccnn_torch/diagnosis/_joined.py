@@ -6,22 +6,21 @@ eliminated by dividing, and what is left to be factorised is a matrix of the oth
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._evidence import Grams, padded
+from ccnn_torch.diagnosis._evidence import Grams
 from ccnn_torch.diagnosis._scales import Scales
 
-__all__ = ["Joined", "fit_joined"]
+__all__ = ["Joined", "fit_joined", "side_by_side"]
 
 _DIGITS = 1e-13
 
 
 class Joined(NamedTuple):
-    """One entry a set, `b` sets of up to `g` groups, the first group being the widest.
+    """One entry a set, `b` sets of `g` groups, the first group being the widest.
 
     Attributes:
         log_evidence: `b`.
@@ -43,71 +42,76 @@ class Joined(NamedTuple):
     log_scale: Tensor
 
 
+def side_by_side(begin: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns of `b` sets of `g` runs, which begin at some column and are so wide, `b x g` each.
+
+    Returns:
+        the columns of each set, `b x M`, M > 0, and which of its runs they belong to; -1 where there are no more.
+    """
+    ends = width.cumsum(-1)
+    place = torch.arange(max(int(ends[:, -1].max()), 1))
+    slot = (place[:, None] >= ends[:, None, :]).sum(-1)
+    there = slot < width.shape[1]
+    own = slot.clamp_max(width.shape[1] - 1)
+    columns = place + (begin - ends + width).gather(1, own)
+    return torch.where(there, columns, -1), torch.where(there, slot, -1)
+
+
 def fit_joined(
-    turned: Grams,
-    sets: Sequence[Sequence[Tensor]],
-    noise_dof: float,
-    start: tuple[Tensor, Tensor],
-    updates: int,
+    turned: Grams, begin: Tensor, width: Tensor, noise_dof: float, start: tuple[Tensor, Tensor], updates: int
 ) -> Joined:
     """Fit every set of groups.
 
     Args:
-        turned: inner products of all columns, each group in its principal axes.
-        sets: each a sequence of groups, the widest first, a group being the indices of its columns, int64.
+        turned: inner products of all columns, each group in its principal axes, and of a last column of zeros.
+        begin, width: first column of each group of a set and how many it has, the widest group first, `b x g`, g > 1.
         noise_dof: as for `fit_sets`.
         start: log α² of each group, `b x g`, and σ², `b`.
         updates: MacKay's.
     """
-    index, _ = padded([s[:1] for s in sets])
-    others, slot = padded([s[1:] for s in sets])
-    real, there = index >= 0, others >= 0
-    square = torch.where(real, turned.xx.diagonal()[index.clamp_min(0)], 0.0)
-    along_first = torch.where(real, turned.xy[index.clamp_min(0)], 0.0)
-    along_rest = torch.where(there, turned.xy[others.clamp_min(0)], 0.0)
-    # Products with columns that are not there are NaN, and no factor 0 makes a number of that.
-    safe = others.clamp_min(0)[:, None, :]
-    across = torch.where(real[:, :, None] & there[:, None, :], turned.xx[index.clamp_min(0)[:, :, None], safe], 0.0)
-    own = torch.where(there[:, :, None] & there[:, None, :], turned.xx[others.clamp_min(0)[:, :, None], safe], 0.0)
+    index, _ = side_by_side(begin[:, :1], width[:, :1])
+    others, slot = side_by_side(begin[:, 1:], width[:, 1:])
+    # -1, no column, is the last one.
+    square, along_first, along_rest = turned.xx.diagonal()[index], turned.xy[index], turned.xy[others]
+    across = turned.xx[index[:, :, None], others[:, None, :]]
+    own = turned.xx[others[:, :, None], others[:, None, :]]
+    member = (slot[..., None] == torch.arange(width.shape[1] - 1)).to(own.dtype)
+    scales = Scales(turned.values, noise_dof, width > 0)
     psi, noise = start
-    member = torch.nn.functional.one_hot(slot.clamp_min(0), max(psi.shape[1] - 1, 1)).to(own.dtype) * there[..., None]
-    member = member[..., : psi.shape[1] - 1]
-    used = torch.cat([real.any(1, keepdim=True), (member > 0).any(1)], 1)
-    scales = Scales(turned.values, noise_dof, used)
 
     def by_group(first: Tensor, rest: Tensor) -> Tensor:
-        """Sums over each group's columns, `b x g`."""
-        return torch.cat([first.sum(-1, keepdim=True), (rest[..., None] * member).sum(1)], -1)
+        """Sums over each group's columns, `b x g`; first: that of the first group, `b`."""
+        return torch.cat([first[:, None], (rest[:, None] @ member)[:, 0]], -1)
 
     for k in range(updates + 1):
-        half = (psi / 2).exp()
+        half, sigma = (psi / 2).exp(), noise.sqrt()[:, None]
         scale_first, scale_rest = half[:, :1], (member @ half[:, 1:, None])[..., 0]
-        sigma = noise.sqrt()[:, None]
-        diagonal = 1 + square * (scale_first / sigma).square()
-        rest = scale_rest / sigma
-        coupled = across * (scale_first / sigma * rest)[:, None, :]
-        inner = (own * rest[:, :, None]).mul_(rest[:, None, :])
-        if inner.shape[-1]:
-            # Columns that are nearly the same, under next to no noise, would leave no digit of the 1 on the diagonal.
-            edge = inner.diagonal(dim1=-2, dim2=-1)
-            edge += (1 + _DIGITS * edge.amax(-1))[:, None]
-        shared = coupled / diagonal[..., None]
-        factor = torch.linalg.cholesky_ex(inner - coupled.mT @ shared).L
-        inverse = torch.cholesky_inverse(factor) if inner.shape[-1] else inner
+        first_in, rest_in = scale_first / sigma, scale_rest / sigma
+        diagonal = 1 + square * first_in.square()
+        # The first group's columns, weighted as they take part in what is left of the others.
+        weighted = across * (first_in.square() / diagonal)[..., None]
+        both = rest_in[:, :, None] * rest_in[:, None, :]
+        inner = (own - across.mT @ weighted).mul_(both)
+        # Columns that are nearly the same, under next to no noise, would leave no digit of the 1 on the diagonal.
+        largest = (own.diagonal(dim1=-2, dim2=-1) * rest_in.square()).amax(-1, keepdim=True)
+        inner.diagonal(dim1=-2, dim2=-1).add_(1 + _DIGITS * largest)
+        factor = torch.linalg.cholesky_ex(inner).L
+        inverse = torch.cholesky_inverse(factor)
         c_first, c_rest = scale_first * along_first / noise[:, None], scale_rest * along_rest / noise[:, None]
-        u_rest = (inverse @ (c_rest[..., None] - shared.mT @ c_first[..., None]))[..., 0]
-        u_first = (c_first - (coupled @ u_rest[..., None])[..., 0]) / diagonal
-        spread = 1 / diagonal + ((coupled @ inverse) * coupled).sum(-1) / diagonal.square()
-        gamma = by_group(1 - spread, 1 - inverse.diagonal(dim1=-2, dim2=-1))
-        first, mean = scale_first * u_first, scale_rest * u_rest
+        taken = (across.mT @ (first_in / diagonal * c_first)[..., None])[..., 0]
+        u_rest = (inverse @ (c_rest - rest_in * taken)[..., None])[..., 0]
+        mean = scale_rest * u_rest
+        reached = (across @ mean[..., None])[..., 0]
+        u_first = (c_first - first_in / sigma * reached) / diagonal
+        first = scale_first * u_first
+        spread = (across.mT @ weighted.div_(diagonal[..., None])).mul_(both).mul_(inverse).sum((-2, -1))
+        gamma = by_group((1 - 1 / diagonal).sum(-1) - spread, 1 - inverse.diagonal(dim1=-2, dim2=-1))
         explained = (first * along_first).sum(-1) + (mean * along_rest).sum(-1)
-        made = (square * first.square()).sum(-1) + ((own @ mean[..., None])[..., 0] * mean).sum(-1)
-        made = made + 2 * ((across @ mean[..., None])[..., 0] * first).sum(-1)
+        made = (first * (square * first + 2 * reached)).sum(-1) + ((own @ mean[..., None])[..., 0] * mean).sum(-1)
         rss = (turned.yy - 2 * explained + made).clamp_min(0)
         if k == updates:
             break
-        size = by_group(u_first.square(), u_rest.square())
-        psi, noise = scales.updated(psi, size, gamma, rss)
+        psi, noise = scales.updated(psi, by_group(u_first.square().sum(-1), u_rest.square()), gamma, rss)
     log_det = diagonal.log().sum(-1) + 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     evidence = scales.log_evidence(psi, gamma, noise, (turned.yy - explained) / noise, log_det)
     parts = mean[..., None] * member

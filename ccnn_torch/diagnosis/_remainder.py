@@ -140,8 +140,8 @@ class Remainder:
         count, _, own, width = factors.shape[-4:]
         leads = lead.shape[-1]
         if own > 1:
-            # Thousands of tiny products take longer than a few large ones.
-            z = (lead[..., None, :, :, :, None] * factors[..., None, :, :]).flatten(-4, -3).flatten(-2)
+            # Thousands of tiny products take longer than a few large ones, and so do short runs that are multiplied.
+            z = (lead.repeat_interleave(width, -1).unsqueeze(-4) * factors.flatten(-2).unsqueeze(-2)).flatten(-3, -2)
             inner = z.mT @ z
         else:
             # By pairs of factors where these are few, else by candidates.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,7 +13,7 @@ from ccnn_torch.diagnosis._added import added_scale
 from ccnn_torch.diagnosis._dictionary import Dictionary, Found
 from ccnn_torch.diagnosis._joined import Joined, fit_joined
 
-__all__ = ["promising", "scored"]
+__all__ = ["fewer", "promising", "scored"]
 
 # Updates of a fit; after the short one no set that came within 12 of the best in the end was 30 below it, in trials.
 _UPDATES, _SHORT, _HOPELESS = 4, 1, 60.0
@@ -22,8 +22,8 @@ _UPDATES, _SHORT, _HOPELESS = 4, 1, 60.0
 _LESS_NOISE = 0.1
 # Smaller sets that are so near the best (log odds), and so much better than nothing, are begun from as well.
 _RIVAL, _THERE = 30.0, 10.0
-# Sets are fitted side by side where their widths differ by less than this.
-_ALIKE = 24
+# Sets of about the same widths are fitted side by side, as many as have their products near the processor.
+_NEAR = 50_000
 # A third cause at once is rarer still than a second one.
 _CROWD = math.log(0.1)
 
@@ -54,12 +54,36 @@ def promising(
     return [*_fitted(dictionary, sets, tried, best).values()]
 
 
-class _Start(NamedTuple):
-    """A set, the smaller one that it is begun from, and the member that this one lacks."""
+def fewer(members: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """The set without each of its members."""
+    return [members[:k] + members[k + 1 :] for k in range(len(members))]
 
-    members: tuple[int, ...]
+
+class _Start(NamedTuple):
+    """A set by its number, the smaller one that it is begun from, and the place of the member that this one lacks."""
+
+    number: int
     before: Found
-    more: int
+    place: int
+
+
+class _Begun(NamedTuple):
+    """Fits of sets of as many members, `b`, on their way.
+
+    Attributes:
+        number: of the set, `b`.
+        members: the widest first, `b x g`.
+        log_scale: log α² of each, `b x g`.
+        noise: σ², `b`.
+    """
+
+    number: Tensor
+    members: Tensor
+    log_scale: Tensor
+    noise: Tensor
+
+    def some(self, rows: Tensor) -> _Begun:
+        return _Begun(*(v[rows] for v in self))
 
 
 def _fitted(
@@ -69,33 +93,52 @@ def _fitted(
     best: float | None,
 ) -> dict[tuple[int, ...], Found]:
     """Sets by their members; best: as for `promising`, None = all of them."""
-    lots = _lots(dictionary, _starts(dictionary, sets, tried))
-    fits, likely = [], []
-    for starts, begin in lots:
-        fits.append(_updated(dictionary, [s.members for s in starts], begin, _SHORT))
-        prior = torch.tensor([_log_prior(dictionary, s.members) for s in starts], dtype=torch.float64)
-        likely.append((torch.nan_to_num(fits[-1].log_evidence, nan=-math.inf) + prior).tolist())
-    reached: dict[tuple[int, ...], float] = {}
-    for (starts, _), mine in zip(lots, likely, strict=True):
-        for start, value in zip(starts, mine, strict=True):
-            reached[start.members] = max(value, reached.get(start.members, -math.inf))
-    least = -math.inf if best is None else max([best, *reached.values()]) - _HOPELESS
+    starts = _starts(dictionary, sets, tried)
+    sizes = sorted({len(s) for s in sets})
+    short = [_short(dictionary, _begun(dictionary, sets, [s for s in starts if len(sets[s.number]) == n])) for n in sizes]
+    reached = torch.full((len(sets),), -math.inf, dtype=dictionary.grams.yy.dtype)
+    for begun, likely in short:
+        reached.scatter_reduce_(0, begun.number, likely, "amax")
+    least = -math.inf if best is None else max(best, float(reached.max()) if len(sets) else best) - _HOPELESS
     found: dict[tuple[int, ...], Found] = {}
-    for (starts, _), first, mine in zip(lots, fits, likely, strict=True):
-        rows = [k for k, (s, v) in enumerate(zip(starts, mine, strict=True)) if least <= v == reached[s.members]]
-        if not rows:
-            continue
-        kept = [starts[k].members for k in rows]
-        begin = first.log_scale[rows], first.noise[rows]
-        found |= _read(dictionary, kept, _updated(dictionary, kept, begin, _UPDATES - _SHORT))
+    for begun, likely in short:
+        kept = begun.some(torch.nonzero((likely >= least) & (likely == reached[begun.number]))[:, 0])
+        for lot in _lots(dictionary, kept.members):
+            mine = kept.some(lot)
+            fits = _updated(dictionary, mine, _UPDATES - _SHORT)
+            found |= _read(dictionary, [sets[k] for k in mine.number.tolist()], mine.members, fits)
     return found
 
 
-def _updated(
-    dictionary: Dictionary, sets: Sequence[tuple[int, ...]], begin: tuple[Tensor, Tensor], updates: int
-) -> Joined:
-    groups = [[dictionary.groups[i] for i in _widest_first(dictionary, members)] for members in sets]
-    return fit_joined(dictionary.turned, groups, dictionary.noise_dof, begin, updates)
+def _short(dictionary: Dictionary, begun: _Begun) -> tuple[_Begun, Tensor]:
+    """Where a short fit brings the sets, and their log posteriors there, `b`."""
+    log_scale, noise, likely = (torch.empty_like(v) for v in (begun.log_scale, begun.noise, begun.noise))
+    for lot in _lots(dictionary, begun.members):
+        fits = _updated(dictionary, begun.some(lot), _SHORT)
+        log_scale[lot], noise[lot], likely[lot] = fits.log_scale, fits.noise, fits.log_evidence
+    likely = torch.nan_to_num(likely, nan=-math.inf) + _log_prior(dictionary, begun.members)
+    return begun._replace(log_scale=log_scale, noise=noise), likely
+
+
+def _lots(dictionary: Dictionary, members: Tensor) -> Iterator[Tensor]:
+    """Rows of sets `b x g`, whose members have the widest first, that are fitted side by side."""
+    widths = dictionary.widths[members]
+    first, rest = widths[:, 0], widths[:, 1:].sum(-1)
+    order = (rest * (1 + int(widths.max())) + first).argsort() if len(widths) else first
+    begin = wide = 0
+    for k, (f, r) in enumerate(zip(first[order].tolist(), rest[order].tolist(), strict=True)):
+        wide = max(wide, f)
+        if k > begin and (k + 1 - begin) * wide * r > _NEAR:
+            yield order[begin:k]
+            begin, wide = k, f
+    if len(order):
+        yield order[begin:]
+
+
+def _updated(dictionary: Dictionary, begun: _Begun, updates: int) -> Joined:
+    begin, width = dictionary.begins[begun.members], dictionary.widths[begun.members]
+    start = begun.log_scale, begun.noise
+    return fit_joined(dictionary.turned, begin, width, dictionary.noise_dof, start, updates)
 
 
 def _starts(
@@ -103,73 +146,63 @@ def _starts(
 ) -> list[_Start]:
     """Every set from the most probable of those that lack one of its members, and from the rivals of this one: of two
     that explain the same, the one that is there first leaves nothing to the other."""
-    known = {**dictionary.alone, **tried}
+    alone = dictionary.alone
     # Where none of them was fitted, the one without the member that is least probable by itself is fitted now.
     orphans = {
-        tuple(m for m in s if m != min(s, key=lambda i: dictionary.alone[i,].log_posterior))
+        tuple(m for m in s if m != min(s, key=lambda i: alone[i,].log_posterior))
         for s in sets
-        if not any(f in known for f in _fewer(s))
+        if len(s) > 2 and not any(f in tried for f in fewer(s))
     }
-    known |= {f.members: f for f in scored(dictionary, sorted(orphans), tried)} if orphans else {}
-    something = dictionary.alone[()].log_posterior + _THERE
+    new = {f.members: f for f in scored(dictionary, sorted(orphans), tried)} if orphans else {}
+    something = alone[()].log_posterior + _THERE
     starts = []
-    for members in sets:
-        begun = [_Start(members, known[f], i) for f, i in zip(_fewer(members), members, strict=True) if f in known]
+    for number, members in enumerate(sets):
+        before = (tried.get(f) or alone.get(f) or new.get(f) for f in fewer(members))
+        begun = [_Start(number, f, place) for place, f in enumerate(before) if f is not None]
         top = max(begun, key=lambda s: s.before.log_posterior)
         least = max(top.before.log_posterior - _RIVAL, something)
         starts += [s for s in begun if s is top or s.before.log_posterior > least]
     return starts
 
 
-def _lots(dictionary: Dictionary, starts: Sequence[_Start]) -> list[tuple[list[_Start], tuple[Tensor, Tensor]]]:
-    """Sets of as many members whose widest groups are about as wide, and the others together as well; and log α² of
-    each group, the widest first, and σ² to begin with."""
-    own = added_scale(dictionary, [s.before for s in starts], [s.more for s in starts]).tolist() if starts else []
-    lots: dict[tuple[int, int, int], list[tuple[_Start, list[float]]]] = {}
-    for start, scale in zip(starts, own, strict=True):
-        each = {**dict(zip(start.before.members, start.before.log_scale, strict=True)), start.more: scale}
-        ordered = _widest_first(dictionary, start.members)
-        first, *rest = (dictionary.widths[i] for i in ordered)
-        lot = len(ordered), -(-first // _ALIKE), -(-sum(rest) // _ALIKE)
-        lots.setdefault(lot, []).append((start, [each[i] for i in ordered]))
-    begun = []
-    for alike in lots.values():
-        scales = torch.tensor([scale for _, scale in alike], dtype=torch.float64)
-        noise = torch.tensor([_LESS_NOISE * start.before.noise for start, _ in alike], dtype=torch.float64)
-        begun.append(([start for start, _ in alike], (scales, noise)))
-    return begun
+def _begun(dictionary: Dictionary, sets: Sequence[tuple[int, ...]], starts: Sequence[_Start]) -> _Begun:
+    """Sets of as many members each at the scales of the smaller one and that of the member which this one lacks."""
+    members = torch.tensor([sets[s.number] for s in starts])
+    own = added_scale(dictionary, [s.before for s in starts], [sets[s.number][s.place] for s in starts]).tolist()
+    each = [(*s.before.log_scale[: s.place], a, *s.before.log_scale[s.place :]) for s, a in zip(starts, own, strict=True)]
+    scales = torch.tensor(each, dtype=torch.float64)
+    noise = torch.tensor([_LESS_NOISE * s.before.noise for s in starts], dtype=torch.float64)
+    order = (-dictionary.widths[members]).argsort(dim=-1, stable=True)
+    return _Begun(torch.tensor([s.number for s in starts]), members.gather(1, order), scales.gather(1, order), noise)
 
 
-def _fewer(members: tuple[int, ...]) -> list[tuple[int, ...]]:
-    """The set without each of its members."""
-    return [tuple(m for m in members if m != i) for i in members]
+def _log_prior(dictionary: Dictionary, members: Tensor) -> Tensor:
+    return dictionary.log_prior[members].sum(-1) + _CROWD * max(members.shape[1] - 2, 0)
 
 
-def _widest_first(dictionary: Dictionary, members: tuple[int, ...]) -> list[int]:
-    return sorted(members, key=lambda i: (-dictionary.widths[i], i))
-
-
-def _log_prior(dictionary: Dictionary, members: tuple[int, ...]) -> float:
-    return sum(dictionary.atoms[i].log_prior for i in members) + _CROWD * max(len(members) - 2, 0)
-
-
-def _read(dictionary: Dictionary, sets: Sequence[tuple[int, ...]], fits: Joined) -> dict[tuple[int, ...], Found]:
+def _read(
+    dictionary: Dictionary, sets: Sequence[tuple[int, ...]], members: Tensor, fits: Joined
+) -> dict[tuple[int, ...], Found]:
+    """members: of the sets, the widest first, `b x g`."""
     found = {}
-    numbers = zip(*(v.tolist() for v in (fits.log_evidence, fits.rss, fits.noise, fits.effective)), strict=True)
-    energy, log_scale = fits.energy.tolist(), fits.log_scale.tolist()
-    for row, (members, (evidence, rss, noise, effective)) in enumerate(zip(sets, numbers, strict=True)):
-        ordered = _widest_first(dictionary, members)
-        widths = [dictionary.widths[i] for i in ordered]
-        means = fits.first[row, : widths[0]], *torch.split(fits.rest[row, : sum(widths[1:])], widths[1:])
-        place = [ordered.index(i) for i in members]
-        evidence = evidence if math.isfinite(evidence) else -math.inf
-        found[members] = Found(
-            members=members,
-            log_posterior=evidence + _log_prior(dictionary, members),
-            log_evidence=evidence,
-            mean=tuple(dictionary.axes[i] @ means[k] for i, k in zip(members, place, strict=True)),
-            log_scale=tuple(log_scale[row][k] for k in place),
-            energy=tuple(energy[row][k] for k in place),
+    evidence = torch.where(torch.isfinite(fits.log_evidence), fits.log_evidence, -torch.inf)
+    posterior = evidence + _log_prior(dictionary, members)
+    numbers = zip(*(v.tolist() for v in (posterior, evidence, fits.rss, fits.noise, fits.effective)), strict=True)
+    tables = (members, dictionary.widths[members], fits.energy, fits.log_scale)
+    rows = zip(sets, *(v.tolist() for v in tables), numbers, strict=True)
+    for row, (own, ordered, widths, energy, log_scale, (log_posterior, log_evidence, rss, noise, effective)) in enumerate(
+        rows
+    ):
+        along = fits.first[row, : widths[0]], *torch.split(fits.rest[row, : sum(widths[1:])], widths[1:])
+        place = [ordered.index(i) for i in own]
+        found[own] = Found(
+            members=own,
+            log_posterior=log_posterior,
+            log_evidence=log_evidence,
+            along=tuple(along[k] for k in place),
+            axes=tuple(dictionary.axes[i] for i in own),
+            log_scale=tuple(log_scale[k] for k in place),
+            energy=tuple(energy[k] for k in place),
             rss=rss,
             noise=noise,
             effective=effective,

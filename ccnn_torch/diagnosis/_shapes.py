@@ -42,9 +42,18 @@ class Shaped(NamedTuple):
 
 @runtime_checkable
 class _OneByOne(Protocol):
-    """An effect that tells what `basis` tells without its zeros, for long grids."""
+    """An effect on the joints that tells what `basis` tells without its zeros, for long grids."""
 
-    def one_by_one(self, situation: Situation, shape: Tensor) -> Tensor: ...
+    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor: ...
+
+
+@runtime_checkable
+class _Factored(Protocol):
+    """An effect on the pose whose `basis` is fixed columns, each times a number that depends on the shapes."""
+
+    def fixed(self, situation: Situation) -> Tensor: ...
+
+    def factors(self, situation: Situation, shape: Tensor) -> Tensor: ...
 
 
 class _Part(NamedTuple):
@@ -98,6 +107,9 @@ class Scan:
         self.start = default_shape(situation, effect)
         kind = {"joints": lambda: there.jacobian, "parameters": lambda: there.parameter_jacobian}.get(effect.kind)
         self.lead = white(torch.nan_to_num(kind())) if kind is not None else None
+        self.fixed: Tensor | None = None
+        if isinstance(effect, _Factored):
+            self.fixed = white(torch.nan_to_num(situation.once(effect.fixed))) * self.size
         # Which joint a column moves is a matter of the effect's form: the middle and the ends of its grids show it.
         ends = torch.tensor([[s.grid[0], s.grid[-1]] for s in self.shapes], dtype=self.start.dtype).mT
         first = effect.basis(situation, torch.stack([self.start, *ends]))
@@ -109,8 +121,12 @@ class Scan:
     def columns(self, candidates: Tensor, rows: Tensor | None) -> list[Tried]:
         """Of each part, whitened, in plausible sizes; candidates: `g x h`; rows: which, None = all."""
         if self.movers is not None and isinstance(self.effect, _OneByOne):
-            moved = _of(self.effect.one_by_one(self.situation, candidates), rows, 1)
+            moved = self.effect.one_by_one(self.situation, candidates, rows)
             return [self._by_movers(_of_run(moved, p.columns), p.columns, rows) for p in self.parts]
+        if self.fixed is not None and isinstance(self.effect, _Factored):
+            factors = _of(self.effect.factors(self.situation, candidates), rows, 1)
+            columns = _of(self.fixed, rows, 0) * factors.unsqueeze(-2)
+            return [Tried(_of_run(columns, p.columns)) for p in self.parts]
         basis = _of(self.effect.basis(self.situation, candidates), rows, 1)
         if self.movers is None:
             return [Tried(self._whitened(basis, part.columns, rows)) for part in self.parts]

@@ -15,6 +15,7 @@ __all__ = [
     "TWIST",
     "by_joint",
     "caused_by",
+    "of_rows",
     "one_by_one",
     "own_parameters",
     "parameter_columns",
@@ -42,7 +43,7 @@ def by_joint(values: Tensor, joints: Sequence[int] | None = None) -> Tensor:
     n, m = values.shape[-2:]
     eye = torch.eye(n, dtype=values.dtype, device=values.device).unsqueeze(-1)
     blocks = values.unsqueeze(-2) * eye
-    if joints is not None:
+    if joints is not None and len(joints) < n:
         blocks = blocks[..., list(joints), :]
     return blocks.reshape(*values.shape[:-1], blocks.shape[-2] * m)
 
@@ -51,6 +52,11 @@ def one_by_one(values: Tensor, joints: Sequence[int] | None = None) -> Tensor:
     """`by_joint` without its zeros: of each column the change of the one joint that it moves, `... x s x m`."""
     chosen = values if joints is None else values[..., list(joints), :]
     return chosen.flatten(-2)
+
+
+def of_rows(values: Tensor, rows: Tensor | None, dim: int = -2) -> Tensor:
+    """Some of the rows, which count along `dim`; all where rows is None."""
+    return values if rows is None else values.index_select(dim, rows)
 
 
 def per_force(unit: str) -> str:

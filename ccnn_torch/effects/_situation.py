@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.mechanisms._pose import frame_jacobian
 from ccnn_torch.rotations import rotation_vector_to_matrix
 
 __all__ = ["PLATFORM_WEIGHT", "WEIGHTS", "Situation", "default_gravity"]
@@ -68,17 +67,17 @@ class Situation:
     @cached_property
     def jacobian(self) -> Tensor:
         """Derivative of position and rotation vector by the joints, `... x s x c x n`, c = 3 or 6; NaN without pose."""
-        return self.machine.jacobian(self.joints, self.parameters, self.pose).detach()
+        return self.machine.jacobian_at(self.pose, self.joints, self.parameters).detach()
 
     @cached_property
     def parameter_jacobian(self) -> Tensor:
         """The same by the mechanism's parameters, `... x s x c x k`."""
-        return self.machine.parameter_jacobian(self.joints, self.parameters, self.pose).detach()
+        return self.machine.parameter_jacobian_at(self.pose, self.joints, self.parameters).detach()
 
     @cached_property
     def frame_slope(self) -> Tensor:
         """Derivative of position and rotation vector by the pose coordinates, `... x s x c x p`."""
-        return frame_jacobian(self.mechanism.frame, _known(self.pose)).detach()
+        return self.mechanism.frame_slope(_known(self.pose)).detach()
 
     @cached_property
     def visible(self) -> Tensor:
@@ -121,6 +120,13 @@ class Situation:
         """Commanded joints less the middle of their workspace, `... x s x n` [joint's unit]."""
         low, high = self.workspace
         return self.joints - (low + high) / 2
+
+    def once(self, make: Callable[[Situation], Tensor]) -> Tensor:
+        """What a function makes of these rows, kept with them from when it is first asked for."""
+        kept: dict[Callable[[Situation], Tensor], Tensor] = self.__dict__.setdefault("_kept", {})
+        if make not in kept:
+            kept[make] = make(self)
+        return kept[make]
 
     def with_covariates(self, covariates: Mapping[str, Tensor]) -> Situation:
         """The same rows under other covariates; the nominal pose and its derivatives stay as they were."""
@@ -201,17 +207,18 @@ class Situation:
         size: Tensor = torch.linalg.vector_norm(self.gravity)
         return self.gravity / size.clamp_min(1e-300)
 
-    def push(self, weight: Tensor) -> Tensor:
+    def push(self, weight: Tensor, rows: Tensor | None = None) -> Tensor:
         """How hard weight and load push each joint along its coordinate, `... x s x n` [1].
 
         In units of what `PLATFORM_WEIGHT` typically asks of the joints of the same unit in the workspace.
 
         Args:
             weight: of the machine, `...` [N].
+            rows: which are asked for, `t`; None = all.
         """
-        return (self.own_weight_torque * weight[..., None, None] + self.load_torque) / (
-            self.typical_torque * PLATFORM_WEIGHT
-        )
+        own, load = self.own_weight_torque, self.load_torque
+        own, load = (own, load) if rows is None else (v.index_select(-2, rows) for v in (own, load))
+        return (own * weight[..., None, None] + load) / (self.typical_torque * PLATFORM_WEIGHT)
 
     @cached_property
     def typical_torque(self) -> Tensor:

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from ccnn_torch.effects._protocol import Effect
 from ccnn_torch.effects._situation import Situation
-from ccnn_torch.mechanisms._pose import frame_jacobian
 from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 __all__ = ["Acting", "measured_pose", "pose_residual", "reached", "signature"]
@@ -88,7 +87,7 @@ def measured_pose(situation: Situation, frame: Tensor) -> Tensor:
         gap = position - there[0]
         if rotation is not None and there[1] is not None:
             gap = torch.cat([gap, matrix_to_rotation_vector(rotation @ there[1].mT)], -1)
-        slope = frame_jacobian(mechanism.frame, pose).detach()
+        slope = mechanism.frame_slope(pose).detach()
         step: Tensor = torch.linalg.solve(slope.mT @ slope, slope.mT @ gap.unsqueeze(-1))
         pose = pose + step.squeeze(-1)
     return pose

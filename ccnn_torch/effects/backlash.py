@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import by_joint, one_by_one
+from ccnn_torch.effects._columns import by_joint, of_rows, one_by_one
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.mechanisms import Mechanism
@@ -68,14 +68,17 @@ class Backlash:
         """`... x s x n x 3 · (joints whose direction is known)`."""
         return by_joint(self._moves(situation, shape), situation.directed)
 
-    def one_by_one(self, situation: Situation, shape: Tensor) -> Tensor:
-        """The same without its zeros: what each coefficient does to the joint that it moves, `... x s x m`."""
-        return one_by_one(self._moves(situation, shape), situation.directed)
+    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
 
-    def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
+        rows: which, `t`; None = all. Returns `... x t x m`.
+        """
+        return one_by_one(self._moves(situation, shape, rows), situation.directed)
+
+    def _moves(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
         weight = shape[..., 0] if situation.loaded else shape.new_tensor(PLATFORM_WEIGHT)
         hold = shape[..., -1, None, None]
-        left = situation.push(weight) / hold - situation.direction
+        left = situation.push(weight, rows) / hold - of_rows(situation.direction, rows)
         rest = _rest(left, _SOFT)
         edges = [_rest(left, soft) - rest for _, soft in _EDGES]
         return torch.stack([rest, *edges], -1)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import by_joint, one_by_one
+from ccnn_torch.effects._columns import by_joint, of_rows, one_by_one
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.effects._time import elapsed
@@ -66,9 +66,12 @@ class Drift:
         """`... x s x n x 6n`."""
         return by_joint(self._moves(situation, shape))
 
-    def one_by_one(self, situation: Situation, shape: Tensor) -> Tensor:
-        """The same without its zeros: what each coefficient does to the joint that it moves, `... x s x m`."""
-        return one_by_one(self._moves(situation, shape))
+    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
+
+        rows: which, `t`; None = all. Returns `... x t x m`.
+        """
+        return one_by_one(of_rows(self._moves(situation, shape), rows, -3))
 
     def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
         time = elapsed(situation.covariates["time"]).expand(situation.joints.shape[:-1])

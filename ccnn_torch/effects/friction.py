@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import by_joint, one_by_one, per_force
+from ccnn_torch.effects._columns import by_joint, of_rows, one_by_one, per_force
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.effects.backlash import Backlash
@@ -71,9 +71,12 @@ class Friction:
         """`... x s x n x m`, joint by joint."""
         return by_joint(self._moves(situation, shape), situation.directed)
 
-    def one_by_one(self, situation: Situation, shape: Tensor) -> Tensor:
-        """The same without its zeros: what each coefficient does to the joint that it moves, `... x s x m`."""
-        return one_by_one(self._moves(situation, shape), situation.directed)
+    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
+
+        rows: which, `t`; None = all. Returns `... x t x m`.
+        """
+        return one_by_one(of_rows(self._moves(situation, shape), rows, -3), situation.directed)
 
     def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
         load, weight = situation.load_torque, situation.own_weight_torque

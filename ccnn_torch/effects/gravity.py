@@ -61,7 +61,7 @@ class Gravity:
                 )
                 for part, u, v in parts
             ]
-        if _centred(mechanism):
+        if _centred(situation):
             found += [Coefficient(f"centre {axis}", "N*m", _MOMENT, secondary=True) for axis in "xyz"]
         return tuple(found)
 
@@ -82,12 +82,12 @@ class Gravity:
         if not arm:
             kept = [4 * i + k for i, turns in enumerate(turning) for k in (range(4) if turns else range(2))]
             columns = columns[..., kept]
-        return torch.cat([columns, _off_centre(situation)], -1) if _centred(mechanism) else columns
+        return torch.cat([columns, _off_centre(situation)], -1) if _centred(situation) else columns
 
 
-def _centred(mechanism: Mechanism) -> bool:
+def _centred(situation: Situation) -> bool:
     """Whether the platform's centre of mass has columns: it turns, and is no arm's, whose tool is small."""
-    return not isinstance(mechanism, SerialArm) and mechanism.frame(mechanism.home_pose)[1] is not None
+    return not isinstance(situation.mechanism, SerialArm) and situation.platform[1] is not None
 
 
 def _off_centre(situation: Situation) -> Tensor:

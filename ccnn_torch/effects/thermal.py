@@ -105,26 +105,41 @@ class Thermal:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
+        return situation.once(self.fixed) * self.factors(situation, shape).unsqueeze(-2)
+
+    def fixed(self, situation: Situation) -> Tensor:
+        """What of the columns does not depend on the shapes, `... x s x c x m`: `factors` times this they are."""
         mechanism = situation.mechanism
-        warm = (situation.covariates["temperature"] - REFERENCE).expand(situation.joints.shape[:-1])
-        time = situation.covariates.get("time")
-        body = warm if time is None else lagged(time, warm, shape[..., 0])
         values = mechanism.resolve(situation.parameters).unsqueeze(-2)
         longer = torch.nan_to_num(situation.parameter_jacobian) * values
         jacobian = torch.nan_to_num(situation.jacobian)
         sliding = [i for i, j in enumerate(mechanism.joints) if j.unit == "m"]
         lengths = [k for m in members(mechanism) for k in m.lengths]
         whole = longer[..., lengths].sum(-1, keepdim=True)
-        parts = [whole, *(longer[..., m.lengths].sum(-1, keepdim=True) for m in _apart(mechanism))]
+        apart = [longer[..., m.lengths].sum(-1, keepdim=True) for m in _apart(mechanism)]
         travel = (jacobian * situation.joints.unsqueeze(-2))[..., sliding]
-        following = torch.cat([*parts, travel, jacobian], -1) * body[..., None, None]
-        others = [whole]
-        if time is not None:
-            ahead, own = warm - body, -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
-            core = lagged(time, warm, shape[..., 1])
-            others += [whole * warm[..., None, None], whole * core[..., None, None], jacobian * ahead[..., None, None]]
-            others += [whole * own[..., None, None], travel * own[..., None, None]]
-        return torch.cat([following, *(c.expand(*following.shape[:-1], c.shape[-1]) for c in others)], -1)
+        parts = [whole, *apart, travel, jacobian, whole]
+        return torch.cat([*parts, *([whole, whole, jacobian, whole, travel] if _timed(situation) else [])], -1)
+
+    def factors(self, situation: Situation, shape: Tensor) -> Tensor:
+        """What each of the fixed columns is multiplied by: warmth [K], or what has become of it, `... x s x m`."""
+        mechanism = situation.mechanism
+        warm = (situation.covariates["temperature"] - REFERENCE).expand(situation.joints.shape[:-1])
+        n, sliding = len(mechanism.joints), sum(j.unit == "m" for j in mechanism.joints)
+        following, one = 1 + len(_apart(mechanism)) + sliding + n, torch.ones_like(warm)
+        if not _timed(situation):
+            kinds = [(warm, following), (one, 1)]
+        else:
+            time = situation.covariates["time"]
+            body, core = (lagged(time, warm, shape[..., k]) for k in (0, 1))
+            own = -torch.expm1(-elapsed(time).expand(warm.shape) / _WARM_UP)
+            kinds = [(body, following), (one, 1), (warm, 1), (core, 1), (warm - body, n), (own, 1 + sliding)]
+        each = torch.stack(torch.broadcast_tensors(*(k for k, _ in kinds)), -1)  # type: ignore[no-untyped-call]
+        return each[..., [i for i, (_, count) in enumerate(kinds) for _ in range(count)]]
+
+
+def _timed(situation: Situation) -> bool:
+    return "time" in situation.covariates
 
 
 def _apart(mechanism: Mechanism) -> list[Member]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import by_joint, one_by_one
+from ccnn_torch.effects._columns import by_joint, of_rows, one_by_one
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.mechanisms import Mechanism
@@ -70,14 +70,17 @@ class Transmission:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x 8n`."""
-        return by_joint(self._moves(situation, shape))
+        return by_joint(self._moves(situation.joints, shape))
 
-    def one_by_one(self, situation: Situation, shape: Tensor) -> Tensor:
-        """The same without its zeros: what each coefficient does to the joint that it moves, `... x s x m`."""
-        return one_by_one(self._moves(situation, shape))
+    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor:
+        """The same in some of the rows, without its zeros: what each coefficient does to the joint that it moves.
 
-    def _moves(self, situation: Situation, shape: Tensor) -> Tensor:
-        angle = situation.joints * shape.unsqueeze(-2)
+        rows: which, `t`; None = all. Returns `... x t x m`.
+        """
+        return one_by_one(self._moves(of_rows(situation.joints, rows), shape))
+
+    def _moves(self, joints: Tensor, shape: Tensor) -> Tensor:
+        angle = joints * shape.unsqueeze(-2)
         sine, cosine = torch.sin(angle), torch.cos(angle)
         waves = [sine, cosine]
         # The next harmonic by the sum of angles: sines are what a grid of hundreds of frequencies takes its time for.

@@ -14,7 +14,13 @@ from ccnn_torch.batching import expand_leading
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import _numeric
-from ccnn_torch.mechanisms._pose import PoseError, frame_from_coordinates, frame_jacobian, pose_error
+from ccnn_torch.mechanisms._pose import (
+    PoseError,
+    coordinates_jacobian,
+    frame_from_coordinates,
+    frame_jacobian,
+    pose_error,
+)
 from ccnn_torch.rotations import matrix_to_rotation_vector, wrap_angle
 
 __all__ = ["InverseKinematics", "Mechanism"]
@@ -168,6 +174,18 @@ class Mechanism(nn.Module):
         """
         return frame_from_coordinates(pose, self.pose, self.name)
 
+    def frame_slope(self, pose: Tensor) -> Tensor:
+        """Derivative of position and (with orientation) rotation vector in the base frame by the pose coordinates.
+
+        Closed form for the frame by name, by differentiation for another; pose `... x p` [SI].
+
+        Returns:
+            `... x 6 x p`, or `... x 3 x p` without orientation.
+        """
+        if type(self).frame is Mechanism.frame:
+            return coordinates_jacobian(pose, self.pose)
+        return frame_jacobian(self.frame, pose)
+
     def pose_near(self, position: Tensor, rotation: Tensor | None) -> Tensor:
         """A pose whose frame is close to a given one: where a search for the closest pose starts, `... x p` [SI].
 
@@ -236,6 +254,17 @@ class Mechanism(nn.Module):
         """The same by the parameters, at joints `... x n`; `... x 6 x k` or `... x 3 x k`, per parameter's unit."""
         values = self.resolve(parameters).expand(*joints.shape[:-1], -1)
         return frame_jacobian(lambda theta: self.frame(self.forward_kinematics(joints, theta, guess)), values)
+
+    def jacobian_at(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """As `jacobian`, where the pose of the joints is known, `... x p` [SI]; NaN where that is.
+
+        The default finds it again from there; a closed form at the pose saves that.
+        """
+        return self.jacobian(joints, parameters, pose)
+
+    def parameter_jacobian_at(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """As `parameter_jacobian`, where the pose of the joints is known."""
+        return self.parameter_jacobian(joints, parameters, pose)
 
     def under(self, conditions: Mapping[str, Tensor]) -> Mechanism:
         """The machine under conditions of the rows that it is then asked about, `...` each [SI], by covariate.

@@ -20,7 +20,7 @@ def solve(
     closure: Callable[..., Tensor],
     start: Tensor,
     data: tuple[Tensor, ...],
-    jacobian: Callable[..., Tensor] | None = None,
+    both: Callable[..., tuple[Tensor, Tensor]] | None = None,
 ) -> Tensor:
     """The root that damped Newton reaches from `start`.
 
@@ -28,7 +28,8 @@ def solve(
         closure: `(x, *data)` -> `... x c`.
         start: `... x k`, broadcasts with the data.
         data: what the closure needs besides x, `... x d` each.
-        jacobian: `(x, *data)` -> `... x c x k`; by differentiation when not given.
+        both: `(x, *data)` -> the closure and its derivative by x, `... x c` and `... x c x k`, which share most of
+            their work; by differentiation when not given.
 
     Returns:
         `... x k`; NaN in rows without a root. Differentiable in the data by the implicit function theorem (first
@@ -36,12 +37,15 @@ def solve(
     """
     lead = leading_shape(start, *data)
     plain = tuple(d.detach() for d in data)
-    found = levenberg_marquardt(closure, start.detach().expand(*lead, start.shape[-1]), jacobian, plain)
+    found = levenberg_marquardt(closure, start.detach().expand(*lead, start.shape[-1]), None, plain, both=both)
     root = (2 * found.cost).sqrt() <= _ROOT
     # A row without a root takes part from its start on, so that its NaN stays out of the others' derivatives.
     x = torch.where(root[..., None], found.value, start.detach())
-    slope = jacobian_of(lambda point: closure(point, *plain), x)[1] if jacobian is None else jacobian(x, *plain)
-    return torch.where(root[..., None], carry_derivative(x, slope, closure(x, *data)), torch.nan)
+    if both is None:
+        residual, slope = closure(x, *data), jacobian_of(lambda point: closure(point, *plain), x)[1]
+    else:
+        residual, slope = both(x, *data)
+    return torch.where(root[..., None], carry_derivative(x, slope, residual), torch.nan)
 
 
 def carry_derivative(x: Tensor, slope: Tensor, residual: Tensor) -> Tensor:

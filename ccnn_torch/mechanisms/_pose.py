@@ -11,11 +11,12 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.least_squares import jacobian_of
-from ccnn_torch.rotations import geodesic_angle, rotation_vector_to_matrix, skew
+from ccnn_torch.rotations import geodesic_angle, rotation_vector_rate, rotation_vector_to_matrix, skew
 
-__all__ = ["Frame", "PoseError", "frame_from_coordinates", "frame_jacobian", "pose_error"]
+__all__ = ["Frame", "PoseError", "coordinates_jacobian", "frame_from_coordinates", "frame_jacobian", "pose_error"]
 
 Frame = tuple[Tensor, Tensor | None]
+_LENGTHS, _TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
 
 
 class PoseError(NamedTuple):
@@ -41,16 +42,28 @@ def frame_from_coordinates(pose: Tensor, coordinates: tuple[Coordinate, ...], na
     """Frame of a pose whose coordinates are named x, y, z and rx, ry, rz."""
     columns = {c.name: pose[..., i] for i, c in enumerate(coordinates)}
     angles = [c.name for c in coordinates if c.unit == "rad"]
-    strange = [a for a in angles if a not in ("rx", "ry", "rz")]
+    strange = [a for a in angles if a not in _TURNS]
     if strange:
         raise InputError(
             f"mechanism '{name}' has the pose angle '{strange[0]}': override frame(pose) to say how it turns"
         )
     zero = torch.zeros_like(pose[..., 0])
-    position = torch.stack([columns.get(c, zero) for c in ("x", "y", "z")], dim=-1)
+    position = torch.stack([columns.get(c, zero) for c in _LENGTHS], dim=-1)
     if not angles:
         return position, None
-    return position, rotation_vector_to_matrix(torch.stack([columns.get(c, zero) for c in ("rx", "ry", "rz")], dim=-1))
+    return position, rotation_vector_to_matrix(torch.stack([columns.get(c, zero) for c in _TURNS], dim=-1))
+
+
+def coordinates_jacobian(pose: Tensor, coordinates: tuple[Coordinate, ...]) -> Tensor:
+    """Of `frame_from_coordinates`, as `frame_jacobian` gives it: `... x 6 x p`, or `... x 3 x p` without angles."""
+    names = [c.name for c in coordinates]
+    chosen = [(*_LENGTHS, *_TURNS).index(name) for name in names]
+    slope = torch.eye(6, dtype=pose.dtype, device=pose.device)[:, chosen].expand(*pose.shape[:-1], 6, len(names))
+    if not any(c.unit == "rad" for c in coordinates):
+        return slope[..., :3, :]
+    zero = torch.zeros_like(pose[..., 0])
+    vector = torch.stack([pose[..., names.index(t)] if t in names else zero for t in _TURNS], -1)
+    return torch.cat([slope[..., :3, :], rotation_vector_rate(vector) @ slope[..., 3:, :]], -2)
 
 
 def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -60,10 +61,7 @@ class Stewart(Mechanism):
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Distances between the joints of each leg, less the offset, by the gain; closed form, for every pose."""
-        values = self.resolve(parameters)
-        legs = values.reshape(*values.shape[:-1], 6, 8)
-        length: Tensor = torch.linalg.vector_norm(self._arms_and_legs(pose, values)[1], dim=-1)
-        return (length - legs[..., 6]) / legs[..., 7]
+        return self._legs(pose, self.resolve(parameters)).joints()
 
     def forward_kinematics(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
@@ -74,59 +72,88 @@ class Stewart(Mechanism):
         def closure(pose: Tensor, joints: Tensor, values: Tensor) -> Tensor:
             return self.solve_inverse(pose, values) - joints
 
-        def slope(pose: Tensor, joints: Tensor, values: Tensor) -> Tensor:
-            rows = self._joint_rates(pose, values)
-            return torch.cat([rows[..., :3], rows[..., 3:] @ rotation_vector_rate(pose[..., 3:])], dim=-1)
+        def both(pose: Tensor, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+            legs = self._legs(pose, values)
+            rows = legs.rates()
+            slope = torch.cat([rows[..., :3], rows[..., 3:] @ rotation_vector_rate(pose[..., 3:])], dim=-1)
+            return legs.joints() - joints, slope
 
-        pose = solve(closure, self.home_pose if guess is None else guess, (joints, values), slope)
+        pose = solve(closure, self.home_pose if guess is None else guess, (joints, values), both=both)
         return torch.where(self.reachable(pose.detach(), values.detach())[..., None], pose, torch.nan)
 
     def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Closed form at the pose of the joints; see `Mechanism.jacobian`."""
-        values = self.resolve(parameters)
-        pose = self.forward_kinematics(joints, values, guess)
-        known = torch.isfinite(pose).all(-1)[..., None, None]
-        rows = torch.where(known, self._joint_rates(pose, values), torch.eye(6, dtype=pose.dtype, device=pose.device))
-        return torch.where(known, torch.linalg.inv(rows), torch.nan)
+        return self.jacobian_at(self.forward_kinematics(joints, parameters, guess), joints, parameters)
+
+    def jacobian_at(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Closed form; see `Mechanism.jacobian_at`."""
+        rates, known = _inverted(self._legs(pose, self.resolve(parameters)).rates(), pose)
+        return torch.where(known, rates, torch.nan)
 
     def parameter_jacobian(
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
     ) -> Tensor:
         """Closed form, -∂X/∂q ∂q/∂θ at the pose of the joints; see `Mechanism.parameter_jacobian`."""
-        values = self.resolve(parameters)
-        pose = self.forward_kinematics(joints, values, guess)
-        known = torch.isfinite(pose).all(-1)[..., None, None]
-        leg = self._arms_and_legs(pose, values)[1]
-        direction = leg / torch.linalg.vector_norm(leg, dim=-1, keepdim=True)
-        on_platform = direction @ rotation_vector_to_matrix(pose[..., 3:])
-        gain = values.reshape(*values.shape[:-1], 6, 8)[..., 7, None]
-        length = joints.unsqueeze(-1).expand(*direction.shape[:-1], 1)
+        return self.parameter_jacobian_at(self.forward_kinematics(joints, parameters, guess), joints, parameters)
+
+    def parameter_jacobian_at(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Closed form; see `Mechanism.parameter_jacobian_at`."""
+        legs = self._legs(pose, self.resolve(parameters))
+        on_platform = legs.direction @ legs.rotation
+        length = joints.unsqueeze(-1).expand(*on_platform.shape[:-1], 1)
         # By the joint on the base and on the platform, offset and gain of a leg: what its own joint's value goes by.
-        own = torch.cat([-direction, on_platform, -torch.ones_like(length), -length], -1) / gain
-        rows = torch.where(known, self._joint_rates(pose, values), torch.eye(6, dtype=pose.dtype, device=pose.device))
-        slope = -(torch.linalg.inv(rows)[..., None] * own.unsqueeze(-3)).flatten(-2)
-        return torch.where(known, slope, torch.nan)
+        own = torch.cat([-legs.direction, on_platform, -torch.ones_like(length), -length], -1) / legs.gain
+        rates, known = _inverted(legs.rates(), pose)
+        return torch.where(known, -(rates[..., None] * own.unsqueeze(-3)).flatten(-2), torch.nan)
 
     def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
         """The assembly mode: det(∂q/∂X) has the sign that it has in the middle of the workspace; `...`, bool."""
         values = self.resolve(parameters)
-        here, home = (torch.linalg.det(self._joint_rates(x, values)) for x in (pose, self.home_pose))
+        here, home = (torch.linalg.det(self._legs(x, values).rates()) for x in (pose, self.home_pose))
         same: Tensor = here * home > 0
         return same
 
-    def _joint_rates(self, pose: Tensor, values: Tensor) -> Tensor:
+    def _legs(self, pose: Tensor, values: Tensor) -> _Legs:
+        legs = values.reshape(*values.shape[:-1], 6, 8)
+        rotation = rotation_vector_to_matrix(pose[..., 3:])
+        arm = legs[..., 3:6] @ rotation.mT
+        leg = pose[..., None, :3] + arm - legs[..., :3]
+        length = torch.linalg.vector_norm(leg, dim=-1, keepdim=True)
+        return _Legs(rotation, arm, length, leg / length, legs[..., 6:7], legs[..., 7:])
+
+
+class _Legs(NamedTuple):
+    """The legs of poses `...`.
+
+    Attributes:
+        rotation: of the platform, `... x 3 x 3`.
+        arm: from the platform's origin to its joints, in base axes, `... x 6 x 3` [m].
+        length: `... x 6 x 1` [m].
+        direction: from the joint on the base to that on the platform, `... x 6 x 3`.
+        offset, gain: of the drives, `... x 6 x 1` [m], [1].
+    """
+
+    rotation: Tensor
+    arm: Tensor
+    length: Tensor
+    direction: Tensor
+    offset: Tensor
+    gain: Tensor
+
+    def joints(self) -> Tensor:
+        """`... x 6` [m]."""
+        return ((self.length - self.offset) / self.gain)[..., 0]
+
+    def rates(self) -> Tensor:
         """Joints' rates per velocity and rate of rotation of the platform, `... x 6 x 6`.
 
         One row (u, R p x u) / gain per leg, u its direction and R p its joint on the platform.
         """
-        arm, leg = self._arms_and_legs(pose, values)
-        direction = leg / torch.linalg.vector_norm(leg, dim=-1, keepdim=True)
-        gain = values.reshape(*values.shape[:-1], 6, 8)[..., 7, None]
-        return torch.cat([direction, torch.linalg.cross(arm, direction, dim=-1)], dim=-1) / gain
+        turned = torch.linalg.cross(self.arm, self.direction, dim=-1)
+        return torch.cat([self.direction, turned], dim=-1) / self.gain
 
-    def _arms_and_legs(self, pose: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """From the platform's origin to its joints, and from base to platform joint, `... x 6 x 3` [m] in base axes."""
-        legs = values.reshape(*values.shape[:-1], 6, 8)
-        rotation = rotation_vector_to_matrix(pose[..., 3:])
-        arm = (rotation[..., None, :, :] @ legs[..., 3:6, None])[..., 0]
-        return arm, pose[..., None, :3] + arm - legs[..., :3]
+
+def _inverted(rates: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+    """The platform's velocities per rate of the joints, `... x 6 x 6`; and where there is a pose, `... x 1 x 1`."""
+    known = torch.isfinite(pose).all(-1)[..., None, None]
+    return torch.linalg.inv(torch.where(known, rates, torch.eye(6, dtype=pose.dtype, device=pose.device))), known
