@@ -41,7 +41,12 @@ def added_scale(dictionary: Dictionary, before: Sequence[Found], more: Sequence[
     own, _ = side_by_side(dictionary.begins[atom], dictionary.widths[atom])
     place = row[:, None], own
     fits = fit_in_axes(
-        square[place].clamp_min(0), along[place], own[:, 0] >= 0, yy.clamp_min(0)[row], turned.values, dictionary.noise_dof
+        square[place].clamp_min(0),
+        along[place],
+        own[:, 0] >= 0,
+        yy.clamp_min(0)[row],
+        turned.values,
+        dictionary.noise_dof,
     )
     return fits.log_scale
 

@@ -5,23 +5,27 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._alone import NOTHING, fit_alone, own_products
+from ccnn_torch.diagnosis._alone import NOTHING, Own, fit_alone, own_products
 from ccnn_torch.diagnosis._atoms import Atom
-from ccnn_torch.diagnosis._evidence import Grams, grams_of
+from ccnn_torch.diagnosis._evidence import Grams
 
-__all__ = ["Dictionary", "Found", "covariance", "dictionary_of", "singles_of"]
+__all__ = ["Dictionary", "Found", "Singles", "covariance", "dictionary_of", "singles_of"]
+
+# Columns from which their products with all others are worth a call of their own.
+_NARROW = 128
 
 
 @dataclass(frozen=True)
 class Found:
     """A set of atoms with its log posterior (up to a constant), log evidence, and fit.
 
-    `along` are the coefficients along the principal `axes` of each atom, and `log_scale` log α² of each atom's; `energy`
-    the squares that each atom's own part makes; `rss` what the set leaves.
+    `along` are the coefficients along the principal `axes` of each atom, `log_scale` is log α² of each, `energy` the
+    squares that each atom's own part makes, and `rss` what the set leaves.
     """
 
     members: tuple[int, ...]
@@ -47,10 +51,11 @@ class Dictionary:
 
     Attributes:
         atoms: all candidates.
-        columns: whitened, of the library effects and then of the catch-alls that are put beside them, side by side,
-            `s x c x P`; rows that count.
+        columns: whitened, of the library effects, name by name, and then of the catch-alls that are put beside them,
+            side by side, `s x c x P`; rows that count.
         groups: which of the columns are those of an atom, for the atoms that have such.
-        grams: of the columns; NaN between catch-alls, which are in no set together.
+        grams: of the columns; NaN may stand between catch-alls and between atoms of one name, which are in no set
+            together.
         axes: principal axes of the columns of each of these atoms, `m x m`.
         turned: `grams` with every group in its axes, and with a last column of zeros.
         alone: no atom, and each by itself.
@@ -92,10 +97,16 @@ def covariance(dictionary: Dictionary, found: Found) -> Tensor:
     return scale[:, None] * inverse * scale
 
 
-def singles_of(
-    atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof: float
-) -> tuple[dict[tuple[int, ...], Found], list[Tensor]]:
-    """No atom, and each by itself; and the principal axes of each.
+class Singles(NamedTuple):
+    """Fits of no atom, and of each by itself; the principal axes of each; and the inner products of its columns."""
+
+    found: dict[tuple[int, ...], Found]
+    axes: list[Tensor]
+    products: list[Own]
+
+
+def singles_of(atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof: float) -> Singles:
+    """Fit no atom, and each by itself.
 
     Args:
         atoms: candidates.
@@ -125,7 +136,7 @@ def singles_of(
             noise=noise,
             effective=effective,
         )
-    return found, [*fits.axes[1:]]
+    return Singles(found, [*fits.axes[1:]], products[1:])
 
 
 def dictionary_of(
@@ -133,23 +144,67 @@ def dictionary_of(
     x: Sequence[Tensor],
     y: Tensor,
     others: Sequence[int],
-    axes: Sequence[Tensor],
-    alone: Mapping[tuple[int, ...], Found],
+    singles: Singles,
     noise_dof: float,
+    firsts: Sequence[int] | None = None,
 ) -> Dictionary:
-    """Of the library effects and the catch-alls `others`; axes and alone: as `singles_of` gives them."""
+    """Of the library effects and the catch-alls `others`.
+
+    Args:
+        atoms, x, y, noise_dof: as for `singles_of`.
+        others: catch-alls.
+        singles: what that says of them.
+        firsts: atoms of which one is in every set that will be asked for; None = any.
+    """
     library = [i for i, a in enumerate(atoms) if not a.catch_all]
-    columns = torch.cat([y[..., None][..., :0], *(x[i] for i in (*library, *others))], -1)
-    ends = torch.tensor([x[i].shape[-1] for i in (*library, *others)], dtype=torch.int64).cumsum(0).tolist()
-    groups = {i: torch.arange(e - x[i].shape[-1], e) for i, e in zip((*library, *others), ends, strict=True)}
-    grams = grams_of(columns, y)
-    wild = torch.tensor(
-        [-1] * (ends[len(library) - 1] if library else 0) + [k for k in others for _ in range(x[k].shape[-1])]
-    )
-    apart = (wild[:, None] >= 0) & (wild >= 0) & (wild[:, None] != wild)
-    grams = grams._replace(xx=grams.xx.masked_fill_(apart, torch.nan))
-    own = {i: axes[i] for i in groups}
-    return Dictionary(tuple(atoms), columns, groups, grams, own, _turned(grams, groups, own), alone, noise_dof)
+    names = list(dict.fromkeys(atoms[i].name for i in library))
+    # Atoms that are never in one set stand side by side.
+    kinds = [*([i for i in library if atoms[i].name == name] for name in names), [*others]]
+    chosen = [i for kind in kinds for i in kind]
+    columns = torch.cat([y[..., None][..., :0], *(x[i] for i in chosen)], -1)
+    ends = torch.tensor([x[i].shape[-1] for i in chosen], dtype=torch.int64).cumsum(0).tolist()
+    groups = {i: torch.arange(e - x[i].shape[-1], e) for i, e in zip(chosen, ends, strict=True)}
+    grams = _grams(columns, y, kinds, groups, singles, firsts)
+    own = {i: singles.axes[i] for i in groups}
+    return Dictionary(tuple(atoms), columns, groups, grams, own, _turned(grams, groups, own), singles.found, noise_dof)
+
+
+def _grams(
+    columns: Tensor,
+    y: Tensor,
+    kinds: Sequence[Sequence[int]],
+    groups: Mapping[int, Tensor],
+    singles: Singles,
+    firsts: Sequence[int] | None,
+) -> Grams:
+    """Inner products of what may be in one set: atoms of two kinds, one of them among the firsts; others may be NaN."""
+    flat = columns.flatten(0, 1)
+    width = flat.shape[-1]
+    xx = flat.new_full((width, width), torch.nan)
+    ends = [int(groups[kind[-1]][-1]) + 1 for kind in kinds if kind]
+    if firsts is None:
+        begin = 0
+        for k, end in enumerate(ends):
+            # Thin products take as long as wide ones: narrow kinds go together, for all that they have among them.
+            if end - begin < _NARROW and end < width and ends[k + 1] - end < _NARROW:
+                continue
+            after = end if begin == (0, *ends)[k] else begin
+            xx[begin:end, after:] = flat[:, begin:end].mT @ flat[:, after:]
+            xx[end:, begin:end] = xx[begin:end, end:].mT
+            begin = end
+    else:
+        mine = torch.cat([torch.arange(0), *(groups[i] for i in firsts)])
+        xx[mine] = flat[:, mine].mT @ flat
+        xx[:, mine] = xx[mine].mT
+    for i, group in groups.items():
+        xx[_run(group), _run(group)] = singles.products[i].xx
+    xy = torch.cat([y.reshape(-1)[:0], *(singles.products[i].xy for kind in kinds for i in kind)])
+    return Grams(xx, xy, y.square().sum(), float(y.numel()))
+
+
+def _run(group: Tensor) -> slice:
+    """Of columns that stand side by side."""
+    return slice(int(group[0]), int(group[-1]) + 1)
 
 
 def _turned(grams: Grams, groups: Mapping[int, Tensor], axes: Mapping[int, Tensor]) -> Grams:
@@ -157,9 +212,9 @@ def _turned(grams: Grams, groups: Mapping[int, Tensor], axes: Mapping[int, Tenso
     width = len(grams.xy)
     xx, xy = grams.xx.new_zeros(width + 1, width + 1), grams.xy.new_zeros(width + 1)
     for i, group in groups.items():
-        place = slice(int(group[0]), int(group[-1]) + 1)
+        place = _run(group)
         xx[place, :width], xy[place] = axes[i].mT @ grams.xx[place], axes[i].mT @ grams.xy[place]
     for i, group in groups.items():
-        place = slice(int(group[0]), int(group[-1]) + 1)
+        place = _run(group)
         xx[:width, place] = xx[:width, place] @ axes[i]
     return grams._replace(xx=xx, xy=xy)

@@ -87,8 +87,9 @@ def local_catch_alls(
     places = _places(spread_out(place, _WITHIN), _RADII_WITHIN)
     # What pulls the platform acts through the joints; what bends a measurement does not.
     platform = platform_moves(situation)
-    for raw in (moved, platform):
-        found += atoms(["workspace"], place[None], places, raw[None])
+    kinds = [moved, platform]
+    for raw in [torch.stack(kinds)] if moved.shape == platform.shape else [k[None] for k in kinds]:
+        found += atoms(["workspace"] * len(raw), place.expand(len(raw), -1, -1), places, raw)
     if "time" in situation.covariates:
         lead = white(platform)
         found += sway(situation.covariates["time"], platform, lead, few, plain.beside(_LOOSE * lead[few]))

@@ -87,7 +87,7 @@ def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Found
         for i in own.members
         for name in judgement.classes.get(atoms[i].name, ())
         for j, a in enumerate(atoms)
-        if a.name == name
+        if a.name == name and name not in {atoms[m].name for m in own.members if m != i}
     }
     known = [_names(analysis, one) for _, one in plain]
     for one in sorted(

@@ -36,12 +36,14 @@ def search(
         noise_dof: as for `fit_sets`.
         quick: whether to look at pairs with the likeliest atoms only, for a start.
     """
-    tried, axes = singles_of(atoms, x, y, noise_dof)
+    alone = singles_of(atoms, x, y, noise_dof)
+    tried = dict(alone.found)
     singles = sorted((f for s, f in tried.items() if s), key=lambda f: -f.log_posterior)
     catch_alls = {i for i, a in enumerate(atoms) if a.catch_all}
     known = [f.members[0] for f in singles if f.members[0] not in catch_alls]
     others = _of_several_drivers([f.members[0] for f in singles if f.members[0] in catch_alls], atoms)
-    dictionary = dictionary_of(atoms, x, y, others, axes, dict(tried), noise_dof)
+    firsts, most = (known[:_LIKELIEST], 2) if quick else (known, _MOST)
+    dictionary = dictionary_of(atoms, x, y, others, alone, noise_dof, firsts if quick else None)
     seen: set[tuple[int, ...]] = set()
 
     def look(sets: Sequence[tuple[int, ...]]) -> None:
@@ -70,7 +72,6 @@ def search(
             for mine in (tried, {s: f for s, f in tried.items() if catch_alls.isdisjoint(s)})
         )
 
-    firsts, most = (known[:_LIKELIEST], 2) if quick else (known, _MOST)
     look([s for i in firsts for j in (*known, *others) if (s := _joined((i,), j, atoms))])
     for size in range(2, most):
         if not better(size) or (size > 2 and best(size, 1)[0].log_posterior < _top(tried.values())):

@@ -95,7 +95,9 @@ def _fitted(
     """Sets by their members; best: as for `promising`, None = all of them."""
     starts = _starts(dictionary, sets, tried)
     sizes = sorted({len(s) for s in sets})
-    short = [_short(dictionary, _begun(dictionary, sets, [s for s in starts if len(sets[s.number]) == n])) for n in sizes]
+    short = [
+        _short(dictionary, _begun(dictionary, sets, [s for s in starts if len(sets[s.number]) == n])) for n in sizes
+    ]
     reached = torch.full((len(sets),), -math.inf, dtype=dictionary.grams.yy.dtype)
     for begun, likely in short:
         reached.scatter_reduce_(0, begun.number, likely, "amax")
@@ -169,7 +171,9 @@ def _begun(dictionary: Dictionary, sets: Sequence[tuple[int, ...]], starts: Sequ
     """Sets of as many members each at the scales of the smaller one and that of the member which this one lacks."""
     members = torch.tensor([sets[s.number] for s in starts])
     own = added_scale(dictionary, [s.before for s in starts], [sets[s.number][s.place] for s in starts]).tolist()
-    each = [(*s.before.log_scale[: s.place], a, *s.before.log_scale[s.place :]) for s, a in zip(starts, own, strict=True)]
+    each = [
+        (*s.before.log_scale[: s.place], a, *s.before.log_scale[s.place :]) for s, a in zip(starts, own, strict=True)
+    ]
     scales = torch.tensor(each, dtype=torch.float64)
     noise = torch.tensor([_LESS_NOISE * s.before.noise for s in starts], dtype=torch.float64)
     order = (-dictionary.widths[members]).argsort(dim=-1, stable=True)
@@ -190,9 +194,14 @@ def _read(
     numbers = zip(*(v.tolist() for v in (posterior, evidence, fits.rss, fits.noise, fits.effective)), strict=True)
     tables = (members, dictionary.widths[members], fits.energy, fits.log_scale)
     rows = zip(sets, *(v.tolist() for v in tables), numbers, strict=True)
-    for row, (own, ordered, widths, energy, log_scale, (log_posterior, log_evidence, rss, noise, effective)) in enumerate(
-        rows
-    ):
+    for row, (
+        own,
+        ordered,
+        widths,
+        energy,
+        log_scale,
+        (log_posterior, log_evidence, rss, noise, effective),
+    ) in enumerate(rows):
         along = fits.first[row, : widths[0]], *torch.split(fits.rest[row, : sum(widths[1:])], widths[1:])
         place = [ordered.index(i) for i in own]
         found[own] = Found(

@@ -1,6 +1,6 @@
 """Batched differentiable kinematics: base class, parallel mechanisms, serial arms, and how to load them."""
 
-from ccnn_torch.mechanisms._mechanism import InverseKinematics as InverseKinematics
+from ccnn_torch.mechanisms._inverse_kinematics import InverseKinematics as InverseKinematics
 from ccnn_torch.mechanisms._mechanism import Mechanism as Mechanism
 from ccnn_torch.mechanisms._pose import PoseError as PoseError
 from ccnn_torch.mechanisms._registry import load_mechanism as load_mechanism

@@ -14,6 +14,7 @@ from ccnn_torch.batching import expand_leading
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import _numeric
+from ccnn_torch.mechanisms._inverse_kinematics import InverseKinematics
 from ccnn_torch.mechanisms._pose import (
     PoseError,
     coordinates_jacobian,
@@ -23,30 +24,7 @@ from ccnn_torch.mechanisms._pose import (
 )
 from ccnn_torch.rotations import matrix_to_rotation_vector, wrap_angle
 
-__all__ = ["InverseKinematics", "Mechanism"]
-
-
-class InverseKinematics(nn.Module):
-    """The module that torch forward hooks sit on; it only calls `mechanism.solve_inverse`."""
-
-    def __init__(self, mechanism: Mechanism) -> None:
-        super().__init__()
-        # A bound method, not the module itself: a child that holds its parent as a submodule would never end.
-        self._solve = mechanism.solve_inverse
-
-    def forward(
-        self,
-        pose: Tensor,
-        parameters: Tensor | None = None,
-        guess: Tensor | None = None,
-        covariates: Tensor | None = None,
-        **ignored: object,
-    ) -> Tensor:
-        """Joints of a pose, as `Mechanism.solve_inverse`.
-
-        `covariates` and further keywords are there for the hooks: the nominal kinematics do not depend on them.
-        """
-        return self._solve(pose, parameters, guess)
+__all__ = ["Mechanism"]
 
 
 class Mechanism(nn.Module):

@@ -126,8 +126,7 @@ def _dictionary(seed: int, noise_dof: float, opposed: float) -> Dictionary:
     y = 10 * (x[..., 0] - x[..., 5]) + 2 * x[..., 8] + _columns(seed + 1, 80, 1)[..., 0]
     columns = [x[..., k] for k in (slice(0, 5), slice(5, 8), slice(8, 12), slice(12, 14))]
     atoms = [Atom(f"group {k}", make_effect("tool"), y.new_zeros(0), c, -2.0) for k, c in enumerate(columns)]
-    alone, axes = singles_of(atoms, columns, y, noise_dof)
-    return dictionary_of(atoms, columns, y, [], axes, alone, noise_dof)
+    return dictionary_of(atoms, columns, y, [], singles_of(atoms, columns, y, noise_dof), noise_dof)
 
 
 @pytest.mark.parametrize("opposed", [0.0, 0.7])
