@@ -36,6 +36,14 @@ def test_curve_fits_agree_with_scipy():
     whole = levenberg_marquardt(residual, start)
     rows = levenberg_marquardt(residual, start, data=(y,))
     torch.testing.assert_close(whole.value, rows.value, rtol=0, atol=1e-12)
+
+    def both(x, rows):
+        wave = torch.exp(-x[..., 1:] * t)
+        return residual(x, rows), torch.stack([wave, -x[..., :1] * t * wave], dim=-1)
+
+    at_once = levenberg_marquardt(residual, start, data=(y,), both=both)
+    assert at_once.iterations == rows.iterations and at_once.converged.all()
+    torch.testing.assert_close(at_once.value, rows.value, rtol=0, atol=1e-12)
     for i in range(6):
         theirs = least_squares(
             lambda x, i=i: residual(torch.from_numpy(x), y[i]).numpy(), [1.0, 1.0], xtol=1e-15, ftol=1e-15, gtol=1e-15

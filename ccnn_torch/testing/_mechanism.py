@@ -199,7 +199,8 @@ def _differences(function: _RowFunction, point: Tensor) -> Tensor:
 
 
 def _check_jacobians(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
-    """By the joints and by the parameters, against central differences of the forward kinematics."""
+    """By the joints and by the parameters, against central differences of the forward kinematics; the frame's by the
+    pose."""
 
     def by_joints(step: Tensor) -> Tensor:
         return m.forward_kinematics(joints + step, guess=pose)
@@ -207,12 +208,19 @@ def _check_jacobians(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
     def by_parameters(step: Tensor) -> Tensor:
         return m.forward_kinematics(joints, m.nominal + step, guess=pose)
 
-    jacobian = m.jacobian(joints, guess=pose)
-    _check_slopes(m, "jacobian", jacobian, by_joints, [f"joint {j.name}" for j in m.joints], pose)
+    found = {"jacobian": m.jacobian(joints, guess=pose), "jacobian_at": m.jacobian_at(pose, joints)}
+    for name, slopes in found.items():
+        _check_slopes(m, name, slopes, by_joints, [f"joint {j.name}" for j in m.joints], pose)
     if len(m.geometry):
-        jacobian = m.parameter_jacobian(joints, guess=pose)
         along = [f"parameter {g.name}" for g in m.geometry]
-        _check_slopes(m, "parameter_jacobian", jacobian, by_parameters, along, pose)
+        found = {
+            "parameter_jacobian": m.parameter_jacobian(joints, guess=pose),
+            "parameter_jacobian_at": m.parameter_jacobian_at(pose, joints),
+        }
+        for name, slopes in found.items():
+            _check_slopes(m, name, slopes, by_parameters, along, pose)
+    along = [f"pose coordinate {c.name}" for c in m.pose]
+    _check_slopes(m, "frame_slope", m.frame_slope(pose), lambda step: pose + step, along, pose)
 
 
 def _check_slopes(

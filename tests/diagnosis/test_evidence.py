@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from ccnn_torch.diagnosis._alone import NOTHING, fit_alone, own_products
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._dictionary import Dictionary, dictionary_of, singles_of
 from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
+from ccnn_torch.diagnosis._joined import side_by_side
 from ccnn_torch.diagnosis._remainder import Remainder, Tried
 from ccnn_torch.diagnosis._sets import promising, scored
 from ccnn_torch.effects import make_effect
@@ -65,6 +67,8 @@ def test_columns_without_their_zeros_are_the_columns(name: str) -> None:
     own = effect.one_by_one(situation, shape)  # type: ignore[attr-defined]
     assert torch.equal(dense.sum(-2), own)
     assert int((dense != 0).sum(-2).max()) == 1
+    rows = torch.tensor([17, 3, 8])
+    assert torch.equal(effect.one_by_one(situation, shape, rows), own[:, rows])  # type: ignore[attr-defined]
 
 
 def test_what_is_put_beside_in_parts_takes_what_it_takes_at_once() -> None:
@@ -119,14 +123,14 @@ def test_groups_in_their_axes_are_as_sets_of_one() -> None:
             assert float(getattr(found, name)[k]) == pytest.approx(float(getattr(one, name)[0]), rel=1e-9)
 
 
-def _dictionary(seed: int, noise_dof: float, opposed: float) -> Dictionary:
+def _dictionary(seed: int, noise_dof: float, opposed: float, firsts: Sequence[int] | None = None) -> Dictionary:
     """Four groups, of which the first two make the data; opposed: how far they cancel each other."""
     x = _columns(seed, 80, 14)
     x[..., 5:8] = opposed * x[..., :3] + (1 - opposed**2) ** 0.5 * x[..., 5:8]
     y = 10 * (x[..., 0] - x[..., 5]) + 2 * x[..., 8] + _columns(seed + 1, 80, 1)[..., 0]
     columns = [x[..., k] for k in (slice(0, 5), slice(5, 8), slice(8, 12), slice(12, 14))]
     atoms = [Atom(f"group {k}", make_effect("tool"), y.new_zeros(0), c, -2.0) for k, c in enumerate(columns)]
-    return dictionary_of(atoms, columns, y, [], singles_of(atoms, columns, y, noise_dof), noise_dof)
+    return dictionary_of(atoms, columns, y, [], singles_of(atoms, columns, y, noise_dof), noise_dof, firsts)
 
 
 @pytest.mark.parametrize("opposed", [0.0, 0.7])
@@ -139,6 +143,22 @@ def test_sets_are_fitted_to_the_end(noise_dof: float, opposed: float) -> None:
         assert found.members == members
         assert found.log_evidence == pytest.approx(float(fit.log_evidence[0]), abs=0.3)
         assert torch.cat([dictionary.grams.xy[:0], *found.mean]).numpy() == pytest.approx(fit.mean[0].numpy(), abs=0.1)
+
+
+def test_a_dictionary_for_some_sets_says_of_these_what_the_whole_says() -> None:
+    whole, some = _dictionary(60, 0.0, 0.5), _dictionary(60, 0.0, 0.5, firsts=[2])
+    sets = [(0, 2), (1, 2), (2, 3)]
+    for one, other in zip(scored(whole, sets, {}), scored(some, sets, {}), strict=True):
+        assert one.log_evidence == pytest.approx(other.log_evidence, abs=1e-6)
+        assert torch.cat(one.mean).numpy() == pytest.approx(torch.cat(other.mean).numpy(), abs=1e-9)
+    assert bool(some.grams.xx[whole.groups[0]][:, whole.groups[1]].isnan().all())
+
+
+def test_columns_of_runs_stand_side_by_side() -> None:
+    begin, width = torch.tensor([[4, 0], [2, 9]]), torch.tensor([[2, 3], [1, 1]])
+    columns, slot = side_by_side(begin, width)
+    assert columns.tolist() == [[4, 5, 0, 1, 2], [2, 9, -1, -1, -1]]
+    assert slot.tolist() == [[0, 0, 1, 1, 1], [0, 1, -1, -1, -1]]
 
 
 def test_what_is_far_behind_is_left_out_and_the_best_is_not() -> None:
