@@ -56,8 +56,8 @@ def _left_by_one(dictionary: Dictionary, sets: Sequence[Found]) -> tuple[Tensor,
     turned = dictionary.turned
     left = []
     for f in sets:
-        group = dictionary.groups[f.members[0]]
-        place = slice(int(group[0]), int(group[-1]) + 1)
+        begin, width = (int(v[f.members[0]]) for v in (dictionary.begins, dictionary.widths))
+        place = slice(begin, begin + width)
         size = math.exp(f.log_scale[0]) / f.noise
         weight = size / (1 + size * turned.xx.diagonal()[place])
         products, with_y = turned.xx[place], weight * turned.xy[place]

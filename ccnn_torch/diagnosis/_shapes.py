@@ -51,9 +51,9 @@ class _OneByOne(Protocol):
 class _Factored(Protocol):
     """An effect on the pose whose `basis` is fixed columns, each times a number that depends on the shapes."""
 
-    def fixed(self, situation: Situation) -> Tensor: ...
+    def fixed_columns(self, situation: Situation) -> Tensor: ...
 
-    def factors(self, situation: Situation, shape: Tensor) -> Tensor: ...
+    def column_factors(self, situation: Situation, shape: Tensor) -> Tensor: ...
 
 
 class _Part(NamedTuple):
@@ -109,7 +109,7 @@ class Scan:
         self.lead = white(torch.nan_to_num(kind())) if kind is not None else None
         self.fixed: Tensor | None = None
         if isinstance(effect, _Factored):
-            self.fixed = white(torch.nan_to_num(situation.once(effect.fixed))) * self.size
+            self.fixed = white(torch.nan_to_num(situation.once(effect.fixed_columns))) * self.size
         # Which joint a column moves is a matter of the effect's form: the middle and the ends of its grids show it.
         ends = torch.tensor([[s.grid[0], s.grid[-1]] for s in self.shapes], dtype=self.start.dtype).mT
         first = effect.basis(situation, torch.stack([self.start, *ends]))
@@ -124,7 +124,7 @@ class Scan:
             moved = self.effect.one_by_one(self.situation, candidates, rows)
             return [self._by_movers(_of_run(moved, p.columns), p.columns, rows) for p in self.parts]
         if self.fixed is not None and isinstance(self.effect, _Factored):
-            factors = _of(self.effect.factors(self.situation, candidates), rows, 1)
+            factors = _of(self.effect.column_factors(self.situation, candidates), rows, 1)
             columns = _of(self.fixed, rows, 0) * factors.unsqueeze(-2)
             return [Tried(_of_run(columns, p.columns)) for p in self.parts]
         basis = _of(self.effect.basis(self.situation, candidates), rows, 1)

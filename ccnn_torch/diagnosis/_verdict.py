@@ -12,7 +12,7 @@ from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._catch_all import ANY
 from ccnn_torch.diagnosis._dictionary import Found
-from ccnn_torch.diagnosis._sets import scored
+from ccnn_torch.diagnosis._sets import fewer, scored
 from ccnn_torch.effects import EXACT
 
 __all__ = ["Judgement", "gap_squares", "judge", "withdrawn"]
@@ -82,7 +82,7 @@ def judge(analysis: Analysis) -> Judgement:
     tried = {f.members: f for f in analysis.found}
     near = [f for f in analysis.found if f.log_posterior > top - _FAR]
     # What is asked for one by one below is fitted side by side first.
-    _fits(analysis, [s for f in near if len(f.members) > 1 for s in _fewer(f).values()], tried)
+    _fits(analysis, [s for f in near if len(f.members) > 1 for s in fewer(f.members)], tried)
     for found in near:
         essential = _essential(analysis, found, tried)
         groups.setdefault(_named(analysis, essential), []).extend([found, essential])
@@ -209,19 +209,13 @@ def _net(
 ) -> dict[int, tuple[float, tuple[int, ...]]]:
     """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
     gap = gap_squares(analysis)
-    fewer = _fewer(found)
-    without = _fits(analysis, list(fewer.values()), tried)
-    return {i: ((f.rss - found.rss) / gap, f.members) for i, f in zip(fewer, without, strict=True)}
+    without = _fits(analysis, fewer(found.members), tried)
+    return {i: ((f.rss - found.rss) / gap, f.members) for i, f in zip(found.members, without, strict=True)}
 
 
 def gap_squares(analysis: Analysis) -> float:
     """Squares above the noise."""
     return max(float(analysis.dictionary.grams.yy) - analysis.floor * analysis.dictionary.grams.values, 1e-300)
-
-
-def _fewer(found: Found) -> dict[int, tuple[int, ...]]:
-    """The set without each of its members."""
-    return {i: tuple(m for m in found.members if m != i) for i in found.members}
 
 
 def _fits(analysis: Analysis, sets: Sequence[tuple[int, ...]], tried: dict[tuple[int, ...], Found]) -> list[Found]:
@@ -256,8 +250,8 @@ def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fo
         missed = _unexplained(analysis, found)
         idle = [
             i
-            for i, (share, fewer) in shares.items()
-            if i not in carries and share < limits[i] and (missed or not _unexplained(analysis, tried[fewer]))
+            for i, (share, without) in shares.items()
+            if i not in carries and share < limits[i] and (missed or not _unexplained(analysis, tried[without]))
         ]
         if not idle:
             break

@@ -105,10 +105,10 @@ class Thermal:
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
-        return situation.once(self.fixed) * self.factors(situation, shape).unsqueeze(-2)
+        return situation.once(self.fixed_columns) * self.column_factors(situation, shape).unsqueeze(-2)
 
-    def fixed(self, situation: Situation) -> Tensor:
-        """What of the columns does not depend on the shapes, `... x s x c x m`: `factors` times this they are."""
+    def fixed_columns(self, situation: Situation) -> Tensor:
+        """Of the columns what does not depend on the shapes, `... x s x c x m`, to be times `column_factors`."""
         mechanism = situation.mechanism
         values = mechanism.resolve(situation.parameters).unsqueeze(-2)
         longer = torch.nan_to_num(situation.parameter_jacobian) * values
@@ -121,7 +121,7 @@ class Thermal:
         parts = [whole, *apart, travel, jacobian, whole]
         return torch.cat([*parts, *([whole, whole, jacobian, whole, travel] if _timed(situation) else [])], -1)
 
-    def factors(self, situation: Situation, shape: Tensor) -> Tensor:
+    def column_factors(self, situation: Situation, shape: Tensor) -> Tensor:
         """What each of the fixed columns is multiplied by: warmth [K], or what has become of it, `... x s x m`."""
         mechanism = situation.mechanism
         warm = (situation.covariates["temperature"] - REFERENCE).expand(situation.joints.shape[:-1])
