@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -17,6 +17,8 @@ __all__ = ["added_scale"]
 _DIGITS = 1e-13
 # Sets are looked at side by side where their widths differ by less than this.
 _ALIKE = 24
+# Beside a set that so many atoms are added to, all columns are looked at once.
+_FEW = 5
 
 
 def added_scale(dictionary: Dictionary, before: Sequence[Found], more: Sequence[int]) -> Tensor:
@@ -26,29 +28,40 @@ def added_scale(dictionary: Dictionary, before: Sequence[Found], more: Sequence[
     as the set has it. Of Zᵀ K⁻¹ Z the diagonal is looked at only, along the principal axes of Z: near enough to begin
     from, and far better than the scale at which the atom explains all by itself.
     """
-    turned = dictionary.turned
-    singles = {f.members: f for f in before if len(f.members) == 1}
-    others = {f.members: f for f in before if len(f.members) > 1}
-    parts = [_left_by_one(dictionary, [*singles.values()])] if singles else []
-    lots: dict[tuple[int, int], list[Found]] = {}
-    for f in others.values():
-        width = int(dictionary.widths[list(f.members)].sum())
-        lots.setdefault((len(f.members), -(-width // _ALIKE)), []).append(f)
-    parts += [_left_of_columns(dictionary, lot) for lot in lots.values()]
-    rows = {members: k for k, members in enumerate((*singles, *(f.members for lot in lots.values() for f in lot)))}
-    square, along, yy = (torch.cat(each) for each in zip(*parts, strict=True))
-    row, atom = torch.tensor([rows[f.members] for f in before]), torch.tensor([*more])[:, None]
-    own, _ = side_by_side(dictionary.begins[atom], dictionary.widths[atom])
-    place = row[:, None], own
-    fits = fit_in_axes(
-        square[place].clamp_min(0),
-        along[place],
-        own[:, 0] >= 0,
-        yy.clamp_min(0)[row],
-        turned.values,
-        dictionary.noise_dof,
-    )
+    turned, atoms = dictionary.turned, torch.tensor([*more])[:, None]
+    own, _ = side_by_side(dictionary.begins[atoms], dictionary.widths[atoms])
+    square, along, yy = turned.yy.new_zeros(own.shape), turned.yy.new_zeros(own.shape), turned.yy.new_zeros(len(own))
+    for rows, sets, each in _lots(dictionary, before):
+        if len(sets[0].members) == 1:
+            squares, products, left = _left_by_one(dictionary, sets)
+        else:
+            squares, products, left = _left_of_columns(dictionary, sets, own[rows] if each is None else None)
+        if each is None:
+            square[rows], along[rows], yy[rows] = squares, products, left
+        else:
+            place = torch.tensor(each)[:, None], own[rows]
+            square[rows], along[rows], yy[rows] = squares[place], products[place], left[place[0][:, 0]]
+    fits = fit_in_axes(square.clamp_min(0), along, own[:, 0] >= 0, yy.clamp_min(0), turned.values, dictionary.noise_dof)
     return fits.log_scale
+
+
+def _lots(dictionary: Dictionary, before: Sequence[Found]) -> Iterator[tuple[list[int], list[Found], list[int] | None]]:
+    """Rows that are looked at side by side; sets of as many members; and which of these sets each row is beside, what
+    they leave of all columns being asked for. Or None: then each row has a set, and asks for its own columns."""
+    beside: dict[tuple[int, ...], list[int]] = {}
+    for row, f in enumerate(before):
+        beside.setdefault(f.members, []).append(row)
+    lots: dict[tuple[int, int, bool], list[tuple[int, ...]]] = {}
+    for members, rows in beside.items():
+        width = int(dictionary.widths[list(members)].sum()) if len(members) > 1 else 0
+        lots.setdefault((len(members), -(-width // _ALIKE), len(members) == 1 or len(rows) > _FEW), []).append(members)
+    for (_, _, whole), sets in lots.items():
+        rows = [row for members in sets for row in beside[members]]
+        if whole:
+            each = [k for k, members in enumerate(sets) for _ in beside[members]]
+            yield rows, [before[beside[members][0]] for members in sets], each
+        else:
+            yield rows, [before[row] for row in rows], None
 
 
 def _left_by_one(dictionary: Dictionary, sets: Sequence[Found]) -> tuple[Tensor, Tensor, Tensor]:
@@ -66,9 +79,11 @@ def _left_by_one(dictionary: Dictionary, sets: Sequence[Found]) -> tuple[Tensor,
     return turned.xx.diagonal() - square, turned.xy - along, turned.yy - yy
 
 
-def _left_of_columns(dictionary: Dictionary, sets: Sequence[Found]) -> tuple[Tensor, Tensor, Tensor]:
-    """What each of the sets of as many members leaves of every column: its squares and its products with y, `b x P`;
-    and yᵀ K⁻¹ y, `b`."""
+def _left_of_columns(
+    dictionary: Dictionary, sets: Sequence[Found], wanted: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What each of the sets of as many members leaves of the columns `wanted` of each, `b x w`, or of all: their
+    squares and their products with y, `b x w`; and yᵀ K⁻¹ y, `b`."""
     turned = dictionary.turned
     members = torch.tensor([f.members for f in sets])
     columns, slot = side_by_side(dictionary.begins[members], dictionary.widths[members])
@@ -79,9 +94,10 @@ def _left_of_columns(dictionary: Dictionary, sets: Sequence[Found]) -> tuple[Ten
     edge = kernel.diagonal(dim1=-2, dim2=-1)
     edge += 1 + _DIGITS * edge.amax(-1, keepdim=True)
     factor = torch.linalg.cholesky_ex(kernel).L
-    right = turned.xx[columns].mul_(size[..., None])
-    taken = torch.linalg.solve_triangular(factor, right, upper=False)
+    right = turned.xx[columns] if wanted is None else turned.xx[columns[:, :, None], wanted[:, None, :]]
+    taken = torch.linalg.solve_triangular(factor, right.mul_(size[..., None]), upper=False)
     with_y = torch.linalg.solve_triangular(factor, (turned.xy[columns] * size)[..., None], upper=False)
-    along = turned.xy - (taken.mT @ with_y)[..., 0]
-    square = turned.xx.diagonal() - taken.square_().sum(-2)
+    every = slice(None) if wanted is None else wanted
+    along = turned.xy[every] - (taken.mT @ with_y)[..., 0]
+    square = turned.xx.diagonal()[every] - taken.square_().sum(-2)
     return square, along, turned.yy - with_y.square().sum((-2, -1))
