@@ -124,17 +124,18 @@ def _short(dictionary: Dictionary, begun: _Begun) -> tuple[_Begun, Tensor]:
 
 def _lots(dictionary: Dictionary, members: Tensor) -> Iterator[Tensor]:
     """Rows of sets `b x g`, whose members have the widest first, that are fitted side by side."""
+    if not len(members):
+        return
     widths = dictionary.widths[members]
     first, rest = widths[:, 0], widths[:, 1:].sum(-1)
-    order = (rest * (1 + int(widths.max())) + first).argsort() if len(widths) else first
+    order = (rest * (1 + int(first.max())) + first).argsort()
     begin = wide = 0
     for k, (f, r) in enumerate(zip(first[order].tolist(), rest[order].tolist(), strict=True)):
         wide = max(wide, f)
         if k > begin and (k + 1 - begin) * wide * r > _NEAR:
             yield order[begin:k]
             begin, wide = k, f
-    if len(order):
-        yield order[begin:]
+    yield order[begin:]
 
 
 def _updated(dictionary: Dictionary, begun: _Begun, updates: int) -> Joined:

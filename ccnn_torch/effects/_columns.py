@@ -43,7 +43,7 @@ def by_joint(values: Tensor, joints: Sequence[int] | None = None) -> Tensor:
     n, m = values.shape[-2:]
     eye = torch.eye(n, dtype=values.dtype, device=values.device).unsqueeze(-1)
     blocks = values.unsqueeze(-2) * eye
-    if joints is not None and len(joints) < n:
+    if joints is not None and list(joints) != list(range(n)):
         blocks = blocks[..., list(joints), :]
     return blocks.reshape(*values.shape[:-1], blocks.shape[-2] * m)
 

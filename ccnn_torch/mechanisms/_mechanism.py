@@ -161,7 +161,7 @@ class Mechanism(nn.Module):
             `... x 6 x p`, or `... x 3 x p` without orientation.
         """
         if type(self).frame is Mechanism.frame:
-            return coordinates_jacobian(pose, self.pose)
+            return coordinates_jacobian(pose, self.pose, self.name)
         return frame_jacobian(self.frame, pose)
 
     def pose_near(self, position: Tensor, rotation: Tensor | None) -> Tensor:

@@ -41,12 +41,7 @@ def pose_error(measured: Frame, reference: Frame) -> PoseError:
 def frame_from_coordinates(pose: Tensor, coordinates: tuple[Coordinate, ...], name: str) -> Frame:
     """Frame of a pose whose coordinates are named x, y, z and rx, ry, rz."""
     columns = {c.name: pose[..., i] for i, c in enumerate(coordinates)}
-    angles = [c.name for c in coordinates if c.unit == "rad"]
-    strange = [a for a in angles if a not in _TURNS]
-    if strange:
-        raise InputError(
-            f"mechanism '{name}' has the pose angle '{strange[0]}': override frame(pose) to say how it turns"
-        )
+    angles = _angles(coordinates, name)
     zero = torch.zeros_like(pose[..., 0])
     position = torch.stack([columns.get(c, zero) for c in _LENGTHS], dim=-1)
     if not angles:
@@ -54,16 +49,27 @@ def frame_from_coordinates(pose: Tensor, coordinates: tuple[Coordinate, ...], na
     return position, rotation_vector_to_matrix(torch.stack([columns.get(c, zero) for c in _TURNS], dim=-1))
 
 
-def coordinates_jacobian(pose: Tensor, coordinates: tuple[Coordinate, ...]) -> Tensor:
+def coordinates_jacobian(pose: Tensor, coordinates: tuple[Coordinate, ...], name: str) -> Tensor:
     """Of `frame_from_coordinates`, as `frame_jacobian` gives it: `... x 6 x p`, or `... x 3 x p` without angles."""
-    names = [c.name for c in coordinates]
-    chosen = [(*_LENGTHS, *_TURNS).index(name) for name in names]
-    slope = torch.eye(6, dtype=pose.dtype, device=pose.device)[:, chosen].expand(*pose.shape[:-1], 6, len(names))
-    if not any(c.unit == "rad" for c in coordinates):
+    names, angles = [c.name for c in coordinates], _angles(coordinates, name)
+    rows = torch.tensor([[float(own == row) for own in names] for row in (*_LENGTHS, *_TURNS)])
+    slope = rows.to(pose).expand(*pose.shape[:-1], 6, len(names))
+    if not angles:
         return slope[..., :3, :]
     zero = torch.zeros_like(pose[..., 0])
     vector = torch.stack([pose[..., names.index(t)] if t in names else zero for t in _TURNS], -1)
     return torch.cat([slope[..., :3, :], rotation_vector_rate(vector) @ slope[..., 3:, :]], -2)
+
+
+def _angles(coordinates: tuple[Coordinate, ...], name: str) -> list[str]:
+    """Names of a pose's angles, which a frame by name must know; lengths of other names do not move it."""
+    angles = [c.name for c in coordinates if c.unit == "rad"]
+    strange = [a for a in angles if a not in _TURNS]
+    if strange:
+        raise InputError(
+            f"mechanism '{name}' has the pose angle '{strange[0]}': override frame(pose) to say how it turns"
+        )
+    return angles
 
 
 def frame_jacobian(function: Callable[[Tensor], Frame], point: Tensor) -> Tensor:

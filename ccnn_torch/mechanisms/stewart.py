@@ -67,7 +67,7 @@ class Stewart(Mechanism):
         self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
     ) -> Tensor:
         """Newton from the middle of the workspace (or `guess`); NaN where it leaves the assembly mode."""
-        values = self.resolve(parameters)
+        values, own = self.resolve(parameters), type(self).solve_inverse is Stewart.solve_inverse
 
         def closure(pose: Tensor, joints: Tensor, values: Tensor) -> Tensor:
             return self.solve_inverse(pose, values) - joints
@@ -76,7 +76,9 @@ class Stewart(Mechanism):
             legs = self._legs(pose, values)
             rows = legs.rates()
             slope = torch.cat([rows[..., :3], rows[..., 3:] @ rotation_vector_rate(pose[..., 3:])], dim=-1)
-            return legs.joints() - joints, slope
+            # A class of its own may have drives of another kind.
+            reached = legs.joints() if own else self.solve_inverse(pose, values)
+            return reached - joints, slope
 
         pose = solve(closure, self.home_pose if guess is None else guess, (joints, values), both=both)
         return torch.where(self.reachable(pose.detach(), values.detach())[..., None], pose, torch.nan)

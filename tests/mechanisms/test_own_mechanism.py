@@ -6,10 +6,11 @@ import pytest
 import torch
 from catalogue import OWN_MECHANISM
 
-from ccnn_torch.coordinates import Parameter, plausible_error
+from ccnn_torch.coordinates import Coordinate, Parameter, plausible_error
 from ccnn_torch.errors import InputError
 from ccnn_torch.least_squares import levenberg_marquardt
-from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.mechanisms._pose import frame_jacobian
 
 DOCS = Path(__file__).parents[2] / "docs" / "mechanisms.md"
 
@@ -89,3 +90,27 @@ def test_plausible_errors():
     assert plausible_error(Parameter("l", "m", 1.0, 2, 5e-3)) == 5e-3
     with pytest.raises(InputError, match="'stiff' has the unit 'N/m': give it a scale"):
         plausible_error(Parameter("stiff", "N/m", 1.0))
+
+
+@pytest.mark.parametrize("name", ["h", "z", "phi"])
+def test_the_slope_of_a_frame_by_name_is_that_of_the_frame(name):
+    """A length of another name does not move the frame; an angle of another name says what to do."""
+
+    class Slides(Mechanism):
+        def __init__(self):
+            unit = "rad" if name == "phi" else "m"
+            joints, pose = (
+                (Coordinate("q1", "m"), Coordinate("q2", unit)),
+                (Coordinate("x", "m"), Coordinate(name, unit)),
+            )
+            super().__init__("slides", joints, pose, [], (-1, -1), (1, 1))
+
+        def solve_inverse(self, pose, parameters=None, guess=None):
+            return pose
+
+    slides, pose = Slides(), torch.zeros(3, 2, dtype=torch.float64)
+    if name == "phi":
+        with pytest.raises(InputError, match="pose angle 'phi': override frame"):
+            slides.frame_slope(pose)
+    else:
+        assert torch.equal(slides.frame_slope(pose), frame_jacobian(slides.frame, pose))

@@ -9,7 +9,7 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from ccnn_torch.least_squares import jacobian_of
-from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms import Stewart, load_mechanism
 from ccnn_torch.rotations import rotation_vector_rate, rotation_vector_to_matrix
 
 PARALLEL = ("five_bar", "overconstrained_2dof", "stewart", "delta", "delta_linear")
@@ -186,3 +186,14 @@ def test_rate_of_a_rotation_vector():
             spin = (ahead - behind) / 2e-6 @ rotation_vector_to_matrix(vector).mT
             found = torch.stack([spin[2, 1], spin[0, 2], spin[1, 0]])
             torch.testing.assert_close(rate[:, i], found, rtol=0, atol=1e-8)
+
+
+def test_a_platform_with_drives_of_another_kind_has_them_both_ways():
+    class Bent(Stewart):
+        def solve_inverse(self, pose, parameters=None, guess=None):
+            return super().solve_inverse(pose, parameters, guess) + 0.01 * pose[..., :1] ** 2
+
+    bent = Bent()
+    pose = bent.sample_workspace(20, torch.Generator().manual_seed(3))
+    reached = bent.forward_kinematics(bent.solve_inverse(pose))
+    torch.testing.assert_close(reached, pose, rtol=0, atol=1e-9)
