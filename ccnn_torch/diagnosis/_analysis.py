@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis._again import known_shapes, settled
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._candidates import cleaned, first_candidates, plain_atom, renewed_candidates
 from ccnn_torch.diagnosis._catch_all import catch_alls
@@ -26,11 +27,8 @@ __all__ = ["Analysis", "analyse", "frame_columns"]
 _CONDITION = 50.0
 # Or where the joints move the platform so many times as far as usual.
 _GAIN = 3.0
-# Another look is spared where the noise of the channels changed among each other by less than this, and the fit by such
-# a share of the noise's square.
-_SAME_NOISE, _SAME_FIT = 0.1, 0.01
 _FAR_BELOW = 0.5
-# And where, with its shapes looked for beside its best, the library is so far behind (log odds).
+# No third look where, with its shapes looked for beside its best, the library is so far behind (log odds).
 _FAR_BEHIND = 20.0
 # Values of the residual that the search for a set to start from takes, at most.
 _START = 900
@@ -124,41 +122,31 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         if before is not None and result.found[0].log_posterior - best.log_posterior > _FAR_BEHIND:
             break
         acting = result.acting(best)
-        same = before == (before := frozenset(a.effect.name for a in acting))
+        act = frozenset(a.effect.name for a in acting)
         new, left = _renewed(result, noise, usable), remainder(situation, measured, acting)
-        if same and _settled(result, best, new, left):
-            break
+        known: Mapping[str, Sequence[Atom]] = {}
+        if before is not None:
+            # Shapes found beside more than there is are as good, where what was too much explains nothing any more.
+            if act <= before and settled(result.dictionary, result.y, best, result.whitening, new, left):
+                break
+            known = known_shapes(result.dictionary, result.found, best, act == before)
+        before = act
         there, target = tangent(situation, left, acting)
         ok = usable & torch.isfinite(target).all(-1) & torch.isfinite(there.jacobian).flatten(1).all(-1)
         if int(ok.sum()) < 0.9 * int(usable.sum()):
             there, target, ok = situation, residual, usable
         target = torch.where(ok[:, None], target, 0.0)
         white = new if bool((ok == usable).all()) else _renewed(result, noise, ok)
-        known = atoms if same else []
         atoms = renewed_candidates(
             situation, there, measured, target, effects, acting, starts, known, white, ok, fitted
         )
         # The first of a name has the shapes found now; its parts and earlier shapes add next to nothing.
-        first = {a.name: a.columns for a in reversed(atoms)}
-        beside = torch.cat([fitted, *(first[name] for name in sorted(before))], -1)
+        newest = {a.name: a.columns for a in reversed(atoms)}
+        beside = torch.cat([fitted, *(newest[name] for name in sorted(act))], -1)
         again = local_catch_alls(situation, jacobian, target, white, beside)
         places = [*local, *(cleaned(a, ok) for a in again)]
         result = _searched(situation, measured, target, white, [*atoms, *rest, *places], near, rich, fitted)
     return replace(result, idle=idle)
-
-
-def _settled(result: Analysis, best: Found, new: Whitening, left: Tensor) -> bool:
-    """Whether to look again would change little: the same rows are set aside, the channels' noise is in the same
-    proportion, and what the best set leaves of every row by the machine itself, `s x c0`, is what the linear model
-    says."""
-    old = result.whitening
-    change = (new.sigma / old.sigma).log()
-    if not torch.equal(new.keep(), old.keep()) or float((change - change.mean()).abs().max()) > _SAME_NOISE:
-        return False
-    linear = result.y
-    for i, mean in zip(best.members, best.mean, strict=True):
-        linear = linear - result.dictionary.columns[..., result.dictionary.groups[i]] @ mean
-    return float((old(torch.nan_to_num(left))[old.keep()] - linear).square().mean()) < _SAME_FIT
 
 
 def _near_singular(situation: Situation, channels: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -71,7 +71,7 @@ def renewed_candidates(
     effects: Sequence[Effect],
     acting: Sequence[Acting],
     starts: Sequence[Atom],
-    known: Sequence[Atom],
+    known: Mapping[str, Sequence[Atom]],
     white: Whitening,
     usable: Tensor,
     fitted: Tensor,
@@ -85,7 +85,7 @@ def renewed_candidates(
         effects: candidates.
         acting: those of the best set.
         starts: shapes found at first: they stay candidates, since what acts now may have hidden the better ones.
-        known: candidates from when the same effects acted last: shapes found beside these are not looked for again.
+        known: by names of effects whose shapes are not looked for again those that they have.
         white, usable, fitted: as in `first_candidates`.
     """
 
@@ -115,15 +115,16 @@ def renewed_candidates(
     for effect in (e for e in effects if e.shapes(situation)):
         others = [a for a in acting if a.effect is not effect]
         start = next((a.shape for a in acting if a.effect is effect), None)
-        last = next((a for a in known if a.effect is effect), None)
-        if start is None and last is not None:
-            shapes = [Shaped(last.shape, last.used, LOG_PRIOR - last.log_prior)]
+        shapes: list[Shaped] = []
+        if start is None and effect.name in known:
+            found = known[effect.name]
         else:
             # What acts beside an effect may be there to mend a wrong shape: the right one needs nothing beside it.
             beside_what = [others] if start is None or not others else [others, []]
             scan = Scan(situation, there, effect, _only(white, usable))
             shapes = [scan.best(ground(them), start) for them in beside_what]
-        shapes += [Shaped(a.shape, a.used, LOG_PRIOR - a.log_prior) for a in starts if a.effect is effect]
+            found = [a for a in starts if a.effect is effect]
+        shapes += [Shaped(a.shape, a.used, LOG_PRIOR - a.log_prior) for a in found]
         own: list[Atom] = []
         for shaped in shapes:
             if not any(_same_shape(a, shaped) for a in own):

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._alone import NOTHING, Own, fit_alone
+from ccnn_torch.diagnosis._alone import NOTHING, Own, fit_alone, own_products
 from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
 from ccnn_torch.diagnosis._whitening import NO_NOISE, Whitening, reweighted
 
@@ -16,6 +17,10 @@ __all__ = ["fitted_whitening"]
 
 # The richest fit: at most so many candidates, the log evidence from which one is taken in, the spread of its log size.
 _RICH, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
+# Candidates that are looked at with the rows' weights as they are, the most promising when all weigh alike.
+_NEXT = 4
+# Updates of a fit that begins where the one before it ended.
+_UPDATES = 4
 
 
 def fitted_whitening(
@@ -42,6 +47,7 @@ def fitted_whitening(
     if noise is None:
         white = replace(white, sigma=sigma * _noise_share(every, y, white).sqrt())
     chosen: list[int] = []
+    log_scale = y.new_zeros(1, 0)
     least = None if noise is not None else (1e-4 * rms).clamp_min(NO_NOISE)
     left, free = y, 1.0
     for _ in range(_RICH):
@@ -49,23 +55,43 @@ def fitted_whitening(
             own = torch.cat([shown[k] / every.size[k] for k in chosen], -1)
             ends = torch.tensor([shown[k].shape[-1] for k in chosen]).cumsum(0).tolist()
             parts = [torch.arange(e - shown[k].shape[-1], e) for e, k in zip(ends, chosen, strict=True)]
-            fit = fit_sets(grams_of(white.scaled(own), white.scaled(y)), [parts], 0.0, spread=_ANY_SIZE)
-            left = y - own @ fit.mean[0]
+            grams = grams_of(white.scaled(own), white.scaled(y))
+            fit = fit_sets(grams, [parts], 0.0, _UPDATES, _ANY_SIZE, (log_scale, y.new_ones(1)))
+            left, log_scale = y - own @ fit.mean[0], fit.log_scale
             free = max(1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), 0.1)
             white = _settled(white, left, usable, free, least)
-        products = [NOTHING if k in chosen else own for k, own in enumerate(every.products(white, left))]
-        squares = white.scaled(left).square().sum()
-        fits = fit_alone([NOTHING, *products], squares, float(left.numel()), 0.0, _ANY_SIZE)
-        best = int(fits.log_evidence[1:].argmax())
-        if not shown or float(fits.log_evidence[best + 1] - fits.log_evidence[0]) < _SLIGHT:
+        rest = [k for k in range(len(shown)) if k not in chosen]
+        if not rest:
             break
-        chosen.append(best)
+        squares = white.scaled(left).square().sum()
+        rough = _added(every.products(white, left, rest), squares, y.numel())
+        likely = [rest[k] for k in rough.gain.argsort(descending=True)[:_NEXT].tolist()]
+        products = [own_products(white.scaled(shown[k]), white.scaled(left), every.size[k]) for k in likely]
+        added = _added(products, squares, y.numel())
+        best = int(added.gain.argmax())
+        if float(added.gain[best]) < _SLIGHT:
+            break
+        chosen.append(likely[best])
+        log_scale = torch.cat([log_scale, added.log_scale[None, best : best + 1]], -1)
     white = _settled(white, left, usable, free, least)
     return replace(white, known=0.0 if noise is None else 50.0)
 
 
+class _Added(NamedTuple):
+    """Log evidence gained by each of the candidates, `k`, and log α² with which it is, `k`."""
+
+    gain: Tensor
+    log_scale: Tensor
+
+
+def _added(products: Sequence[Own], squares: Tensor, values: int) -> _Added:
+    """products: of each candidate; squares: of what it is added to, and of how many values."""
+    fits = fit_alone([NOTHING, *products], squares, float(values), 0.0, _ANY_SIZE)
+    return _Added(fits.log_evidence[1:] - fits.log_evidence[0], fits.log_scale[1:])
+
+
 class _Everything:
-    """All that may be there, and its inner products channel by channel: these stay when only the noise changes.
+    """All that may be there, and its inner products channel by channel: these stay when the noise changes.
 
     Columns count by what they tell, whatever their size: all have the same mean square.
 
@@ -100,16 +126,18 @@ class _Everything:
             found.append([Own(xx, xy) for xx, xy in zip(square, along, strict=True)])
         return found
 
-    def products(self, white: Whitening, left: Tensor) -> list[Own]:
-        """Of every candidate with itself and with what a fit leaves, `s x c`, in units of the noise."""
-        if not torch.equal(white.weight, self._weight):
-            self._weight = white.weight
-            self._among = [self._by_channel(c, c) for c in self.columns]
+    def products(self, white: Whitening, left: Tensor, which: Sequence[int]) -> list[Own]:
+        """Of some candidates with what a fit leaves, `s x c`, in units of the noise; and with themselves, as if all
+        rows weighed alike: near enough to tell which may be the best."""
         per = white.sigma**-2
         target = (left * white.weight[:, None] * per).reshape(-1)
+        square = (per * white.weight.sum() / self._weight.sum())[:, None, None]
         return [
-            Own((among * per[:, None, None]).sum(0) / size**2, columns.flatten(0, 1).mT @ target / size)
-            for columns, among, size in zip(self.columns, self._among, self.size, strict=True)
+            Own(
+                (self._among[k] * square).sum(0) / self.size[k] ** 2,
+                self.columns[k].flatten(0, 1).mT @ target / self.size[k],
+            )
+            for k in which
         ]
 
 
