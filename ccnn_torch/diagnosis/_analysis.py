@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,6 +31,8 @@ _GAIN = 3.0
 _FAR_BELOW = 0.5
 # No third look where, with its shapes looked for beside its best, the library is so far behind (log odds).
 _FAR_BEHIND = 20.0
+# An effect shows where a coefficient of plausible size makes this share of the gap.
+_SHOWN = 1e-9
 # Values of the residual that the search for a set to start from takes, at most.
 _START = 900
 
@@ -73,6 +76,32 @@ class Analysis:
         return out
 
 
+class _Rows(NamedTuple):
+    """What every look goes by: the rows, `measured` poses `s x p`, the `noise` that was given, rows that are `usable`
+    and those `near` a singularity, `s`; and 0 in rows that are left out: the `residual`, `s x c0`, what was `fitted` to
+    them before, `s x c0 x r`, and the joints' `jacobian`, `s x c0 x n`."""
+
+    situation: Situation
+    measured: Tensor
+    noise: Tensor | None
+    usable: Tensor
+    near: Tensor
+    residual: Tensor
+    fitted: Tensor
+    jacobian: Tensor
+
+
+class _Standing(NamedTuple):
+    """What stays whatever is found: effects that show, shapes found at first, catch-alls, those of one place or sway,
+    and the noise of the richest fit, `c`."""
+
+    effects: list[Effect]
+    starts: list[Atom]
+    rest: list[Atom]
+    local: list[Atom]
+    rich: Tensor
+
+
 def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], noise: Tensor | None) -> Analysis:
     """The whole search.
 
@@ -82,39 +111,8 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         effects: candidates, all of which the rows have the covariates for.
         noise: standard deviation of each pose channel, `c0` [m, rad], or None.
     """
-    residual = pose_residual(situation, measured)
-    channels = moving_channels(situation)
-    near = _near_singular(situation, channels)
-    usable = torch.isfinite(residual).all(-1) & torch.isfinite(situation.jacobian).flatten(1).all(-1) & ~near
-    residual = torch.where(usable[:, None], residual, 0.0)
-
-    atoms = [cleaned(plain_atom(situation, situation, e), usable) for e in effects]
-    names = [e.name for e in effects]
-    rest = [*catch_alls(situation, names), *straight_catch_alls(situation, names)]
-    rest = [cleaned(a, usable) for a in rest if bool((torch.isfinite(a.columns).flatten(1).all(-1) | ~usable).all())]
-    fitted = frame_columns(situation, usable)
-    # What does not show at all in these rows is no candidate (latency at rest).
-    size = [
-        float(
-            (a.columns[:, channels] / residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)[:, None]).abs().max()
-        )
-        for a in atoms
-    ]
-    idle = tuple(e.name for e, s in zip(effects, size, strict=True) if s <= 1e-9)
-    effects = [e for e in effects if e.name not in idle]
-    atoms = [a for a, s in zip(atoms, size, strict=True) if s > 1e-9]
-    everything = [a.columns for a in (*atoms, *rest) if not (a.catch_all and a.name.startswith("joint"))]
-    white = fitted_whitening(residual, [fitted, *everything], channels, noise, usable)
-
-    rich = white.sigma
-    fixed, starts = first_candidates(situation, atoms, white, residual, usable, fitted)
-    jacobian = torch.where(usable[:, None, None], situation.jacobian, 0.0)
-    local = [cleaned(a, usable) for a in local_catch_alls(situation, jacobian, residual, white, fitted)]
-    # Only where to start from: a part of the rows will do.
-    few = _drawn(white.keep(), len(channels))
-    every = [*fixed, *starts, *rest, *local]
-    result = _searched(situation, measured, residual, white, every, near, rich, fitted, few)
-
+    rows = _rows_of(situation, measured, noise)
+    result, standing = _first_look(rows, effects)
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
     before: frozenset[str] | None = None
     for _ in range(2):
@@ -123,30 +121,96 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
             break
         acting = result.acting(best)
         act = frozenset(a.effect.name for a in acting)
-        new, left = _renewed(result, noise, usable), remainder(situation, measured, acting)
+        white, left = _renewed(result, noise, rows.usable), remainder(situation, measured, acting)
         known: Mapping[str, Sequence[Atom]] = {}
         if before is not None:
             # Shapes found beside more than there is are as good, where what was too much explains nothing any more.
-            if act <= before and settled(result.dictionary, result.y, best, result.whitening, new, left):
+            if act <= before and settled(result.dictionary, result.y, best, result.whitening, white, left):
                 break
             known = known_shapes(result.dictionary, result.found, best, act == before)
         before = act
-        there, target = tangent(situation, left, acting)
-        ok = usable & torch.isfinite(target).all(-1) & torch.isfinite(there.jacobian).flatten(1).all(-1)
-        if int(ok.sum()) < 0.9 * int(usable.sum()):
-            there, target, ok = situation, residual, usable
-        target = torch.where(ok[:, None], target, 0.0)
-        white = new if bool((ok == usable).all()) else _renewed(result, noise, ok)
-        atoms = renewed_candidates(
-            situation, there, measured, target, effects, acting, starts, known, white, ok, fitted
-        )
-        # The first of a name has the shapes found now; its parts and earlier shapes add next to nothing.
-        newest = {a.name: a.columns for a in reversed(atoms)}
-        beside = torch.cat([fitted, *(newest[name] for name in sorted(act))], -1)
-        again = local_catch_alls(situation, jacobian, target, white, beside)
-        places = [*local, *(cleaned(a, ok) for a in again)]
-        result = _searched(situation, measured, target, white, [*atoms, *rest, *places], near, rich, fitted)
-    return replace(result, idle=idle)
+        result = _looked_again(rows, standing, result, acting, white, left, known)
+    shown = {e.name for e in standing.effects}
+    return replace(result, idle=tuple(e.name for e in effects if e.name not in shown))
+
+
+def _rows_of(situation: Situation, measured: Tensor, noise: Tensor | None) -> _Rows:
+    residual = pose_residual(situation, measured)
+    near = _near_singular(situation, moving_channels(situation))
+    usable = torch.isfinite(residual).all(-1) & torch.isfinite(situation.jacobian).flatten(1).all(-1) & ~near
+    residual = torch.where(usable[:, None], residual, 0.0)
+    jacobian = torch.where(usable[:, None, None], situation.jacobian, 0.0)
+    return _Rows(situation, measured, noise, usable, near, residual, frame_columns(situation, usable), jacobian)
+
+
+def _first_look(rows: _Rows, effects: Sequence[Effect]) -> tuple[Analysis, _Standing]:
+    """About the nominal machine, on a part of the rows: only where to start from."""
+    situation, usable = rows.situation, rows.usable
+    channels = moving_channels(situation)
+    atoms = [cleaned(plain_atom(situation, situation, e), usable) for e in effects]
+    names = [e.name for e in effects]
+    rest = [*catch_alls(situation, names), *straight_catch_alls(situation, names)]
+    rest = [cleaned(a, usable) for a in rest if bool((torch.isfinite(a.columns).flatten(1).all(-1) | ~usable).all())]
+    # What does not show at all in these rows is no candidate (latency at rest).
+    largest = rows.residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)
+    atoms = [a for a in atoms if float((a.columns[:, channels] / largest[:, None]).abs().max()) > _SHOWN]
+    everything = [a.columns for a in (*atoms, *rest) if not (a.catch_all and a.name.startswith("joint"))]
+    white = fitted_whitening(rows.residual, [rows.fitted, *everything], channels, rows.noise, usable)
+
+    fixed, starts = first_candidates(situation, atoms, white, rows.residual, usable, rows.fitted)
+    local = local_catch_alls(situation, rows.jacobian, rows.residual, white, rows.fitted)
+    shown = [a.effect for a in atoms if a.effect is not None]
+    standing = _Standing(shown, starts, rest, [cleaned(a, usable) for a in local], white.sigma)
+    every = [*fixed, *starts, *rest, *standing.local]
+    few = _drawn(white.keep(), len(channels))
+    return _searched(rows, rows.residual, white, every, standing.rich, few), standing
+
+
+def _looked_again(
+    rows: _Rows,
+    standing: _Standing,
+    result: Analysis,
+    acting: Sequence[Acting],
+    white: Whitening,
+    left: Tensor,
+    known: Mapping[str, Sequence[Atom]],
+) -> Analysis:
+    """About the machine with the best set's effects, on all rows.
+
+    Args:
+        rows, standing: what stays.
+        result: of the look before.
+        acting: effects of its best set.
+        white: noise and weights that its most probable set leaves.
+        left: what those effects leave by the machine itself, `s x c0` [m, rad].
+        known: as for `renewed_candidates`.
+    """
+    situation, usable = rows.situation, rows.usable
+    there, target = tangent(situation, left, acting)
+    ok = usable & torch.isfinite(target).all(-1) & torch.isfinite(there.jacobian).flatten(1).all(-1)
+    if int(ok.sum()) < 0.9 * int(usable.sum()):
+        there, target, ok = situation, rows.residual, usable
+    target = torch.where(ok[:, None], target, 0.0)
+    white = white if bool((ok == usable).all()) else _renewed(result, rows.noise, ok)
+    atoms = renewed_candidates(
+        situation,
+        there,
+        rows.measured,
+        target,
+        standing.effects,
+        acting,
+        standing.starts,
+        known,
+        white,
+        ok,
+        rows.fitted,
+    )
+    # The first of a name has the shapes found now; its parts and earlier shapes add next to nothing.
+    newest = {a.name: a.columns for a in reversed(atoms)}
+    beside = torch.cat([rows.fitted, *(newest[name] for name in sorted({a.effect.name for a in acting}))], -1)
+    again = local_catch_alls(situation, rows.jacobian, target, white, beside)
+    every = [*atoms, *standing.rest, *standing.local, *(cleaned(a, ok) for a in again)]
+    return _searched(rows, target, white, every, standing.rich)
 
 
 def _near_singular(situation: Situation, channels: Tensor) -> Tensor:
@@ -170,23 +234,16 @@ def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
 
 
 def _searched(
-    situation: Situation,
-    measured: Tensor,
-    target: Tensor,
-    white: Whitening,
-    atoms: list[Atom],
-    near: Tensor,
-    rich: Tensor,
-    fitted: Tensor,
-    few: Tensor | None = None,
+    rows: _Rows, target: Tensor, white: Whitening, atoms: list[Atom], rich: Tensor, few: Tensor | None = None
 ) -> Analysis:
-    """few: rows for a quick look, `t`; None = all that count, thoroughly."""
+    """target: what a linear model has to explain, `s x c0`; rich: noise of the richest fit, `c`; few: rows for a quick
+    look, `t`; None = all that count, thoroughly."""
     keep = white.keep() if few is None else few
-    rows = slice(None) if len(keep) == len(target) else keep
-    columns, y = [white(a.columns)[rows] for a in atoms], white(target)[rows]
-    if fitted.shape[-1]:
+    counted = slice(None) if len(keep) == len(target) else keep
+    columns, y = [white(a.columns)[counted] for a in atoms], white(target)[counted]
+    if rows.fitted.shape[-1]:
         # What was fitted before takes its part out of everything.
-        u, s, _ = torch.linalg.svd(white(fitted)[rows].flatten(0, 1), full_matrices=False)
+        u, s, _ = torch.linalg.svd(white(rows.fitted)[counted].flatten(0, 1), full_matrices=False)
         q = u[:, s > 1e-9 * s[0]]
         y = (y.flatten() - q @ (q.mT @ y.flatten())).reshape(y.shape)
         columns = [(c.flatten(0, 1) - q @ (q.mT @ c.flatten(0, 1))).reshape(c.shape) for c in columns]
@@ -197,7 +254,7 @@ def _searched(
     left = found[0].rss / max(y.numel() - found[0].effective, 1.0)
     floor = min(float((rich / white.sigma).square().mean()), 1.0)
     floor = left if white.known == 0 and left < _FAR_BELOW * floor else floor
-    return Analysis(situation, measured, target, white, dictionary, y, found, near, floor)
+    return Analysis(rows.situation, rows.measured, target, white, dictionary, y, found, rows.near, floor)
 
 
 def _drawn(rows: Tensor, channels: int) -> Tensor:

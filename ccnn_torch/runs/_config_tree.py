@@ -57,7 +57,7 @@ def config_from_options(model: type[Config], path: Path | None, overrides: Itera
         resolve_paths(tree, path.absolute().parent)
     given = apply_overrides(tree, overrides, Path.cwd())
     filled = {key: value for key, value in tree.items() if value is not None}
-    return validated(model, filled, str(path or "config"), given)
+    return validated(model, filled, str(path or "command line"), given)
 
 
 def config_from_keys(model: type[Config], keys: Mapping[str, Any]) -> Config:
