@@ -11,6 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy.stats import binomtest
 
 from ccnn_torch.report.blind_tables import blind_markdown
@@ -90,8 +91,28 @@ def summary(cases: Sequence[Case]) -> Block:
         "reliability": _reliability(cases),
         "withheld": _withheld(withheld),
         "seconds": sorted(c["answer"]["seconds"] for c in cases if c["answer"].get("seconds") is not None),
+        "seconds_by_machine": _seconds(cases),
         "definitions": DEFINITIONS,
     }
+    return found
+
+
+def _seconds(cases: Sequence[Case]) -> Block:
+    """How long the diagnoses of the longest records took, by machine."""
+    timed = [c for c in cases if c["answer"].get("seconds") is not None]
+    rows = max((c["rows"] for c in timed), default=0)
+    found: Block = {"rows": rows, "machines": {}}
+    for machine in sorted({c["machine"] for c in timed}):
+        took = sorted(c["answer"]["seconds"] for c in timed if (c["machine"], c["rows"]) == (machine, rows))
+        if took:
+            median, ninth = (float(np.quantile(took, q)) for q in (0.5, 0.9))
+            within = share(s < 1 for s in took)
+            found["machines"][machine] = {
+                "median": median,
+                "ninth_decile": ninth,
+                "most": took[-1],
+                "below_1_s": within,
+            }
     return found
 
 

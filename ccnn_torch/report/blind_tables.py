@@ -32,7 +32,7 @@ def blind_tables(found: Mapping[str, Any]) -> list[Table]:
     for key, (column, title) in _GROUPS.items():
         rows = tuple((of, *(_cell(kinds.get(kind)) for kind in _KINDS)) for of, kinds in found[key].items())
         tables.append(Table(title, (column, *_KINDS), rows))
-    return [*tables, _causes(found), _confusion(found), _reliability(found), _withheld(found)]
+    return [*tables, _causes(found), _confusion(found), _reliability(found), _withheld(found), _seconds(found)]
 
 
 def blind_markdown(found: Mapping[str, Any]) -> str:
@@ -106,6 +106,15 @@ def _withheld(found: Mapping[str, Any]) -> Table:
     wrong = found["definitions"]["wrong_name"]
     note = f"Right: outside and by its driver, or names that explain as much. Wrong name: {wrong}."
     return Table("Library without the effect that was there", ("withheld", "right", "wrong name"), rows, note)
+
+
+def _seconds(found: Mapping[str, Any]) -> Table:
+    rows = tuple(
+        (machine, *(number_text(took[k], 3) for k in ("median", "ninth_decile", "most")), _cell(took["below_1_s"]))
+        for machine, took in found["seconds_by_machine"]["machines"].items()
+    )
+    title = f"Seconds of a diagnosis of {count_text(found['seconds_by_machine']['rows'], 'row')}"
+    return Table(title, ("machine", "median", "nine in ten below", "most", "share below a second"), rows)
 
 
 def _sentences(found: Mapping[str, Any]) -> list[str]:

@@ -15,7 +15,7 @@ from blind.test_blind_machines import planned
 
 from ccnn_torch.cli import main
 from ccnn_torch.errors import InputError
-from ccnn_torch.report.blind import share
+from ccnn_torch.report.blind import share, summary
 from ccnn_torch.report.blind_tables import blind_markdown
 from ccnn_torch.report.json_files import load_schema, read_json, write_json
 from ccnn_torch.runs.blind.check import _generator, run_blind_check
@@ -67,6 +67,21 @@ def test_who_knows_the_truth_is_right_and_who_does_not_is_not(tmp_path: Path) ->
         rows = list(csv.DictReader(file))
     assert {"all", "by_machine", "by_cause", "withheld", "reliability"} <= {row["group"] for row in rows}
     assert "| single, right |" in (tmp_path / "b" / "blind.md").read_text() == blind_markdown(known)
+
+
+def test_seconds_are_those_of_the_longest_records() -> None:
+    took = [("tripod", 400, 0.5), ("tripod", 400, 0.7), ("tripod", 400, 1.5), ("tripod", 40, 9.0), ("delta", 100, 9.0)]
+    said = {"effects": [], "outside": False}
+    keys = {"kind": "none", "causes": [], "class": [], "strength": 3.0, "disturbance": "", "noise_told": True}
+    cases = [
+        {**keys, "withheld": None, "machine": machine, "rows": rows, "answer": {**said, "seconds": seconds}}
+        for machine, rows, seconds in took
+    ]
+    found = summary(cases)["seconds_by_machine"]
+    assert found["rows"] == 400 and [*found["machines"]] == ["tripod"]
+    tripod = found["machines"]["tripod"]
+    assert (tripod["median"], tripod["most"]) == (0.7, 1.5) and tripod["ninth_decile"] == pytest.approx(1.34)
+    assert (tripod["below_1_s"]["count"], tripod["below_1_s"]["of"]) == (2, 3)
 
 
 @pytest.mark.usefixtures("beside")
