@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 
 import torch
 from torch import Tensor
@@ -12,19 +12,23 @@ from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._dictionary import Dictionary, Found
 from ccnn_torch.diagnosis._whitening import Whitening
 
-__all__ = ["known_shapes", "settled"]
+__all__ = ["FORM", "joined", "known_shapes", "settled"]
 
-# Another look is spared where the noise of the channels changed among each other by less than this (logarithm), the fit
-# by such a share of the noise's square, and no more of the rows are set aside or taken back.
-_SAME_NOISE, _SAME_FIT, _SAME_ROWS = 0.2, 0.01, 0.01
+FORM = 0.004
+"""Share of the gap's energy that goes with a member of a set and not without it, below which a library effect beside
+others is how their form differs from the textbook."""
+
+# A fit is settled where the noise of the channels changed among each other by less than this (logarithm), and what it
+# leaves by such a share of the noise's square.
+_SAME_NOISE, _SAME_FIT = 0.2, 0.01
 # An effect is out of play where the sets that it takes part in are so far behind the best (log odds), and by such a
 # share of what the best explains: shapes found beside something else may be that much worse.
 _BEHIND, _SHARE = 20.0, 0.05
 
 
 def settled(dictionary: Dictionary, y: Tensor, best: Found, old: Whitening, new: Whitening, left: Tensor) -> bool:
-    """Whether to look again would change little: next to no other rows are set aside, the channels' noise is in the
-    same proportion, and what the best set leaves of every row by the machine itself is what the linear model says.
+    """Whether the channels' noise is in the same proportion as before, and what the best set leaves of every row by the
+    machine itself is what the linear model says.
 
     Args:
         dictionary: candidates.
@@ -34,8 +38,7 @@ def settled(dictionary: Dictionary, y: Tensor, best: Found, old: Whitening, new:
         left: what the set leaves by the machine itself, `s x c0` [m, rad].
     """
     change = (new.sigma / old.sigma).log()
-    rows = int(((new.weight > 0) != (old.weight > 0)).sum())
-    if rows > _SAME_ROWS * len(new.weight) or float((change - change.mean()).abs().max()) > _SAME_NOISE:
+    if float((change - change.mean()).abs().max()) > _SAME_NOISE:
         return False
     linear = y
     for i, mean in zip(best.members, best.mean, strict=True):
@@ -43,31 +46,50 @@ def settled(dictionary: Dictionary, y: Tensor, best: Found, old: Whitening, new:
     return float((old(torch.nan_to_num(left))[old.keep()] - linear).square().mean()) < _SAME_FIT
 
 
-def known_shapes(dictionary: Dictionary, found: Sequence[Found], best: Found, same: bool) -> dict[str, list[Atom]]:
+def joined(dictionary: Dictionary, found: Sequence[Found], best: Found, before: Set[str], floor: float) -> bool:
+    """Whether effects joined the set since the last look that do more than mend the form of the others.
+
+    Those that fell away do not matter: shapes found beside more than there is are as good, where what was too much
+    explains nothing any more.
+
+    Args:
+        dictionary: candidates.
+        found: sets that were tried.
+        best: the set.
+        before: names of the effects that acted in the last look.
+        floor: mean square of the noise.
+    """
+    old = tuple(i for i in best.members if dictionary.atoms[i].name in before)
+    without = best if old == best.members else next((f for f in found if f.members == old), None)
+    gap = float(dictionary.grams.yy) - floor * dictionary.grams.values
+    return without is None or without.rss - best.rss > FORM * gap
+
+
+def known_shapes(
+    dictionary: Dictionary, found: Sequence[Found], best: Found, sought: Set[str] | None
+) -> dict[str, list[Atom]]:
     """Effects whose shapes are not looked for again, by name, with the atoms whose shapes they keep: those out of play
-    with the most probable one; and, where the same effects act as before, those in play with all that they have.
+    with the most probable one, those in play with all that they have.
 
     Args:
         dictionary: candidates.
         found: sets that were tried, most probable first.
-        best: the most probable one of the library; shapes of what acts in it are looked for.
-        same: whether its effects are those beside which the shapes were found.
+        best: the most probable one of the library, whose effects are in play.
+        sought: names whose shapes are looked for again; None = of all that are in play.
     """
     atoms, tried = dictionary.atoms, {f.members: f.log_posterior for f in found}
-    acting = {atoms[i].name for i in best.members}
     least = best.log_posterior - _BEHIND - _SHARE * max(best.log_posterior - tried[()], 0.0)
     likeliest: dict[str, Atom] = {}
-    in_play: set[str] = set()
+    in_play = {atoms[i].name for i in best.members}
     for one in found:
         for k, atom in enumerate(atoms[i] for i in one.members):
-            if atom.effect is None or not atom.shape.numel() or atom.name in acting:
+            if atom.effect is None or not atom.shape.numel():
                 continue
             likeliest.setdefault(atom.name, atom)
             # Beside a set that is as probable without it an effect takes no part.
             without = tried.get(one.members[:k] + one.members[k + 1 :], math.inf)
             if one.log_posterior > max(least, without):
                 in_play.add(atom.name)
-    known = {name: [atom] for name, atom in likeliest.items() if name not in in_play}
-    if same:
-        known |= {name: [a for a in atoms if a.name == name and a.effect is not None] for name in in_play}
-    return known
+    every = {name: [a for a in atoms if a.effect is atom.effect] for name, atom in likeliest.items()}
+    known = {name: every[name] if name in in_play else [atom] for name, atom in likeliest.items()}
+    return {name: shapes for name, shapes in known.items() if name not in (in_play if sought is None else sought)}

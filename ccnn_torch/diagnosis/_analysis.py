@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._again import known_shapes, settled
+from ccnn_torch.diagnosis._again import joined, known_shapes, settled
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._candidates import cleaned, first_candidates, plain_atom, renewed_candidates
 from ccnn_torch.diagnosis._catch_all import catch_alls
@@ -124,10 +124,15 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         white, left = _renewed(result, noise, rows.usable), remainder(situation, measured, acting)
         known: Mapping[str, Sequence[Atom]] = {}
         if before is not None:
-            # Shapes found beside more than there is are as good, where what was too much explains nothing any more.
-            if act <= before and settled(result.dictionary, result.y, best, result.whitening, white, left):
-                break
-            known = known_shapes(result.dictionary, result.found, best, act == before)
+            old, sought = result.whitening, act if act == before else None
+            if not joined(result.dictionary, result.found, best, before, result.floor) and settled(
+                result.dictionary, result.y, best, old, white, left
+            ):
+                if torch.equal(white.keep(), old.keep()):
+                    break
+                # Other rows are bad ones, and nothing else has changed.
+                sought = frozenset()
+            known = known_shapes(result.dictionary, result.found, best, sought)
         before = act
         result = _looked_again(rows, standing, result, acting, white, left, known)
     shown = {e.name for e in standing.effects}

@@ -116,7 +116,7 @@ def renewed_candidates(
         others = [a for a in acting if a.effect is not effect]
         start = next((a.shape for a in acting if a.effect is effect), None)
         shapes: list[Shaped] = []
-        if start is None and effect.name in known:
+        if effect.name in known:
             found = known[effect.name]
         else:
             # What acts beside an effect may be there to mend a wrong shape: the right one needs nothing beside it.

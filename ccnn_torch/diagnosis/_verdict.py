@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from ccnn_torch.diagnosis._again import FORM
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._catch_all import ANY
@@ -17,10 +18,9 @@ from ccnn_torch.effects import EXACT
 
 __all__ = ["Judgement", "gap_squares", "judge", "withdrawn"]
 
-# Share of the gap's energy that goes with a member of a set and not without it: below this a library effect is how the
-# form of the others differs from the textbook; so is a catch-all beside library effects, and so are library effects
-# beside a catch-all, which stands for whatever was not thought of. Exact effects leave no more than the second order.
-_FORM, _FORM_CATCH_ALL, _FORM_EXACT, _BESIDE_CATCH_ALL = 0.004, 0.002, 1e-4, 0.1
+# As `FORM`, of a catch-all beside library effects, and of library effects beside a catch-all, which stands for whatever
+# was not thought of. Exact effects leave no more than the second order.
+_FORM_CATCH_ALL, _FORM_EXACT, _BESIDE_CATCH_ALL = 0.002, 1e-4, 0.1
 # A library effect whose own part is more than this share of the gap is no form of other ones, however well these could
 # do without it.
 _CARRIES = 0.5
@@ -240,7 +240,7 @@ def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fo
         beside = min(_BESIDE_CATCH_ALL, wild / 2)
         limits = {}
         for i in found.members:
-            wide = _FORM_CATCH_ALL if atoms[i].catch_all else _FORM
+            wide = _FORM_CATCH_ALL if atoms[i].catch_all else FORM
             form = _FORM_EXACT if _exact(analysis, [m for m in found.members if m != i]) else wide
             limits[i] = form if atoms[i].catch_all else max(form, beside)
         alone = not any(atoms[i].catch_all for i in found.members)

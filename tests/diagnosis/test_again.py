@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._again import known_shapes, settled
+from ccnn_torch.diagnosis._again import joined, known_shapes, settled
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._dictionary import Dictionary, Found, dictionary_of, singles_of
 from ccnn_torch.diagnosis._sets import scored
@@ -30,43 +30,51 @@ def looked_at() -> tuple[Dictionary, Tensor, list[Found]]:
     near = x[..., :2] + 0.1 * x[..., 2:4]
     names = ["backlash", "backlash", "drift", "drift", "thermal", "thermal"]
     own = [x[..., 2:4], x[..., :2], x[..., 4:5], near, x[..., 5:6], x[..., 6:8]]
-    shape = y.new_ones(1)
-    atoms = [Atom(n, make_effect(n), k * shape, c, -2.0) for k, (n, c) in enumerate(zip(names, own, strict=True))]
+    shape, effects = y.new_ones(1), {name: make_effect(name) for name in names}
+    atoms = [Atom(n, effects[n], k * shape, c, -2.0) for k, (n, c) in enumerate(zip(names, own, strict=True))]
     dictionary = dictionary_of(atoms, own, y, [], singles_of(atoms, own, y, 0.0), 0.0)
     pairs = [(i, j) for i, j in combinations(range(len(names)), 2) if names[i] != names[j]]
     found = scored(dictionary, [(), *((i,) for i in range(len(names))), *pairs], {})
     return dictionary, y, sorted(found, key=lambda f: -f.log_posterior)
 
 
-@pytest.mark.parametrize("same", [False, True])
-def test_shapes_of_what_is_out_of_play_are_not_looked_for_again(same: bool) -> None:
+@pytest.mark.parametrize("sought", [None, frozenset({"backlash"}), frozenset()])
+def test_shapes_of_what_is_out_of_play_are_not_looked_for_again(sought: frozenset[str] | None) -> None:
     dictionary, _, found = looked_at()
     assert found[0].members == (1,)
-    known = known_shapes(dictionary, found, found[0], same)
+    known = known_shapes(dictionary, found, found[0], sought)
     shapes = {name: [float(a.shape) for a in atoms] for name, atoms in known.items()}
-    assert "backlash" not in shapes, "what acts is looked for whatever is known"
-    assert len(shapes["thermal"]) == 1, "it adds nothing beside what acts, and stays with one shape"
-    if same:
-        assert shapes["drift"] == [2.0, 3.0], "nearly as good, and looked for beside the same before"
-    else:
-        assert "drift" not in shapes, "nearly as good, and looked for beside something else before"
+    assert len(shapes.pop("thermal")) == 1, "it adds nothing beside what acts, and stays with one shape"
+    # Backlash acts, drift does it nearly as well: they keep all shapes, unless these are looked for.
+    kept = {"backlash": [0.0, 1.0], "drift": [2.0, 3.0]}
+    assert shapes == {name: kept[name] for name in kept if sought is not None and name not in sought}
 
 
-def test_another_look_is_spared_only_where_noise_rows_and_machine_are_as_the_linear_model_says() -> None:
+def test_only_names_that_do_something_have_joined_a_set() -> None:
+    dictionary, _, found = looked_at()
+    alone = found[0]
+    beside = next(f for f in found if f.members == (1, 4))
+
+    def anew(best: Found, *before: str) -> bool:
+        return joined(dictionary, found, best, frozenset(before), 1.0)
+
+    assert not anew(alone, "backlash")
+    assert not anew(alone, "backlash", "drift"), "that one fell away is nothing new"
+    assert not anew(beside, "backlash"), "thermal does nothing beside backlash"
+    assert anew(beside, "thermal"), "backlash does nearly all"
+    assert anew(alone, "drift")
+
+
+def test_a_fit_is_settled_where_noise_and_machine_are_as_the_linear_model_says() -> None:
     dictionary, y, found = looked_at()
     best = found[0]
     old = Whitening(torch.arange(CHANNELS), torch.full((CHANNELS,), 2e-5), torch.ones(ROWS), 0.0)
     linear = y - dictionary.columns[..., dictionary.groups[1]] @ best.mean[0]
     left = linear * old.sigma
 
-    def spared(new: Whitening = old, left: Tensor = left) -> bool:
+    def fits(new: Whitening = old, left: Tensor = left) -> bool:
         return settled(dictionary, y, best, old, new, left)
 
-    assert spared() and spared(replace(old, sigma=3 * old.sigma))
-    assert not spared(replace(old, sigma=old.sigma * torch.tensor([1.0, 2.0]))), "one channel is noisier than thought"
-    aside = old.weight.clone()
-    aside[:1] = 0
-    assert spared(replace(old, weight=aside))
-    aside[:5] = 0
-    assert not spared(replace(old, weight=aside)), "many rows are set aside"
-    assert not spared(left=left + 0.2 * old.sigma), "the machine itself does something else"
+    assert fits() and fits(replace(old, sigma=3 * old.sigma))
+    assert not fits(replace(old, sigma=old.sigma * torch.tensor([1.0, 2.0]))), "one channel is noisier than thought"
+    assert not fits(left=left + 0.2 * old.sigma), "the machine itself does something else"
