@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._dictionary import Dictionary, Found
+from ccnn_torch.diagnosis._sets import fewer
 from ccnn_torch.diagnosis._whitening import Whitening
 
 __all__ = ["FORM", "joined", "known_shapes", "settled"]
@@ -46,7 +47,7 @@ def settled(dictionary: Dictionary, y: Tensor, best: Found, old: Whitening, new:
     return float((old(torch.nan_to_num(left))[old.keep()] - linear).square().mean()) < _SAME_FIT
 
 
-def joined(dictionary: Dictionary, found: Sequence[Found], best: Found, before: Set[str], floor: float) -> bool:
+def joined(dictionary: Dictionary, found: Sequence[Found], best: Found, before: Set[str], gap: float) -> bool:
     """Whether effects joined the set since the last look that do more than mend the form of the others.
 
     Those that fell away do not matter: shapes found beside more than there is are as good, where what was too much
@@ -57,11 +58,12 @@ def joined(dictionary: Dictionary, found: Sequence[Found], best: Found, before: 
         found: sets that were tried.
         best: the set.
         before: names of the effects that acted in the last look.
-        floor: mean square of the noise.
+        gap: squares above the noise.
     """
     old = tuple(i for i in best.members if dictionary.atoms[i].name in before)
-    without = best if old == best.members else next((f for f in found if f.members == old), None)
-    gap = float(dictionary.grams.yy) - floor * dictionary.grams.values
+    if old == best.members:
+        return False
+    without = next((f for f in found if f.members == old), None)
     return without is None or without.rss - best.rss > FORM * gap
 
 
@@ -82,13 +84,13 @@ def known_shapes(
     likeliest: dict[str, Atom] = {}
     in_play = {atoms[i].name for i in best.members}
     for one in found:
-        for k, atom in enumerate(atoms[i] for i in one.members):
+        for i, others in zip(one.members, fewer(one.members), strict=True):
+            atom = atoms[i]
             if atom.effect is None or not atom.shape.numel():
                 continue
             likeliest.setdefault(atom.name, atom)
             # Beside a set that is as probable without it an effect takes no part.
-            without = tried.get(one.members[:k] + one.members[k + 1 :], math.inf)
-            if one.log_posterior > max(least, without):
+            if one.log_posterior > max(least, tried.get(others, math.inf)):
                 in_play.add(atom.name)
     every = {name: [a for a in atoms if a.effect is atom.effect] for name, atom in likeliest.items()}
     known = {name: every[name] if name in in_play else [atom] for name, atom in likeliest.items()}

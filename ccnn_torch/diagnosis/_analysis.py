@@ -66,6 +66,11 @@ class Analysis:
     floor: float
     idle: tuple[str, ...] = ()
 
+    @property
+    def gap(self) -> float:
+        """Squares above the noise, in the units of `y`."""
+        return max(float(self.dictionary.grams.yy) - self.floor * self.dictionary.grams.values, 1e-300)
+
     def acting(self, found: Found) -> list[Acting]:
         """The effects of a set with their most probable numbers; catch-alls are left out."""
         out = []
@@ -125,7 +130,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         known: Mapping[str, Sequence[Atom]] = {}
         if before is not None:
             old, sought = result.whitening, act if act == before else None
-            if not joined(result.dictionary, result.found, best, before, result.floor) and settled(
+            if not joined(result.dictionary, result.found, best, before, result.gap) and settled(
                 result.dictionary, result.y, best, old, white, left
             ):
                 if torch.equal(white.keep(), old.keep()):

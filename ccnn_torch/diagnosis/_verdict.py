@@ -16,7 +16,7 @@ from ccnn_torch.diagnosis._dictionary import Found
 from ccnn_torch.diagnosis._sets import fewer, scored
 from ccnn_torch.effects import EXACT
 
-__all__ = ["Judgement", "gap_squares", "judge", "withdrawn"]
+__all__ = ["Judgement", "judge", "withdrawn"]
 
 # As `FORM`, of a catch-all beside library effects, and of library effects beside a catch-all, which stands for whatever
 # was not thought of. Exact effects leave no more than the second order.
@@ -182,7 +182,7 @@ def _could_be_another(analysis: Analysis, found: Found) -> bool:
     names = {atoms[i].name for i in found.members}
     own = torch.cat([groups[_whole(analysis, i)] for i in found.members])
     inverse = torch.linalg.pinv(grams.xx[own][:, own], rtol=1e-9, hermitian=True)
-    gap = gap_squares(analysis)
+    gap = analysis.gap
     for i, atom in enumerate(atoms):
         if atom.catch_all or atom.name in names:
             continue
@@ -208,14 +208,9 @@ def _net(
     analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]
 ) -> dict[int, tuple[float, tuple[int, ...]]]:
     """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
-    gap = gap_squares(analysis)
+    gap = analysis.gap
     without = _fits(analysis, fewer(found.members), tried)
     return {i: ((f.rss - found.rss) / gap, f.members) for i, f in zip(found.members, without, strict=True)}
-
-
-def gap_squares(analysis: Analysis) -> float:
-    """Squares above the noise."""
-    return max(float(analysis.dictionary.grams.yy) - analysis.floor * analysis.dictionary.grams.values, 1e-300)
 
 
 def _fits(analysis: Analysis, sets: Sequence[tuple[int, ...]], tried: dict[tuple[int, ...], Found]) -> list[Found]:
@@ -244,7 +239,7 @@ def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fo
             form = _FORM_EXACT if _exact(analysis, [m for m in found.members if m != i]) else wide
             limits[i] = form if atoms[i].catch_all else max(form, beside)
         alone = not any(atoms[i].catch_all for i in found.members)
-        large = _CARRIES * gap_squares(analysis)
+        large = _CARRIES * analysis.gap
         carries = {i for i, e in zip(found.members, found.energy, strict=True) if alone and e > large}
         # What leaves more than the noise when it goes is missed, however small it is.
         missed = _unexplained(analysis, found)

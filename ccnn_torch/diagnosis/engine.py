@@ -17,7 +17,7 @@ from ccnn_torch.diagnosis._missing import missing_covariates
 from ccnn_torch.diagnosis._next import next_measurements
 from ccnn_torch.diagnosis._report import Blocks, blocks, in_order
 from ccnn_torch.diagnosis._rows import picked
-from ccnn_torch.diagnosis._verdict import Judgement, gap_squares, judge, withdrawn
+from ccnn_torch.diagnosis._verdict import Judgement, judge, withdrawn
 from ccnn_torch.diagnosis._where import where
 from ccnn_torch.diagnosis.from_file import not_held_notes
 from ccnn_torch.diagnosis.result import Diagnosis
@@ -175,7 +175,7 @@ def _notes(
     beside = [atoms[i] for i in judgement.fullest.members if i not in judgement.found.members]
     mends = [a.name for a in beside if not a.catch_all]
     if judgement.names and mends:
-        share = (judgement.found.rss - judgement.fullest.rss) / gap_squares(analysis)
+        share = (judgement.found.rss - judgement.fullest.rss) / analysis.gap
         notes.append(
             f"the numbers of {' and '.join(judgement.names)} are told beside {' and '.join(mends)}, which would take "
             f"{100 * share:.2g} % of the gap more, too little to be told from another form of what is named"

@@ -54,11 +54,13 @@ def test_only_names_that_do_something_have_joined_a_set() -> None:
     dictionary, _, found = looked_at()
     alone = found[0]
     beside = next(f for f in found if f.members == (1, 4))
+    gap = float(dictionary.grams.yy) - ROWS * CHANNELS
 
     def anew(best: Found, *before: str) -> bool:
-        return joined(dictionary, found, best, frozenset(before), 1.0)
+        return joined(dictionary, found, best, frozenset(before), gap)
 
     assert not anew(alone, "backlash")
+    assert not joined(dictionary, found, alone, frozenset({"backlash"}), 0.0), "nothing joined, in no gap either"
     assert not anew(alone, "backlash", "drift"), "that one fell away is nothing new"
     assert not anew(beside, "backlash"), "thermal does nothing beside backlash"
     assert anew(beside, "thermal"), "backlash does nearly all"
