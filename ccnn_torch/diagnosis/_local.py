@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._catch_all import LOG_PRIOR, joint_moves, platform_moves, spread_out, unit_range
-from ccnn_torch.diagnosis._remainder import Remainder, Tried, search_charge
+from ccnn_torch.diagnosis._remainder import Lead, Remainder, Tried, search_charge
 from ccnn_torch.diagnosis._sway import sway
 from ccnn_torch.diagnosis._whitening import Whitening
 from ccnn_torch.effects import Situation
@@ -120,10 +120,12 @@ def _searched(points: Tensor, places: Tensor, lead: Tensor, left: Remainder, tim
         times: how many rows there are for each of these.
     """
 
+    led_by = Lead(lead)
+
     def gain(tried: Tensor) -> Tensor:
         bumps = _bumps(points, tried)
         touched = bumps.sum(-2)
-        score = left.gain(Tried(bumps.mT[..., None, None], lead))
+        score = left.gain(Tried(bumps.mT[..., None, None], led_by))
         return torch.where((touched > _TOUCHED) & (touched < points.shape[-2] / 2), score, -torch.inf)
 
     score = gain(places.expand(len(points), -1, -1))

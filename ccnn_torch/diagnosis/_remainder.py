@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -11,7 +13,7 @@ from torch import Tensor, unflatten
 
 from ccnn_torch.diagnosis._alone import Own, fit_alone
 
-__all__ = ["Remainder", "Tried", "search_charge"]
+__all__ = ["Lead", "Remainder", "Tried", "search_charge"]
 
 _DIGITS = 1e-13
 
@@ -21,39 +23,74 @@ def search_charge(gain: Tensor) -> float:
     return math.log(len(gain)) - float(torch.logsumexp((gain - gain.max()) / 2, 0))
 
 
-class Tried(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Lead:
+    """Columns that many candidates share, whitened, `... x s x c x k`: one object for all that have them, so that what
+    is worked out for the first serves the others."""
+
+    columns: Tensor
+
+    @cached_property
+    def among(self) -> Tensor:
+        """Their products with each other, summed over the channels, `... x k x k x s`."""
+        return (self.columns.mT @ self.columns).movedim(-3, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
     """Columns of `g` candidates, whitened.
 
     Attributes:
         factors: the columns, `... x g x s x c x m`; or, where there is a lead, what it is multiplied by: each of its
             columns by its own, `... x g x s x k x f`, or all by the same, `... x g x s x 1 x f`.
-        lead: columns that all candidates share, `... x s x c x k`, or None.
+        lead: columns that all candidates share, or None.
     """
 
     factors: Tensor
-    lead: Tensor | None = None
+    lead: Lead | None = None
 
     @property
     def width(self) -> int:
         """How many columns a candidate has."""
-        return self.factors.shape[-1] * (1 if self.lead is None else self.lead.shape[-1])
+        return self.factors.shape[-1] * (1 if self.lead is None else self.lead.columns.shape[-1])
 
-    def some(self, which: slice | Tensor) -> Tried:
-        """Some of the candidates; no leading dimensions."""
-        return Tried(self.factors[which], self.lead)
+    def first(self, count: int) -> Tried:
+        """The first of the candidates; no leading dimensions."""
+        return Tried(self.factors[:count], self.lead)
 
     def one(self, number: int) -> Tensor:
         """Columns of one candidate, `s x c x m`; no leading dimensions."""
         mine = self.factors[number]
-        return mine if self.lead is None else (self.lead[..., None] * mine[:, None]).flatten(-2)
+        return mine if self.lead is None else (self.lead.columns[..., None] * mine[:, None]).flatten(-2)
+
+    @cached_property
+    def inner(self) -> Tensor:
+        """Products of each candidate's columns with each other, `... x g x m x m`."""
+        if self.lead is None:
+            z = self.factors.flatten(-3, -2)
+            return z.mT @ z
+        factors, lead = self.factors, self.lead.columns
+        own, width, leads = *factors.shape[-2:], lead.shape[-1]
+        if own > 1:
+            # Thousands of tiny products take longer than a few large ones, and so do short runs that are multiplied.
+            z = (lead.repeat_interleave(width, -1).unsqueeze(-4) * factors.flatten(-2).unsqueeze(-2)).flatten(-3, -2)
+            return z.mT @ z
+        # By pairs of factors where these are few, else by candidates.
+        alike, among = factors[..., 0, :], self.lead.among
+        if width < leads:
+            pairs = (alike[..., None] * alike[..., None, :]).transpose(-4, -3).flatten(-3)
+            inner = unflatten(among.flatten(-3, -2) @ pairs, -1, (factors.shape[-4], width, width))
+            inner = unflatten(inner, -4, (leads, leads)).movedim(-3, -5).transpose(-3, -2)
+        else:
+            between = among[..., None, :, :, :, None] * alike[..., None, None, :, :]
+            inner = (alike.mT[..., None, None, :, :] @ between).transpose(-3, -2)
+        return inner.flatten(-4, -3).flatten(-2)
 
 
 class _Led(NamedTuple):
-    """Sums over the channels of what a lead `... x s x c x k` is multiplied with: itself, `... x k x k x s`; what is
-    taken, `... x k x P x s`; and what is left of y, `... x k x 1 x s`."""
+    """Sums over the channels of what a lead `... x s x c x k` is multiplied with: what is taken, `... x k x P x s`, and
+    what is left of y, `... x k x 1 x s`."""
 
-    lead: Tensor
-    among: Tensor
     taken: Tensor
     along: Tensor
 
@@ -66,7 +103,7 @@ class Remainder:
         self.y = self._whole = y.reshape(-1)
         self._rows = y.shape
         self._taken = y.new_zeros(0, y.numel())
-        self._last: _Led | None = None
+        self._leds: dict[Lead, _Led] = {}
         self._take(nuisance)
 
     def beside(self, more: Tensor) -> Remainder:
@@ -74,7 +111,7 @@ class Remainder:
         if not more.shape[-1]:
             return self
         other = copy(self)
-        other._last = None
+        other._leds = {}
         other._take(more)
         return other
 
@@ -102,58 +139,39 @@ class Remainder:
         gain: Tensor = (b * solved).sum(-1)
         return gain
 
-    def log_evidence(self, tried: Tried) -> Tensor:
-        """Of each candidate, with one scale of its coefficients about their plausible sizes, `g`; no leading
+    def log_evidence(self, tried: Tried, which: Tensor) -> Tensor:
+        """Of some candidates, with one scale of the coefficients of each about their plausible sizes; no leading
         dimensions."""
-        inner, b = self._beside(tried)
+        inner, b = self._beside(tried, which)
         groups = [Own(xx, xy) for xx, xy in zip(inner, b, strict=True)]
         return fit_alone(groups, self._whole @ self.y, float(len(self.y)), 0.0).log_evidence
 
-    def _beside(self, tried: Tried) -> tuple[Tensor, Tensor]:
+    def _beside(self, tried: Tried, which: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Of the columns, the nuisance taken out of them, among themselves and with y: `... x g x m x m`,
-        `... x g x m`."""
-        inner, cross, b = (
-            self._products(tried.factors) if tried.lead is None else self._led_products(tried.lead, tried.factors)
-        )
+        `... x g x m`; which: of the candidates, None = all."""
+        inner, factors = (v if which is None else v[which] for v in (tried.inner, tried.factors))
+        cross, b = self._crossed(factors) if tried.lead is None else self._led_across(tried.lead, factors)
         return inner - cross.mT @ cross, b
 
-    def _products(self, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Of columns `... x g x s x c x m` among themselves, with what is taken, and with y: `... x g x m x m`,
-        `... x g x P x m`, `... x g x m`."""
+    def _crossed(self, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """Of columns `... x g x s x c x m` with what is taken, and with y: `... x g x P x m`, `... x g x m`."""
         z = columns.flatten(-3, -2)
         flat = z.transpose(-3, -2).flatten(-2)
         cross = unflatten(self._taken @ flat, -1, (z.shape[-3], z.shape[-1])).transpose(-3, -2)
-        return z.mT @ z, cross, (z.mT @ self.y[..., None, :, None])[..., 0]
+        return cross, (z.mT @ self.y[..., None, :, None])[..., 0]
 
-    def _led(self, lead: Tensor) -> _Led:
-        """Of a lead `... x s x c x k`, which is mostly the one that was asked for last."""
-        if self._last is None or self._last.lead is not lead:
-            taken = unflatten(self._taken, -1, self._rows).transpose(-3, -2) @ lead
-            along = lead.mT @ unflatten(self.y, -1, self._rows)[..., None]
-            among = (lead.mT @ lead).movedim(-3, -1)
-            self._last = _Led(lead, among, taken.movedim(-1, -3).mT.contiguous(), along.movedim(-3, -1))
-        return self._last
+    def _led(self, lead: Lead) -> _Led:
+        if lead not in self._leds:
+            columns = lead.columns
+            taken = unflatten(self._taken, -1, self._rows).transpose(-3, -2) @ columns
+            along = columns.mT @ unflatten(self.y, -1, self._rows)[..., None]
+            self._leds[lead] = _Led(taken.movedim(-1, -3).mT.contiguous(), along.movedim(-3, -1))
+        return self._leds[lead]
 
-    def _led_products(self, lead: Tensor, factors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As `_products`: summed over the channels once, and not for every candidate."""
+    def _led_across(self, lead: Lead, factors: Tensor) -> tuple[Tensor, Tensor]:
+        """As `_crossed`: summed over the channels once, and not for every candidate."""
         led = self._led(lead)
         count, _, own, width = factors.shape[-4:]
-        leads = lead.shape[-1]
-        if own > 1:
-            # Thousands of tiny products take longer than a few large ones, and so do short runs that are multiplied.
-            z = (lead.repeat_interleave(width, -1).unsqueeze(-4) * factors.flatten(-2).unsqueeze(-2)).flatten(-3, -2)
-            inner = z.mT @ z
-        else:
-            # By pairs of factors where these are few, else by candidates.
-            alike = factors[..., 0, :]
-            if width < leads:
-                pairs = (alike[..., None] * alike[..., None, :]).transpose(-4, -3).flatten(-3)
-                inner = unflatten(led.among.flatten(-3, -2) @ pairs, -1, (count, width, width))
-                inner = unflatten(inner, -4, (leads, leads)).movedim(-3, -5).transpose(-3, -2)
-            else:
-                between = led.among[..., None, :, :, :, None] * alike[..., None, None, :, :]
-                inner = (alike.mT[..., None, None, :, :] @ between).transpose(-3, -2)
-            inner = inner.flatten(-4, -3).flatten(-2)
         flat = factors.movedim(-4, -2).transpose(-4, -3).flatten(-2)
         if own > 1:
             taken, along = led.taken @ flat, led.along @ flat
@@ -165,4 +183,4 @@ class Remainder:
             )
         cross = unflatten(taken, -1, (count, width)).movedim(-2, -4).transpose(-3, -2).flatten(-2)
         b = unflatten(along[..., 0, :], -1, (count, width)).transpose(-3, -2).flatten(-2)
-        return inner, cross, b
+        return cross, b

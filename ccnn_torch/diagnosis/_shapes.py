@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import default_shape, scales
-from ccnn_torch.diagnosis._remainder import Remainder, Tried, search_charge
+from ccnn_torch.diagnosis._remainder import Lead, Remainder, Tried, search_charge
 from ccnn_torch.diagnosis._whitening import Whitening
 from ccnn_torch.effects import Effect, Shape, Situation
 
@@ -64,11 +64,11 @@ class _Part(NamedTuple):
 
 
 class _Turn(NamedTuple):
-    """Candidates `g x h`, the columns of each part there, and how many of them a part looks at: 0 = none this time."""
+    """Candidates `g x h`, the columns of each part there, and those that a part looks at: None = none this time."""
 
     candidates: Tensor
     columns: list[Tried]
-    sizes: list[int]
+    tried: list[Tried | None]
 
 
 class Ground:
@@ -117,6 +117,7 @@ class Scan:
         free = [c for c in range(len(coefficients)) if not any(c in p.columns for p in self.parts)]
         self.unshaped = self._whitened(first[:1], free, None)[0]
         self.coarse: list[_Turn] | None = None
+        self.leads: dict[tuple[int, ...], Lead] = {}
 
     def columns(self, candidates: Tensor, rows: Tensor | None) -> list[Tried]:
         """Of each part, whitened, in plausible sizes; candidates: `g x h`; rows: which, None = all."""
@@ -124,9 +125,8 @@ class Scan:
             moved = self.effect.one_by_one(self.situation, candidates, rows)
             return [self._by_movers(_of_run(moved, p.columns), p.columns, rows) for p in self.parts]
         if self.fixed is not None and isinstance(self.effect, _Factored):
-            factors = _of(self.effect.column_factors(self.situation, candidates), rows, 1)
-            columns = _of(self.fixed, rows, 0) * factors.unsqueeze(-2)
-            return [Tried(_of_run(columns, p.columns)) for p in self.parts]
+            factors = _of(self.effect.column_factors(self.situation, candidates), rows, 1)[..., None]
+            return [Tried(factors[:, :, p.columns], self._lead(self.fixed, p.columns, rows)) for p in self.parts]
         basis = _of(self.effect.basis(self.situation, candidates), rows, 1)
         if self.movers is None:
             return [Tried(self._whitened(basis, part.columns, rows)) for part in self.parts]
@@ -136,11 +136,19 @@ class Scan:
         """moved: change of the joint or parameter that each of the columns moves, in the rows, `g x s x m`."""
         assert self.lead is not None and self.movers is not None
         one = (moved * self.size[columns]).nan_to_num_()
-        lead, movers = _of(self.lead, rows, 0), self.movers[columns]
+        movers = self.movers[columns]
         which, each = torch.unique_consecutive(movers, return_counts=True)
         if len(columns) and bool((each == each[0]).all()):
-            return Tried(one.reshape(*one.shape[:-1], len(which), -1), lead[..., which])
-        return Tried(lead[..., movers] * one[..., None, :])
+            return Tried(one.reshape(*one.shape[:-1], len(which), -1), self._lead(self.lead, which.tolist(), rows))
+        return Tried(_of(self.lead, rows, 0)[..., movers] * one[..., None, :])
+
+    def _lead(self, columns: Tensor, which: Sequence[int], rows: Tensor | None) -> Lead:
+        """Some of the columns in the rows looked at, which are the same all along: one object, however often it is
+        asked for."""
+        key = tuple(which)
+        if key not in self.leads:
+            self.leads[key] = Lead(_of(columns, rows, 0)[..., list(which)])
+        return self.leads[key]
 
     def _whitened(self, basis: Tensor, columns: list[int], rows: Tensor | None) -> Tensor:
         """basis: in the rows, `g x s x ... x m`; `g x s x c x m`."""
@@ -165,20 +173,19 @@ class Scan:
         for level in range(ground.rounds + 1):
             if level == 1 and not self._promising(gains, charges):
                 break
-            for candidates, pieces, sizes in self._level(value, level, ground.rows):
+            for candidates, pieces, looked_at in self._level(value, level, ground.rows):
                 chosen = [self._nearest(candidates, value, part) for part in self.parts]
                 spent = [0.0] * len(self.parts)
                 # Beside each other: over the grid once each by itself before, and then about what that has found.
                 both = start is not None and len(self.parts) > 1
                 for sweep in ((0, 1) if level == 0 else (1,)) if both else (0,):
-                    for i, piece in enumerate(pieces):
-                        if not sizes[i]:
+                    for i, tried in enumerate(looked_at):
+                        if tried is None:
                             continue
                         own = [_LOOSE * p.one(chosen[j]) for j, p in enumerate(pieces) if sweep and j != i]
                         left = plain.beside(torch.cat(own, -1)) if own else plain
                         # What chance explains does not grow with the rows.
-                        tried = piece.some(slice(sizes[i]))
-                        score = times * (left.gain(tried) - piece.width) + piece.width
+                        score = times * (left.gain(tried) - tried.width) + tried.width
                         chosen[i] = _likeliest(left, tried, score) if level == 0 else int(score.argmax())
                         gains[i] = float(score[chosen[i]])
                         spent[i] = search_charge(score) if level == 0 else 0.0
@@ -209,8 +216,9 @@ class Scan:
                 if table.shape[-1]:
                     candidates[: len(table), part.shapes] = table
                     candidates[len(table) :, part.shapes] = table[-1]
-            sizes = [len(table) if table.shape[-1] else 0 for table in mine]
-            found.append(_Turn(candidates, self.columns(candidates, rows), sizes))
+            columns = self.columns(candidates, rows)
+            tried = [c.first(len(t)) if t.shape[-1] else None for c, t in zip(columns, mine, strict=True)]
+            found.append(_Turn(candidates, columns, tried))
         if level == 0:
             self.coarse = found
         return found
@@ -267,7 +275,7 @@ def _likeliest(left: Remainder, tried: Tried, score: Tensor) -> int:
     if len(near) < 2 or float(score[best]) < _THERE:
         return best
     near = near[score[near].argsort(descending=True)[:_FEW]]
-    return int(near[left.log_evidence(tried.some(near)).argmax()])
+    return int(near[left.log_evidence(tried, near).argmax()])
 
 
 def _movers(basis: Tensor) -> Tensor | None:

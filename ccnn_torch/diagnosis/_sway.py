@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._catch_all import LOG_PRIOR
-from ccnn_torch.diagnosis._remainder import Remainder, Tried, search_charge
+from ccnn_torch.diagnosis._remainder import Lead, Remainder, Tried, search_charge
 
 __all__ = ["sway"]
 
@@ -37,7 +37,7 @@ def sway(time: Tensor, raw: Tensor, lead: Tensor, few: Tensor, left: Remainder) 
     if span <= 0 or fastest < _SLOWEST + 1:
         return []
     share = (time - time.min()) / span
-    looked_at = lead[few]
+    looked_at = Lead(lead[few])
 
     def gain(periods: Tensor) -> Tensor:
         return left.gain(Tried(_waves(share[few], periods)[:, :, None], looked_at))

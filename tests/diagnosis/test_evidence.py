@@ -15,7 +15,7 @@ from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._dictionary import Dictionary, dictionary_of, singles_of
 from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
 from ccnn_torch.diagnosis._joined import side_by_side
-from ccnn_torch.diagnosis._remainder import Remainder, Tried
+from ccnn_torch.diagnosis._remainder import Lead, Remainder, Tried
 from ccnn_torch.diagnosis._sets import promising, scored
 from ccnn_torch.effects import make_effect
 
@@ -74,7 +74,7 @@ def test_columns_without_their_zeros_are_the_columns(name: str) -> None:
 def test_what_is_put_beside_in_parts_takes_what_it_takes_at_once() -> None:
     y, x = _columns(6, 60, 1).reshape(30, 2), 5 * _columns(7, 60, 9).reshape(30, 2, 9)
     at_once, in_parts = Remainder(y, x), Remainder(y, x[..., :4]).beside(x[..., 4:])
-    factors, lead = _columns(8, 30, 12).reshape(30, 4, 3).transpose(0, 1), _columns(9, 60, 2).reshape(30, 2, 2)
+    factors, lead = _columns(8, 30, 12).reshape(30, 4, 3).transpose(0, 1), Lead(_columns(9, 60, 2).reshape(30, 2, 2))
     led, each = Tried(factors[..., None, :], lead), Tried(factors[..., :2, None], lead)
     plain, apart = (Tried(torch.stack([t.one(k) for k in range(4)])) for t in (led, each))
     wanted = at_once.gain(plain)
@@ -98,9 +98,9 @@ def test_several_remainders_at_once_are_as_one_by_one(own: bool, width: int) -> 
     more, lead = _columns(22, 180, 2).reshape(3, 30, 2, 2), _columns(23, 180, 3).reshape(3, 30, 2, 3)
     factors = _columns(24, 3 * 5 * 30 * 3, width).reshape(3, 5, 30, 3, width)[..., : 3 if own else 1, :]
     left = Remainder(y, x)
-    together = left.beside(more).gain(Tried(factors, lead))
+    together = left.beside(more).gain(Tried(factors, Lead(lead)))
     for mine, m, f, k in zip(together, more, factors, lead, strict=True):
-        assert mine == pytest.approx(left.beside(m).gain(Tried(f, k)).numpy(), rel=1e-9)
+        assert mine == pytest.approx(left.beside(m).gain(Tried(f, Lead(k))).numpy(), rel=1e-9)
 
 
 def test_nearly_the_same_columns_far_above_the_noise_can_be_taken_out_twice() -> None:
