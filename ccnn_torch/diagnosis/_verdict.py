@@ -81,12 +81,8 @@ def judge(analysis: Analysis) -> Judgement:
     top = analysis.found[0].log_posterior
     tried = {f.members: f for f in analysis.found}
     near = [f for f in analysis.found if f.log_posterior > top - _FAR]
-    # What is asked for one by one below is fitted side by side first.
-    _fits(analysis, [s for f in near if len(f.members) > 1 for s in fewer(f.members)], tried)
-    for found in near:
-        essential = _essential(analysis, found, tried)
+    for found, essential in zip(near, _essential(analysis, near, tried), strict=True):
         groups.setdefault(_named(analysis, essential), []).extend([found, essential])
-        tried[essential.members] = essential
     weights = {key: math.exp(max(f.log_posterior for f in fs) - top) for key, fs in groups.items()}
     total = sum(weights.values())
     leading = sorted(((k[0], k[1], w / total, _plainest(groups[k])) for k, w in weights.items()), key=lambda x: -x[2])
@@ -169,7 +165,7 @@ def _best_without(analysis: Analysis, names: frozenset[str], tried: dict[tuple[i
     atoms = analysis.dictionary.atoms
     for found in analysis.found:
         if any(atoms[i].catch_all for i in found.members) and not names & {atoms[i].name for i in found.members}:
-            return _essential(analysis, found, tried)
+            return _essential(analysis, [found], tried)[0]
     return None
 
 
@@ -225,35 +221,49 @@ def _smallest(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fou
     return min(share for share, _ in _net(analysis, found, tried).values())
 
 
-def _essential(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]) -> Found:
-    """The set without members that only mend the form of the others."""
-    atoms = analysis.dictionary.atoms
-    while len(found.members) > 1:
-        shares = _net(analysis, found, tried)
-        # Library effects are a form of the catch-all beside them only where that carries much more than they do.
-        wild = max((share for i, (share, _) in shares.items() if atoms[i].catch_all), default=0.0)
-        beside = min(_BESIDE_CATCH_ALL, wild / 2)
-        limits = {}
-        for i in found.members:
-            wide = _FORM_CATCH_ALL if atoms[i].catch_all else FORM
-            form = _FORM_EXACT if _exact(analysis, [m for m in found.members if m != i]) else wide
-            limits[i] = form if atoms[i].catch_all else max(form, beside)
-        alone = not any(atoms[i].catch_all for i in found.members)
-        large = _CARRIES * analysis.gap
-        carries = {i for i, e in zip(found.members, found.energy, strict=True) if alone and e > large}
-        # What leaves more than the noise when it goes is missed, however small it is.
-        missed = _unexplained(analysis, found)
-        idle = [
-            i
-            for i, (share, without) in shares.items()
-            if i not in carries and share < limits[i] and (missed or not _unexplained(analysis, tried[without]))
-        ]
-        if not idle:
-            break
-        # A catch-all can stand in for much of the library, so it is the first to go; else what is missed least.
-        least = max(idle, key=lambda i: (atoms[i].catch_all, tried[shares[i][1]].log_posterior))
-        found = tried[shares[least][1]]
+def _essential(analysis: Analysis, sets: Sequence[Found], tried: dict[tuple[int, ...], Found]) -> list[Found]:
+    """Each of the sets without members that only mend the form of the others."""
+    found = [*sets]
+    going = range(len(found))
+    while going:
+        # What is asked for one by one below is fitted side by side first.
+        _fits(analysis, [s for k in going if len(found[k].members) > 1 for s in fewer(found[k].members)], tried)
+        less = {k: _with_less(analysis, found[k], tried) for k in going}
+        going = [k for k in going if less[k].members != found[k].members]
+        for k in going:
+            found[k] = less[k]
     return found
+
+
+def _with_less(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Found]) -> Found:
+    """The set without the first of its members that only mend the form of the others; itself where there is none."""
+    atoms = analysis.dictionary.atoms
+    if len(found.members) < 2:
+        return found
+    shares = _net(analysis, found, tried)
+    # Library effects are a form of the catch-all beside them only where that carries much more than they do.
+    wild = max((share for i, (share, _) in shares.items() if atoms[i].catch_all), default=0.0)
+    beside = min(_BESIDE_CATCH_ALL, wild / 2)
+    limits = {}
+    for i in found.members:
+        wide = _FORM_CATCH_ALL if atoms[i].catch_all else FORM
+        form = _FORM_EXACT if _exact(analysis, [m for m in found.members if m != i]) else wide
+        limits[i] = form if atoms[i].catch_all else max(form, beside)
+    alone = not any(atoms[i].catch_all for i in found.members)
+    large = _CARRIES * analysis.gap
+    carries = {i for i, e in zip(found.members, found.energy, strict=True) if alone and e > large}
+    # What leaves more than the noise when it goes is missed, however small it is.
+    missed = _unexplained(analysis, found)
+    idle = [
+        i
+        for i, (share, without) in shares.items()
+        if i not in carries and share < limits[i] and (missed or not _unexplained(analysis, tried[without]))
+    ]
+    if not idle:
+        return found
+    # A catch-all can stand in for much of the library, so it is the first to go; else what is missed least.
+    least = max(idle, key=lambda i: (atoms[i].catch_all, tried[shares[i][1]].log_posterior))
+    return tried[shares[least][1]]
 
 
 def _plainest(found: list[Found]) -> Found:
