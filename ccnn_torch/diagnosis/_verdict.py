@@ -224,7 +224,7 @@ def _smallest(analysis: Analysis, found: Found, tried: dict[tuple[int, ...], Fou
 def _essential(analysis: Analysis, sets: Sequence[Found], tried: dict[tuple[int, ...], Found]) -> list[Found]:
     """Each of the sets without members that only mend the form of the others."""
     found = [*sets]
-    going = range(len(found))
+    going = list(range(len(found)))
     while going:
         # What is asked for one by one below is fitted side by side first.
         _fits(analysis, [s for k in going if len(found[k].members) > 1 for s in fewer(found[k].members)], tried)
