@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._scales import LIMIT, SPREAD, Scales
 
-__all__ = ["NOTHING", "Alone", "Own", "fit_alone", "fit_in_axes", "own_products"]
+__all__ = ["NOTHING", "Alone", "Axes", "Own", "axes_of", "fit_alone", "fit_in_axes", "own_products"]
 
 _UPDATES = 8
 # Principal axes with less than this share of the largest one's squares are rounding.
@@ -77,10 +77,11 @@ def fit_alone(groups: Sequence[Own], yy: Tensor, values: float, noise_dof: float
         noise_dof: weight of the prior of σ² about 1, in values; 0 = the noise is not known.
         spread: standard deviation of log α².
     """
-    square, along, axes = _in_axes(groups, yy)
+    axes = axes_of([g.xx for g in groups], yy)
+    along = axes.turned([g.xy for g in groups])
     there = torch.tensor([g.xy.numel() > 0 for g in groups])
-    fits = fit_in_axes(square, along, there, yy, values, noise_dof, spread)
-    return fits._replace(axes=axes)
+    fits = fit_in_axes(axes.square, along, there, yy, values, noise_dof, spread)
+    return fits._replace(axes=axes.each())
 
 
 def fit_in_axes(
@@ -114,18 +115,42 @@ def fit_in_axes(
     return Alone(evidence, noise, mean, (square * mean.square()).sum(-1), rss, gamma, psi[:, 0])
 
 
-def _in_axes(groups: Sequence[Own], yy: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Squares and products with y along each group's principal axes, `b x M`, padded with 0; and the axes, `m x m`."""
-    widths = [g.xy.numel() for g in groups]
-    square, along = yy.new_zeros(len(groups), max(widths, default=0)), yy.new_zeros(len(groups), max(widths, default=0))
-    axes = [yy.new_zeros(0, 0) for _ in groups]
+class Axes(NamedTuple):
+    """Principal axes of `b` groups of columns.
+
+    Attributes:
+        square: squares of the columns along them, `b x M`, 0 where that is rounding or there are no more.
+        alike: which groups are as wide as each other, and their axes, `k x m x m`.
+    """
+
+    square: Tensor
+    alike: Sequence[tuple[list[int], Tensor]]
+
+    def turned(self, products: Sequence[Tensor]) -> Tensor:
+        """Products of the columns with something, `m` each, along the axes, `b x M`, padded with 0."""
+        along = torch.zeros_like(self.square)
+        for mine, vectors in self.alike:
+            width = vectors.shape[-1]
+            along[mine, :width] = (vectors.mT @ torch.stack([products[k] for k in mine])[..., None])[..., 0]
+        return torch.where(self.square > 0, along, 0.0)
+
+    def each(self) -> list[Tensor]:
+        """The axes of every group, `m x m`."""
+        found = [self.square.new_zeros(0, 0) for _ in self.square]
+        for mine, vectors in self.alike:
+            for k, v in zip(mine, vectors, strict=True):
+                found[k] = v
+        return found
+
+
+def axes_of(products: Sequence[Tensor], like: Tensor) -> Axes:
+    """products: of each group's columns with each other, `m x m`; like: numbers of the type that is wanted."""
+    widths = [len(xx) for xx in products]
+    square = like.new_zeros(len(products), max(widths, default=0))
+    alike = []
     for width in sorted(set(widths) - {0}):
         mine = [k for k, w in enumerate(widths) if w == width]
-        values, vectors = torch.linalg.eigh(torch.stack([groups[k].xx for k in mine]))
-        products = (vectors.mT @ torch.stack([groups[k].xy for k in mine])[..., None])[..., 0]
-        real = values > _DIGITS * values[:, -1:]
-        square[mine, :width] = torch.where(real, values, 0.0)
-        along[mine, :width] = torch.where(real, products, 0.0)
-        for k, v in zip(mine, vectors, strict=True):
-            axes[k] = v
-    return square, along, axes
+        values, vectors = torch.linalg.eigh(torch.stack([products[k] for k in mine]))
+        square[mine, :width] = torch.where(values > _DIGITS * values[:, -1:], values, 0.0)
+        alike.append((mine, vectors))
+    return Axes(square, alike)

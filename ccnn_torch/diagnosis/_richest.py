@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._alone import NOTHING, Own, fit_alone, own_products
+from ccnn_torch.diagnosis._alone import NOTHING, Axes, Own, axes_of, fit_alone, fit_in_axes, own_products
 from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
 from ccnn_torch.diagnosis._whitening import NO_NOISE, Whitening, reweighted
 
@@ -19,6 +19,8 @@ __all__ = ["fitted_whitening"]
 _RICH, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
 # Candidates that are looked at with the rows' weights as they are, the most promising when all weigh alike.
 _NEXT = 4
+# Their principal axes are taken anew where the channels' noise has changed by more among each other (logarithm).
+_SAME_AXES = 0.2
 # Updates of a fit that begins where the one before it ended.
 _UPDATES = 4
 
@@ -64,8 +66,8 @@ def fitted_whitening(
         if not rest:
             break
         squares = white.scaled(left).square().sum()
-        rough = _added(every.products(white, left, rest), squares, y.numel())
-        likely = [rest[k] for k in rough.gain.argsort(descending=True)[:_NEXT].tolist()]
+        rough = every.roughly_added(white, left)[rest]
+        likely = [rest[k] for k in rough.argsort(descending=True)[:_NEXT].tolist()]
         products = [own_products(white.scaled(shown[k]), white.scaled(left), every.size[k]) for k in likely]
         added = _added(products, squares, y.numel())
         best = int(added.gain.argmax())
@@ -103,6 +105,8 @@ class _Everything:
     def __init__(self, columns: Sequence[Tensor], white: Whitening) -> None:
         self.columns = columns
         self._weight = white.weight
+        self._axes: Axes | None = None
+        self._share = white.sigma
         self._among = [self._by_channel(c, c) for c in columns]
         # Weights are 1 or 0 at first.
         count = white.weight.sum() * len(white.channels)
@@ -126,19 +130,23 @@ class _Everything:
             found.append([Own(xx, xy) for xx, xy in zip(square, along, strict=True)])
         return found
 
-    def products(self, white: Whitening, left: Tensor, which: Sequence[int]) -> list[Own]:
-        """Of some candidates with what a fit leaves, `s x c`, in units of the noise; and with themselves, as if all
-        rows weighed alike: near enough to tell which may be the best."""
+    def roughly_added(self, white: Whitening, left: Tensor) -> Tensor:
+        """Log evidence that each candidate would gain beside a fit that leaves so much, `s x c`, as if all rows weighed
+        alike and up to a number that all have in common: near enough to tell which may be the best."""
         per = white.sigma**-2
+        share = per * white.weight.sum() / self._weight.sum()
+        change = (share / self._share).log()
+        if self._axes is None or float(change.amax() - change.amin()) > _SAME_AXES:
+            square = share[:, None, None]
+            inner = [(a * square).sum(0) / size**2 for a, size in zip(self._among, self.size, strict=True)]
+            self._axes, self._share = axes_of(inner, left), share
         target = (left * white.weight[:, None] * per).reshape(-1)
-        square = (per * white.weight.sum() / self._weight.sum())[:, None, None]
-        return [
-            Own(
-                (self._among[k] * square).sum(0) / self.size[k] ** 2,
-                self.columns[k].flatten(0, 1).mT @ target / self.size[k],
-            )
-            for k in which
-        ]
+        along = self._axes.turned(
+            [c.flatten(0, 1).mT @ target / size for c, size in zip(self.columns, self.size, strict=True)]
+        )
+        square = self._axes.square * (share / self._share).mean()
+        squares, there = white.scaled(left).square().sum(), torch.ones(len(square), dtype=torch.bool)
+        return fit_in_axes(square, along, there, squares, float(left.numel()), 0.0, _ANY_SIZE).log_evidence
 
 
 def _noise_share(every: _Everything, y: Tensor, white: Whitening) -> Tensor:
