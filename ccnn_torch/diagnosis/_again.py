@@ -13,7 +13,7 @@ from ccnn_torch.diagnosis._dictionary import Dictionary, Found
 from ccnn_torch.diagnosis._sets import fewer
 from ccnn_torch.diagnosis._whitening import Whitening
 
-__all__ = ["FORM", "joined", "known_shapes", "settled"]
+__all__ = ["FORM", "joined", "known_shapes", "likeliest", "settled"]
 
 FORM = 0.004
 """Share of the gap's energy that goes with a member of a set and not without it, below which a library effect beside
@@ -65,6 +65,22 @@ def joined(dictionary: Dictionary, found: Sequence[Found], best: Found, before: 
         return False
     without = next((f for f in found if f.members == old), None)
     return without is None or without.rss - best.rss > FORM * gap
+
+
+def likeliest(atoms: Sequence[Atom], dictionary: Dictionary, found: Sequence[Found], acting: Set[str]) -> list[Atom]:
+    """Of the atoms those of effects that act, and the most probable one of every other effect.
+
+    Args:
+        atoms: some of the candidates.
+        dictionary: all of them.
+        found: sets that were tried, most probable first.
+        acting: names.
+    """
+    first: dict[str, Atom] = {}
+    for atom in (dictionary.atoms[i] for one in found for i in one.members):
+        if any(atom is a for a in atoms):
+            first.setdefault(atom.name, atom)
+    return [a for a in atoms if a.name in acting or first.get(a.name) is a]
 
 
 def known_shapes(

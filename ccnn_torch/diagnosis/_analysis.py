@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._again import joined, known_shapes, settled
+from ccnn_torch.diagnosis._again import joined, known_shapes, likeliest, settled
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._candidates import cleaned, first_candidates, plain_atom, renewed_candidates
 from ccnn_torch.diagnosis._catch_all import catch_alls
@@ -138,6 +138,9 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
                 # Other rows are bad ones, and nothing else has changed.
                 sought = frozenset()
             known = known_shapes(result.dictionary, result.found, best, sought)
+        else:
+            # What acts now may have hidden the better shapes.
+            standing = standing._replace(starts=likeliest(standing.starts, result.dictionary, result.found, act))
         before = act
         result = _looked_again(rows, standing, result, acting, white, left, known)
     shown = {e.name for e in standing.effects}

@@ -16,7 +16,7 @@ from ccnn_torch.diagnosis._joined import Joined, fit_joined
 __all__ = ["fewer", "promising", "scored"]
 
 # Updates of a fit; after the short one no set that came within 12 of the best in the end was 30 below it, in trials.
-_UPDATES, _SHORT, _HOPELESS = 4, 1, 60.0
+_UPDATES, _SHORT, _HOPELESS = 4, 1, 40.0
 # What is left of a smaller set's noise to begin with. Two groups may explain together what neither nearly does alone:
 # the scales that suit a low noise are not reached from a high one, and a noise that is too low is mended by one update.
 _LESS_NOISE = 0.1
