@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._again import joined, known_shapes, settled
+from ccnn_torch.diagnosis._again import joined, known_shapes, likeliest, settled
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._dictionary import Dictionary, Found, dictionary_of, singles_of
 from ccnn_torch.diagnosis._sets import scored
@@ -48,6 +48,14 @@ def test_shapes_of_what_is_out_of_play_are_not_looked_for_again(sought: frozense
     # Backlash acts, drift does it nearly as well: they keep all shapes, unless these are looked for.
     kept = {"backlash": [0.0, 1.0], "drift": [2.0, 3.0]}
     assert shapes == {name: kept[name] for name in kept if sought is not None and name not in sought}
+
+
+def test_of_what_does_not_act_the_likeliest_shape_goes_on() -> None:
+    dictionary, _, found = looked_at()
+    kept = likeliest(dictionary.atoms, dictionary, found, frozenset({"backlash"}))
+    assert [float(a.shape) for a in kept if a.name == "backlash"] == [0.0, 1.0], "it acts"
+    assert [float(a.shape) for a in kept if a.name == "drift"] == [3.0]
+    assert [a.name for a in kept].count("thermal") == 1
 
 
 def test_only_names_that_do_something_have_joined_a_set() -> None:
