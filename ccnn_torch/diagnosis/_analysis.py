@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -11,7 +11,13 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._again import joined, known_shapes, likeliest, settled
 from ccnn_torch.diagnosis._atoms import Atom
-from ccnn_torch.diagnosis._candidates import cleaned, first_candidates, plain_atom, renewed_candidates
+from ccnn_torch.diagnosis._candidates import (
+    cleaned,
+    first_candidates,
+    of_the_textbook,
+    plain_atom,
+    renewed_candidates,
+)
 from ccnn_torch.diagnosis._catch_all import catch_alls
 from ccnn_torch.diagnosis._dictionary import Dictionary, Found
 from ccnn_torch.diagnosis._linear import remainder, tangent
@@ -139,8 +145,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
                 sought = frozenset()
             known = known_shapes(result.dictionary, result.found, best, sought)
         else:
-            # What acts now may have hidden the better shapes.
-            standing = standing._replace(starts=likeliest(standing.starts, result.dictionary, result.found, act))
+            standing = standing._replace(starts=_kept(situation, standing.starts, result, act))
         before = act
         result = _looked_again(rows, standing, result, acting, white, left, known)
     shown = {e.name for e in standing.effects}
@@ -177,6 +182,13 @@ def _first_look(rows: _Rows, effects: Sequence[Effect]) -> tuple[Analysis, _Stan
     every = [*fixed, *starts, *rest, *standing.local]
     few = _drawn(white.keep(), len(channels))
     return _searched(rows, rows.residual, white, every, standing.rich, few), standing
+
+
+def _kept(situation: Situation, starts: Sequence[Atom], result: Analysis, acting: Set[str]) -> list[Atom]:
+    """Of the shapes found at first those that stay candidates: of effects that act all, since what else acts now may
+    have hidden the better ones, and of the others the likeliest and that of the textbook."""
+    likely = likeliest(starts, result.dictionary, result.found, acting)
+    return [a for a in starts if any(a is b for b in likely) or of_the_textbook(situation, a)]
 
 
 def _looked_again(

@@ -16,7 +16,7 @@ from ccnn_torch.diagnosis._shapes import Ground, Scan, Shaped
 from ccnn_torch.diagnosis._whitening import Whitening
 from ccnn_torch.effects import Acting, Effect, Situation
 
-__all__ = ["cleaned", "first_candidates", "plain_atom", "renewed_candidates"]
+__all__ = ["cleaned", "first_candidates", "of_the_textbook", "plain_atom", "renewed_candidates"]
 
 LOG_PRIOR = math.log(0.1)
 
@@ -146,6 +146,12 @@ def _usual(situation: Situation, effect: Effect) -> list[Shaped]:
     if any(value is None for value in usual):
         return []
     return [Shaped(torch.tensor(usual, dtype=situation.joints.dtype), None, 0.0)]
+
+
+def of_the_textbook(situation: Situation, atom: Atom) -> bool:
+    """Whether an atom has the shapes that are usual for its effect."""
+    usual = [] if atom.effect is None else _usual(situation, atom.effect)
+    return any(_same_shape(atom, shaped) for shaped in usual)
 
 
 def _same_shape(atom: Atom, shaped: Shaped) -> bool:
