@@ -13,7 +13,7 @@ from ccnn_torch.diagnosis._dictionary import Dictionary, Found
 from ccnn_torch.diagnosis._sets import fewer
 from ccnn_torch.diagnosis._whitening import Whitening
 
-__all__ = ["FORM", "joined", "known_shapes", "likeliest", "settled"]
+__all__ = ["FORM", "catch_alls_play", "joined", "known_shapes", "likeliest", "settled"]
 
 FORM = 0.004
 """Share of the gap's energy that goes with a member of a set and not without it, below which a library effect beside
@@ -65,6 +65,22 @@ def joined(dictionary: Dictionary, found: Sequence[Found], best: Found, before: 
         return False
     without = next((f for f in found if f.members == old), None)
     return without is None or without.rss - best.rss > FORM * gap
+
+
+def catch_alls_play(dictionary: Dictionary, found: Sequence[Found], best: Found) -> bool:
+    """Whether a catch-all does something beside a set that is not far behind the best one of the library.
+
+    Args:
+        dictionary: candidates.
+        found: sets that were tried.
+        best: the most probable one of the library.
+    """
+    tried = {f.members: f.log_posterior for f in found}
+    for one in found:
+        bare = tuple(i for i in one.members if not dictionary.atoms[i].catch_all)
+        if bare != one.members and one.log_posterior > max(best.log_posterior - _BEHIND, tried.get(bare, math.inf)):
+            return True
+    return False
 
 
 def likeliest(atoms: Sequence[Atom], dictionary: Dictionary, found: Sequence[Found], acting: Set[str]) -> list[Atom]:

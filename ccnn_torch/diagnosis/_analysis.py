@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._again import joined, known_shapes, likeliest, settled
+from ccnn_torch.diagnosis._again import catch_alls_play, joined, known_shapes, likeliest, settled
 from ccnn_torch.diagnosis._atoms import Atom
 from ccnn_torch.diagnosis._candidates import (
+    Known,
     cleaned,
     first_candidates,
     of_the_textbook,
@@ -103,11 +104,10 @@ class _Rows(NamedTuple):
 
 
 class _Standing(NamedTuple):
-    """What stays whatever is found: effects that show, shapes found at first, catch-alls, those of one place or sway,
-    and the noise of the richest fit, `c`."""
+    """What stays whatever is found: effects that show, catch-alls, those of one place or sway found at first, and the
+    noise of the richest fit, `c`."""
 
     effects: list[Effect]
-    starts: list[Atom]
     rest: list[Atom]
     local: list[Atom]
     rich: Tensor
@@ -127,13 +127,14 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
     # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
     before: frozenset[str] | None = None
     for _ in range(2):
-        best = next(f for f in result.found if not any(result.dictionary.atoms[i].catch_all for i in f.members))
+        atoms = result.dictionary.atoms
+        best = next(f for f in result.found if not any(atoms[i].catch_all for i in f.members))
         if before is not None and result.found[0].log_posterior - best.log_posterior > _FAR_BEHIND:
             break
         acting = result.acting(best)
         act = frozenset(a.effect.name for a in acting)
         white, left = _renewed(result, noise, rows.usable), remainder(situation, measured, acting)
-        known: Mapping[str, Sequence[Atom]] = {}
+        shapes = Known([a for a in atoms if a.effect is not None and a.shape.numel()], {}, before is None)
         if before is not None:
             old, sought = result.whitening, act if act == before else None
             if not joined(result.dictionary, result.found, best, before, result.gap) and settled(
@@ -143,11 +144,13 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
                     break
                 # Other rows are bad ones, and nothing else has changed.
                 sought = frozenset()
-            known = known_shapes(result.dictionary, result.found, best, sought)
+            shapes = shapes._replace(kept=known_shapes(result.dictionary, result.found, best, sought))
         else:
-            standing = standing._replace(starts=_kept(situation, standing.starts, result, act))
+            shapes = shapes._replace(starts=_kept(situation, shapes.starts, result, act))
+        # A bump is not looked for again where nothing outside the library does anything.
+        local = before is None or catch_alls_play(result.dictionary, result.found, best)
         before = act
-        result = _looked_again(rows, standing, result, acting, white, left, known)
+        result = _looked_again(rows, standing, result, acting, white, left, shapes, local)
     shown = {e.name for e in standing.effects}
     return replace(result, idle=tuple(e.name for e in effects if e.name not in shown))
 
@@ -178,7 +181,7 @@ def _first_look(rows: _Rows, effects: Sequence[Effect]) -> tuple[Analysis, _Stan
     fixed, starts = first_candidates(situation, atoms, white, rows.residual, usable, rows.fitted)
     local = local_catch_alls(situation, rows.jacobian, rows.residual, white, rows.fitted)
     shown = [a.effect for a in atoms if a.effect is not None]
-    standing = _Standing(shown, starts, rest, [cleaned(a, usable) for a in local], white.sigma)
+    standing = _Standing(shown, rest, [cleaned(a, usable) for a in local], white.sigma)
     every = [*fixed, *starts, *rest, *standing.local]
     few = _drawn(white.keep(), len(channels))
     return _searched(rows, rows.residual, white, every, standing.rich, few), standing
@@ -198,7 +201,8 @@ def _looked_again(
     acting: Sequence[Acting],
     white: Whitening,
     left: Tensor,
-    known: Mapping[str, Sequence[Atom]],
+    shapes: Known,
+    local: bool,
 ) -> Analysis:
     """About the machine with the best set's effects, on all rows.
 
@@ -208,7 +212,8 @@ def _looked_again(
         acting: effects of its best set.
         white: noise and weights that its most probable set leaves.
         left: what those effects leave by the machine itself, `s x c0` [m, rad].
-        known: as for `renewed_candidates`.
+        shapes: found before.
+        local: whether bumps are looked for again.
     """
     situation, usable = rows.situation, rows.usable
     there, target = tangent(situation, left, acting)
@@ -224,16 +229,17 @@ def _looked_again(
         target,
         standing.effects,
         acting,
-        standing.starts,
-        known,
+        shapes,
         white,
         ok,
         rows.fitted,
     )
-    # The first of a name has the shapes found now; its parts and earlier shapes add next to nothing.
-    newest = {a.name: a.columns for a in reversed(atoms)}
-    beside = torch.cat([rows.fitted, *(newest[name] for name in sorted({a.effect.name for a in acting}))], -1)
-    again = local_catch_alls(situation, rows.jacobian, target, white, beside)
+    again: list[Atom] = []
+    if local:
+        # The first of a name has the shapes found now; its parts and earlier shapes add next to nothing.
+        newest = {a.name: a.columns for a in reversed(atoms)}
+        beside = torch.cat([rows.fitted, *(newest[name] for name in sorted({a.effect.name for a in acting}))], -1)
+        again = local_catch_alls(situation, rows.jacobian, target, white, beside)
     every = [*atoms, *standing.rest, *standing.local, *(cleaned(a, ok) for a in again)]
     return _searched(rows, target, white, every, standing.rich)
 

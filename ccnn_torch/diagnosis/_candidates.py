@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,9 +17,23 @@ from ccnn_torch.diagnosis._shapes import Ground, Scan, Shaped
 from ccnn_torch.diagnosis._whitening import Whitening
 from ccnn_torch.effects import Acting, Effect, Situation
 
-__all__ = ["cleaned", "first_candidates", "of_the_textbook", "plain_atom", "renewed_candidates"]
+__all__ = ["Known", "cleaned", "first_candidates", "of_the_textbook", "plain_atom", "renewed_candidates"]
 
 LOG_PRIOR = math.log(0.1)
+
+
+class Known(NamedTuple):
+    """Shapes found before.
+
+    Attributes:
+        starts: they stay candidates, since what acts now may have hidden the better ones.
+        kept: by names of effects whose shapes are not looked for again those that they have.
+        alone: whether shapes of what acts are looked for with nothing beside it, too.
+    """
+
+    starts: Sequence[Atom]
+    kept: Mapping[str, Sequence[Atom]]
+    alone: bool
 
 
 def plain_atom(situation: Situation, there: Situation, effect: Effect) -> Atom:
@@ -70,8 +85,7 @@ def renewed_candidates(
     target: Tensor,
     effects: Sequence[Effect],
     acting: Sequence[Acting],
-    starts: Sequence[Atom],
-    known: Mapping[str, Sequence[Atom]],
+    known: Known,
     white: Whitening,
     usable: Tensor,
     fitted: Tensor,
@@ -84,8 +98,7 @@ def renewed_candidates(
         target: what a linear model about `there` has to explain, `s x c0` [m, rad].
         effects: candidates.
         acting: those of the best set.
-        starts: shapes found at first: they stay candidates, since what acts now may have hidden the better ones.
-        known: by names of effects whose shapes are not looked for again those that they have.
+        known: of shapes.
         white, usable, fitted: as in `first_candidates`.
     """
 
@@ -116,14 +129,14 @@ def renewed_candidates(
         others = [a for a in acting if a.effect is not effect]
         start = next((a.shape for a in acting if a.effect is effect), None)
         shapes: list[Shaped] = []
-        if effect.name in known:
-            found = known[effect.name]
+        if effect.name in known.kept:
+            found = known.kept[effect.name]
         else:
             # What acts beside an effect may be there to mend a wrong shape: the right one needs nothing beside it.
-            beside_what = [others] if start is None or not others else [others, []]
+            beside_what = [others, []] if known.alone and start is not None and others else [others]
             scan = Scan(situation, there, effect, _only(white, usable))
             shapes = [scan.best(ground(them), start) for them in beside_what]
-            found = [a for a in starts if a.effect is effect]
+            found = [a for a in known.starts if a.effect is effect]
         shapes += [Shaped(a.shape, a.used, LOG_PRIOR - a.log_prior) for a in found]
         own: list[Atom] = []
         for shaped in shapes:
