@@ -19,7 +19,7 @@ __all__ = ["fitted_whitening"]
 _RICH, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
 # Candidates that are looked at with the rows' weights as they are, the most promising when all weigh alike.
 _NEXT = 4
-# Their principal axes are taken anew where the channels' noise has changed by more among each other (logarithm).
+# The principal axes of all are taken anew where the channels' noise has changed by more among each other (logarithm).
 _SAME_AXES = 0.2
 # Updates of a fit that begins where the one before it ended.
 _UPDATES = 4
@@ -105,8 +105,7 @@ class _Everything:
     def __init__(self, columns: Sequence[Tensor], white: Whitening) -> None:
         self.columns = columns
         self._weight = white.weight
-        self._axes: Axes | None = None
-        self._share = white.sigma
+        self._turned: tuple[Axes, Tensor] | None = None
         self._among = [self._by_channel(c, c) for c in columns]
         # Weights are 1 or 0 at first.
         count = white.weight.sum() * len(white.channels)
@@ -135,18 +134,24 @@ class _Everything:
         alike and up to a number that all have in common: near enough to tell which may be the best."""
         per = white.sigma**-2
         share = per * white.weight.sum() / self._weight.sum()
-        change = (share / self._share).log()
-        if self._axes is None or float(change.amax() - change.amin()) > _SAME_AXES:
+        if self._turned is None or _spread(share / self._turned[1]) > _SAME_AXES:
             square = share[:, None, None]
             inner = [(a * square).sum(0) / size**2 for a, size in zip(self._among, self.size, strict=True)]
-            self._axes, self._share = axes_of(inner, left), share
+            self._turned = axes_of(inner, left), share
+        axes, before = self._turned
         target = (left * white.weight[:, None] * per).reshape(-1)
-        along = self._axes.turned(
+        along = axes.turned(
             [c.flatten(0, 1).mT @ target / size for c, size in zip(self.columns, self.size, strict=True)]
         )
-        square = self._axes.square * (share / self._share).mean()
+        square = axes.square * (share / before).mean()
         squares, there = white.scaled(left).square().sum(), torch.ones(len(square), dtype=torch.bool)
         return fit_in_axes(square, along, there, squares, float(left.numel()), 0.0, _ANY_SIZE).log_evidence
+
+
+def _spread(factors: Tensor) -> float:
+    """Between the least and the largest, in logarithms."""
+    least, largest = factors.log().aminmax()
+    return float(largest - least)
 
 
 def _noise_share(every: _Everything, y: Tensor, white: Whitening) -> Tensor:
