@@ -7,10 +7,13 @@ from itertools import combinations
 
 import pytest
 import torch
+from diagnosis._machines import measured, rows_of
 from torch import Tensor
 
-from ccnn_torch.diagnosis._again import joined, known_shapes, likeliest, settled
+from ccnn_torch.diagnosis import diagnose_rows
+from ccnn_torch.diagnosis._again import catch_alls_play, joined, known_shapes, likeliest, settled
 from ccnn_torch.diagnosis._atoms import Atom
+from ccnn_torch.diagnosis._candidates import of_the_textbook
 from ccnn_torch.diagnosis._dictionary import Dictionary, Found, dictionary_of, singles_of
 from ccnn_torch.diagnosis._sets import scored
 from ccnn_torch.diagnosis._whitening import Whitening
@@ -58,6 +61,19 @@ def test_of_what_does_not_act_the_likeliest_shape_goes_on() -> None:
     assert [a.name for a in kept].count("thermal") == 1
 
 
+@pytest.mark.parametrize("bend", [0.0, 1.0])
+def test_a_catch_all_plays_where_it_does_something_beside_the_library(bend: float) -> None:
+    x = columns(0, 4)
+    y = 5 * x[..., 0] + bend * x[..., 2] + columns(1, 1)[..., 0]
+    own = [x[..., :2], x[..., 2:]]
+    known = Atom("backlash", make_effect("backlash"), y.new_ones(1), own[0], -2.0)
+    atoms = [known, Atom("workspace", None, y.new_zeros(0), own[1], -7.0)]
+    dictionary = dictionary_of(atoms, own, y, [1], singles_of(atoms, own, y, 0.0), 0.0)
+    found = sorted(scored(dictionary, [(), (0,), (1,), (0, 1)], {}), key=lambda f: -f.log_posterior)
+    best = next(f for f in found if f.members == (0,))
+    assert catch_alls_play(dictionary, found, best) == (bend > 0)
+
+
 def test_only_names_that_do_something_have_joined_a_set() -> None:
     dictionary, _, found = looked_at()
     alone = found[0]
@@ -88,3 +104,17 @@ def test_a_fit_is_settled_where_noise_and_machine_are_as_the_linear_model_says()
     assert fits() and fits(replace(old, sigma=3 * old.sigma))
     assert not fits(replace(old, sigma=old.sigma * torch.tensor([1.0, 2.0]))), "one channel is noisier than thought"
     assert not fits(left=left + 0.2 * old.sigma), "the machine itself does something else"
+
+
+def test_what_does_not_act_keeps_few_shapes_and_that_of_the_textbook() -> None:
+    situation = rows_of("five_bar", 120, 3)
+    said = diagnose_rows(situation, measured(situation, {"joint_gain": 12.0}, 4))
+    assert said.verdict["effects"] == ["joint_gain"]
+    shapes: dict[str, list[Atom]] = {}
+    for atom in said.analysis.dictionary.atoms:
+        if atom.effect is not None and atom.shape.numel():
+            shapes.setdefault(atom.name, []).append(atom)
+    for name in ("backlash", "friction"):
+        assert any(of_the_textbook(situation, atom) for atom in shapes[name]), name
+    # One found beside the gain, the likeliest of those found at first, and that of the textbook.
+    assert max(len(atoms) for atoms in shapes.values()) <= 3 and len(shapes["drift"]) <= 2
