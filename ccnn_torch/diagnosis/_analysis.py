@@ -171,7 +171,7 @@ def _first_look(rows: _Rows, effects: Sequence[Effect]) -> tuple[Analysis, _Stan
     atoms = [cleaned(plain_atom(situation, situation, e), usable) for e in effects]
     names = [e.name for e in effects]
     rest = [*catch_alls(situation, names), *straight_catch_alls(situation, names)]
-    rest = [cleaned(a, usable) for a in rest if bool((torch.isfinite(a.columns).flatten(1).all(-1) | ~usable).all())]
+    rest = [cleaned(a, usable) for a in rest if bool((torch.isfinite(a.columns.sum((1, 2))) | ~usable).all())]
     # What does not show at all in these rows is no candidate (latency at rest).
     largest = rows.residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)
     atoms = [a for a in atoms if float((a.columns[:, channels] / largest[:, None]).abs().max()) > _SHOWN]
