@@ -83,20 +83,18 @@ def catch_alls_play(dictionary: Dictionary, found: Sequence[Found], best: Found)
     return False
 
 
-def likeliest(atoms: Sequence[Atom], dictionary: Dictionary, found: Sequence[Found], acting: Set[str]) -> list[Atom]:
-    """Of the atoms those of effects that act, and the most probable one of every other effect.
+def likeliest(dictionary: Dictionary, found: Sequence[Found]) -> dict[str, Atom]:
+    """The most probable atom of every effect that has shapes, by name.
 
     Args:
-        atoms: some of the candidates.
-        dictionary: all of them.
+        dictionary: candidates.
         found: sets that were tried, most probable first.
-        acting: names.
     """
     first: dict[str, Atom] = {}
     for atom in (dictionary.atoms[i] for one in found for i in one.members):
-        if any(atom is a for a in atoms):
+        if atom.effect is not None and atom.shape.numel():
             first.setdefault(atom.name, atom)
-    return [a for a in atoms if a.name in acting or first.get(a.name) is a]
+    return first
 
 
 def known_shapes(
@@ -113,17 +111,13 @@ def known_shapes(
     """
     atoms, tried = dictionary.atoms, {f.members: f.log_posterior for f in found}
     least = best.log_posterior - _BEHIND - _SHARE * max(best.log_posterior - tried[()], 0.0)
-    likeliest: dict[str, Atom] = {}
+    likely = likeliest(dictionary, found)
     in_play = {atoms[i].name for i in best.members}
     for one in found:
         for i, others in zip(one.members, fewer(one.members), strict=True):
-            atom = atoms[i]
-            if atom.effect is None or not atom.shape.numel():
-                continue
-            likeliest.setdefault(atom.name, atom)
             # Beside a set that is as probable without it an effect takes no part.
             if one.log_posterior > max(least, tried.get(others, math.inf)):
-                in_play.add(atom.name)
-    every = {name: [a for a in atoms if a.effect is atom.effect] for name, atom in likeliest.items()}
-    known = {name: every[name] if name in in_play else [atom] for name, atom in likeliest.items()}
+                in_play.add(atoms[i].name)
+    every = {name: [a for a in atoms if a.effect is atom.effect] for name, atom in likely.items()}
+    known = {name: every[name] if name in in_play else [atom] for name, atom in likely.items()}
     return {name: shapes for name, shapes in known.items() if name not in (in_play if sought is None else sought)}

@@ -190,8 +190,8 @@ def _first_look(rows: _Rows, effects: Sequence[Effect]) -> tuple[Analysis, _Stan
 def _kept(situation: Situation, starts: Sequence[Atom], result: Analysis, acting: Set[str]) -> list[Atom]:
     """Of the shapes found at first those that stay candidates: of effects that act all, since what else acts now may
     have hidden the better ones, and of the others the likeliest and that of the textbook."""
-    likely = likeliest(starts, result.dictionary, result.found, acting)
-    return [a for a in starts if any(a is b for b in likely) or of_the_textbook(situation, a)]
+    likely = likeliest(result.dictionary, result.found)
+    return [a for a in starts if a.name in acting or a is likely.get(a.name) or of_the_textbook(situation, a)]
 
 
 def _looked_again(
