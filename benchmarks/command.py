@@ -49,14 +49,12 @@ def main(folder: Path, calls: int) -> None:
     feeds = dict(zip(("joints", "covariates"), (t.numpy() for t in tensors), strict=False))
     single = {name: value.astype(np.float32) for name, value in feeds.items()}
     double_session, single_session = session(folder / "model.onnx"), session(folder / "model.float32.onnx")
-    program = torch.export.load(folder / "model.pt2").module()
     loaded = load_model(folder / "model.onnx")
     ways: dict[str, Callable[[], object]] = {
         "onnxruntime, float64": lambda: double_session.run(None, feeds),
         "onnxruntime, float32": lambda: single_session.run(None, single),
         "load_model(.onnx)": lambda: loaded(*feeds.values()),
         "eager": lambda: compensator(*tensors),
-        ".pt2 module()": lambda: program(*tensors),
     }
     print(f"{folder}: {compensator.iterations} steps of the fixed point, {calls} calls")
     print(f"{'':24}{'p50 µs':>10}{'p99 µs':>10}{'ratio':>10}")

@@ -24,5 +24,9 @@ class MethodFailedError(CcnnError):
     method of an identification did not converge: its files are there, and the command exits with 2."""
 
 
+class FallbackWarning(UserWarning):
+    """A model file gave a command that breaks what its card promises; the joints are commanded as they are there."""
+
+
 class OutsideDomainWarning(UserWarning):
     """A command lies outside the domain that a compensator was trained on; the safe correction is used there."""

@@ -10,20 +10,49 @@ import os
 import sys
 import sysconfig
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 from ccnn_torch.errors import CcnnError, InputError
 
-__all__ = ["class_hint", "failure", "is_plugin", "load_plugin"]
+__all__ = ["class_hint", "code_refused", "failure", "file_that_names", "is_plugin", "load_plugin"]
 
 # Lines of this package, of Python and of what is installed tell a user nothing about the own file.
 _OTHERS = (f"{Path(__file__).parent}{os.sep}", f"{sysconfig.get_path('stdlib')}{os.sep}", "<")
+
+# What is being read, while it may name no code.
+_SOURCE: ContextVar[str | None] = ContextVar("source", default=None)
 
 
 def is_plugin(spec: str) -> bool:
     """Whether a name in a config means a class in a Python file."""
     return ".py:" in spec
+
+
+@contextmanager
+def code_refused(source: str, allow_code: bool = False) -> Iterator[None]:
+    """Within it `load_plugin` runs nothing: a file from outside may name no code that its reader has not allowed.
+
+    Args:
+        source: what names the code, as the refusal begins: `identified.yaml: its key 'mechanism'`.
+        allow_code: whether the user has allowed it. What an outer one refuses an inner one cannot allow.
+    """
+    if allow_code:
+        yield
+        return
+    token = _SOURCE.set(source)
+    try:
+        yield
+    finally:
+        _SOURCE.reset(token)
+
+
+def file_that_names() -> str | None:
+    """What is being read where it may name no code, as given to `code_refused`; None elsewhere."""
+    return _SOURCE.get()
 
 
 def class_hint(file: str) -> str:
@@ -68,8 +97,16 @@ def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
     """Run the file and return what it calls `Name`: something that can be called, or an object of a class of `also`.
 
     Raises:
-        InputError: there is no such file or name in it, or the file cannot be run (the sentence names the line).
+        InputError: there is no such file or name in it, or the file cannot be run (the sentence names the line); or a
+            file from outside names it, which is not allowed to run code (`code_refused`).
     """
+    source = file_that_names()
+    if source is not None:
+        raise InputError(
+            f"{source} names Python code, {spec}, which would run; look at that file, and if you trust it allow it: "
+            "--allow-code (ccnn compensate, ccnn verify), allow_code=True (Python), mechanism_keys.allow_code=true "
+            "(configs)"
+        )
     file, _, name = spec.rpartition(":")
     path = Path(file)
     if not path.is_file():

@@ -155,7 +155,7 @@ def test_own_records_train_compensate_and_come_back(cli: Cli, tmp_path: Path) ->
     assert results["floor"] is None
     program, commands, again = (tmp_path / name for name in ("in.csv", "out.csv", "back.csv"))
     write_table(program, {f"q{k}[m]": np.linspace(0.95, 1.0, 5) for k in (1, 2, 3)})
-    for model in ("model.onnx", "model.safetensors", "model.pt2"):
+    for model in ("model.onnx", "model.safetensors"):
         code, _, err = cli("compensate", out / model, program, commands)
         assert code == 0, err
         table = read_table(commands)
@@ -165,6 +165,8 @@ def test_own_records_train_compensate_and_come_back(cli: Cli, tmp_path: Path) ->
             *("deviation_q1", "deviation_q2", "deviation_q3"),
             "inside_domain",
         )
+    code, _, err = cli("compensate", out / "model.pt2", program, commands)
+    assert code == 2 and "never read back" in err and len(err.splitlines()) == 1
     write_table(again, {f"q{k}[m]": read_table(commands).column(f"command_q{k}", "m") for k in (1, 2, 3)})
     code, _, err = cli("compensate", out / "model.onnx", again, commands, "--back")
     assert code == 0, err

@@ -19,6 +19,7 @@ from ccnn_torch.cli.keys import keys
 from ccnn_torch.cli.picture import picture
 from ccnn_torch.cli.plan import plan
 from ccnn_torch.cli.run import run
+from ccnn_torch.cli.sign import sign
 from ccnn_torch.cli.simulate import simulate
 from ccnn_torch.cli.suite import suite
 from ccnn_torch.errors import InputError, MethodFailedError
@@ -49,7 +50,7 @@ def _common(
         typer.echo(context.get_help())
 
 
-for _command in (run, suite, identify, compensate, plan, simulate, diagnose, check, blind_check, picture, keys):
+for _command in (run, suite, identify, compensate, plan, simulate, diagnose, check, blind_check, picture, sign, keys):
     app.command()(_command)
 
 

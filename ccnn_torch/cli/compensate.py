@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import FallbackWarning, InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,12 +31,18 @@ _STARTS = 64
 
 
 def compensate(
-    model: Annotated[Path, typer.Argument(help="A .safetensors, .onnx or .pt2 file, or identified.yaml.")],
+    model: Annotated[Path, typer.Argument(help="A .safetensors or .onnx file, or identified.yaml.")],
     input: Annotated[Path, typer.Argument(metavar="IN.csv", help="Ideal joints; columns are name[unit].")],
     output: Annotated[Path, typer.Argument(metavar="OUT.csv", help="IN's columns and the commands.")],
     pose: Annotated[bool, typer.Option("--pose", help="IN has wanted poses instead of joints.")] = False,
     back: Annotated[bool, typer.Option("--back", help="IN has commands; OUT gets the ideal joints.")] = False,
     sd: Annotated[bool, typer.Option("--sd", help="OUT gets the deviations' standard deviations, too.")] = False,
+    public_key: Annotated[
+        Path | None, typer.Option("--public-key", metavar="PUBLIC.pem", help="Take only a model signed by this key.")
+    ] = None,
+    allow_code: Annotated[
+        bool, typer.Option("--allow-code", help="Run the Python file that the model names as its mechanism.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
 ) -> None:
     """Correct joints so that the machine reaches what was meant; or, from commands, tell what it reaches.
@@ -48,6 +55,9 @@ def compensate(
     100 places inside the domain. With identified.yaml, which ccnn identify writes, the commands are those of the real
     kinematics.
 
+    Every row is held to what the model's card promises. Where the model breaks it (a number that is not finite, a
+    deviation above the limit), the row has command = joints and inside_domain = 0, and the exit code is 2.
+
     Examples:
 
     ccnn compensate checkpoints/tripod/model.onnx joints.csv commands.csv
@@ -59,6 +69,8 @@ def compensate(
     ccnn compensate checkpoints/tripod/model.onnx joints.csv commands.csv --sd
 
     ccnn compensate runs/five_bar/identified.yaml poses.csv commands.csv --pose
+
+    ccnn compensate from_a_stranger/model.onnx joints.csv commands.csv --public-key theirs.public.pem
     """
     if pose and back:
         raise InputError("--pose and --back exclude each other: --pose takes wanted poses, --back takes commands")
@@ -67,17 +79,23 @@ def compensate(
     for file, what in ((input, "IN.csv"), (model, "the model")):
         if output.resolve() == file.resolve():
             raise InputError(f"{output}: OUT.csv is {what} itself, which would be overwritten; name another file")
-    from ccnn_torch.compensation import load_compensation
-    from ccnn_torch.records import read_table, stack_columns, write_table
+    import numpy as np
 
-    loaded = load_compensation(model)
+    from ccnn_torch.compensation import load_compensation
+    from ccnn_torch.records import name_lines, read_table, stack_columns, write_table
+
+    loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
     table = read_table(input)
-    if pose:
-        joints, units = _joints_of_poses(loaded, table), {c.name: c.unit for c in loaded.joints}
+    mechanism = _mechanism_of(loaded, allow_code) if pose else None
+    if mechanism is not None:
+        joints, units = _joints_of_poses(loaded, mechanism, table), {c.name: c.unit for c in loaded.joints}
     else:
         joints, units = _joints(loaded, table, back)
     covariates = stack_columns(table, loaded.covariates) if loaded.covariates else None
-    found = loaded(joints, covariates)
+    with warnings.catch_warnings():
+        # Told at the end, with the line of the table.
+        warnings.simplefilter("ignore", FallbackWarning)
+        found = loaded(joints, covariates)
     if back:
         added = _named("ideal", loaded, found["ideal"], units)
         inside = found["ideal_inside_domain"]
@@ -95,12 +113,28 @@ def compensate(
     write_table(output, kept | added)
     if not quiet:
         _tell(output, inside, trained=bool(loaded.covariates) or "deviation_sd" in found)
-        if pose and _chooses_branch(loaded, table):
+        if mechanism is not None and _chooses_branch(loaded, mechanism, table):
             typer.echo(
                 "An arm takes a pose on several branches (elbow, wrist): these are the joints nearest to those of the "
                 "row before, and may be on another branch than meant; give "
                 f"{_guess_headers(loaded)} near the joints wanted."
             )
+    bad = np.flatnonzero(found["fallback"])
+    if len(bad):
+        raise InputError(
+            f"{output}: in {len(bad)} of {len(joints)} rows, the first from {name_lines(table.lines, bad[:1])} of "
+            f"{input}, {model} breaks what its card promises (finite numbers, |deviation| within the limit); they were "
+            "written without any correction and with inside_domain = 0: do not use this model"
+        )
+
+
+def _mechanism_of(loaded: Model, allow_code: bool) -> Mechanism:
+    """The mechanism that the model was made for."""
+    from ccnn_torch.mechanisms import mechanism_from_description
+    from ccnn_torch.plugins import code_refused
+
+    with code_refused(f"{loaded.path}: its mechanism", allow_code):
+        return mechanism_from_description(loaded.facts["mechanism"], allow_code=True)
 
 
 def _joints(loaded: Model, table: Table, back: bool) -> tuple[Array, dict[str, str]]:
@@ -128,7 +162,7 @@ def _refuse_other_machine(loaded: Model, table: Table) -> None:
         )
 
 
-def _joints_of_poses(loaded: Model, table: Table) -> Array:
+def _joints_of_poses(loaded: Model, mechanism: Mechanism, table: Table) -> Array:
     """Ideal joints of wanted poses on the mechanism that the model was made for, `rows x n` [SI].
 
     Raises:
@@ -138,10 +172,8 @@ def _joints_of_poses(loaded: Model, table: Table) -> Array:
     import torch
 
     from ccnn_torch.coordinates import Coordinate
-    from ccnn_torch.mechanisms import mechanism_from_description
     from ccnn_torch.records import JOINT_LIMIT, name_lines, read_pose, stack_columns
 
-    mechanism = mechanism_from_description(loaded.facts["mechanism"])
     values, coordinates, _ = read_pose(table, mechanism)
     if len(coordinates) != len(mechanism.pose):
         missing = [c.header for c in mechanism.pose if c.name not in {k.name for k in coordinates}]
@@ -166,12 +198,9 @@ def _joints_of_poses(loaded: Model, table: Table) -> Array:
     return joints.detach().numpy()
 
 
-def _chooses_branch(loaded: Model, table: Table) -> bool:
+def _chooses_branch(loaded: Model, mechanism: Mechanism, table: Table) -> bool:
     """Whether joints of poses were found without a word on their branch, where there are several."""
-    from ccnn_torch.mechanisms import mechanism_from_description
-
-    arm = bool(mechanism_from_description(loaded.facts["mechanism"]).orientations)
-    return arm and not any(f"guess_{c.name}" in table for c in loaded.joints)
+    return bool(mechanism.orientations) and not any(f"guess_{c.name}" in table for c in loaded.joints)
 
 
 def _guess_headers(loaded: Model) -> str:

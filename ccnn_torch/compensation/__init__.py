@@ -15,6 +15,7 @@ from ccnn_torch.compensation._geometry import geometric_deviation as geometric_d
 from ccnn_torch.compensation._geometry import settled_damping as settled_damping
 from ccnn_torch.compensation._identified import IdentifiedGeometry as IdentifiedGeometry
 from ccnn_torch.compensation._identified import load_compensation as load_compensation
+from ccnn_torch.compensation._identified import sign_model as sign_model
 from ccnn_torch.compensation._loaded import LoadedModel as LoadedModel
 from ccnn_torch.compensation._loaded import load_model as load_model
 from ccnn_torch.compensation._model_file import FORMS as FORMS
@@ -24,3 +25,4 @@ from ccnn_torch.compensation._networks import UncertainNetwork as UncertainNetwo
 from ccnn_torch.compensation._networks import network_from_description as network_from_description
 from ccnn_torch.compensation._networks import register_network as register_network
 from ccnn_torch.compensation._settled_effects import settled_effects as settled_effects
+from ccnn_torch.compensation._signature import new_key_pair as new_key_pair

@@ -182,7 +182,8 @@ class Compensator(nn.Module):
         """For `mechanism.inverse_kinematics.register_forward_hook(compensator.hook(), with_kwargs=True)`.
 
         Covariates travel as the keyword `covariates` of the call, `... x m`. A pose without inverse kinematics stays
-        NaN, since no correction makes it reachable.
+        NaN, since no correction makes it reachable; joints whose command is not finite (a network out of a file may
+        give anything) stay as they are.
 
         Args:
             warn: warn once with `OutsideDomainWarning` when a command is outside the domain; False inside torch.func
@@ -205,7 +206,8 @@ class Compensator(nn.Module):
                     OutsideDomainWarning,
                     stacklevel=2,
                 )
-            return torch.where(solved.unsqueeze(-1), command, output)
+            good = solved & torch.isfinite(command).all(-1)
+            return torch.where(good.unsqueeze(-1), command, output)
 
         return compensate
 

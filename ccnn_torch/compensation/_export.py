@@ -25,7 +25,7 @@ from torch.fx import config as fx_config
 
 from ccnn_torch.compensation._compensator import Compensator
 from ccnn_torch.compensation._contraction import TOLERANCE, Steepness, iterations_needed
-from ccnn_torch.compensation._session import METADATA_KEY, OUTPUTS, open_onnx, open_pt2, run_onnx, run_pt2
+from ccnn_torch.compensation._session import METADATA_KEY, OUTPUTS, Array, check_graph, open_onnx, run_onnx
 from ccnn_torch.errors import MethodFailedError
 
 __all__ = [
@@ -103,6 +103,8 @@ def export_onnx(compensator: Compensator, program: torch.export.ExportedProgram,
         MethodFailedError: the file does not give the eager model's numbers, see `verify`, or cannot be run.
     """
     model = to_onnx(program, None, OUTPUTS, _OPSET, metadata, _plain(compensator))
+    # What is read back must not be refused.
+    check_graph(model)
     content: bytes = model.SerializeToString(deterministic=True)
     try:
         session = open_onnx(content)
@@ -118,16 +120,22 @@ def export_onnx(compensator: Compensator, program: torch.export.ExportedProgram,
 def export_pt2(compensator: Compensator, program: torch.export.ExportedProgram, metadata: str) -> bytes:
     """The traced compensator as a verified `torch.export` file; arguments and errors as `export_onnx`.
 
-    Nothing in the file is pickled: it carries no example inputs, which are the one thing torch would pickle here.
+    Nothing in the file is pickled: it carries no example inputs, which are the one thing torch would pickle here. What
+    is verified is the program that is written, since opening such a file can run code that stands in it.
     """
+    module = program.module()
+
+    def run(joints: Array, covariates: Array | None) -> dict[str, Array]:
+        inputs = [torch.tensor(v) for v in (joints, covariates) if v is not None]
+        with torch.no_grad():
+            return {name: value.numpy() for name, value in zip(OUTPUTS, module(*inputs), strict=True)}
+
+    verify(compensator, run, ".pt2")
     program.example_inputs = None
     stream = io.BytesIO()
     with quiet_exporter():
         torch.export.save(program, stream, extra_files={METADATA_KEY: metadata})
-    content = stream.getvalue()
-    module = open_pt2(content).module()
-    verify(compensator, lambda joints, covariates: run_pt2(module, joints, covariates), ".pt2")
-    return content
+    return stream.getvalue()
 
 
 def export_float32(compensator: Compensator, metadata: str) -> bytes:

@@ -27,6 +27,7 @@ __all__ = [
     "check_tensors",
     "coordinates",
     "facts_of",
+    "from_json",
     "to_json",
 ]
 
@@ -125,6 +126,22 @@ def to_json(value: Mapping[str, Any], indent: int | None = None) -> str:
         return json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False, indent=indent)
     except (TypeError, ValueError) as problem:
         raise InputError(f"a model's fields must be JSON: {problem}") from None
+
+
+def from_json(text: str | bytes) -> Any:
+    """JSON of a file from outside.
+
+    Raises:
+        ValueError: it is none, holds NaN or infinity, or is nested without end.
+    """
+
+    def no_number(word: str) -> None:
+        raise ValueError(f"{word} is no number")
+
+    try:
+        return json.loads(text, parse_constant=no_number)
+    except RecursionError:
+        raise ValueError("is nested too deeply") from None
 
 
 def _format(compensator: Compensator) -> str:

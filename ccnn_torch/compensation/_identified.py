@@ -5,18 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from ccnn_torch.compensation._card import MODEL_FORMS, card_of, read_model
 from ccnn_torch.compensation._loaded import LoadedModel, load_model
+from ccnn_torch.compensation._promise import Promise, as_matrix, kept
+from ccnn_torch.compensation._signature import check_signature, sign_content, signature_path
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError
-from ccnn_torch.mechanisms import Mechanism, load_mechanism
-from ccnn_torch.mechanisms.mechanism_file import read_mechanism_file
+from ccnn_torch.mechanisms import Mechanism, mechanism_of_file
+from ccnn_torch.mechanisms.mechanism_file import MechanismFile, read_mechanism_file
+from ccnn_torch.training import write_whole
 
-__all__ = ["IdentifiedGeometry", "load_compensation", "load_geometry"]
+__all__ = ["IdentifiedGeometry", "load_compensation", "load_geometry", "sign_model"]
 
 Array = NDArray[Any]
 
@@ -25,7 +28,6 @@ _CLOSE = 1e-8
 # How far joints may be from those that the inverse kinematics give for their pose [SI].
 _SAME = 1e-6
 _FORMS = (".yaml", ".yml", ".json")
-MODEL_FORMS = (".safetensors", ".onnx", ".pt2")
 
 
 class IdentifiedGeometry:
@@ -62,37 +64,114 @@ class IdentifiedGeometry:
             covariates: none.
 
         Returns:
-            `command`, `deviation` and `ideal`, `... x n` [SI]; `inside_domain` and `ideal_inside_domain`, `...`, bool:
-            False where the machine cannot take the pose, and the joints come back as they are.
+            `command`, `deviation` and `ideal`, `... x n` [SI], all finite; `inside_domain` and `ideal_inside_domain`,
+            `...`, bool: False where the machine cannot take the pose, and the joints come back as they are (the home
+            joints for what is no number); `fallback`, `...`, bool: where the file gives what is no command, and the
+            joints come back as well.
+
+        Raises:
+            InputError: the last dimension is wrong.
         """
-        given = torch.as_tensor(np.asarray(joints, dtype=np.float64))
-        if given.ndim == 0 or given.shape[-1] != len(self.joints):
-            names = ", ".join(c.header for c in self.joints)
-            raise InputError(
-                f"the model takes the joints {names} as last dimension; got the shape {tuple(given.shape)}"
-            )
+        array = as_matrix(joints, self.joints, "joints")
+        rows = array.reshape(-1, array.shape[-1])
+        home = self.nominal.home_joints
+        given = torch.tensor(rows)
+        given = torch.where(torch.isfinite(given), given, home)
         command, inside = _carried(self.nominal, self.identified, given)
         ideal, ideal_inside = _carried(self.identified, self.nominal, given)
-        return {
+        found = {
             "command": command.numpy(),
             "deviation": (given - command).numpy(),
             "inside_domain": inside.numpy(),
             "ideal": ideal.numpy(),
             "ideal_inside_domain": ideal_inside.numpy(),
         }
+        checked = kept(found, rows, None, Promise.without_card(home.numpy()))
+        return {name: value.reshape((*array.shape[:-1], *value.shape[1:])) for name, value in checked.items()}
 
 
-def load_geometry(path: str | Path) -> IdentifiedGeometry:
-    """Read `identified.yaml`, or the `identified.json` beside it.
+def load_geometry(
+    path: str | Path, *, public_key: str | Path | None = None, allow_code: bool = False
+) -> IdentifiedGeometry:
+    """Read `identified.yaml`, or the `identified.yaml` beside an `identified.json`.
+
+    Args:
+        path: the file.
+        public_key, allow_code: as `load_model`.
 
     Raises:
         ModelFileError: the file is not one that `ccnn identify` wrote.
-        InputError: it lacks a key or a parameter.
+        InputError: it lacks a key or a parameter, or names code that was not allowed.
     """
     path = Path(path)
+    source, content = _read_geometry(path)
+    if public_key is not None:
+        check_signature(source, content, b"", public_key)
+    file = _parsed(path, source, content)
+    nominal, identified = (mechanism_of_file(file, what, allow_code) for what in ("nominal", "value"))
+    return IdentifiedGeometry(path, nominal, identified)
+
+
+def load_compensation(
+    path: str | Path, *, public_key: str | Path | None = None, allow_code: bool = False
+) -> LoadedModel | IdentifiedGeometry:
+    """A model file (.safetensors, .onnx) or an identified machine (.yaml, .json), by what the name ends in.
+
+    Args:
+        path: the file.
+        public_key, allow_code: as `load_model`.
+
+    Raises:
+        ModelFileError, InputError: see `load_model` and `load_geometry`.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in (*_FORMS, *MODEL_FORMS, ".pt2") and Path(path).is_file():
+        raise ModelFileError(
+            f"{path}: is no model file; one ends in {', '.join(MODEL_FORMS)}, or is an identified.yaml"
+        )
+    load = load_geometry if suffix in _FORMS else load_model
+    return load(path, public_key=public_key, allow_code=allow_code)
+
+
+def sign_model(path: str | Path, key: str | Path) -> Path:
+    """Write MODEL.sig beside a model: the signature of the file and of the card that vouches for it.
+
+    Args:
+        path: as for `load_compensation`; an identified.yaml has no card.
+        key: PEM file with a private Ed25519 key.
+
+    Raises:
+        ModelFileError: the file cannot be read, or no card vouches for it.
+        InputError: the key is none, or the package for signatures is missing.
+    """
+    path = Path(path)
+    if path.suffix.lower() in _FORMS:
+        source, content = _read_geometry(path)
+        _parsed(path, source, content)
+        path, card = source, b""
+    else:
+        content = read_model(path)
+        card = card_of(path, content)[1]
+    signature = sign_content(content, card, key)
+    try:
+        write_whole(signature_path(path), signature)
+    except OSError as reason:
+        raise InputError(f"{signature_path(path)}: cannot be written: {reason.strerror}") from None
+    return signature_path(path)
+
+
+def _read_geometry(path: Path) -> tuple[Path, bytes]:
+    """The mechanism file of an identified machine, and its bytes."""
     source = path.with_suffix(".yaml") if path.suffix == ".json" else path
     try:
-        file = read_mechanism_file(str(source))
+        return source, source.read_bytes() if source.is_file() else b""
+    except OSError as reason:
+        raise ModelFileError(f"{source}: cannot be read: {reason.strerror}") from None
+
+
+def _parsed(path: Path, source: Path, content: bytes) -> MechanismFile:
+    try:
+        file = read_mechanism_file(str(source), content)
     except InputError as reason:
         raise ModelFileError(f"{reason}; {path} is no model file: give identified.yaml or model.safetensors") from None
     if file is None:
@@ -100,24 +179,7 @@ def load_geometry(path: str | Path) -> IdentifiedGeometry:
             f"{path}: there is no identified machine; give the identified.yaml that ccnn identify writes, which holds "
             "the nominal parameters, too"
         )
-    identified = load_mechanism(str(source))
-    nominal = load_mechanism(file.spec, **file.keys)
-    nominal.set_parameters(file.parameters_of(nominal, "nominal"))
-    return IdentifiedGeometry(path, nominal, identified)
-
-
-def load_compensation(path: str | Path) -> LoadedModel | IdentifiedGeometry:
-    """A model file (.safetensors, .onnx, .pt2) or an identified machine (.yaml, .json), by what the name ends in.
-
-    Raises:
-        ModelFileError: it is no model file; see `load_model` and `load_geometry`.
-    """
-    suffix = Path(path).suffix.lower()
-    if suffix not in (*_FORMS, *MODEL_FORMS) and Path(path).is_file():
-        raise ModelFileError(
-            f"{path}: is no model file; one ends in {', '.join(MODEL_FORMS)}, or is an identified.yaml"
-        )
-    return load_geometry(path) if suffix in _FORMS else load_model(path)
+    return file
 
 
 @torch.no_grad()

@@ -5,6 +5,7 @@ from ccnn_torch.mechanisms._mechanism import Mechanism as Mechanism
 from ccnn_torch.mechanisms._pose import PoseError as PoseError
 from ccnn_torch.mechanisms._registry import load_mechanism as load_mechanism
 from ccnn_torch.mechanisms._registry import mechanism_from_description as mechanism_from_description
+from ccnn_torch.mechanisms._registry import mechanism_of_file as mechanism_of_file
 from ccnn_torch.mechanisms._simulator_calls import simulated_rows as simulated_rows
 from ccnn_torch.mechanisms.black_box import BlackBox as BlackBox
 from ccnn_torch.mechanisms.delta import Delta as Delta

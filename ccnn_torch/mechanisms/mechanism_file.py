@@ -65,20 +65,25 @@ class MechanismFile:
         return found
 
 
-def read_mechanism_file(path: str) -> MechanismFile | None:
-    """The file's content, or None where it is no mechanism file: has no key `mechanism`, or cannot be read at all.
+def read_mechanism_file(path: str, content: bytes | None = None) -> MechanismFile | None:
+    """What the file says, or None where it is no mechanism file: has no key `mechanism`, or cannot be read at all.
+
+    Args:
+        path: of the file.
+        content: its bytes, where they were read already.
 
     Raises:
         InputError: it has the key `mechanism` and lacks another one.
     """
     try:
-        content = YAML(typ="safe", pure=True).load(Path(path).read_text(encoding="utf-8"))
+        text = (Path(path).read_bytes() if content is None else content).decode("utf-8")
+        tree = YAML(typ="safe", pure=True).load(text)
     except (OSError, UnicodeDecodeError, MarkedYAMLError):
         # Whoever asked knows what else the file should have been, and says so.
         return None
-    if not isinstance(content, Mapping) or "mechanism" not in content:
+    if not isinstance(tree, Mapping) or "mechanism" not in tree:
         return None
-    return MechanismFile(path, content)
+    return MechanismFile(path, tree)
 
 
 def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float]) -> str:

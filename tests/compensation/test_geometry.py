@@ -24,7 +24,7 @@ from ccnn_torch.compensation import (
 from ccnn_torch.compensation._expanded_geometry import ExpandedGeometry, expand_geometry
 from ccnn_torch.compensation._export import quiet_exporter, to_onnx
 from ccnn_torch.compensation._serial_geometry import SerialGeometry
-from ccnn_torch.compensation._session import open_onnx
+from ccnn_torch.compensation._session import check_graph, open_onnx
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
@@ -151,10 +151,12 @@ def test_every_file_form_of_an_arm_gives_the_same_commands(tmp_path: Path) -> No
     paths = save_model(tmp_path, made, fields_of(arm), forms=("pt2",))
     assert json.loads(paths["card"].read_text())["format"] == "ccnn_torch compensator 3"
     expected = made.solve(joints)
-    for form in ("safetensors", "pt2"):
-        found = load_model(paths[form])(joints.numpy())
-        for name, value in expected._asdict().items():
-            torch.testing.assert_close(torch.from_numpy(found[name]), value, rtol=1e-9, atol=1e-12)
+    master = load_model(paths["safetensors"])(joints.numpy())
+    program = torch.export.load(paths["pt2"]).module()
+    assert not master["fallback"].any()
+    for (name, value), exported in zip(expected._asdict().items(), program(joints), strict=True):
+        torch.testing.assert_close(torch.from_numpy(master[name]), value, rtol=1e-9, atol=1e-12)
+        torch.testing.assert_close(exported, value, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["arm", "expansion"])
@@ -167,6 +169,7 @@ def test_the_deviation_runs_in_onnx_in_double(kind: str) -> None:
     with quiet_exporter():
         program = torch.export.export(module, (joints[:3],), dynamic_shapes=({0: batch},))
         model = to_onnx(program, None, ("deviation",), 20, "{}")
+    check_graph(model)
     session = open_onnx(model.SerializeToString())
     (found,) = session.run(None, {session.get_inputs()[0].name: joints.numpy()})
     torch.testing.assert_close(torch.from_numpy(found), module(joints), rtol=0, atol=1e-14)

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
-import pickle
 import shutil
 import subprocess
 import sys
-import zipfile
 from functools import cache
 from pathlib import Path
 
@@ -26,16 +23,23 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from stand_ins import Sigmoids, fields, tripod_compensator
 
-from ccnn_torch.compensation import Compensator, LoadedModel, fit_compensator, load_model, save_model
+from ccnn_torch.compensation import (
+    Compensator,
+    LoadedModel,
+    fit_compensator,
+    load_compensation,
+    load_model,
+    save_model,
+)
 from ccnn_torch.compensation._export import probe_points, to_onnx, verify
-from ccnn_torch.compensation._session import OUTPUTS, open_pt2
+from ccnn_torch.compensation._session import OUTPUTS
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.mechanisms import Tripod, load_mechanism
 from ccnn_torch.report.json_files import load_schema
 from ccnn_torch.training import Scaling
 
-FORMS = ("safetensors", "onnx", "pt2")
+FORMS = ("safetensors", "onnx")
 
 
 @pytest.fixture
@@ -64,7 +68,7 @@ def test_all_forms_give_the_eager_numbers(folder: Path, tripod: Compensator, arm
         with torch.no_grad():
             expected = compensator.solve(joints, covariates)
         found = loaded(joints.numpy(), None if covariates is None else covariates.numpy())
-        assert tuple(found) == OUTPUTS
+        assert {*found} == {*OUTPUTS, "fallback"} and not found["fallback"].any()
         limit = compensator.limit.numpy()
         for output, wanted in zip(OUTPUTS, (v.numpy() for v in expected), strict=True):
             if wanted.dtype == bool:
@@ -74,6 +78,26 @@ def test_all_forms_give_the_eager_numbers(folder: Path, tripod: Compensator, arm
             assert (np.abs(found[output] - wanted) <= 1e-12 * limit + rounding).all()
         single = loaded(joints[0].numpy(), None if covariates is None else covariates[0].numpy())
         assert single["command"].shape == (len(limit),) and single["inside_domain"].shape == ()
+
+
+def test_a_pt2_holds_the_same_model_and_is_never_read_back(folder: Path, tripod: Compensator, arm: Compensator) -> None:
+    for name, compensator in (("model", tripod), ("arm", arm)):
+        program = torch.export.load(folder / f"{name}.pt2").module()
+
+        def run(*given: np.ndarray | None, program: torch.nn.Module = program) -> dict[str, np.ndarray]:
+            found = program(*(torch.from_numpy(v) for v in given if v is not None))
+            return dict(zip(OUTPUTS, (v.numpy() for v in found), strict=True))
+
+        verify(compensator, run, ".pt2")
+    for load in (load_model, load_compensation):
+        with pytest.raises(ModelFileError, match=r"never read back.*torch\.export\.load\(.*model\.pt2'\)\.module\(\)"):
+            load(folder / "model.pt2")
+
+
+def test_a_pt2_is_refused_before_it_is_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "model.pt2")
+    with pytest.raises(ModelFileError, match="never read back"):
+        load_model(tmp_path / "model.pt2")
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -279,36 +303,6 @@ def test_a_file_of_an_earlier_version_says_what_to_do(copied: Path) -> None:
         load_model(path)
 
 
-def test_a_flipped_weight_in_a_pt2_is_refused_also_where_the_card_was_forged(copied: Path) -> None:
-    path = copied / "model.pt2"
-    content = bytearray(path.read_bytes())
-    with zipfile.ZipFile(io.BytesIO(bytes(content))) as archive:
-        weight = archive.read("archive/data/weights/weight_0") if "archive" in archive.namelist()[0] else b""
-        weight = weight or archive.read(next(n for n in archive.namelist() if n.endswith("weights/weight_0")))
-    content[bytes(content).index(weight) + 3] ^= 1
-    path.write_bytes(content)
-    vouch(path)
-    with pytest.raises(ModelFileError):
-        load_model(path)
-
-
-def test_a_pickle_in_a_pt2_is_never_loaded(folder: Path) -> None:
-    class Bomb:
-        def __reduce__(self) -> tuple[object, tuple[str]]:
-            return (pytest.fail, ("unpickled",))
-
-    for entry in ("archive/data/sample_inputs/model.pt", "archive/data/constants/opaque_obj_0"):
-        stream = io.BytesIO()
-        source = zipfile.ZipFile(folder / "model.pt2")
-        with source, zipfile.ZipFile(stream, "w") as target:
-            for name in source.namelist():
-                if name != entry:
-                    target.writestr(name, source.read(name))
-            target.writestr(entry, pickle.dumps(Bomb()))
-        with pytest.raises(ModelFileError, match="pickled data"):
-            open_pt2(stream.getvalue())
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_truncated_empty_and_foreign_files(copied: Path, form: str) -> None:
     path = copied / f"model.{form}"
@@ -358,7 +352,7 @@ def test_cards(copied: Path) -> None:
 
 def test_other_endings_are_refused(copied: Path) -> None:
     (copied / "model.bin").write_bytes((copied / "model.onnx").read_bytes())
-    with pytest.raises(ModelFileError, match=r"ends in \.safetensors, \.onnx or \.pt2"):
+    with pytest.raises(ModelFileError, match=r"ends in \.safetensors or \.onnx"):
         load_model(copied / "model.bin")
 
 

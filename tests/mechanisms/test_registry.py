@@ -45,7 +45,7 @@ def test_description_is_json_and_exact(name, tmp_path):
     shifted = original.with_nominal(original.nominal + torch.tensor(1 / 3, dtype=torch.float64))
     for mechanism in (original, shifted):
         description = json.loads(json.dumps(mechanism.describe()))
-        twin = mechanism_from_description(description)
+        twin = mechanism_from_description(description, allow_code=True)
         assert torch.equal(twin.nominal, mechanism.nominal) and type(twin).__name__ == type(mechanism).__name__
         assert twin.describe() == mechanism.describe()
 
@@ -80,7 +80,7 @@ def test_a_copy_leaves_the_hooks_behind():
 def test_a_directly_made_mechanism_describes_itself():
     assert Tripod(L=1.1).describe()["spec"] == "tripod"
     bar = FiveBar(crank=0.45)
-    twin = mechanism_from_description(json.loads(json.dumps(bar.describe())))
+    twin = mechanism_from_description(json.loads(json.dumps(bar.describe())), allow_code=True)
     assert torch.equal(twin.nominal, bar.nominal)
     homeless = type("Homeless", (FiveBar,), {"__module__": "__nowhere__"})()
     with pytest.raises(InputError, match="Homeless stands in no file"):

@@ -1,0 +1,159 @@
+"""What comes out of a model is held to what its card promises, whatever the file computes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError
+
+__all__ = ["Promise", "as_matrix", "kept"]
+
+Array = NDArray[Any]
+
+# From here an input counts as infinite; as in a `Domain`.
+_HUGE = 1e300
+# Of the limit: how far command + deviation may be from the joints, and of the half range: from the domain's edge.
+# Exports agree with their master to 1e-9 of the limit.
+_SLACK = 1e-6
+_EDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What holds for every row of a model with n joints and d inputs, the joints first.
+
+    Attributes:
+        limit: of |deviation|, `n` [SI]; infinity without one.
+        sd: standard deviation where the deviation is taken as 0, `n` [SI]; None for a model that tells none.
+        centre, low, high: what stands for an input that is no number, and for an infinite one, `d` [SI].
+        half_range: unit of the rows of `directions`, `d` [SI].
+        directions: `k x d` [1], with `least` and `most`, `k` [1]: inside the domain, directions · (x - centre) /
+            half_range is between the two; no rows where the domain is told by the model alone.
+    """
+
+    limit: Array
+    sd: Array | None
+    centre: Array
+    low: Array
+    high: Array
+    half_range: Array
+    directions: Array
+    least: Array
+    most: Array
+
+    @classmethod
+    def of_card(cls, facts: Mapping[str, Any]) -> Promise:
+        """Out of facts of the right form (`check_form`)."""
+        domain, principal = facts["domain"], facts["domain"]["principal"]
+        # By name: JSON has its keys in another order.
+        edges = [domain["inputs"][c["name"]] for c in facts["joints"] + facts["covariates"]]
+        limits = [facts["limits"][c["name"]] for c in facts["joints"]]
+        low, high = (np.array([edge[k] for edge in edges], dtype=float) for k in ("low", "high"))
+        centre, half_range = (np.array(principal[k], dtype=float) for k in ("centre", "half_range"))
+        return cls(
+            np.array([entry["limit"] for entry in limits], dtype=float),
+            np.hypot([entry["safe_correction"] for entry in limits], [entry["safe_sd"] for entry in limits]),
+            centre,
+            low,
+            high,
+            half_range,
+            np.concatenate([np.eye(len(centre)), np.array(principal["directions"], dtype=float)]),
+            np.concatenate([(low - centre) / half_range, principal["low"]]),
+            np.concatenate([(high - centre) / half_range, principal["high"]]),
+        )
+
+    @classmethod
+    def without_card(cls, home: Array) -> Promise:
+        """Of identified geometry, which has no limit and tells its domain itself; home: `n` [SI]."""
+        n = len(home)
+        nothing = np.zeros(0)
+        return cls(np.full(n, np.inf), None, home, home, home, np.ones(n), np.zeros((0, n)), nothing, nothing)
+
+    def inside(self, inputs: Array) -> Array:
+        """Whether inputs `s x d` [SI] are in the domain, `s`, bool."""
+        y = ((inputs - self.centre) / self.half_range) @ self.directions.T
+        return np.asarray(((y >= self.least - _EDGE) & (y <= self.most + _EDGE)).all(-1))
+
+
+def as_matrix(values: ArrayLike, wanted: tuple[Coordinate, ...], what: str) -> Array:
+    """Rows of what a caller gives, `... x len(wanted)` [SI].
+
+    Raises:
+        InputError: they are no numbers, or the last dimension is wrong.
+    """
+    names = ", ".join(c.header for c in wanted)
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"the model takes numbers, the {what} {names} as last dimension") from None
+    if array.ndim == 0 or array.shape[-1] != len(wanted):
+        raise InputError(f"the model takes the {what} {names} as last dimension; got the shape {array.shape}")
+    return array
+
+
+@np.errstate(invalid="ignore", over="ignore")
+def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, promise: Promise) -> dict[str, Array]:
+    """The outputs, with what breaks the promise replaced by the safe fallback.
+
+    A row falls back where an output is missing, of another shape or kind, or not finite, where |deviation| or
+    |ideal - joints| is above the limit, or where command + deviation is not the joints. It then has command = ideal =
+    joints and deviation 0, outside the domain. A row is inside only where the card's domain says so, too. Joints that
+    are no number count as the middle of the domain, infinite ones as its edge.
+
+    Args:
+        found: outputs by name; others than these are left out.
+        joints: `s x n` [SI], anything.
+        covariates: `s x m` [SI], anything; None without any.
+        promise: of the card.
+
+    Returns:
+        `command`, `deviation`, `ideal`, and `deviation_sd` where the promise has one, `s x n` [SI], all finite;
+        `inside_domain`, `ideal_inside_domain` and `fallback`, `s`, bool.
+    """
+    rows, n = joints.shape
+    inputs = joints if covariates is None else np.concatenate([joints, covariates], -1)
+    strange = ~(np.abs(inputs) < _HUGE)
+    edge = np.where(np.isnan(inputs), promise.centre, np.where(inputs > 0, promise.high, promise.low))
+    inputs = np.where(strange, edge, inputs)
+    given = inputs[:, :n]
+
+    floats, bools = ["command", "deviation", "ideal"], ["inside_domain", "ideal_inside_domain"]
+    safe = {"command": given, "deviation": np.zeros_like(given), "ideal": given}
+    if promise.sd is not None:
+        floats.append("deviation_sd")
+        safe["deviation_sd"] = np.broadcast_to(promise.sd, given.shape)
+    # Where an output is no such numbers there are none.
+    there = {name: _of_kind(found.get(name), (rows, n), np.float64) for name in floats}
+    flags = {name: _of_kind(found.get(name), (rows,), np.bool_) for name in bools}
+    whole = all(value is not None for value in (*there.values(), *flags.values()))
+    numbers = {name: safe[name] if value is None else value for name, value in there.items()}
+
+    command, deviation, ideal = (numbers[name] for name in floats[:3])
+    rounding = _SLACK * np.minimum(promise.limit, 1.0) + 8 * np.spacing(np.abs(given) + np.abs(deviation))
+    # Written so that a NaN is not good.
+    good = np.isfinite(command) & np.isfinite(ideal) & (np.abs(deviation) <= promise.limit * (1 + _EDGE))
+    good &= (np.abs(command + deviation - given) <= rounding) & (np.abs(ideal - given) <= promise.limit + rounding)
+    if promise.sd is not None:
+        good &= (numbers["deviation_sd"] >= 0) & (numbers["deviation_sd"] < np.inf)
+    kept_rows: Array = np.logical_and(good.all(-1), whole)
+
+    checked = {name: np.where(kept_rows[:, None], numbers[name], safe[name]) for name in floats}
+    known = kept_rows & ~strange.any(-1)
+    for name, at in (("inside_domain", checked["command"]), ("ideal_inside_domain", given)):
+        flag = flags[name]
+        if flag is None:
+            flag = np.zeros(rows, dtype=bool)
+        checked[name] = known & flag & promise.inside(np.concatenate([at, inputs[:, n:]], -1))
+    return checked | {"fallback": ~kept_rows}
+
+
+def _of_kind(value: Any, shape: tuple[int, ...], kind: type) -> Array | None:
+    """The output, None where it is no array of this shape and kind."""
+    right = isinstance(value, np.ndarray) and value.shape == shape and value.dtype == kind
+    return value if right else None
