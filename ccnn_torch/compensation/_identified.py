@@ -27,6 +27,8 @@ Array = NDArray[Any]
 _CLOSE = 1e-8
 # How far joints may be from those that the inverse kinematics give for their pose [SI].
 _SAME = 1e-6
+# No machine has joints as far [SI]; a double has lost what is small there.
+_FARTHEST = 1e6
 _FORMS = (".yaml", ".yml", ".json")
 
 
@@ -74,11 +76,11 @@ class IdentifiedGeometry:
         """
         array = as_matrix(joints, self.joints, "joints")
         rows = array.reshape(-1, array.shape[-1])
-        home = self.nominal.home_joints
-        given = torch.tensor(rows)
-        given = torch.where(torch.isfinite(given), given, home)
-        command, inside = _carried(self.nominal, self.identified, given)
-        ideal, ideal_inside = _carried(self.identified, self.nominal, given)
+        promise = Promise.without_card(self.middle)
+        given, strange = (torch.from_numpy(v) for v in promise.cleaned(rows))
+        known = ~strange.any(-1)
+        command, inside = _carried(self.nominal, self.identified, given, known)
+        ideal, ideal_inside = _carried(self.identified, self.nominal, given, known)
         found = {
             "command": command.numpy(),
             "deviation": (given - command).numpy(),
@@ -86,7 +88,7 @@ class IdentifiedGeometry:
             "ideal": ideal.numpy(),
             "ideal_inside_domain": ideal_inside.numpy(),
         }
-        checked = kept(found, rows, None, Promise.without_card(home.numpy()))
+        checked = kept(found, rows, None, promise)
         return {name: value.reshape((*array.shape[:-1], *value.shape[1:])) for name, value in checked.items()}
 
 
@@ -183,8 +185,8 @@ def _parsed(path: Path, source: Path, content: bytes) -> MechanismFile:
 
 
 @torch.no_grad()
-def _carried(first: Mechanism, second: Mechanism, joints: Tensor) -> tuple[Tensor, Tensor]:
-    """Joints of `second` at the poses that `first` takes with `joints`, and where there are any."""
+def _carried(first: Mechanism, second: Mechanism, joints: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Joints of `second` at the poses that `first` takes with `joints`, and where there are any among those `known`."""
     pose = first.forward_kinematics(joints)
     found = second.solve_inverse(pose, guess=joints)
     error = second.pose_error(second.forward_kinematics(found, guess=pose), pose)
@@ -194,4 +196,5 @@ def _carried(first: Mechanism, second: Mechanism, joints: Tensor) -> tuple[Tenso
         reached = reached & (error.rotation < _CLOSE)
     # Joints in another working mode take a pose that our inverse kinematics would take with far-off joints.
     reached &= first.wrap(first.solve_inverse(pose, guess=joints) - joints).abs().amax(-1) < _SAME
+    reached &= known & (joints.abs().amax(-1) < _FARTHEST)
     return torch.where(reached[..., None], found, joints), reached

@@ -75,6 +75,12 @@ class Promise:
         nothing = np.zeros(0)
         return cls(np.full(n, np.inf), None, home, home, home, np.ones(n), np.zeros((0, n)), nothing, nothing)
 
+    def cleaned(self, inputs: Array) -> tuple[Array, Array]:
+        """Finite inputs `s x d` [SI], as a `Domain` makes them, and which were not, `s x d`, bool."""
+        strange = ~(np.abs(inputs) < _HUGE)
+        edge = np.where(np.isnan(inputs), self.centre, np.where(inputs > 0, self.high, self.low))
+        return np.where(strange, edge, inputs), strange
+
     def inside(self, inputs: Array) -> Array:
         """Whether inputs `s x d` [SI] are in the domain, `s`, bool."""
         y = ((inputs - self.centre) / self.half_range) @ self.directions.T
@@ -118,9 +124,7 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
     """
     rows, n = joints.shape
     inputs = joints if covariates is None else np.concatenate([joints, covariates], -1)
-    strange = ~(np.abs(inputs) < _HUGE)
-    edge = np.where(np.isnan(inputs), promise.centre, np.where(inputs > 0, promise.high, promise.low))
-    inputs = np.where(strange, edge, inputs)
+    inputs, strange = promise.cleaned(inputs)
     given = inputs[:, :n]
 
     floats, bools = ["command", "deviation", "ideal"], ["inside_domain", "ideal_inside_domain"]
