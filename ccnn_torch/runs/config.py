@@ -193,6 +193,7 @@ class RunConfig(_Part):
         default=None,
         description="mechanism of the records: tripod, machine_tool, a DH file (.yaml), a URDF, or file.py:Name",
     )
+    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
     geometry: Literal["none", "identify"] = Field(
         default="none",
         description="identify = find all geometric parameters on the training rows of records, and let the network "

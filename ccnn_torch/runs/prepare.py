@@ -193,7 +193,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
             f"the config names no {missing}: write {missing}=… "
             "(records: a CSV file; mechanism: tripod, machine_tool, a DH file, a URDF, or file.py:Name)"
         )
-    mechanism = load_mechanism(config.mechanism)
+    mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
     verdict = None if config.effects == "none" else verdict_of(config.effects, mechanism)
     records = load_records(config.records, mechanism, config.covariates)
     check_rows(records, mechanism)

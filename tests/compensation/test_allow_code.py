@@ -136,6 +136,21 @@ def test_the_command_line(own: Path, identified: Path, ran: Callable[[], bool], 
         out.unlink()
 
 
+def test_a_config_allows_it_by_a_key(identified: Path, ran: Callable[[], bool], tmp_path: Path, cli: Cli) -> None:
+    mechanism = load_mechanism("tripod")
+    poses = mechanism.sample_workspace(40, torch.Generator().manual_seed(0))
+    rows = torch.cat([mechanism.solve_inverse(poses) + 1e-4, poses], -1).numpy()
+    headers = [c.header for c in (*mechanism.joints, *mechanism.pose)]
+    write_table(tmp_path / "rows.csv", dict(zip(headers, rows.T, strict=True)))
+    config = tmp_path / "config.yaml"
+    config.write_text(f"records: {tmp_path / 'rows.csv'}\nmechanism: {identified}\nmethods: [constant]\n")
+    words = ("run", config, f"out={tmp_path / 'run'}", "save_models=false", "save_report=false", "--quiet")
+    code, _, err = cli(*words)
+    assert code == 2 and "which would run" in err and "mechanism_keys.allow_code=true" in err and not ran()
+    code, _, err = cli(*words, "mechanism_keys.allow_code=true")
+    assert (code, err) == (0, "") and ran()
+
+
 def test_numbers_that_are_none_or_huge_leave_the_joints_as_they_are(tmp_path: Path) -> None:
     for name in ("tripod", "five_bar", "stewart", "delta"):
         mechanism = load_mechanism(name)
