@@ -16,7 +16,7 @@ from ccnn_torch.compensation._compensator import Compensator, Hook
 from ccnn_torch.compensation._facts import coordinates
 from ccnn_torch.compensation._open import Run, open_model
 from ccnn_torch.compensation._promise import Promise, as_matrix, kept
-from ccnn_torch.compensation._session import RUN_ERRORS, TAKE_AGAIN, Array
+from ccnn_torch.compensation._session import RUN_ERRORS, TAKE_AGAIN, Array, said
 from ccnn_torch.compensation._signature import check_signature
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import FallbackWarning, InputError, ModelFileError
@@ -185,7 +185,7 @@ def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_
     try:
         run(promise.centre[None, :n], promise.centre[None, n:] if model.covariates else None)
     except RUN_ERRORS as reason:
-        raise ModelFileError(f"{path}: cannot be run ({' '.join(str(reason).split())})" + TAKE_AGAIN) from None
+        raise ModelFileError(f"{path}: cannot be run ({said(reason)})" + TAKE_AGAIN) from None
     return model
 
 

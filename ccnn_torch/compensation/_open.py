@@ -29,6 +29,7 @@ from ccnn_torch.compensation._session import (
     check_graph,
     open_onnx,
     run_onnx,
+    said,
 )
 from ccnn_torch.errors import ModelFileError
 from ccnn_torch.training import Scaling
@@ -76,8 +77,7 @@ def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
         compensator = _rebuild(facts, tensors)
         limits = compensator.limit.tolist()
     except RUN_ERRORS as reason:
-        said = (str(reason).splitlines() or [""])[0]
-        raise ModelFileError(f"its tensors are not those that it tells of ({said})" + TAKE_AGAIN) from None
+        raise ModelFileError(f"its tensors are not those that it tells of ({said(reason)})" + TAKE_AGAIN) from None
     if limits != [facts["limits"][c["name"]]["limit"] for c in facts["joints"]]:
         raise ModelFileError("it holds other limits than it tells of" + TAKE_AGAIN)
     return facts, compensator
@@ -101,8 +101,7 @@ def _open_onnx(content: bytes) -> tuple[dict[str, Any], Any]:
     try:
         return facts, open_onnx(content)
     except RUN_ERRORS as reason:
-        said = " ".join(str(reason).split())
-        raise ModelFileError(f"ONNX Runtime does not take its graph ({said})" + TAKE_AGAIN) from None
+        raise ModelFileError(f"ONNX Runtime does not take its graph ({said(reason)})" + TAKE_AGAIN) from None
 
 
 def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensator:

@@ -12,7 +12,17 @@ from onnxruntime.capi import onnxruntime_pybind11_state as runtime
 
 from ccnn_torch.errors import ModelFileError
 
-__all__ = ["METADATA_KEY", "OUTPUTS", "RUN_ERRORS", "TAKE_AGAIN", "Array", "check_graph", "open_onnx", "run_onnx"]
+__all__ = [
+    "METADATA_KEY",
+    "OUTPUTS",
+    "RUN_ERRORS",
+    "TAKE_AGAIN",
+    "Array",
+    "check_graph",
+    "open_onnx",
+    "run_onnx",
+    "said",
+]
 
 Array = NDArray[Any]
 
@@ -27,6 +37,11 @@ RUN_ERRORS: tuple[type[Exception], ...] = (
     *(RuntimeError, ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError, MemoryError),
     *(v for v in vars(runtime).values() if isinstance(v, type) and issubclass(v, Exception)),
 )
+
+
+def said(reason: Exception) -> str:
+    """What such an error says, short enough for a sentence: names out of the file stand in it."""
+    return " ".join("".join(c if c.isprintable() else " " for c in str(reason)).split())[:200] or type(reason).__name__
 
 
 def check_graph(model: onnx.ModelProto) -> None:
