@@ -158,7 +158,8 @@ class PhysicalEffects(nn.Module):
     @classmethod
     def from_description(cls, description: dict[str, Any]) -> PhysicalEffects:
         """The module as it was described, its tensors 0."""
-        mechanism = mechanism_from_description(description["mechanism"])
+        # Whether code may run says whoever reads the file that this stands in.
+        mechanism = mechanism_from_description(description["mechanism"], allow_code=True)
         weight, damping, *most, free = description["care"]
         gain, inverse_gain = (math.inf if m is None else float(m) for m in most)
         acting = [

@@ -392,6 +392,9 @@ def test_a_master_that_names_code_does_not_run_it(copied: Path, tmp_path: Path) 
         with pytest.raises(ModelFileError, match=r"names Python code, .*own\.py:Own, which would run.*allow_code=True"):
             load_model(path)
     assert not (tmp_path / "ran").exists()
+    with pytest.raises(ModelFileError):
+        load_model(path, allow_code=True)
+    assert (tmp_path / "ran").exists()
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"format": NaN}', "1" * 5000, "\x00", "{" * 10])

@@ -22,9 +22,9 @@ from ccnn_torch.compensation import (
     settled_damping,
 )
 from ccnn_torch.compensation._expanded_geometry import ExpandedGeometry, expand_geometry
-from ccnn_torch.compensation._export import quiet_exporter, to_onnx
 from ccnn_torch.compensation._serial_geometry import SerialGeometry
 from ccnn_torch.compensation._session import check_graph, open_onnx
+from ccnn_torch.compensation._to_onnx import quiet_exporter, to_onnx
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
