@@ -80,7 +80,8 @@ def open_onnx(content: bytes) -> onnxruntime.InferenceSession:
     options.log_severity_level = 4
     # Not by what the bytes look like.
     options.add_session_config_entry("session.load_model_format", "ONNX")
-    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    # Else it prints what is wrong with a file, and tries the same again.
+    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
 
 
 def run_onnx(session: onnxruntime.InferenceSession, joints: Array, covariates: Array | None) -> dict[str, Array]:

@@ -184,6 +184,32 @@ def test_further_outputs_are_left_out(copied: Path) -> None:
     assert "nothing" not in load_model(path)(JOINTS)
 
 
+@given(place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_flipped_bit_in_a_graph_gives_a_sentence_or_commands_within_the_limit(
+    copied: Path, capfd: pytest.CaptureFixture[str], place: float, bit: int
+) -> None:
+    path = copied / "model.onnx"
+    good = path.read_bytes()
+    bad = bytearray(good)
+    bad[int(place * len(bad))] ^= 1 << bit
+    path.write_bytes(bad)
+    vouch(path, facts_of(copied))
+    try:
+        model = load_model(path)
+        limit = np.array([model.facts["limits"][c.name]["limit"] for c in model.joints])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FallbackWarning)
+            found = model(np.concatenate([JOINTS, np.full((1, 3), np.nan), np.full((1, 3), 1e155)]))
+        assert np.isfinite(found["command"]).all() and (np.abs(found["deviation"]) <= limit * (1 + 1e-9)).all()
+    except ModelFileError as refused:
+        assert str(path) in str(refused)
+    finally:
+        path.write_bytes(good)
+    # Nor does ONNX Runtime print anything of its own.
+    assert capfd.readouterr() == ("", "")
+
+
 def external(graph: Any) -> None:
     tensor = numpy_helper.from_array(np.zeros((1, 3)), "stolen")
     tensor.ClearField("raw_data")
@@ -327,15 +353,10 @@ def test_a_master_whose_limits_are_not_those_it_tells_of(copied: Path) -> None:
         lambda t: t.update({"network.weights.0": torch.zeros(2, 2)}),
         lambda t: t.update({"domain.centre": torch.zeros(7, dtype=torch.float64)}),
         lambda t: t.update({"scaling.periodic": torch.tensor([7])}),
-        lambda t: t.update({"safe": t["safe"].bfloat16()}),
     ],
 )
 def test_tensors_that_do_not_fit(copied: Path, change: Callable[[dict[str, torch.Tensor]], None]) -> None:
-    try:
-        path = forge_master(copied, facts_of(copied), change)
-    except TypeError:
-        # A kind of number that the digest does not know.
-        return
+    path = forge_master(copied, facts_of(copied), change)
     with pytest.raises(ModelFileError, match=r"tensors are not those|cannot be run"):
         load_model(path)
 
@@ -349,7 +370,7 @@ ANYTHING = st.recursive(
 
 
 @given(key=st.sampled_from(LEAVES), deep=st.booleans(), draw=st.randoms(use_true_random=False), value=ANYTHING)
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_fact_replaced_by_anything_gives_a_sentence_or_finite_commands(
     copied: Path, key: str, deep: bool, draw: Any, value: Any
 ) -> None:
