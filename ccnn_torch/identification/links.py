@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.least_squares import jacobian_of, levenberg_marquardt
-from ccnn_torch.mechanisms.frames import TOOL_SPREAD
+from ccnn_torch.mechanisms.frames import ROTATION_WEIGHT, TOOL_SPREAD
 from ccnn_torch.mechanisms.serial import SerialArm
 from ccnn_torch.outliers import inlying
 from ccnn_torch.rotations import matrix_to_rotation_vector
@@ -23,7 +23,7 @@ def fit_links(
     pose: Tensor,
     start: Tensor,
     weights: Tensor | None = None,
-    rotation_weight: float = 0.3,
+    rotation_weight: float = ROTATION_WEIGHT,
     length_tolerance: float = 1e-3,
     angle_tolerance: float = 1e-3,
 ) -> Tensor:

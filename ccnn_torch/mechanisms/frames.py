@@ -18,7 +18,10 @@ from ccnn_torch.mechanisms.serial import SerialArm
 from ccnn_torch.outliers import FAR, inlying, residual_scale
 from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix, skew
 
-__all__ = ["TOOL_SPREAD", "fit_frames"]
+__all__ = ["ROTATION_WEIGHT", "TOOL_SPREAD", "fit_frames"]
+
+ROTATION_WEIGHT = 0.3
+"""Of orientation against position [m/rad]: 1 mrad counts as 0.3 mm, about an arm's ratio of the two errors."""
 
 TOOL_SPREAD = 0.25
 """Standard deviation of the tool's position about its nominal one, as a share of the reach. With one orientation in all
@@ -35,7 +38,7 @@ def fit_frames(
     joints: Tensor,
     pose: Tensor,
     weights: Tensor | None = None,
-    rotation_weight: float = 0.3,
+    rotation_weight: float = ROTATION_WEIGHT,
     columns: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> Tensor:
     """Fit the unknown ones of base and tool frame to rows, nominal links kept; each repeat on its own rows.
@@ -51,7 +54,7 @@ def fit_frames(
         joints: `s x n` [SI].
         pose: measured, `s x p` [SI].
         weights: `r x s` or `s` [1]; 0 leaves a row out (held-out rows); all 1 when None.
-        rotation_weight: [m/rad]; 0.3 weighs 1 mrad as 0.3 mm, about an arm's ratio of orientation to position errors.
+        rotation_weight: of orientation against position [m/rad].
         columns: the records' other columns, `s` each; needed for `frame_per` and `tool_per`.
 
     Returns:
