@@ -18,8 +18,7 @@ from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Effect, Situation, default_gravity
 from ccnn_torch.errors import InputError, RowsError
-from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.mechanisms.frames import fit_frames
+from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
 from ccnn_torch.records import Records
 
 __all__ = ["diagnose", "naming", "noise_of", "situation_of"]
@@ -108,6 +107,8 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
     parameters = None
     if isinstance(mechanism, SerialArm) and mechanism.unknown_frames:
         parameters = fit_frames(mechanism, records.joints, records.pose, columns=records.columns)
+        about = (records.joints, records.pose, parameters)
+        judge_frames(mechanism, *about, where=records.path, name_rows=records.name_rows)
     down = default_gravity(mechanism) if gravity is None else torch.tensor(list(gravity), dtype=torch.float64)
     if down.shape != (3,):
         raise InputError(f"gravity: needs three numbers (x, y, z in m/s²), not {len(down)}")

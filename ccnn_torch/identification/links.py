@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.least_squares import jacobian_of, levenberg_marquardt
+from ccnn_torch.mechanisms.frames import ROTATION_WEIGHT, TOOL_SPREAD
 from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.outliers import inlying
 from ccnn_torch.rotations import matrix_to_rotation_vector
 
 __all__ = ["fit_links"]
@@ -21,7 +23,7 @@ def fit_links(
     pose: Tensor,
     start: Tensor,
     weights: Tensor | None = None,
-    rotation_weight: float = 0.3,
+    rotation_weight: float = ROTATION_WEIGHT,
     length_tolerance: float = 1e-3,
     angle_tolerance: float = 1e-3,
 ) -> Tensor:
@@ -29,7 +31,8 @@ def fit_links(
 
     Every link parameter is drawn to the maker's value with the tolerance as standard deviation, against the noise that
     the rows show: what the rows cannot tell (two parallel axes, a tool length along the last axis) stays nominal, so
-    that nothing needs to be left out by hand. Frames in `arm.unknown_frames` are free.
+    that nothing needs to be left out by hand. Frames in `arm.unknown_frames` are free but for the tool's position, as
+    in `fit_frames`. Gross outliers are left out.
 
     Args:
         arm: the arm, with one base and one tool frame for all rows.
@@ -45,35 +48,42 @@ def fit_links(
         All parameters, as `start`.
     """
     weights = torch.ones(len(joints), dtype=torch.float64) if weights is None else weights
-    root = weights.sqrt()[..., None]
     position, rotation = arm.frame(pose)
     unit = {"m": 1 / length_tolerance, "rad": 1 / angle_tolerance}
     stiffness = torch.tensor([unit[p.unit] for p in arm.geometry], dtype=torch.float64)
     for name, part in (("base", slice(0, 6)), ("tool", slice(-6, None))):
         if name in arm.unknown_frames:
             stiffness[part] = 0
+    if "tool" in arm.unknown_frames:
+        stiffness[-6:-3] = 1 / (TOOL_SPREAD * arm.reach)
+    # Priors hold the links; the frames are what the rows alone decide.
+    free = 12 if rotation is not None else 9
 
     def gap(values: Tensor) -> Tensor:
-        """Weighted pose difference, `... x s x c`. values: `... x s x k`."""
+        """Pose difference, `... x s x c` [m]. values: `... x s x k`."""
         there, turned = arm.forward_frame(joints, values)
         if rotation is None:
-            return (there - position) * root
+            return there - position
         turn = matrix_to_rotation_vector(turned @ rotation.mT)
-        return torch.cat([there - position, rotation_weight * turn], dim=-1) * root
+        return torch.cat([there - position, rotation_weight * turn], dim=-1)
 
     def by_row(values: Tensor) -> Tensor:
         return values[..., None, :].expand(*values.shape[:-1], len(joints), -1)
 
     value = start
     for _ in range(_ROUNDS):
-        square = gap(by_row(value)).square().mean(-1).sum(-1) / weights.sum(-1)
+        left = gap(by_row(value))
+        kept = weights * inlying(torch.linalg.vector_norm(left, dim=-1), weights > 0, left.shape[-1], free)
+        square = (kept * left.square().mean(-1)).sum(-1) / kept.sum(-1)
         pull = square.sqrt()[..., None] * stiffness
+        root = kept.sqrt()[..., None]
 
-        def residual(values: Tensor, pull: Tensor = pull) -> Tensor:
-            return torch.cat([gap(by_row(values)).flatten(-2), (values - arm.nominal) * pull], dim=-1)
+        def residual(values: Tensor, pull: Tensor = pull, root: Tensor = root) -> Tensor:
+            return torch.cat([(gap(by_row(values)) * root).flatten(-2), (values - arm.nominal) * pull], dim=-1)
 
-        def slope(values: Tensor, pull: Tensor = pull) -> Tensor:
-            return torch.cat([jacobian_of(gap, by_row(values))[1].flatten(-3, -2), torch.diag_embed(pull)], dim=-2)
+        def slope(values: Tensor, pull: Tensor = pull, root: Tensor = root) -> Tensor:
+            rows = jacobian_of(gap, by_row(values))[1] * root[..., None]
+            return torch.cat([rows.flatten(-3, -2), torch.diag_embed(pull)], dim=-2)
 
         value = levenberg_marquardt(residual, value, slope, max_iterations=20, damping=1e-6).value
     return value

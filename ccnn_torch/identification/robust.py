@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 
 import torch
-from scipy.special import chdtr, gammaincinv
+from scipy.special import chdtr
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification._linear import WeightedRows
 from ccnn_torch.identification.problem import Problem
+from ccnn_torch.outliers import chi_quantile, residual_scale
 
 __all__ = ["LOSSES", "loss_weights", "reweighted"]
 
@@ -24,8 +25,7 @@ _BEND = {"huber": 1.345, "cauchy": 2.385}
 def loss_weights(residual: Tensor, weights: Tensor, loss: str, parameters: int) -> Tensor:
     """Weight of every row under a robust loss, from the length of its residual over the scale of all of them.
 
-    The scale is the median length (the MAD about zero), made consistent with normal noise and raised by
-    sqrt(N / (N - k)) for the parameters fitted.
+    The scale is that of `residual_scale`.
 
     Args:
         residual: `… x s x c`, decorrelated, its channels of one variance.
@@ -41,20 +41,11 @@ def loss_weights(residual: Tensor, weights: Tensor, loss: str, parameters: int) 
     channels = residual.shape[-1]
     used = (weights > 0).expand(residual.shape[:-1])
     length = torch.linalg.vector_norm(residual * weights.sqrt()[..., None], dim=-1)
-    middle = torch.where(used, length, torch.nan).nanmedian(-1, keepdim=True).values
-    equations = used.sum(-1, keepdim=True) * channels
-    spared = (equations / (equations - parameters).clamp_min(1)).sqrt()
-    scale = middle / _chi_quantile(0.5, channels) * spared
-    bend = _chi_quantile(chdtr(1, _BEND[loss] ** 2), channels)
+    scale = residual_scale(length, used, channels, parameters)
+    bend = chi_quantile(chdtr(1, _BEND[loss] ** 2), channels)
     ratio = length / (scale * bend).clamp_min(torch.finfo(length.dtype).tiny)
     factor: Tensor = 1 / ratio.clamp_min(1) if loss == "huber" else 1 / (1 + ratio.square())
     return factor
-
-
-def _chi_quantile(probability: float, channels: int) -> float:
-    """Quantile of the length of `channels` standard normals; scipy.stats has it too, but takes long to load."""
-    length: float = float(2 * gammaincinv(channels / 2, probability)) ** 0.5
-    return length
 
 
 def reweighted(problem: Problem, values: Tensor, loss: str) -> Problem:

@@ -12,6 +12,7 @@ from ccnn_torch.mechanisms.delta import Delta as Delta
 from ccnn_torch.mechanisms.delta import DeltaLinear as DeltaLinear
 from ccnn_torch.mechanisms.dh_file import read_dh_file as read_dh_file
 from ccnn_torch.mechanisms.five_bar import FiveBar as FiveBar
+from ccnn_torch.mechanisms.frame_fit import judge_frames as judge_frames
 from ccnn_torch.mechanisms.framed import Framed as Framed
 from ccnn_torch.mechanisms.frames import fit_frames as fit_frames
 from ccnn_torch.mechanisms.machine_tool import MachineTool as MachineTool

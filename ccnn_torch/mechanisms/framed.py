@@ -13,7 +13,7 @@ from ccnn_torch.batching import expand_leading
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.least_squares import jacobian_of, levenberg_marquardt
-from ccnn_torch.mechanisms._frame_start import closed_form_frames, rigid_body_frame
+from ccnn_torch.mechanisms._frame_start import best_closed_form, rigid_body_frame
 from ccnn_torch.mechanisms._links import compose
 from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms._numeric import carry_derivative
@@ -193,7 +193,8 @@ class Framed(Mechanism):
             return torch.cat([rigid_body_frame(here, measured, weights, self.rotation_weight), inner], dim=-1)
         assert here[1] is not None and measured[1] is not None  # a tool without orientation is refused
         if self.base:
-            both = closed_form_frames(here[1], here[0], measured, weights)
+            tool = self._split(self.nominal)[2]
+            both = best_closed_form(here[1], here[0], measured, tool, weights, self.rotation_weight)
             return torch.cat([both[..., :6], inner, both[..., 6:]], dim=-1)
         share = (weights / weights.sum(-1, keepdim=True))[..., None]
         back = here[1].mT

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,9 +15,22 @@ from ccnn_torch.least_squares import levenberg_marquardt
 from ccnn_torch.mechanisms._frame_start import closed_form_frames
 from ccnn_torch.mechanisms._pose import frame_jacobian
 from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.outliers import FAR, inlying, residual_scale
 from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix, skew
 
-__all__ = ["fit_frames"]
+__all__ = ["ROTATION_WEIGHT", "TOOL_SPREAD", "fit_frames"]
+
+ROTATION_WEIGHT = 0.3
+"""Of orientation against position [m/rad]: 1 mrad counts as 0.3 mm, about an arm's ratio of the two errors."""
+
+TOOL_SPREAD = 0.25
+"""Standard deviation of the tool's position about its nominal one, as a share of the reach. With one orientation in all
+rows the tool's position and the base's cannot be separated, and nothing else would hold either of them."""
+
+# Rounds of reweighting: soft ones (Cauchy's weights) from every start, then the best start without gross outliers.
+_SOFT, _HARD = 4, 3
+# Where Cauchy's weights bend, in standard deviations (Holland and Welsch 1977).
+_BEND = 2.385
 
 
 def fit_frames(
@@ -25,22 +38,23 @@ def fit_frames(
     joints: Tensor,
     pose: Tensor,
     weights: Tensor | None = None,
-    rotation_weight: float = 0.3,
+    rotation_weight: float = ROTATION_WEIGHT,
     columns: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> Tensor:
     """Fit the unknown ones of base and tool frame to rows, nominal links kept; each repeat on its own rows.
 
     With orientation both frames are fitted in (position, rotation_weight x rotation vector); without, the base frame
     and the tool's position (the tool's rotation is then nothing that the rows could tell and stays nominal). Damped
-    least squares from a closed-form start, so that there is no wrong basin to fall into. Directions that the rows do
-    not show (the roll of a plate about the line of its two sockets) stay at the start.
+    least squares from several closed-form starts, the best of which is kept; gross outliers are first weighed down and
+    then left out. Directions that the rows do not show (the roll of a plate about the line of its two sockets) stay at
+    the start, and the tool's position is drawn to its nominal one by a quarter of the reach.
 
     Args:
         arm: the arm; `arm.unknown_frames` says what is fitted, `arm.frame_per` and `arm.tool_per` per which groups.
         joints: `s x n` [SI].
         pose: measured, `s x p` [SI].
         weights: `r x s` or `s` [1]; 0 leaves a row out (held-out rows); all 1 when None.
-        rotation_weight: [m/rad]; 0.3 weighs 1 mrad as 0.3 mm, about an arm's ratio of orientation to position errors.
+        rotation_weight: of orientation against position [m/rad].
         columns: the records' other columns, `s` each; needed for `frame_per` and `tool_per`.
 
     Returns:
@@ -71,15 +85,16 @@ def fit_frames(
         torch.stack([base_of, tool_of]), dim=1, return_inverse=True, return_counts=True
     )
     shares = (pair_of == torch.arange(pairs.shape[1])[:, None]).to(weights.dtype)
-    start = closed_form_frames(rotation, position, measured, weights[..., None, :] * shares)
+    starts = closed_form_frames(rotation, position, measured, arm.nominal[-6:], weights[..., None, :] * shares)
+    base, tool = (frames.expand(len(starts), *frames.shape).clone() for frames in (base, tool))
     for i in torch.argsort(sizes).tolist():
-        base[..., pairs[0, i], :free_base] = start[..., i, :free_base]
-        tool[..., pairs[1, i], :free_tool] = start[..., i, 6 : 6 + free_tool]
+        base[..., pairs[0, i], :free_base] = starts[..., i, :free_base]
+        tool[..., pairs[1, i], :free_tool] = starts[..., i, 6 : 6 + free_tool]
     problem = _Problem(
         rotation,
         position,
         *measured,
-        weights.sqrt(),
+        weights,
         rotation_weight,
         base_of,
         tool_of,
@@ -87,13 +102,48 @@ def fit_frames(
         tool,
         free_base,
         free_tool,
+        arm.nominal[-6:],
+        TOOL_SPREAD * arm.reach,
+        weights.new_zeros(()),
     )
-    found = levenberg_marquardt(problem.residual, problem.start(), problem.jacobian, max_iterations=100, damping=1e-6)
-    base, tool = problem.frames(found.value)
+    base, tool = _descend(problem)
     rows = slice(None) if grouped else slice(0, 1)
     values = arm.nominal.expand(*lead, len(base_of[rows]), -1).clone()
     values[..., :6], values[..., -6:] = base[..., base_of[rows], :], tool[..., tool_of[rows], :]
     return values if grouped else values[..., 0, :]
+
+
+def _descend(problem: _Problem) -> tuple[Tensor, Tensor]:
+    """The frames with the least residual of those that the starts lead to, gross outliers left out."""
+    free, used = problem.start(), problem.weights > 0
+    channels = 3 if problem.measured_rotation is None else 6
+    about = (used, channels, free.shape[-1])
+    for _ in range(_SOFT):
+        length = problem.length(free)
+        ratio = length / (_BEND * residual_scale(length, *about)).clamp_min(torch.finfo(length.dtype).tiny)
+        free = _solved(problem, free, 1 / (1 + ratio.square()), channels, max_iterations=20)
+    length = problem.length(free)
+    bound = FAR * residual_scale(length, *about).amin(0)
+    best = (problem.weights * length.clamp_max(bound).square()).sum(-1).argmin(0)
+    problem, free = problem.only(best), _pick(free, best)
+    for _ in range(_HARD):
+        kept = inlying(problem.length(free), *about).to(free.dtype)
+        free = _solved(problem, free, kept, channels, max_iterations=100)
+    return problem.frames(free)
+
+
+def _solved(problem: _Problem, free: Tensor, factor: Tensor, channels: int, max_iterations: int) -> Tensor:
+    """Least squares with weights times a factor, `... x s`, and the prior as the residuals that are left weigh it."""
+    weights = problem.weights * factor
+    square = (weights * problem.length(free).square()).sum(-1) / (channels * weights.sum(-1))
+    now = replace(problem, weights=weights, noise=square.sqrt())
+    return levenberg_marquardt(now.residual, free, now.jacobian, max_iterations=max_iterations, damping=1e-6).value
+
+
+def _pick(values: Tensor, best: Tensor) -> Tensor:
+    """Of `c x ... x k...` the entry that `best` `...` names, `... x k...`."""
+    index = best.reshape(1, *best.shape, *[1] * (values.dim() - 1 - best.dim()))
+    return values.gather(0, index.expand(1, *values.shape[1:]))[0]
 
 
 def _groups(
@@ -125,15 +175,17 @@ class _Problem:
     """Weighted residuals of all rows over the free frame parameters, with their Jacobian in closed form.
 
     rotation `s x 3 x 3`, position `s x 3`: the flange in the base. measured_position `s x 3`, measured_rotation
-    `s x 3 x 3` or None. root_weights `... x s`. base_of, tool_of: `s`, group of each row. base `... x b x 6`, tool
+    `s x 3 x 3` or None. weights `... x s`. base_of, tool_of: `s`, group of each row. base `... x b x 6`, tool
     `... x t x 6`: start and what stays. free_base, free_tool: how many of the six, from the first on, are fitted.
+    nominal_tool `6`, and the standard deviation of a tool's position about it, tool_spread [m], against the noise
+    `...` [m] of the rows.
     """
 
     rotation: Tensor
     position: Tensor
     measured_position: Tensor
     measured_rotation: Tensor | None
-    root_weights: Tensor
+    weights: Tensor
     rotation_weight: float
     base_of: Tensor
     tool_of: Tensor
@@ -141,6 +193,13 @@ class _Problem:
     tool: Tensor
     free_base: int
     free_tool: int
+    nominal_tool: Tensor
+    tool_spread: float
+    noise: Tensor
+
+    def only(self, best: Tensor) -> _Problem:
+        """The problem of the starts that `best` names."""
+        return replace(self, base=_pick(self.base, best), tool=_pick(self.tool, best))
 
     def start(self) -> Tensor:
         """The free parameters at the start, `... x f`: all base groups, then all tool groups."""
@@ -163,14 +222,34 @@ class _Problem:
         lever = (base_rotation @ self.position[..., None] + flange @ tool[..., self.tool_of, :3, None])[..., 0]
         return lever, flange @ tool_rotation, flange
 
-    def residual(self, free: Tensor) -> Tensor:
+    def _gap(self, free: Tensor) -> Tensor:
+        """Predicted less measured position and weighted rotation vector, `... x s x c` [m]."""
         base, tool = self.frames(free)
         lever, rotation, _ = self._placed(base, tool)
         rows = lever + base[..., self.base_of, :3] - self.measured_position
-        if self.measured_rotation is not None:
-            turn = matrix_to_rotation_vector(rotation @ self.measured_rotation.mT)
-            rows = torch.cat([rows, self.rotation_weight * turn], dim=-1)
-        return (rows * self.root_weights[..., None]).flatten(-2)
+        if self.measured_rotation is None:
+            return rows
+        turn = matrix_to_rotation_vector(rotation @ self.measured_rotation.mT)
+        return torch.cat([rows, self.rotation_weight * turn], dim=-1)
+
+    def length(self, free: Tensor) -> Tensor:
+        """Length of each row's residual, `... x s` [m]."""
+        length: Tensor = torch.linalg.vector_norm(self._gap(free), dim=-1)
+        return length
+
+    def residual(self, free: Tensor) -> Tensor:
+        """Of the rows, weighted, and of the tools' positions about their nominal ones."""
+        rows = (self._gap(free) * self.weights.sqrt()[..., None]).flatten(-2)
+        target, pull = self._prior(free)
+        return torch.cat([rows, (free - target) * pull], dim=-1)
+
+    def _prior(self, free: Tensor) -> tuple[Tensor, Tensor]:
+        """What the free parameters are drawn to, `f`, and how strongly, `... x f`; a base and a rotation to nothing."""
+        of_base, tools = self.base.shape[-2] * self.free_base, self.tool.shape[-2]
+        stiffness = free.new_tensor([1 / self.tool_spread] * 3 + [0.0] * 3)[: self.free_tool].repeat(tools)
+        target = self.nominal_tool[: self.free_tool].repeat(tools)
+        none = free.new_zeros(of_base)
+        return torch.cat([none, target]), self.noise[..., None] * torch.cat([none, stiffness])
 
     def jacobian(self, free: Tensor) -> Tensor:
         # The derivative of log(R Rmᵀ) is taken as the rate of rotation itself: the gradient is the same.
@@ -184,13 +263,14 @@ class _Problem:
             tool_rate = flange @ _rotation_rate(tool[..., 3:])[..., self.tool_of, :, :]
             turning = torch.cat([none, base_rate, none, tool_rate], dim=-1)
             rows = torch.cat([rows, self.rotation_weight * turning], dim=-2)
-        rows = rows * self.root_weights[..., None, None]
+        rows = rows * self.weights.sqrt()[..., None, None]
         place, column = self._columns(free.shape[-1])
+        prior = torch.diag_embed(self._prior(free)[1])
         if free.shape[-1] == len(place):  # one group: every free parameter acts on every row
-            return rows[..., place].flatten(-3, -2)
+            return torch.cat([rows[..., place].flatten(-3, -2), prior], dim=-2)
         spread = torch.zeros(*rows.shape[:-1], free.shape[-1], dtype=rows.dtype)
         spread.scatter_(-1, column[:, None, :].expand(*rows.shape[:-1], -1), rows[..., place])
-        return spread.flatten(-3, -2)
+        return torch.cat([spread.flatten(-3, -2), prior], dim=-2)
 
     def _columns(self, count: int) -> tuple[Tensor, Tensor]:
         """Which of a row's 12 derivatives are free, `f'`, and where in all free parameters they belong, `s x f'`."""

@@ -11,16 +11,13 @@ from torch import Tensor
 from ccnn_torch.compensation import Geometry, default_limit, fit_geometry_module, geometric_deviation, settled_damping
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry
-from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.mechanisms.frames import fit_frames
+from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
+from ccnn_torch.mechanisms.frames import ROTATION_WEIGHT
 from ccnn_torch.records import Records
 from ccnn_torch.runs.dataset import Dataset, pad_rows
 from ccnn_torch.splits import Split
 
 __all__ = ["Fitted", "Identified", "fit_machine"]
-
-# Of orientation against position where link parameters are turned into joint deviations [m/rad], as they were fitted.
-_ROTATION_WEIGHT = 0.3
 
 
 @dataclass(frozen=True)
@@ -40,7 +37,7 @@ class Identified:
 
     def deviation(self, guess: Tensor | None = None) -> Callable[[Tensor], Tensor]:
         """γ of commanded joints `r x s x n`, the same [SI]; guess: poses near by, `r x s x p`."""
-        return geometric_deviation(self.mechanism, self.nominal, self.values, _ROTATION_WEIGHT, self.damping, guess)
+        return geometric_deviation(self.mechanism, self.nominal, self.values, ROTATION_WEIGHT, self.damping, guess)
 
     def module(self, repeat: int, joints: Tensor, margin: float) -> Geometry:
         """γ of one repeat for a model file; joints: commanded, of the training rows, `s x n` [SI].
@@ -49,7 +46,7 @@ class Identified:
             InputError, MethodFailedError: see `fit_geometry_module`.
         """
         own = (self.nominal[repeat, 0], self.values[repeat, 0])
-        return fit_geometry_module(self.mechanism, *own, joints, margin, _ROTATION_WEIGHT, self.damping)
+        return fit_geometry_module(self.mechanism, *own, joints, margin, ROTATION_WEIGHT, self.damping)
 
 
 @dataclass(frozen=True)
@@ -81,7 +78,7 @@ class Fitted:
         each = total.expand(len(splits), *total.shape[-2:])
         limits = [default_limit(part[Dataset.part(s, "fit")]) for part, s in zip(each, splits, strict=True)]
         limit = torch.stack(limits).amin(0).clamp_min(1e-12)
-        damping = settled_damping(mechanism, nominal, self.geometry, joints, limit, _ROTATION_WEIGHT, margin)
+        damping = settled_damping(mechanism, nominal, self.geometry, joints, limit, ROTATION_WEIGHT, margin)
         return Identified(mechanism, nominal, self.geometry, damping)
 
 
@@ -109,6 +106,8 @@ def fit_machine(mechanism: Mechanism, records: Records, splits: list[Split], ide
     parameters = geometry = None
     if arm is not None and arm.unknown_frames:
         parameters = fit_frames(arm, records.joints, records.pose, weights, columns=records.columns)
+        about = (records.joints, records.pose, parameters, weights, records.path, records.name_rows)
+        notes += judge_frames(arm, *about)
         if not grouped:
             parameters = parameters.unsqueeze(-2)
         frames = " and ".join(arm.unknown_frames)

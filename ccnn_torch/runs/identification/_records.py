@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames
+from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.runs._sizes import size, sizes_by_name, sizes_of_pose
 from ccnn_torch.runs.identification._kinematics import Kinematics
@@ -27,6 +27,9 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism) -> Measured:
     records, mechanism = read_records(config, config.records, mechanism)
     train, test = split_records(config, records)
     start, unknown = _frames(mechanism, train)
+    far = []
+    if isinstance(mechanism, SerialArm):
+        far = judge_frames(mechanism, train.joints[0], train.observed[0], start, where=records.path)
     return Measured(
         mechanism=mechanism,
         kinematics=Kinematics(mechanism),
@@ -39,7 +42,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism) -> Measured:
         joint_noise=_joint_noise(config, mechanism),
         unknown_frame=unknown,
         data_hash=records.data_hash,
-        notes=_notes(records),
+        notes=[*_notes(records), *far],
     )
 
 
