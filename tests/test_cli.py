@@ -284,3 +284,14 @@ def test_a_python_file_without_a_class_is_told_its_classes(cli: Cli, tmp_path: P
         assert code == 2 and err.startswith(sentence)
     code, _, err = cli("plan", "--mechanism", "xyzzy", *out)
     assert code == 2 and "framed. Otherwise give" in err
+
+
+def test_an_arm_in_the_place_of_a_config_and_many_wrong_keys_are_said_shortly(cli, tmp_path: Path) -> None:
+    arm = tmp_path / "arm.yaml"
+    arm.write_text("convention: standard\nalpha: [0]\na: [0]\n")
+    code, _, err = cli("run", arm)
+    assert code == 2 and "the file of an arm" in err and f"mechanism={arm}" in err
+    strange = tmp_path / "strange.yaml"
+    strange.write_text("".join(f"odd{k}: {k}\n" for k in range(50)))
+    code, _, err = cli("run", strange)
+    assert code == 2 and "and 46 more" in err and len(err) < 2000

@@ -17,6 +17,9 @@ from ccnn_torch.runs._yaml import read_yaml
 
 __all__ = ["explain", "list_keys"]
 
+# Wrong keys that one sentence names.
+_FEW = 4
+
 
 def list_keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, str]]:
     """Every key of a config, dotted, with its default as YAML has it and its description."""
@@ -79,11 +82,14 @@ def explain(error: ValidationError, model: type[BaseModel], file: str, given: Ma
         source = f"'{override}': " if override else ""
         parts[source + _sentence(key, item["type"], item["msg"], item["input"], keys)] = None
     other = _other_command(file, model)
-    return f"{file}: " + (f"this looks like a config for `ccnn {other}`" if other else "; ".join(parts))
+    if other:
+        return f"{file}: this looks like {other}"
+    said = list(parts)
+    return f"{file}: " + "; ".join(said[:_FEW]) + (f"; and {len(said) - _FEW} more" if len(said) > _FEW else "")
 
 
 def _other_command(file: str, model: type[BaseModel]) -> str:
-    """The command that knows all keys at the top of a file of which this one does not; empty where there is none."""
+    """What a file of other keys is: a mechanism, or a config of another command that knows them all; else empty."""
     from ccnn_torch.runs.config import RunConfig
     from ccnn_torch.runs.identify_config import IdentifyConfig
     from ccnn_torch.runs.plan_config import PlanConfig
@@ -92,6 +98,8 @@ def _other_command(file: str, model: type[BaseModel]) -> str:
     if not Path(file).is_file():
         return ""
     there = set(read_yaml(Path(file)))
+    if there >= {"convention", "alpha"}:
+        return f"the file of an arm, no config; write mechanism={file}"
     models: dict[str, type[BaseModel]] = {
         "run": RunConfig,
         "identify": IdentifyConfig,
@@ -101,7 +109,8 @@ def _other_command(file: str, model: type[BaseModel]) -> str:
     # A single strange key is a slip of the pen rather than another command's file.
     if len(there) < 2 or there <= set(model.model_fields):
         return ""
-    return next((name for name, kind in models.items() if there <= set(kind.model_fields)), "")
+    names = (name for name, kind in models.items() if there <= set(kind.model_fields))
+    return next((f"a config for `ccnn {name}`" for name in names), "")
 
 
 def _sentence(key: str, kind: str, message: str, value: Any, keys: Mapping[str, str]) -> str:
