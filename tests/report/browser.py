@@ -17,7 +17,7 @@ _MEASURE = """<script>
 addEventListener("load", () => {
   const box = e => { const r = e.getBoundingClientRect(); return {width: r.width, height: r.height, top: r.top}; };
   const all = s => [...document.querySelectorAll(s)].map(box);
-  document.body.innerHTML = "<pre id=measured></pre>".replace("><", ">" + JSON.stringify({
+  parent.document.body.innerHTML = "<pre id=measured></pre>".replace("><", ">" + JSON.stringify({
     page: document.documentElement.scrollWidth, window: innerWidth, verdict: box(document.querySelector(".verdict")),
     figures: all("figure svg"), tables: all("table"), boxes: [...document.querySelectorAll(".wide")].map(e => ({
       ...box(e), inside: e.clientWidth, content: e.scrollWidth, overflow: getComputedStyle(e).overflowX,
@@ -34,13 +34,19 @@ def find_browser() -> str | None:
 
 
 def measured(browser: str, page: Path, folder: Path, width: int) -> dict[str, Any]:
-    """Sizes of what a browser shows of a page in a window of this width, in pixels, its text, and what it fetched."""
+    """Sizes of what a browser shows of a page in a view of this width, in pixels, its text, and what it fetched.
+
+    The view is a frame: a browser's window is never narrower than 500 pixels, whatever it is asked for.
+    """
     copy = folder / f"measured-{width}.html"
-    copy.write_text(page.read_text(encoding="utf-8").replace("</body>", _MEASURE + "</body>"), encoding="utf-8")
+    text = html.escape(page.read_text(encoding="utf-8").replace("</body>", _MEASURE + "</body>"))
+    frame = f'<iframe style="width: {width}px; height: 900px; border: 0" srcdoc="{text}"></iframe>'
+    copy.write_text(f'<!DOCTYPE html><html><head><meta charset="utf-8"></head><body>{frame}</body></html>', "utf-8")
     command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", *_OFFLINE]
-    command += [f"--user-data-dir={folder / 'profile'}", f"--window-size={width},900", "--dump-dom", copy.as_uri()]
+    command += [f"--user-data-dir={folder / 'profile'}", "--window-size=1400,1000", "--dump-dom", copy.as_uri()]
     dom = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
     found = re.search(r'<pre id="?measured"?>(.*?)</pre>', dom, re.DOTALL)
     assert found, dom[-500:]
     result: dict[str, Any] = json.loads(html.unescape(found[1]))
+    assert result["window"] == width
     return result
