@@ -148,7 +148,7 @@ def test_a_run_killed_on_its_way_resumes_to_the_same_result(
     tmp_path: Path, moment: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chosen = config(tmp_path)
-    whole = RunFolder.create(str(tmp_path / "whole"), "whole")
+    whole = RunFolder(tmp_path / "whole")
     results = calibrate(chosen, whole).results
     jsonschema.validate(plain(results), load_schema("results"))
     auto = results["auto"]
@@ -165,7 +165,7 @@ def test_a_run_killed_on_its_way_resumes_to_the_same_result(
         else:
             patched.setattr("ccnn_torch.runs.choosing.sd_scale", kill)
         with pytest.raises(Killed):
-            calibrate(chosen, RunFolder.create(str(tmp_path / "killed"), "killed"))
+            calibrate(chosen, RunFolder(tmp_path / "killed"))
     killed = RunFolder(tmp_path / "killed")
     assert killed.auto.is_file() == (moment == "between")
     other = calibrate(chosen, killed).results

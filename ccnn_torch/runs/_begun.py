@@ -15,8 +15,8 @@ from ccnn_torch.training import load_checkpoint
 
 __all__ = ["facts_of", "refuse_changes"]
 
-# The folder may have been moved.
-_FREE = ("out",)
+# The folder may have been moved, and what is written at the end changes no figure.
+_FREE = ("out", "save_models", "save_report")
 _MOST = 3
 
 
@@ -60,7 +60,7 @@ def _changed(now: Any, then: Any, key: str) -> Iterator[str]:
         for name in sorted({*now, *then}):
             yield from _changed(now.get(name), then.get(name), f"{key}.{name}" if key else name)
     elif _place_free(now) != _place_free(then):
-        yield f"{key} is {json.dumps(now)}, the checkpoint was made with {json.dumps(then)}"
+        yield f"{key} is {json.dumps(now)}, the checkpoint was made with {key} {json.dumps(then)}"
 
 
 def _place_free(value: Any) -> Any:

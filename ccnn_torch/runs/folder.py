@@ -10,10 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from ccnn_torch._files import sweep, write_whole
-from ccnn_torch.errors import InputError
+from ccnn_torch.errors import InputError, WriteError
 from ccnn_torch.runs._lock import LOCK, locked
 
-__all__ = ["RunFolder"]
+__all__ = ["RunFolder", "kept_for"]
+
+
+@contextmanager
+def kept_for(command: str) -> Iterator[None]:
+    """Where a file cannot be written, say by which command the work goes on once it can."""
+    try:
+        yield
+    except WriteError as problem:
+        raise WriteError(f"{problem}; what was computed is kept, and {command} goes on from there") from None
 
 
 @dataclass(frozen=True)

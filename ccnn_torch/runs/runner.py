@@ -14,7 +14,7 @@ from ccnn_torch.runs._begun import facts_of, refuse_changes
 from ccnn_torch.runs.assemble import plan_of
 from ccnn_torch.runs.calibrate import Calibration, calibrate, makers
 from ccnn_torch.runs.config import RunConfig, dump_config, load_config
-from ccnn_torch.runs.folder import RunFolder
+from ccnn_torch.runs.folder import RunFolder, kept_for
 from ccnn_torch.runs.outputs import write_outputs
 from ccnn_torch.runs.prepare import Prepared, prepare
 from ccnn_torch.runs.screen import note, stdout
@@ -89,17 +89,14 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, 
         names = tuple(joint.name for joint in joints)
         return [HeldOut(prepared.dataset, scaling, names, share_unit(joints), every), *shown]
 
-    calibration: Calibration | None = None
-    try:
-        calibration = calibrate(config, folder, watch, prepared)
+    with kept_for(f"ccnn run --resume {folder.path}"):
+        calibration: Calibration = calibrate(config, folder, watch, prepared)
         note("writing model files, plots and tables …", quiet)
-        write_outputs(calibration, folder)
-    except WriteError as problem:
-        if calibration is not None:
+        try:
+            write_outputs(calibration, folder)
+        except WriteError:
             print_tables(calibration.results, stdout)
-        raise WriteError(
-            f"{problem}; what was computed is kept, and ccnn run --resume {folder.path} goes on from there"
-        ) from None
+            raise
     if tables and not quiet:
         print_tables(calibration.results, stdout)
         stdout.print(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")

@@ -21,7 +21,7 @@ from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
 from ccnn_torch.runs._yaml import read_yaml
 from ccnn_torch.runs.calibrate import makers
 from ccnn_torch.runs.config import RunConfig, load_config
-from ccnn_torch.runs.folder import RunFolder
+from ccnn_torch.runs.folder import RunFolder, kept_for
 from ccnn_torch.runs.runner import resume_run, start_run
 from ccnn_torch.runs.screen import note, stdout
 
@@ -131,7 +131,8 @@ def _run_cases(suite: Suite, quiet: bool) -> Path:
     comparison = compare(suite.name, results, about, failed)
     if not quiet:
         print_suite(comparison, stdout)
-    path = write_suite(suite.out, comparison)
+    with kept_for("the same command"):
+        path = write_suite(suite.out, comparison)
     if not quiet:
         stdout.print(f"Everything is in {suite.out}")
     return path

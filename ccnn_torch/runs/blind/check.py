@@ -21,6 +21,7 @@ from ccnn_torch.runs._lock import locked
 from ccnn_torch.runs.blind.folder import BlindFolder
 from ccnn_torch.runs.blind.machines import MACHINES
 from ccnn_torch.runs.blind.plan import KINDS, plan_cases
+from ccnn_torch.runs.folder import kept_for
 from ccnn_torch.runs.screen import note, stdout
 
 __all__ = ["Diagnoser", "run_blind_check"]
@@ -79,7 +80,7 @@ def run_blind_check(
     plan_cases(cases, seed, machines, kinds)
     folder = BlindFolder(Path(out))
     settings = {"cases": cases, "seed": seed, "machines": list(machines), "kinds": list(kinds)}
-    with locked(folder.path):
+    with locked(folder.path), kept_for("the same command"):
         sweep(folder.path)
         return _checked(folder, settings, diagnose, quiet)
 

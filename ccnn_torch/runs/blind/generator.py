@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from ccnn_torch._files import write_whole
+from ccnn_torch._files import make_folder, write_whole
 from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.arm_files import dh_text
@@ -39,6 +39,7 @@ def write_cases(folder: BlindFolder) -> None:
     settings = read_json(folder.settings)
     seals: dict[str, dict[str, str]] = {}
     told: list[dict[str, Any]] = []
+    make_folder(folder.records(0).parent)
     for case in _cases(settings):
         number = case.plan.number
         _write_machine(folder, case.plan.machine, case.machine)

@@ -12,7 +12,7 @@ from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.identification import Progress
 from ccnn_torch.report.identified_tables import not_settled, print_identified
 from ccnn_torch.runs._begun import facts_of, refuse_changes
-from ccnn_torch.runs.folder import RunFolder
+from ccnn_torch.runs.folder import RunFolder, kept_for
 from ccnn_torch.runs.identification._identify import Identification, identify
 from ccnn_torch.runs.identification._outputs import RESULTS, write_outputs
 from ccnn_torch.runs.identify_config import IdentifyConfig, dump_identify_config, load_identify_config
@@ -67,7 +67,8 @@ def _run(config: IdentifyConfig, path: Path, quiet: bool) -> Identification:
         # Before anything is written: what was found is not lost where the disk is full.
         print_identified(found.results, stdout)
     note("writing tables, plots and files …", quiet)
-    write_outputs(found, path)
+    with kept_for(f"ccnn identify --resume {path}"):
+        write_outputs(found, path)
     if not quiet:
         stdout.print(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
     if found.results["methods"][found.results["method"]]["converged"] == 0:
