@@ -121,6 +121,10 @@ def test_a_decision_is_read_back_and_not_made_again(tmp_path: Path) -> None:
         for key, value in vars(choice).items():
             other = getattr(again.compared[name], key)
             assert torch.equal(other, value) if isinstance(value, torch.Tensor) else other == value, key
+    written = folder.auto.read_text()
+    folder.auto.write_text(written.replace('"spent": ', '"spent": 1'))
+    with pytest.raises(InputError, match=r"auto\.json is damaged"):
+        compared(linear_dataset(2), 100, folder)
     folder.auto.write_text('{"compared": {"constant": {}}, "skipped": {}}')
     with pytest.raises(InputError, match=r"auto\.json is damaged"):
         compared(linear_dataset(2), 100, folder)

@@ -113,5 +113,5 @@ class RunFolder:
     def checkpoint(self, method: str, phase: str) -> Path:
         return self.path / "checkpoints" / f"{method}-{phase}.safetensors"
 
-    def write_text(self, name: str, content: str) -> None:
+    def write(self, name: str, content: str) -> None:
         write_whole(self.path / name, content)

@@ -38,7 +38,7 @@ def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> Ru
     makers(config)
     prepared = prepare(config)
     with RunFolder.fresh(config.out, config.name) as folder:
-        folder.write_text("config.yaml", dump_config(config))
+        folder.write("config.yaml", dump_config(config))
         _run(config, prepared, folder, quiet, tables)
     return folder
 

@@ -30,7 +30,7 @@ def start_identification(config: IdentifyConfig, quiet: bool = False) -> Path:
     """
     with RunFolder.fresh(config.out, config.name, "ccnn identify --resume") as folder:
         try:
-            folder.write_text("config.yaml", dump_identify_config(config))
+            folder.write("config.yaml", dump_identify_config(config))
             _run(config, folder.path, quiet)
         except InputError:
             # Nothing was computed: the next try may take the same name.
