@@ -66,9 +66,9 @@ def make_folder(path: str | Path) -> None:
         raise WriteError(f"{path}: cannot be made ({reason.strerror}); give another place") from None
 
 
-def sweep(folder: Path) -> None:
+def sweep(folder: Path, below: bool = True) -> None:
     """Remove what a killed process left half written in a folder, and below; nobody else may be writing there."""
-    for leftover in folder.rglob(f"{_PREFIX}*{_SUFFIX}"):
+    for leftover in (folder.rglob if below else folder.glob)(f"{_PREFIX}*{_SUFFIX}"):
         leftover.unlink(missing_ok=True)
 
 

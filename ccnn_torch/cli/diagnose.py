@@ -62,6 +62,7 @@ def diagnose(
         if wanted.out is None:
             raise InputError("name the folder to write with --out DIR")
         found = _search(wanted, quiet)
+    from ccnn_torch._files import sweep
     from ccnn_torch.report.diagnosis_report import print_diagnosis
     from ccnn_torch.runs._lock import locked
     from ccnn_torch.runs.diagnose import write_result
@@ -70,6 +71,7 @@ def diagnose(
     folder = Path(wanted.out)
     try:
         with locked(folder):
+            sweep(folder)
             kept = write_result(folder, found)
             stopped = f"interrupted after the verdict, which is kept in {kept}; what comes after it is not complete"
             with if_stopped(stopped):

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ccnn_torch._files import make_folder, sweep
+from ccnn_torch._files import make_folder
 from ccnn_torch.errors import InputError, WriteError
 
 if sys.platform == "win32":
@@ -31,7 +31,7 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder, which is made where it is not there, and sweep what a killed process left half written in it.
+    """Hold a folder, which is made where it is not there.
 
     Raises:
         InputError: another process holds it.
@@ -40,7 +40,6 @@ def locked(folder: Path) -> Iterator[None]:
     make_folder(folder)
     held = _taken(folder)
     try:
-        sweep(folder)
         yield
     finally:
         # The name goes before the lock does: who opens the file from now on finds another one.

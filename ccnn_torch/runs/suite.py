@@ -11,6 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from ccnn_torch._files import sweep
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.suite import compare, write_suite
@@ -108,6 +109,8 @@ def run_suite(suite: Suite, quiet: bool = False) -> Path:
         makers(config)
         _check_folder(config)
     with locked(suite.out):
+        # The cases have locks of their own.
+        sweep(suite.out, below=False)
         return _run_cases(suite, quiet)
 
 
