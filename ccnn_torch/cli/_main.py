@@ -66,10 +66,6 @@ def main() -> None:
         code = _say(str(problem))
     except typer.TyperException as problem:
         code = _say(f"{problem.format_message()} (ccnn --help, or ccnn COMMAND --help, tells what there is)")
-    except BrokenPipeError:
-        # Who reads the output has seen enough, as `head` does; what is left of it goes nowhere.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 0
     except OSError as problem:
         # What has no better sentence of its own: a screen that is a full disk, a folder that went away meanwhile.
         code = _say(f"{problem.filename or 'the output'}: {problem.strerror or problem}")
