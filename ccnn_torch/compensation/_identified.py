@@ -155,10 +155,7 @@ def sign_model(path: str | Path, key: str | Path) -> Path:
         content = read_model(path)
         card = card_of(path, content)[1]
     signature = sign_content(content, card, key)
-    try:
-        write_whole(signature_path(path), signature)
-    except OSError as reason:
-        raise InputError(f"{signature_path(path)}: cannot be written: {reason.strerror}") from None
+    write_whole(signature_path(path), signature)
     return signature_path(path)
 
 
