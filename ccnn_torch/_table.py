@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.errors import InputError
 from ccnn_torch.units import parse_header, to_si, write_hint
 
@@ -178,10 +179,9 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
         raise InputError(f"{path}: the columns to write must be one-dimensional and of one length")
     buffer = io.StringIO()
     np.savetxt(buffer, np.stack(arrays, axis=1), fmt="%.17g", delimiter=",", header=",".join(columns), comments="")
-    try:
-        Path(path).write_text(buffer.getvalue(), encoding="utf-8")
-    except OSError as reason:
-        raise InputError(f"{path}: cannot be written: {reason.strerror}") from None
+    if not Path(path).absolute().parent.is_dir():
+        raise InputError(f"{path}: cannot be written (its folder is not there); make it, or correct the name")
+    write_whole(path, buffer.getvalue())
 
 
 def _read_text(file: str) -> str:

@@ -15,6 +15,10 @@ class RowsError(InputError):
     """Rows that cannot be looked at as a whole: too few, or out of reach. Where they are from a file, it is named."""
 
 
+class WriteError(InputError):
+    """A file or folder cannot be written: the disk is full, a right is missing. What stood there is as it was."""
+
+
 class ModelFileError(InputError):
     """A model file or its card is damaged, foreign, tampered with, or made for another mechanism."""
 

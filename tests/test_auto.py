@@ -121,6 +121,10 @@ def test_a_decision_is_read_back_and_not_made_again(tmp_path: Path) -> None:
         for key, value in vars(choice).items():
             other = getattr(again.compared[name], key)
             assert torch.equal(other, value) if isinstance(value, torch.Tensor) else other == value, key
+    written = folder.auto.read_text()
+    folder.auto.write_text(written.replace('"spent": ', '"spent": 1'))
+    with pytest.raises(InputError, match=r"auto\.json is damaged"):
+        compared(linear_dataset(2), 100, folder)
     folder.auto.write_text('{"compared": {"constant": {}}, "skipped": {}}')
     with pytest.raises(InputError, match=r"auto\.json is damaged"):
         compared(linear_dataset(2), 100, folder)
@@ -148,7 +152,7 @@ def test_a_run_killed_on_its_way_resumes_to_the_same_result(
     tmp_path: Path, moment: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chosen = config(tmp_path)
-    whole = RunFolder.create(str(tmp_path / "whole"), "whole")
+    whole = RunFolder(tmp_path / "whole")
     results = calibrate(chosen, whole).results
     jsonschema.validate(plain(results), load_schema("results"))
     auto = results["auto"]
@@ -165,7 +169,7 @@ def test_a_run_killed_on_its_way_resumes_to_the_same_result(
         else:
             patched.setattr("ccnn_torch.runs.choosing.sd_scale", kill)
         with pytest.raises(Killed):
-            calibrate(chosen, RunFolder.create(str(tmp_path / "killed"), "killed"))
+            calibrate(chosen, RunFolder(tmp_path / "killed"))
     killed = RunFolder(tmp_path / "killed")
     assert killed.auto.is_file() == (moment == "between")
     other = calibrate(chosen, killed).results

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from test_cli import tripod_records
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import load_schema
@@ -166,6 +168,40 @@ def test_resuming_a_finished_run_changes_nothing(finished: RunFolder) -> None:
     before = {p: p.stat().st_mtime_ns for p in finished.path.rglob("*")}
     resume_run(finished.path, quiet=True)
     assert {p: p.stat().st_mtime_ns for p in finished.path.rglob("*")} == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("seed: 0", "seed: 3", r"config\.yaml: seed is 3, the checkpoint was made with seed 0"),
+        ("test: 0.2", "test: 0.3", r"config\.yaml: split\.test is 0\.3, the checkpoint was made with split\.test 0\.2"),
+        ("- constant", "- bp_lm", r'config\.yaml: methods is \["ccnn", "bp_lm"\], the checkpoint'),
+    ],
+)
+def test_a_config_changed_between_kill_and_resume_is_refused(
+    finished: RunFolder, tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(finished.path, run)
+    (run / "results.json").unlink()
+    before = (run / "config.yaml").read_text()
+    assert old in before
+    (run / "config.yaml").write_text(before.replace(old, new, 1))
+    with pytest.raises(InputError, match=message):
+        resume_run(run, quiet=True)
+
+
+def test_records_changed_between_kill_and_resume_are_refused(tmp_path: Path) -> None:
+    records = tripod_records(tmp_path / "rows.csv")
+    run = tmp_path / "run"
+    base = {"case": None, "records": str(records), "mechanism": "tripod", "methods": ["constant"], "geometry": "none"}
+    start_run(short(**base, out=str(run), save_models=False, save_report=False), quiet=True)
+    (run / "results.json").unlink()
+    lines = records.read_text().splitlines()
+    # A row held out from training: no checkpoint would miss it.
+    records.write_text("\n".join([*lines[:-1], lines[-1].replace("1", "2", 1)]) + "\n")
+    with pytest.raises(InputError, match="is of other data than the config's; the records were changed"):
+        resume_run(run, quiet=True)
 
 
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}

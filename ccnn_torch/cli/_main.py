@@ -66,6 +66,9 @@ def main() -> None:
         code = _say(str(problem))
     except typer.TyperException as problem:
         code = _say(f"{problem.format_message()} (ccnn --help, or ccnn COMMAND --help, tells what there is)")
+    except OSError as problem:
+        # What has no better sentence of its own: a screen that is a full disk, a folder that went away meanwhile.
+        code = _say(f"{problem.filename or 'the output'}: {problem.strerror or problem}")
     except Stopped as stopped:
         _say(str(stopped))
         sys.exit(130)

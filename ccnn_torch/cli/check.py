@@ -46,11 +46,10 @@ def check(
     with if_stopped(NOTHING_WRITTEN):
         wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)
         found = watched("looking at what the rows can show …", lambda tell: run_check(wanted), quiet)
+    if not quiet:
+        for line in check_text(found):
+            typer.echo(line)
+        if found.confusable:
+            print_table(check_table(found), stdout)
     if wanted.out is not None:
         write_check(Path(wanted.out), found)
-    if quiet:
-        return
-    for line in check_text(found):
-        typer.echo(line)
-    if found.confusable:
-        print_table(check_table(found), stdout)

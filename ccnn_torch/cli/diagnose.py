@@ -62,25 +62,37 @@ def diagnose(
         if wanted.out is None:
             raise InputError("name the folder to write with --out DIR")
         found = _search(wanted, quiet)
+    from ccnn_torch._files import sweep
+    from ccnn_torch.report.diagnosis_report import print_diagnosis
+    from ccnn_torch.runs._lock import locked
+    from ccnn_torch.runs.diagnose import write_result
+    from ccnn_torch.runs.screen import stdout
+
     folder = Path(wanted.out)
-    kept = folder / "diagnosis.json"
-    with if_stopped(f"interrupted after the verdict, which is kept in {kept}; what comes after it is not complete"):
-        _tell(wanted, folder, found, quiet)
+    try:
+        with locked(folder):
+            sweep(folder)
+            kept = write_result(folder, found)
+            stopped = f"interrupted after the verdict, which is kept in {kept}; what comes after it is not complete"
+            with if_stopped(stopped):
+                _tell(wanted, folder, found, quiet)
+    except InputError:
+        # A full disk, or another process that writes there: what was found is told, if it cannot be kept.
+        print_diagnosis(found.to_json(), stdout)
+        raise
 
 
 def _search(wanted: DiagnoseConfig, quiet: bool) -> Diagnosis:
-    """The verdict; what was found is kept, whatever becomes of the rest."""
+    """The verdict."""
     from ccnn_torch.mechanisms import simulated_rows
-    from ccnn_torch.runs.diagnose import run_diagnosis, write_result
+    from ccnn_torch.runs.diagnose import run_diagnosis
 
     def search(tell: Callable[[str], None]) -> Diagnosis:
         with simulated_rows(lambda n: tell(f"{n:,} rows simulated")):
             return run_diagnosis(wanted)
 
     # Thousands of rows of an arm take half a minute, a slow simulator more; how much is left nobody knows.
-    found = watched("looking for the effects that make the gap …", search, quiet)
-    write_result(Path(str(wanted.out)), found)
-    return found
+    return watched("looking for the effects that make the gap …", search, quiet)
 
 
 def _tell(wanted: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -> None:

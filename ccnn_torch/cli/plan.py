@@ -49,13 +49,14 @@ def plan(
     with Progress(*columns, console=stderr, disable=quiet or not stderr.is_terminal, transient=True) as bar:
         task = bar.add_task("poses", total=1.0)
         machine, plans = make_plan(mechanism, poses, wanted, lambda done: bar.update(task, completed=done))
+    if not quiet:
+        # Before anything is written: minutes of work are not lost where the disk is full.
+        for part in plans:
+            print_table(parameter_table(part), stdout)
+            print_table(gain_table(part, short=True), stdout)
+            if said := left_out_sentence(part):
+                typer.echo(said)
+            typer.echo(plan_sentence(part, wanted.least_gain))
     files = write_plan(out, machine, plans, wanted.least_gain)
-    if quiet:
-        return
-    for part in plans:
-        print_table(parameter_table(part), stdout)
-        print_table(gain_table(part, short=True), stdout)
-        if said := left_out_sentence(part):
-            typer.echo(said)
-        typer.echo(plan_sentence(part, wanted.least_gain))
-    typer.echo(f"Written: {', '.join(str(file) for file in files)}")
+    if not quiet:
+        typer.echo(f"Written: {', '.join(str(file) for file in files)}")

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.compensation._card import MODEL_FORMS, card_of, read_model
 from ccnn_torch.compensation._loaded import LoadedModel, load_model
 from ccnn_torch.compensation._promise import Promise, as_matrix, kept
@@ -17,7 +18,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.mechanisms import Mechanism, mechanism_of_file
 from ccnn_torch.mechanisms.mechanism_file import MechanismFile, read_mechanism_file
-from ccnn_torch.training import write_whole
 
 __all__ = ["IdentifiedGeometry", "load_compensation", "load_geometry", "sign_model"]
 
@@ -155,10 +155,7 @@ def sign_model(path: str | Path, key: str | Path) -> Path:
         content = read_model(path)
         card = card_of(path, content)[1]
     signature = sign_content(content, card, key)
-    try:
-        write_whole(signature_path(path), signature)
-    except OSError as reason:
-        raise InputError(f"{signature_path(path)}: cannot be written: {reason.strerror}") from None
+    write_whole(signature_path(path), signature)
     return signature_path(path)
 
 

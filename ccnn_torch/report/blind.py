@@ -5,7 +5,6 @@ Every share stands with its 95 % interval (Clopper and Pearson 1934).
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.report.blind_tables import blind_markdown
+from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.json_files import write_json
 
 __all__ = ["share", "summary", "write_blind"]
@@ -209,12 +210,9 @@ def _withheld(cases: Sequence[Case]) -> dict[str, Block]:
 
 def write_blind(folder: Path, found: Mapping[str, Any]) -> Path:
     """Write `blind.csv`, `blind.md` and, last, `blind.json`; returns the path of the last."""
-    with (folder / "blind.csv").open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(("group", "of", "figure", "count", "cases", "share", "low", "high"))
-        for row in _tidy(found):
-            writer.writerow("" if v is None else f"{v:.17g}" if isinstance(v, float) else v for v in row)
-    (folder / "blind.md").write_text(blind_markdown(found), encoding="utf-8")
+    header = ("group", "of", "figure", "count", "cases", "share", "low", "high")
+    write_rows(folder / "blind.csv", header, _tidy(found))
+    write_whole(folder / "blind.md", blind_markdown(found))
     path = folder / "blind.json"
     write_json(path, found)
     return path

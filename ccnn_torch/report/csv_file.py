@@ -1,13 +1,16 @@
-"""`results.csv`: every figure of `results.json` as one tidy row, in SI."""
+"""`results.csv`: every figure of `results.json` as one tidy row, in SI; and how all tables of figures are written."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping
+import io
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["tidy_rows", "write_csv"]
+from ccnn_torch._files import write_whole
+
+__all__ = ["tidy_rows", "write_csv", "write_rows"]
 
 HEADER = ("method", "split", "quantity", "joint", "unit", "median", "low", "high")
 Row = tuple[str, str, str, str, str, float | None, float | None, float | None]
@@ -61,8 +64,17 @@ def tidy_rows(results: Mapping[str, Any]) -> Iterator[Row]:
 
 def write_csv(path: str | Path, results: Mapping[str, Any]) -> None:
     """Write `results.csv`; numbers have 17 significant digits, an unknown one is empty."""
-    with Path(path).open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(HEADER)
-        for row in tidy_rows(results):
-            writer.writerow(f"{v:.17g}" if isinstance(v, float | int) else v for v in row)
+    write_rows(path, HEADER, tidy_rows(results))
+
+
+def write_rows(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> None:
+    """Write a CSV file; numbers have 17 significant digits, None is an empty cell.
+
+    Raises:
+        WriteError: it cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows([f"{v:.17g}" if isinstance(v, float | int) else v for v in row] for row in rows)
+    write_whole(path, text.getvalue())

@@ -14,10 +14,10 @@ from safetensors.numpy import load_file
 from safetensors.torch import save
 from torch import Tensor
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import read_json, write_json
-from ccnn_torch.training import write_whole
 
 __all__ = [
     "ARRAYS",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch._display import display_unit, number_text, unit_text
+from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.diagnosis_data import About, used_rows
 from ccnn_torch.report.diagnosis_tables import percent, percent_interval
 from ccnn_torch.report.table_form import Table
@@ -135,13 +135,12 @@ def write_next_csv(path: Path, results: Block, about: About) -> None:
     A covariate that a measurement does not ask for is empty.
     """
     joints, covariates = _columns(results)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*(f"{name}[{about.unit(name)}]" for name in (*joints, *covariates)), "gain[1]"])
-        for entry in results["next_measurements"]:
-            both = {**entry["joints"], **entry["covariates"]}
-            cells = [f"{both[n]:.17g}" if n in both else "" for n in (*joints, *covariates)]
-            writer.writerow([*cells, f"{entry['gain']:.17g}"])
+    names = (*joints, *covariates)
+    rows = [
+        [*({**entry["joints"], **entry["covariates"]}.get(name) for name in names), entry["gain"]]
+        for entry in results["next_measurements"]
+    ]
+    write_rows(path, [*(f"{name}[{about.unit(name)}]" for name in names), "gain[1]"], rows)
 
 
 def _columns(results: Block) -> tuple[list[str], list[str]]:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from torch import Tensor
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.diagnosis.words import aside_text, network_text, unseen_text, verdict_text
 from ccnn_torch.report.diagnosis_data import (
     ARRAYS,
@@ -94,16 +95,14 @@ def write_diagnosis_report(
         InputError: a file is not there or damaged.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     results = read_json(folder / _RESULT) if results is None else results
     if arrays is not None:
         save_diagnosis_arrays(folder, arrays, labels or {})
     numbers, labels = load_diagnosis_arrays(folder), load_labels(folder)
     about = about_of(labels)
-    (folder / _MARKDOWN).write_text(diagnosis_markdown(results, about), encoding="utf-8")
+    write_whole(folder / _MARKDOWN, diagnosis_markdown(results, about))
     write_next_csv(folder / NEXT, results, about)
     plots = _plots(results, numbers, labels, about)
-    (folder / "plots").mkdir(exist_ok=True)
     figures, pictures = {}, {}
     for plot in plots:
         png, svg = save_figure(plot.figure, folder / "plots" / plot.name)
@@ -121,7 +120,7 @@ def write_diagnosis_report(
         best=None,
     )
     path = folder / "report.html"
-    path.write_text(page, encoding="utf-8")
+    write_whole(path, page)
     if tensorboard:
         write_diagnosis_events(folder / "tensorboard", results, verdict_text(results), pictures)
     return path

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.image import imread
 
+from ccnn_torch.report.event_file import EventFile
+
 __all__ = ["write_diagnosis_events"]
 
 
@@ -26,12 +28,9 @@ def write_diagnosis_events(
         verdict: its two sentences.
         pictures: PNG files by name.
     """
-    # TensorBoard takes a second to import, which only those who want events should pay.
-    from torch.utils.tensorboard import SummaryWriter
-
     for old in folder.glob("events.out.tfevents.*"):
         old.unlink()
-    with SummaryWriter(str(folder)) as writer:
+    with EventFile(folder) as writer:
         writer.add_text("diagnosis/verdict", verdict, 0)
         for key in ("gap", "gap_rotation"):
             for part in ("before", "after", "noise_floor"):

@@ -13,11 +13,11 @@ from safetensors.numpy import load_file
 from safetensors.torch import save
 from torch import Tensor
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.html import InlineFigure, page_text
 from ccnn_torch.report.identified_tables import identified_tables, identified_verdict, unknown_sentences
 from ccnn_torch.report.json_files import read_json
-from ccnn_torch.training import write_whole
 
 __all__ = ["ARRAYS", "save_identified_arrays", "write_identified_report"]
 
@@ -57,7 +57,6 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
         arrays: dict[str, NDArray[np.float64]] = load_file(folder / ARRAYS)
     except (OSError, SafetensorError):
         raise InputError(f"{folder / ARRAYS}: is not there or damaged; identify again into another folder") from None
-    (folder / "plots").mkdir(exist_ok=True)
     figures = []
     for plot in identified_plots(results, arrays):
         _, svg = save_figure(plot.figure, folder / "plots" / plot.name)
@@ -75,5 +74,5 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
         [name for name in _LINKED if name == "identified.json" or (folder / name).is_file()],
     )
     path = folder / "report.html"
-    path.write_text(page, encoding="utf-8")
+    write_whole(path, page)
     return path

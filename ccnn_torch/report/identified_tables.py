@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import median
@@ -11,6 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.display import count_text, display_unit, number_text
 from ccnn_torch.report.identified_constraint import BEFORE_SAYS, constraint_table, holder
 from ccnn_torch.report.identified_paper import paper_tables
@@ -32,7 +32,9 @@ Block = Mapping[str, Any]
 
 def identified_verdict(results: Block) -> str:
     """One sentence: what the identified geometry does to the pose error on held-out poses."""
-    named = [(name, results["test"][name]) for name in ("position", "rotation") if results["test"][name]]
+    judged = ((name, results["test"][name]) for name in ("position", "rotation"))
+    # A test pose that the nominal machine does not reach leaves no figure of before.
+    named = [(name, block) for name, block in judged if block and block["before"] is not None]
     if not named:
         return "The pose error could not be judged."
     method = results["method"]
@@ -331,8 +333,4 @@ def _rows(results: Block) -> Iterator[Row]:
 
 def write_identified_csv(path: str | Path, results: Block) -> None:
     """Write `identified.csv`: every figure as one tidy row, in SI, 17 significant digits; an unknown one is empty."""
-    with Path(path).open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_HEADER)
-        for row in _rows(results):
-            writer.writerow(f"{v:.17g}" if isinstance(v, float | int) else v for v in row)
+    write_rows(path, _HEADER, _rows(results))

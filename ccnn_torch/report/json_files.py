@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.errors import InputError
-from ccnn_torch.training import write_whole
 
 __all__ = ["load_schema", "plain", "read_json", "write_json"]
 
@@ -45,7 +45,7 @@ def plain(value: Any) -> Any:
 def write_json(path: str | Path, value: Mapping[str, Any]) -> None:
     """Write a JSON file; a reader sees the old file or the new one, never half of one."""
     text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
-    write_whole(Path(path), (text + "\n").encode())
+    write_whole(path, text + "\n")
 
 
 def read_json(path: str | Path) -> dict[str, Any]:

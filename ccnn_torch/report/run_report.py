@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_arrays, load_history
 from ccnn_torch.report.html import InlineFigure, html_text
@@ -50,7 +51,6 @@ def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -
     results = read_json(folder / "results.json") if results is None else results
     write_tables(folder, results)
     plots = run_plots(folder, results)
-    (folder / "plots").mkdir(exist_ok=True)
     figures = []
     for plot in plots:
         _, svg = save_figure(plot.figure, folder / "plots" / plot.name)
@@ -63,7 +63,7 @@ def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -
         [name for name in _LINKED if (folder / name).is_file()],
     )
     path = folder / "report.html"
-    path.write_text(page, encoding="utf-8")
+    write_whole(path, page)
     return path
 
 
@@ -109,6 +109,5 @@ def make_picture(folder: str | Path, path: str | Path, joint: str | None = None)
     if joint is not None and joint not in names:
         raise InputError(f"There is no joint {joint!r}; this run has {', '.join(names)}.")
     plot = overview_plot(arrays, None if joint is None else names.index(joint))
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
     save_figure(plot.figure, path)
     return plot.caption

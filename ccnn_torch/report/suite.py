@@ -10,13 +10,14 @@ Everything is about the held-out mean squared error of the joint deviation, over
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ccnn_torch._files import write_whole
+from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.plots import save_figure, suite_plot
 from ccnn_torch.report.results import spread
@@ -136,13 +137,9 @@ def _summary(cases: list[Block]) -> dict[str, Block]:
 
 def write_suite(folder: Path, comparison: Mapping[str, Any]) -> Path:
     """Write `suite.csv`, `suite.md`, `suite.png`, `suite.svg` and, last, `suite.json`; returns the path of the last."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "suite.csv").open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(("case", "method", "quantity", "unit", "median", "low", "high", "values"))
-        for row in _tidy(comparison):
-            writer.writerow(f"{v:.17g}" if isinstance(v, float | int) else v for v in row)
-    (folder / "suite.md").write_text(suite_markdown(comparison), encoding="utf-8")
+    header = ("case", "method", "quantity", "unit", "median", "low", "high", "values")
+    write_rows(folder / "suite.csv", header, _tidy(comparison))
+    write_whole(folder / "suite.md", suite_markdown(comparison))
     if comparison["cases"]:
         save_figure(suite_plot(comparison).figure, folder / "suite")
     path = folder / "suite.json"

@@ -14,6 +14,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.report.comparison_tables import comparison_table, method_label, pose_by_method_table, reach_table
 from ccnn_torch.report.csv_file import write_csv
 from ccnn_torch.report.display import count_text, display_unit, interval_text, number_text, removed_percent
@@ -107,7 +108,7 @@ def markdown_text(results: Results) -> str:
 def write_tables(folder: Path, results: Results) -> None:
     """Write `results.csv` and `results.md`."""
     write_csv(folder / "results.csv", results)
-    (folder / "results.md").write_text(markdown_text(results), encoding="utf-8")
+    write_whole(folder / "results.md", markdown_text(results))
 
 
 def cautions(results: Results) -> list[str]:

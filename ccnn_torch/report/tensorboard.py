@@ -6,15 +6,14 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from torch.utils.tensorboard import SummaryWriter
+from ccnn_torch.report.event_file import EventFile
 
 __all__ = ["TensorBoardCallback", "tags_of"]
 
@@ -49,6 +48,7 @@ class TensorBoardCallback:
         every: int = 1,
         masks_every: int = 20,
         past: Callable[[], tuple[Mapping[str, Tensor], Tensor]] | None = None,
+        tell: Callable[[str], None] = lambda sentence: None,
     ) -> None:
         """Make the callback.
 
@@ -60,13 +60,15 @@ class TensorBoardCallback:
             masks_every: write the masks each so many steps.
             past: gives the history before a resumed training, metrics `t x r [x k]`, and the seconds inside the
                 learner after each step, `t`.
+            tell: is given the sentence when the curves cannot be written any further.
         """
         self._folder = Path(folder)
         self._masks = masks
         self._every = every
         self._masks_every = masks_every
         self._past = past
-        self._writer: SummaryWriter | None = None
+        self._tell, self._told = tell, False
+        self._writer: EventFile | None = None
 
     def on_start(self, learner: Any, data: Any, step: int) -> None:
         """Take the learner's masks where it has some; the writer waits for the first step."""
@@ -86,10 +88,7 @@ class TensorBoardCallback:
             metrics: by name, each `r`, `r x k` or a plain number.
         """
         if self._writer is None:
-            # TensorBoard takes a second to import, which only runs that write curves should pay.
-            from torch.utils.tensorboard import SummaryWriter
-
-            self._writer = SummaryWriter(str(self._folder), purge_step=step)
+            self._writer = EventFile(self._folder, purge_step=step)
             self._origin -= _seconds(metrics) or 0.0
             self._repeat_past(step)
         seconds = _seconds(metrics)
@@ -102,6 +101,10 @@ class TensorBoardCallback:
             for layer, mask in enumerate(self._masks(), start=1):
                 picture = np.kron(np.asarray(mask, dtype=np.uint8), np.ones((_CELL, _CELL), dtype=np.uint8)) * 255
                 self._writer.add_image(f"masks/layer_{layer}", picture, step, dataformats="HW")
+        self._writer.flush()
+        if self._writer.failed is not None and not self._told:
+            self._told = True
+            self._tell(f"{self._folder}: the curves end at step {step} ({self._writer.failed}); the run goes on")
 
     def _walltime(self, seconds: float | None) -> float | None:
         """As if nothing but the learner took time; None = now."""

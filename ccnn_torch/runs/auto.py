@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -14,7 +16,7 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner
-from ccnn_torch.report.json_files import read_json, write_json
+from ccnn_torch.report.json_files import plain, read_json, write_json
 from ccnn_torch.report.results import spread
 from ccnn_torch.runs.choosing import Choice, Plan, WatchPhase, choose
 from ccnn_torch.runs.dataset import Dataset
@@ -185,7 +187,8 @@ def _write(folder: RunFolder, comparison: Comparison) -> None:
         }
         for name, choice in comparison.compared.items()
     }
-    write_json(folder.auto, {"compared": compared, "skipped": comparison.skipped, "spent": comparison.spent})
+    decided = {"compared": compared, "skipped": comparison.skipped, "spent": comparison.spent}
+    write_json(folder.auto, {**decided, "sha256": _seal(decided)})
 
 
 def _read(folder: RunFolder, comparison: Comparison) -> None:
@@ -196,6 +199,8 @@ def _read(folder: RunFolder, comparison: Comparison) -> None:
         return None if value is None else make(value)
 
     try:
+        if found.pop("sha256") != _seal(found):
+            raise ValueError("was altered")
         for name, entry in found["compared"].items():
             comparison.compared[name] = Choice(
                 best_step=torch.tensor(entry["best_step"], dtype=torch.int64),
@@ -211,3 +216,7 @@ def _read(folder: RunFolder, comparison: Comparison) -> None:
         comparison.spent = float(found["spent"])
     except (KeyError, TypeError, ValueError, AttributeError):
         raise InputError(f"{folder.auto} is damaged; delete it and resume, which compares the methods again") from None
+
+
+def _seal(decided: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(plain(decided), sort_keys=True).encode()).hexdigest()

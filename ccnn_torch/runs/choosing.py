@@ -122,6 +122,7 @@ def choose(
         data if plan.early_stop else replace(data, validation=None),
         callbacks=watch("choose", scaling),
         checkpoint=folder.checkpoint(name, "choose") if folder else None,
+        facts=folder.facts if folder else None,
         every=plan.checkpoint_every,
         patience=plan.patience if plan.early_stop else None,
         folds=plan.folds,

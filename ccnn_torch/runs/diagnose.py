@@ -63,7 +63,6 @@ def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
     Raises:
         InputError: the folder cannot be written.
     """
-    _make(folder)
     path = folder / "diagnosis.json"
     write_json(path, plain(diagnosis.to_json()))
     return path
@@ -71,17 +70,9 @@ def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
 
 def write_check(folder: Path, check: Check) -> Path:
     """Write `check.json`; raises as `write_result`."""
-    _make(folder)
     path = folder / "check.json"
     write_json(path, asdict(check))
     return path
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as reason:
-        raise InputError(f"{folder}: cannot be made ({reason.strerror}); give another place with --out") from None
 
 
 def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str] | None = None, seed: int = 0) -> Path:

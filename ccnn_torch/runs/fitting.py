@@ -125,6 +125,7 @@ def refit(
         data,
         callbacks=watch("fit", scaling),
         checkpoint=folder.checkpoint(name, "fit") if folder else None,
+        facts=folder.facts if folder else None,
         every=plan.checkpoint_every,
         stop_at=choice.best_step.to(plan.device) if choice is not None and plan.early_stop else None,
     )

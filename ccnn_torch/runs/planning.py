@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from ccnn_torch._files import make_folder, write_whole
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import ParameterChoice
 from ccnn_torch.identification.planning import Plan, plan_poses
@@ -83,15 +84,12 @@ def write_plan(path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: 
     for coordinates, part in ((mechanism.joints, "joints"), (mechanism.pose, "pose")):
         values = torch.cat([getattr(plan, part) for plan in plans])
         columns |= {c.header: values[:, i].numpy() for i, c in enumerate(coordinates)}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as reason:
-        raise InputError(f"{path.parent}: cannot be made ({reason.strerror}); give another place with --out") from None
+    make_folder(path.parent)
     write_table(path, columns)
     plot = plan_plot(mechanism.pose, plans, least_gain)
     pictures = save_figure(plot.figure, path)
     page = path.with_suffix(".md")
-    page.write_text(plan_markdown(mechanism.name, plans, least_gain, pictures[0].name, plot.caption), encoding="utf-8")
+    write_whole(page, plan_markdown(mechanism.name, plans, least_gain, pictures[0].name, plot.caption))
     return [path, page, *pictures]
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from ccnn_torch.errors import WriteError
 from ccnn_torch.report.results import share_unit
 from ccnn_torch.report.tables import print_tables
 from ccnn_torch.report.tensorboard import TensorBoardCallback
+from ccnn_torch.runs._begun import facts_of, refuse_changes
 from ccnn_torch.runs.assemble import plan_of
 from ccnn_torch.runs.calibrate import Calibration, calibrate, makers
 from ccnn_torch.runs.config import RunConfig, dump_config, load_config
-from ccnn_torch.runs.folder import RunFolder
+from ccnn_torch.runs.folder import RunFolder, kept_for
 from ccnn_torch.runs.outputs import write_outputs
 from ccnn_torch.runs.prepare import Prepared, prepare
 from ccnn_torch.runs.screen import note, stdout
@@ -29,13 +32,14 @@ def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> Ru
         tables: show the results when it is done.
 
     Raises:
-        InputError: the config or its data cannot be used, or the folder is taken.
+        InputError: the config or its data cannot be used, or the folder is taken or in use.
+        WriteError: a file cannot be written; what was computed until then is kept.
     """
     makers(config)
     prepared = prepare(config)
-    folder = RunFolder.create(config.out, config.name)
-    folder.write_text("config.yaml", dump_config(config))
-    _run(config, prepared, folder, quiet, tables)
+    with RunFolder.fresh(config.out, config.name) as folder:
+        folder.write("config.yaml", dump_config(config))
+        _run(config, prepared, folder, quiet, tables)
     return folder
 
 
@@ -46,20 +50,27 @@ def resume_run(path: Path, quiet: bool = False, tables: bool = True) -> RunFolde
         quiet, tables: as in `start_run`.
 
     Raises:
-        InputError: there is no run in the folder, or its records or checkpoints were changed.
+        InputError: there is no run in the folder, it is in use, or its config, records or checkpoints were changed.
+        WriteError: as `start_run`.
     """
-    folder = RunFolder.existing(path)
+    folder = RunFolder(path)
     if folder.finished:
         note(f"{path} is finished; nothing to do", quiet)
         return folder
-    config = load_config(folder.config, [])
-    _run(config, prepare(config), folder, quiet, tables)
+    with RunFolder.existing(path) as folder:
+        config = load_config(folder.config, [])
+        refuse_changes(folder.checkpoints, facts_of(config), folder.config)
+        _run(config, prepare(config), folder, quiet, tables)
     return folder
 
 
 def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, tables: bool) -> None:
     for sentence in prepared.notes:
         note(sentence, quiet)
+    folder = replace(folder, facts=facts_of(config, prepared.data_hash))
+    refuse_changes(folder.checkpoints, folder.facts, folder.config)
+
+    tell = partial(note, quiet=quiet)
 
     def watch(prepared: Prepared, method: str, phase: str, scaling: Scaling) -> list[Callback]:
         joints = prepared.mechanism.joints
@@ -68,16 +79,24 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, 
         board = folder.tensorboard / (method if phase == "fit" else f"{method}-{phase}")
         every = config.training.log_every
         past = partial(past_of, folder.checkpoint(method, phase))
-        shown: list[Callback] = [TensorBoardCallback(board, every=every, past=past), ProgressBar(label, quiet)]
+        shown: list[Callback] = [
+            TensorBoardCallback(board, every=every, past=past, tell=tell),
+            ProgressBar(label, quiet),
+        ]
         if phase == "choose":
             # It has held-out errors of its own, of rows that are there to choose by.
             return shown
         names = tuple(joint.name for joint in joints)
         return [HeldOut(prepared.dataset, scaling, names, share_unit(joints), every), *shown]
 
-    calibration: Calibration = calibrate(config, folder, watch, prepared)
-    note("writing model files, plots and tables …", quiet)
-    write_outputs(calibration, folder)
+    with kept_for(f"ccnn run --resume {folder.path}"):
+        calibration: Calibration = calibrate(config, folder, watch, prepared)
+        note("writing model files, plots and tables …", quiet)
+        try:
+            write_outputs(calibration, folder)
+        except WriteError:
+            print_tables(calibration.results, stdout)
+            raise
     if tables and not quiet:
         print_tables(calibration.results, stdout)
         stdout.print(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")

@@ -11,16 +11,18 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from ccnn_torch._files import sweep
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.suite import compare, write_suite
 from ccnn_torch.report.suite_tables import case_line, print_suite
 from ccnn_torch.runs._config_tree import validated
+from ccnn_torch.runs._lock import locked
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
 from ccnn_torch.runs._yaml import read_yaml
 from ccnn_torch.runs.calibrate import makers
 from ccnn_torch.runs.config import RunConfig, load_config
-from ccnn_torch.runs.folder import RunFolder
+from ccnn_torch.runs.folder import RunFolder, kept_for
 from ccnn_torch.runs.runner import resume_run, start_run
 from ccnn_torch.runs.screen import note, stdout
 
@@ -100,12 +102,19 @@ def run_suite(suite: Suite, quiet: bool = False) -> Path:
         The path of `suite.json`.
 
     Raises:
-        InputError: a case cannot be run, or its folder holds another run.
+        InputError: a case cannot be run, its folder holds another run, or the folder is in use.
         MethodFailedError: not a single case could be run.
     """
     for config in suite.cases.values():
         makers(config)
         _check_folder(config)
+    with locked(suite.out):
+        # The cases have locks of their own.
+        sweep(suite.out, below=False)
+        return _run_cases(suite, quiet)
+
+
+def _run_cases(suite: Suite, quiet: bool) -> Path:
     results: dict[str, Mapping[str, Any]] = {}
     failed: dict[str, str] = {}
     for number, (name, config) in enumerate(suite.cases.items(), 1):
@@ -123,9 +132,11 @@ def run_suite(suite: Suite, quiet: bool = False) -> Path:
         raise MethodFailedError("; ".join(f"case '{name}': {sentence}" for name, sentence in failed.items()))
     about = {name: _about(config) for name, config in suite.cases.items()}
     comparison = compare(suite.name, results, about, failed)
-    path = write_suite(suite.out, comparison)
     if not quiet:
         print_suite(comparison, stdout)
+    with kept_for("the same command"):
+        path = write_suite(suite.out, comparison)
+    if not quiet:
         stdout.print(f"Everything is in {suite.out}")
     return path
 

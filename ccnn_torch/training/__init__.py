@@ -4,7 +4,6 @@ from ccnn_torch.training._callbacks import Callback as Callback
 from ccnn_torch.training._checkpoint import load_checkpoint as load_checkpoint
 from ccnn_torch.training._checkpoint import save_checkpoint as save_checkpoint
 from ccnn_torch.training._checkpoint import tensor_digest as tensor_digest
-from ccnn_torch.training._checkpoint import write_whole as write_whole
 from ccnn_torch.training._scaling import Scaling as Scaling
 from ccnn_torch.training._trainer import Training as Training
 from ccnn_torch.training._trainer import past_of as past_of

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +11,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.errors import InputError
 
-__all__ = ["load_checkpoint", "save_checkpoint", "tensor_digest", "write_whole"]
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file through a temporary one beside it; a reader sees the old content or the new, never a part."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    with temporary.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(temporary, path)
+__all__ = ["load_checkpoint", "save_checkpoint", "tensor_digest"]
 
 
 def tensor_digest(tensors: dict[str, Tensor]) -> str:
@@ -39,9 +28,13 @@ def tensor_digest(tensors: dict[str, Tensor]) -> str:
 
 
 def save_checkpoint(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
-    """Write tensors (any device) and JSON-able facts about them."""
+    """Write tensors (any device) and JSON-able facts about them, all under one hash.
+
+    Raises:
+        WriteError: it cannot be written; an older one is as it was.
+    """
     held = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-    facts = json.dumps({"about": about, "sha256": tensor_digest(held)}, sort_keys=True)
+    facts = json.dumps({"about": about, "sha256": _seal(held, about)}, sort_keys=True)
     write_whole(path, save(held, metadata={"ccnn_torch": facts}))
 
 
@@ -59,11 +52,20 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise InputError(
             f"{path}: this checkpoint cannot be read ({problem}); delete it and resume, which starts its phase again"
         ) from None
-    facts = json.loads(metadata.get("ccnn_torch", "{}"))
-    if facts.get("sha256") != tensor_digest(tensors):
+    try:
+        facts = json.loads(metadata["ccnn_torch"])
+        about: dict[str, Any] = facts["about"]
+        whole = isinstance(about, dict) and facts["sha256"] == _seal(tensors, about)
+    except (KeyError, TypeError, ValueError, RecursionError):
+        whole = False
+    if not whole:
         raise InputError(
             f"{path}: this checkpoint was altered after it was written; delete it and resume, "
             "which starts its phase again"
         )
-    about: dict[str, Any] = facts["about"]
     return tensors, about
+
+
+def _seal(tensors: dict[str, Tensor], about: dict[str, Any]) -> str:
+    """SHA-256 over the tensors and what is said of them."""
+    return hashlib.sha256((tensor_digest(tensors) + json.dumps(about, sort_keys=True)).encode()).hexdigest()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +15,7 @@ from torch import Tensor
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners._protocol import Learner, TrainingData
 from ccnn_torch.training._callbacks import Callback
-from ccnn_torch.training._checkpoint import load_checkpoint, save_checkpoint
+from ccnn_torch.training._checkpoint import load_checkpoint, save_checkpoint, tensor_digest
 from ccnn_torch.training._interrupt import interrupts_held_back
 
 __all__ = ["Training", "past_of", "train", "weighted_mse"]
@@ -59,6 +59,7 @@ def train(
     *,
     callbacks: Sequence[Callback] = (),
     checkpoint: Path | None = None,
+    facts: Mapping[str, Any] | None = None,
     every: int = 20,
     patience: int | None = None,
     stop_at: Tensor | None = None,
@@ -77,6 +78,7 @@ def train(
     Args:
         checkpoint: file to write every `every` steps and before the first; if it is there, the training goes on from
             it and ends in the same tensors as one that was never stopped.
+        facts: JSON-able, kept in the checkpoint under its hash: what the training was begun with.
         stop_at: steps of each repeat, `r` int64.
         folds: so many neighbouring repeats are the folds of one: they share the step of their lowest mean validation
             error.
@@ -94,7 +96,7 @@ def train(
     if checkpoint is not None and checkpoint.exists():
         run.restore(checkpoint)
     elif checkpoint is not None:
-        run.save(checkpoint)
+        run.save(checkpoint, facts)
     with interrupts_held_back():
         for callback in callbacks:
             callback.on_start(learner, data, run.step)
@@ -109,13 +111,13 @@ def train(
             del metrics["seconds"]
             run.note(metrics)
             if checkpoint is not None and run.step % every == 0:
-                run.save(checkpoint)
+                run.save(checkpoint, facts)
     finally:
         with interrupts_held_back():
             for callback in callbacks:
                 callback.on_end()
     if checkpoint is not None:
-        run.save(checkpoint)
+        run.save(checkpoint, facts)
     return run.finish()
 
 
@@ -207,15 +209,14 @@ class _Run:
             ended,
         )
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path, facts: Mapping[str, Any] | None) -> None:
         tensors = {f"state.{name}": value for name, value in self.learner.state_dict().items()}
         tensors |= {f"history.{name}": value for name, value in _stack(self.history).items()}
         tensors |= {"best_step": self.best_step, "best_validation": self.best_validation}
         if self.chooses:
             tensors |= {f"kept.{name}": value for name, value in self.kept.items()}
-        save_checkpoint(
-            path, tensors, {**self._identity(), "step": self.step, "seconds": self.seconds, "clock": self.clock}
-        )
+        progress = {"step": self.step, "seconds": self.seconds, "clock": self.clock}
+        save_checkpoint(path, tensors, {**self._identity(), **progress, "facts": dict(facts or {})})
 
     def restore(self, path: Path) -> None:
         tensors, about = load_checkpoint(path)
@@ -242,7 +243,7 @@ class _Run:
             "learner": self.learner.name,
             "rows": list(data.inputs.shape),
             "validation": None if data.validation is None else list(data.validation.inputs.shape),
-            "checksum": float(data.inputs.sum() + data.targets.sum()),
+            "data": tensor_digest({"inputs": data.inputs, "targets": data.targets, "weights": data.weights}),
         }
 
     def _copy_state(self) -> dict[str, Tensor]:

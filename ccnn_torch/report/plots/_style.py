@@ -5,6 +5,7 @@ Figures are made without pyplot, so nothing of matplotlib's global state is read
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from typing import Any, ParamSpec, TypeVar
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from ccnn_torch._files import write_whole
 
 __all__ = ["AFTER", "BEFORE", "FLOOR", "GREY", "RASTER_ABOVE", "SERIES", "Plot", "inline_svg", "save_figure", "styled"]
 
@@ -90,14 +93,18 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
 
     Returns:
         The two paths.
+
+    Raises:
+        WriteError: they cannot be written.
     """
-    stem = Path(path)
-    png, svg = stem.with_suffix(".png"), stem.with_suffix(".svg")
+    png, svg = Path(path).with_suffix(".png"), Path(path).with_suffix(".svg")
     # The layout is found once and kept: finding it again for each file costs more than the drawing.
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    figure.savefig(png, metadata={"Software": None})
-    figure.savefig(svg, metadata={"Date": None, "Creator": None})
+    for path, form, about in ((png, "png", {"Software": None}), (svg, "svg", {"Date": None, "Creator": None})):
+        content = io.BytesIO()
+        figure.savefig(content, format=form, metadata=about)
+        write_whole(path, content.getvalue())
     return [png, svg]
 
 

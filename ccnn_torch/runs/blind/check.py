@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from ccnn_torch._files import sweep
 from ccnn_torch.effects import EFFECTS, Effect, make_effect
 from ccnn_torch.errors import CcnnError, InputError, MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
@@ -16,9 +17,11 @@ from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.blind import summary, write_blind
 from ccnn_torch.report.blind_tables import case_line, print_blind
 from ccnn_torch.report.json_files import read_json, write_json
+from ccnn_torch.runs._lock import locked
 from ccnn_torch.runs.blind.folder import BlindFolder
 from ccnn_torch.runs.blind.machines import MACHINES
 from ccnn_torch.runs.blind.plan import KINDS, plan_cases
+from ccnn_torch.runs.folder import kept_for
 from ccnn_torch.runs.screen import note, stdout
 
 __all__ = ["Diagnoser", "run_blind_check"]
@@ -71,14 +74,21 @@ def run_blind_check(
         The path of `blind.json`.
 
     Raises:
-        InputError: an argument that does not fit, or a folder of another check.
+        InputError: an argument that does not fit, or a folder of another check or in use.
         MethodFailedError: the generating process failed.
     """
     plan_cases(cases, seed, machines, kinds)
     folder = BlindFolder(Path(out))
-    _settle(folder, {"cases": cases, "seed": seed, "machines": list(machines), "kinds": list(kinds)})
+    settings = {"cases": cases, "seed": seed, "machines": list(machines), "kinds": list(kinds)}
+    with locked(folder.path), kept_for("the same command"):
+        sweep(folder.path)
+        return _checked(folder, settings, diagnose, quiet)
+
+
+def _checked(folder: BlindFolder, settings: dict[str, Any], diagnose: Diagnoser, quiet: bool) -> Path:
+    _settle(folder, settings)
     if not folder.seal.is_file():
-        note(f"generating {cases} sealed cases in a process of their own", quiet)
+        note(f"generating {settings['cases']} sealed cases in a process of their own", quiet)
         _generator("write", folder)
     told = read_json(folder.public)["cases"]
     _diagnose_all(folder, told, diagnose, None, quiet)
@@ -93,9 +103,10 @@ def run_blind_check(
         note("judging", quiet)
         _generator("judge", folder)
     found = summary(read_json(folder.judged)["cases"])
-    path = write_blind(folder.path, found)
     if not quiet:
         print_blind(found, stdout)
+    path = write_blind(folder.path, found)
+    if not quiet:
         stdout.print(f"Everything is in {folder.path}")
     return path
 
@@ -111,7 +122,6 @@ def _settle(folder: BlindFolder, settings: dict[str, Any]) -> None:
                 "--out, or remove that one"
             )
         return
-    folder.path.mkdir(parents=True, exist_ok=True)
     write_json(folder.settings, settings)
 
 
@@ -136,7 +146,6 @@ def _diagnose_all(
     """Diagnose what is not diagnosed yet."""
     machines: dict[str, Mechanism] = {}
     withheld = without is not None
-    folder.diagnosis(0, withheld).parent.mkdir(exist_ok=True)
     left = [case for case in told if not folder.diagnosis(case["number"], withheld).is_file()]
     for position, case in enumerate(left, 1):
         number, name = case["number"], case["machine"]

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from ccnn_torch._files import make_folder, write_whole
 from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.arm_files import dh_text
@@ -38,8 +39,7 @@ def write_cases(folder: BlindFolder) -> None:
     settings = read_json(folder.settings)
     seals: dict[str, dict[str, str]] = {}
     told: list[dict[str, Any]] = []
-    for sub in ("cases", "machines"):
-        (folder.path / sub).mkdir(parents=True, exist_ok=True)
+    make_folder(folder.records(0).parent)
     for case in _cases(settings):
         number = case.plan.number
         _write_machine(folder, case.plan.machine, case.machine)
@@ -110,7 +110,7 @@ def _write_machine(folder: BlindFolder, name: str, machine: BlindMachine) -> Non
     else:
         nominal = dict(zip((p.name for p in mechanism.geometry), mechanism.nominal.tolist(), strict=True))
         text = mechanism_text(mechanism, nominal)
-    path.write_text(text, encoding="utf-8")
+    write_whole(path, text)
 
 
 def _main(arguments: Sequence[str]) -> int:

@@ -11,7 +11,8 @@ from rich.progress import Progress as Bar
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.identification import Progress
 from ccnn_torch.report.identified_tables import not_settled, print_identified
-from ccnn_torch.runs.folder import RunFolder
+from ccnn_torch.runs._begun import facts_of, refuse_changes
+from ccnn_torch.runs.folder import RunFolder, kept_for
 from ccnn_torch.runs.identification._identify import Identification, identify
 from ccnn_torch.runs.identification._outputs import RESULTS, write_outputs
 from ccnn_torch.runs.identify_config import IdentifyConfig, dump_identify_config, load_identify_config
@@ -27,16 +28,15 @@ def start_identification(config: IdentifyConfig, quiet: bool = False) -> Path:
         InputError: the config or its data cannot be used, or the folder is taken.
         MethodFailedError: everything is written, but the first method did not converge.
     """
-    folder = RunFolder.create(config.out, config.name, "ccnn identify --resume")
-    try:
-        folder.write_text("config.yaml", dump_identify_config(config))
-        _run(config, folder.path, quiet)
-    except InputError:
-        # Nothing was computed: the next try may take the same name.
-        if not any(folder.path.glob("methods/*")):
-            folder.config.unlink(missing_ok=True)
-            folder.path.rmdir()
-        raise
+    with RunFolder.fresh(config.out, config.name, "ccnn identify --resume") as folder:
+        try:
+            folder.write("config.yaml", dump_identify_config(config))
+            _run(config, folder.path, quiet)
+        except InputError:
+            # Nothing was computed: the next try may take the same name.
+            if not any(folder.path.glob("methods/*")):
+                folder.config.unlink(missing_ok=True)
+            raise
     return folder.path
 
 
@@ -44,15 +44,16 @@ def resume_identification(path: Path, quiet: bool = False) -> Path:
     """Finish the identification in a folder; methods that are finished are kept.
 
     Raises:
-        InputError: there is none in the folder, or its records were changed.
+        InputError: there is none in the folder, it is in use, or its config or records were changed.
         MethodFailedError: as `start_identification`.
     """
-    if not (path / "config.yaml").is_file():
-        raise InputError(f"{path} has no config.yaml, so there is nothing to resume; name a folder of ccnn identify")
     if (path / RESULTS).is_file():
         note(f"{path} is finished; nothing to do", quiet)
         return path
-    _run(load_identify_config(path / "config.yaml"), path, quiet)
+    with RunFolder.existing(path, "ccnn identify") as folder:
+        config = load_identify_config(folder.config)
+        refuse_changes(sorted(path.glob("methods/*.safetensors")), facts_of(config), folder.config)
+        _run(config, path, quiet)
     return path
 
 
@@ -62,10 +63,13 @@ def _run(config: IdentifyConfig, path: Path, quiet: bool) -> Identification:
         found = identify(config, path / "methods", bars.watch)
     finally:
         bars.stop()
-    note("writing tables, plots and files …", quiet)
-    write_outputs(found, path)
     if not quiet:
+        # Before anything is written: what was found is not lost where the disk is full.
         print_identified(found.results, stdout)
+    note("writing tables, plots and files …", quiet)
+    with kept_for(f"ccnn identify --resume {path}"):
+        write_outputs(found, path)
+    if not quiet:
         stdout.print(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
     if found.results["methods"][found.results["method"]]["converged"] == 0:
         raise MethodFailedError(

@@ -11,9 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Fit, Progress, bootstrap
 from ccnn_torch.mechanisms import Framed, Mechanism
+from ccnn_torch.runs._begun import facts_of, refuse_changes
 from ccnn_torch.runs.identification._assemble import assemble
 from ccnn_torch.runs.identification._constrained import identify_by_constraint
 from ccnn_torch.runs.identification._counts import count_study
@@ -35,7 +37,6 @@ from ccnn_torch.runs.identification._solve import (
 from ccnn_torch.runs.identification._store import load_outcome, save_outcome
 from ccnn_torch.runs.identification._transfer import read_elsewhere, transferred
 from ccnn_torch.runs.identify_config import IdentifyConfig, base_method, dump_identify_config
-from ccnn_torch.training import write_whole
 
 __all__ = ["Identification", "Watch", "identify"]
 
@@ -74,8 +75,7 @@ class Identification:
         from ccnn_torch.runs.identification._outputs import write_outputs
 
         folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / "config.yaml", dump_identify_config(self.config).encode())
+        write_whole(folder / "config.yaml", dump_identify_config(self.config))
         write_outputs(self, folder)
 
     def nominal(self) -> dict[str, float]:
@@ -101,7 +101,8 @@ def identify(config: IdentifyConfig, store: Path | None = None, watch: Watch | N
     """Identify the parameters of a config by every method.
 
     Args:
-        store: folder in which each method's outcome is kept, and from which finished ones are taken.
+        store: folder beside config.yaml in which each method's outcome is kept, and from which finished ones are
+            taken.
         watch: where progress goes.
 
     Raises:
@@ -114,16 +115,18 @@ def identify(config: IdentifyConfig, store: Path | None = None, watch: Watch | N
     for method in config.methods:  # what cannot be solved is said before anything takes minutes
         solver_of(method, config)
         pieces_of(measured, config, is_apart(method, config), torch.arange(1))
-    mark = _fingerprint(measured)
+    facts = facts_of(config, _fingerprint(measured))
+    if store is not None:
+        refuse_changes(sorted(store.glob("*.safetensors")), facts, store.parent / "config.yaml")
     outcomes: dict[str, Outcome] = {}
     for method in config.methods:
         path = None if store is None else store / f"{method}.safetensors"
-        outcome = None if path is None else load_outcome(path, mark)
-        if outcome is None:
-            outcome = run_method(method, measured, config, None if watch is None else watch(method))
-            if path is not None:
-                save_outcome(path, outcome, mark)
-        outcomes[method] = outcome
+        if path is not None and path.is_file():
+            outcomes[method] = load_outcome(path)
+            continue
+        outcomes[method] = run_method(method, measured, config, None if watch is None else watch(method))
+        if path is not None:
+            save_outcome(path, outcomes[method], facts)
     counts = count_study(config, mechanism)
     done = assemble(config, measured, outcomes, counts, _bootstrap(config, measured, outcomes))
     if elsewhere is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.arm_files import dh_text, urdf_text
 from ccnn_torch.mechanisms.mechanism_file import mechanism_text
@@ -11,7 +12,6 @@ from ccnn_torch.report.identified_report import save_identified_arrays, write_id
 from ccnn_torch.report.identified_tables import identified_markdown, write_identified_csv
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.runs.identification._identify import Identification
-from ccnn_torch.training import write_whole
 
 __all__ = ["RESULTS", "write_machine", "write_outputs"]
 
@@ -22,7 +22,7 @@ def write_outputs(found: Identification, folder: Path) -> None:
     """Write everything; `identified.json` comes last: a folder that has it is finished."""
     results = found.results
     write_identified_csv(folder / "identified.csv", results)
-    (folder / "identified.md").write_text(identified_markdown(results), encoding="utf-8")
+    write_whole(folder / "identified.md", identified_markdown(results))
     save_identified_arrays(folder, found.arrays)
     write_machine(found, folder)
     if found.config.save_report:
@@ -39,5 +39,5 @@ def write_machine(found: Identification, folder: Path) -> list[Path]:
         if mechanism.convention != "urdf":
             texts["identified_dh.yaml"] = dh_text(mechanism)
     for name, text in texts.items():
-        write_whole(folder / name, text.encode())
+        write_whole(folder / name, text)
     return [folder / name for name in texts]

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ccnn_torch._files import make_folder
 from ccnn_torch.effects import OUTLIER, Acting, Situation, default_gravity, measured_pose, reached
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
@@ -126,10 +127,7 @@ def write_simulated(path: Path, simulated: Simulated) -> None:
     columns = {c.header: simulated.joints[:, i].numpy() for i, c in enumerate(machine.joints)}
     columns |= {c.header: simulated.pose[:, i].numpy() for i, c in enumerate(machine.pose)}
     columns |= {f"{name}[{units[name]}]": values.numpy() for name, values in simulated.covariates.items()}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as reason:
-        raise InputError(f"{path.parent}: cannot be made ({reason.strerror}); give another place with --out") from None
+    make_folder(path.parent)
     write_table(path, columns)
 
 

@@ -1,0 +1,88 @@
+"""The one way in which this package writes files: whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from uuid import uuid4
+
+from ccnn_torch.errors import WriteError
+
+__all__ = ["make_folder", "sweep", "write_whole"]
+
+_PREFIX, _SUFFIX = ".ccnn-", ".part"
+
+
+def write_whole(path: str | Path, content: bytes | str) -> None:
+    """Write a file through a temporary one beside it; a reader sees the old content or the new, never a part.
+
+    Its folder is made where it is not there; text is written as UTF-8. A link stays a link, a file keeps its rights,
+    and what is no file at all, like /dev/stdout in a pipe, is written to directly.
+
+    Raises:
+        WriteError: it cannot be written (disk full, no permission, a folder of that name …); an old file is as it was.
+    """
+    path = Path(path)
+    data = content.encode() if isinstance(content, str) else content
+    with _told(path):
+        kind = _kind(path)
+        if kind is not None and stat.S_ISDIR(kind):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if kind is not None and not stat.S_ISREG(kind):
+            path.write_bytes(data)
+            return
+        if kind is not None and not os.access(path, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        target = Path(os.path.realpath(path))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        # Its name does not grow with the file's, which may be as long as a name can be.
+        temporary = target.with_name(f"{_PREFIX}{uuid4().hex}{_SUFFIX}")
+        try:
+            with temporary.open("xb") as stream:
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+            if kind is not None:
+                shutil.copymode(target, temporary)
+            os.replace(temporary, target)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def make_folder(path: str | Path) -> None:
+    """Make a folder and those above it, where they are not there.
+
+    Raises:
+        WriteError: it cannot be made.
+    """
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as reason:
+        raise WriteError(f"{path}: cannot be made ({reason.strerror}); give another place") from None
+
+
+def sweep(folder: Path, below: bool = True) -> None:
+    """Remove what a killed process left half written in a folder, and below; nobody else may be writing there."""
+    for leftover in (folder.rglob if below else folder.glob)(f"{_PREFIX}*{_SUFFIX}"):
+        leftover.unlink(missing_ok=True)
+
+
+def _kind(path: Path) -> int | None:
+    """The mode of what stands there; None where nothing does."""
+    try:
+        return path.stat().st_mode
+    except FileNotFoundError:
+        return None
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as reason:
+        raise WriteError(f"{path}: cannot be written ({reason.strerror}); what stood there is as it was") from None

@@ -1,0 +1,96 @@
+"""An event file for TensorBoard. It grows with the run, so it cannot be replaced whole; it ends with a whole record."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import os
+import socket
+import time
+from pathlib import Path
+from typing import Any, Self
+
+__all__ = ["EventFile"]
+
+_numbers = itertools.count()
+
+
+class EventFile:
+    """One event file, written by the thread that has the numbers.
+
+    torch's own `SummaryWriter` writes in a thread, whose traceback nobody can catch when the disk is full. Here the
+    file ends with the last record that fitted, `failed` says why, and what comes after it is dropped: curves are there
+    to be looked at, and no run ends for their sake.
+    """
+
+    def __init__(self, folder: Path, purge_step: int | None = None) -> None:
+        """Open a new file.
+
+        Args:
+            folder: made where it is not there.
+            purge_step: tells TensorBoard to forget what older files of this folder hold from this step on.
+        """
+        # TensorBoard takes a second to import, which only runs that write curves should pay.
+        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+        from tensorboard.summary.writer.record_writer import RecordWriter
+        from torch.utils.tensorboard import summary
+
+        self._event: Any = Event
+        self._summary: Any = summary
+        self._pending = io.BytesIO()
+        self._records = RecordWriter(self._pending)
+        self._file: io.FileIO | None = None
+        self.failed: str | None = None
+        name = f"events.out.tfevents.{int(time.time()):010}.{socket.gethostname()}.{os.getpid()}.{next(_numbers)}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = io.FileIO(folder / name, "w")
+        except OSError as reason:
+            self.failed = reason.strerror
+        self._add(None, file_version="brain.Event:2")
+        if purge_step is not None:
+            self._add(None, step=purge_step, file_version="brain.Event:2")
+            self._add(None, step=purge_step, session_log=SessionLog(status=SessionLog.START))
+
+    def add_scalar(self, tag: str, number: float, step: int, walltime: float | None = None) -> None:
+        self._add(walltime, step=step, summary=self._summary.scalar(tag, number))
+
+    def add_image(self, tag: str, pixels: Any, step: int, dataformats: str) -> None:
+        self._add(None, step=step, summary=self._summary.image(tag, pixels, dataformats=dataformats))
+
+    def add_text(self, tag: str, text: str, step: int) -> None:
+        self._add(None, step=step, summary=self._summary.text(tag, text))
+
+    def flush(self) -> None:
+        """Put what was added into the file, so that TensorBoard sees it."""
+        content = memoryview(self._pending.getvalue())
+        self._pending.seek(0)
+        self._pending.truncate()
+        if self._file is None:
+            return
+        whole = self._file.tell()
+        try:
+            while content:
+                # A disk that is filling up takes a part.
+                content = content[self._file.write(content) or 0 :]
+        except OSError as reason:
+            self.failed = reason.strerror
+            self._file.truncate(whole)
+            self._file.close()
+            self._file = None
+
+    def close(self) -> None:
+        self.flush()
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _add(self, walltime: float | None, **content: Any) -> None:
+        event = self._event(wall_time=time.time() if walltime is None else walltime, **content)
+        self._records.write(event.SerializeToString())
