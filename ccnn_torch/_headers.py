@@ -76,11 +76,12 @@ def read_header(cells: Sequence[str], file: str, columns: Mapping[str, str] | No
 def _targets(cells: Sequence[str], file: str, columns: Mapping[str, str]) -> dict[int, str]:
     """Number of a column -> what the map says of it."""
     whole = [cell.strip() for cell in cells]
-    names = [split_header(cell)[0] for cell in cells]
+    pairs = [split_header(cell) for cell in cells]
+    names = [name for name, _ in pairs]
     found: dict[int, str] = {}
     for key, target in columns.items():
         there = [k for k, cell in enumerate(whole) if cell == key.strip()]
-        there = there or [k for k, name in enumerate(names) if name == key.strip()]
+        there = there or [k for k, pair in enumerate(pairs) if pair in (split_header(key), (key.strip(), pair[1]))]
         if len(there) != 1:
             near = nearest(key, [*whole, *names])
             hint = f"did you mean '{near}'?" if near else f"it has {', '.join(whole)}"

@@ -5,9 +5,12 @@ from __future__ import annotations
 import codecs
 import csv
 import re
-from collections.abc import Iterable, Mapping, Sequence
+import warnings
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +21,11 @@ from ccnn_torch.errors import InputError
 
 __all__ = ["Frame", "read_frame", "read_table"]
 
+# What a damaged workbook makes openpyxl, zipfile and the XML parser raise.
+_DAMAGED = (
+    *(BadZipFile, EOFError, KeyError, IndexError, ValueError, TypeError, AttributeError, SyntaxError, zlib.error),
+    *(NotImplementedError, RuntimeError, OverflowError),
+)
 _WORKBOOKS = (".xlsx", ".xlsm")
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 _DOT_NUMBER = re.compile(r"[+-]?\d*\.\d*([eE][+-]?\d+)?")
@@ -61,7 +69,7 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Ta
         raise InputError(f"{file}: the file is empty; line 1 must be the header, e.g. q1[rad],x[mm]")
     first = text_lines[filled[0]]
     separator = max(",;\t", key=first.count)
-    header = read_header(next(csv.reader([first], delimiter=separator)), file, columns)
+    header = read_header(next(_split([first], separator, file)), file, columns)
     rows = [text_lines[number] for number in filled[1:]]
     if not rows:
         raise InputError(f"{file}: there is a header but no row below it")
@@ -75,8 +83,15 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Ta
     except ValueError:
         uniform = False
     if not uniform:
-        values, bad = _read_cells(csv.reader(rows, delimiter=separator), header, file, lines, separator)
+        values, bad = _read_cells(_split(rows, separator, file), header, file, lines, separator)
     return _kept(file, header, values, lines, bad, notes)
+
+
+def _split(rows: Sequence[str], separator: str, file: str) -> Iterator[list[str]]:
+    try:
+        yield from csv.reader(rows, delimiter=separator)
+    except csv.Error as reason:
+        raise InputError(f"{file}: this is no CSV that can be read: {reason}") from None
 
 
 def read_frame(frame: Frame, columns: Mapping[str, str] | None = None) -> Table:
@@ -95,6 +110,22 @@ def read_frame(frame: Frame, columns: Mapping[str, str] | None = None) -> Table:
 
 
 def _read_workbook(file: str, columns: Mapping[str, str] | None) -> Table:
+    found = _sheet_with_header(file)
+    if found is None:
+        raise InputError(f"{file}: no sheet begins with a header, a row of texts such as q1[rad] and x[mm]")
+    title, filled = found
+    width = max(k + 1 for _, row in filled for k, cell in enumerate(row) if _filled(cell))
+    where = f"{file} (sheet {title})"
+    header = read_header([str(cell or "") for cell in _fit(filled[0][1], width)], where, columns)
+    if len(filled) == 1:
+        raise InputError(f"{where}: there is a header but no row below it")
+    lines = np.array([number for number, _ in filled[1:]], dtype=np.int64)
+    values, bad = _read_cells((_fit(row, width) for _, row in filled[1:]), header, where, lines)
+    return _kept(where, header, values, lines, bad)
+
+
+def _sheet_with_header(file: str) -> tuple[str, list[tuple[int, _Cells]]] | None:
+    """Name of the first sheet with a header, and its rows that are not empty with their numbers; None without one."""
     try:
         import openpyxl
     except ImportError:
@@ -102,34 +133,26 @@ def _read_workbook(file: str, columns: Mapping[str, str] | None) -> Table:
             f"{file}: reading a workbook needs openpyxl; install it with pip install 'ccnn-torch[excel]', or save the "
             "sheet as CSV"
         ) from None
-    from zipfile import BadZipFile
-
     try:
-        # Formulas count by the values that were last calculated.
-        book = openpyxl.load_workbook(file, read_only=True, data_only=True)
+        with warnings.catch_warnings():
+            # Of styles and extensions that it passes over.
+            warnings.simplefilter("ignore", UserWarning)
+            # Formulas count by the values that were last calculated.
+            book = openpyxl.load_workbook(file, read_only=True, data_only=True)
+            for sheet in book.worksheets:
+                # Some programs write a wrong extent.
+                sheet.reset_dimensions()
+                rows = ((k + 1, row) for k, row in enumerate(sheet.iter_rows(values_only=True)))
+                filled = [(number, row) for number, row in rows if any(map(_filled, row))]
+                if filled and all(isinstance(cell, str) for cell in filled[0][1] if _filled(cell)):
+                    return sheet.title, filled
+        return None
     except FileNotFoundError:
         raise InputError(f"{file}: there is no such file; give the path of a CSV file or a workbook") from None
     except OSError as reason:
         raise InputError(f"{file}: cannot be read: {reason.strerror or reason}") from None
-    except (BadZipFile, KeyError, ValueError, SyntaxError, openpyxl.utils.exceptions.InvalidFileException):
+    except _DAMAGED:
         raise InputError(f"{file}: this is no workbook that openpyxl can read; save the sheet as CSV") from None
-    try:
-        for sheet in book.worksheets:
-            filled = [(k + 1, row) for k, row in enumerate(sheet.iter_rows(values_only=True)) if any(map(_filled, row))]
-            if filled and all(isinstance(cell, str) for cell in filled[0][1] if _filled(cell)):
-                break
-        else:
-            raise InputError(f"{file}: no sheet begins with a header, a row of texts such as q1[rad] and x[mm]")
-    finally:
-        book.close()
-    width = max(k + 1 for _, row in filled for k, cell in enumerate(row) if _filled(cell))
-    where = f"{file} (sheet {sheet.title})"
-    header = read_header([str(cell or "") for cell in _fit(filled[0][1], width)], where, columns)
-    if len(filled) == 1:
-        raise InputError(f"{where}: there is a header but no row below it")
-    lines = np.array([number for number, _ in filled[1:]], dtype=np.int64)
-    values, bad = _read_cells((_fit(row, width) for _, row in filled[1:]), header, where, lines)
-    return _kept(where, header, values, lines, bad)
 
 
 def _fit(row: _Cells, width: int) -> _Cells:
@@ -170,7 +193,7 @@ def _read_text(file: str) -> tuple[str, list[str]]:
             text = data.decode(name)
         except UnicodeDecodeError:
             continue
-        guessed = f"{file} is not UTF-8 and was read as Windows code page 1252; look at the units if that is not meant"
+        guessed = f"{Path(file).name} is not UTF-8 and was read as Windows code page 1252; check units such as ° and µm"
         return text, [guessed] if name == "cp1252" else []
     raise InputError(f"{file}: the file is neither UTF-8 nor UTF-16 nor Windows-1252 text; save it as 'CSV UTF-8'")
 

@@ -123,6 +123,7 @@ def test_a_map_that_does_not_fit(tmp_path: Path, columns: dict[str, str], parts:
 def test_the_unit_may_stand_in_the_file_and_a_name_do_for_its_header(tmp_path: Path) -> None:
     short = NAMES | {"PHI [rad]": "phi", "Temp [°C]": "temperature"}
     short["PHI"] = short.pop("PHI [rad]")
+    short["Temp[°C]"] = short.pop("Temp [°C]")
     same(load_records(german(tmp_path), Slide(), columns=short), load_records(ours(tmp_path), Slide()))
 
 
