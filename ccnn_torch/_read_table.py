@@ -38,7 +38,7 @@ class Frame(Protocol):
 
     @property
     def columns(self) -> Iterable[Any]: ...
-    def to_numpy(self, dtype: Any = ...) -> NDArray[Any]: ...
+    def to_numpy(self) -> NDArray[Any]: ...
 
 
 def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Table:
@@ -101,7 +101,7 @@ def read_frame(frame: Frame, columns: Mapping[str, str] | None = None) -> Table:
     """
     file = "DataFrame"
     header = read_header([str(column) for column in frame.columns], file, columns)
-    rows = frame.to_numpy(dtype=object)
+    rows = frame.to_numpy()
     if len(rows) == 0:
         raise InputError(f"{file}: it has columns but no row")
     lines = np.arange(len(rows), dtype=np.int64) + 2
