@@ -59,7 +59,7 @@ def test_a_file_of_test_rows_from_config_to_results_and_resumed(folder: Path, cl
     again = json.loads((out / "results.json").read_text())
     assert again["methods"]["constant"]["test"] == json.loads(before)["methods"]["constant"]["test"]
     # The same rows held out by their column, in one file; the test rows are those of every repeat.
-    column = {"kind": "column", "by": "set", "test_values": [2]}
+    column = {"kind": "column", "by": "set", "test_values": 2}
     found = calibrate(records=str(folder / "whole.csv"), split=column, repeats=2, covariates=[], **QUICK)
     assert found.results["methods"]["constant"]["test"] == results["methods"]["constant"]["test"]
     assert "Held out: the 40 rows whose set is 2." in found.results["notes"]

@@ -30,6 +30,10 @@ def _share_or_file(value: Any) -> Any:
     return float(value)
 
 
+def _listed(value: Any) -> Any:
+    return [value] if isinstance(value, int | float) else value
+
+
 class HeldOutConfig(Section):
     """Which rows are held out; see `ccnn_torch.splits`."""
 
@@ -48,7 +52,7 @@ class HeldOutConfig(Section):
         description="share of the rows (group: of the groups) that is held out; or another file of records with the "
         "same columns, all of whose rows are held out",
     )
-    test_values: list[float] | None = Field(
+    test_values: Annotated[list[float] | None, BeforeValidator(_listed)] = Field(
         default=None,
         min_length=1,
         description="with split.kind=column: rows whose column split.by has one of these values are held out",
