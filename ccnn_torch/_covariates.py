@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 
-from ccnn_torch._table import Table, nearest
+from ccnn_torch._table import FILE, Table, nearest
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
-from ccnn_torch.units import si_unit_of, to_si
+from ccnn_torch.units import parse_header, si_unit_of, to_si
 
 __all__ = ["DEFAULT_COVARIATES", "choose_covariates"]
 
@@ -16,13 +16,14 @@ DEFAULT_COVARIATES = ("time", "temperature", "load_*", "direction*", "speed*")
 
 
 def choose_covariates(
-    table: Table, joints: Sequence[Coordinate], pose: Sequence[Coordinate], wanted: Sequence[str] | None
+    table: Table, joints: Sequence[Coordinate], pose: Mapping[str, str], wanted: Sequence[str] | None
 ) -> tuple[tuple[Coordinate, ...], list[str]]:
     """Choose the covariates of a table.
 
     Args:
         table: the records.
-        joints, pose: the columns that are joints and pose; none of them may be a covariate.
+        joints: the columns that are joints; none of them may be a covariate.
+        pose: SI unit of the columns that are pose, likewise.
         wanted: names or patterns (``load_*``) instead of the default ones; None = the default ones that are there.
 
     Returns:
@@ -31,7 +32,7 @@ def choose_covariates(
     Raises:
         InputError: a wanted column is missing, is a joint or a pose column, or a column has the wrong dimension.
     """
-    taken = {coordinate.name for coordinate in (*joints, *pose)}
+    taken = {coordinate.name for coordinate in joints} | set(pose)
     free = [name for name in table.names if name not in taken]
     if wanted is None:
         chosen = [name for name in free if _matches(name, DEFAULT_COVARIATES)]
@@ -39,16 +40,16 @@ def choose_covariates(
         for pattern in wanted:
             _check_wanted(pattern, free, table, joints, pose)
         chosen = [name for name in free if _matches(name, wanted)]
-    pose_units = {coordinate.name: coordinate.unit for coordinate in pose}
     covariates, notes = [], []
     for name in chosen:
-        coordinate = Coordinate(name, _si_unit(name, table, pose_units))
+        coordinate = Coordinate(name, _si_unit(name, table, pose))
         values = table.column(name, coordinate.unit)
         if values.min() == values.max():
             notes.append(f"covariate '{name}' is constant ({table.raw(name)[0]:g} {table.units[name]}) and was dropped")
         else:
             covariates.append(coordinate)
-    ignored = [name for name in free if name not in chosen]
+    # The column that numbers several files is ours, and nobody asked for it.
+    ignored = [name for name in free if name not in chosen and not (table.parts and name == FILE)]
     if ignored:
         notes.append(f"ignored columns: {', '.join(ignored)}; name them in covariates to use them as inputs")
     for name in ignored:
@@ -63,13 +64,13 @@ def _matches(name: str, patterns: Sequence[str]) -> bool:
 
 
 def _check_wanted(
-    pattern: str, free: list[str], table: Table, joints: Sequence[Coordinate], pose: Sequence[Coordinate]
+    pattern: str, free: list[str], table: Table, joints: Sequence[Coordinate], pose: Mapping[str, str]
 ) -> None:
     if _matches_any(pattern, free):
         return
     if pattern in {coordinate.name for coordinate in joints}:
         raise InputError(f"covariates: '{pattern}' is a joint and an input already; remove it from the list")
-    if pattern in {coordinate.name for coordinate in pose}:
+    if pattern in pose:
         raise InputError(f"covariates: '{pattern}' is the measured pose, which no command can know; remove it")
     near = nearest(pattern, free)
     hint = f"did you mean '{near}'?" if near else f"the columns that could be are: {', '.join(free) or 'none'}"
@@ -80,24 +81,26 @@ def _matches_any(pattern: str, names: list[str]) -> bool:
     return any(fnmatchcase(name, pattern) for name in names)
 
 
-def _si_unit(name: str, table: Table, pose_units: dict[str, str]) -> str:
+def _si_unit(name: str, table: Table, pose: Mapping[str, str]) -> str:
     """SI unit of a covariate, whose dimension must fit a name that has a meaning."""
     where = f"{table.path}: column '{name}'"
+    if not table.units[name]:
+        parse_header(name, table.path)
     found = si_unit_of(table.units[name], where)
-    allowed = _allowed(name, pose_units)
+    allowed = _allowed(name, pose)
     if allowed and found not in allowed:
         to_si([], table.units[name], allowed[0], where, name)
     return found
 
 
-def _allowed(name: str, pose_units: dict[str, str]) -> tuple[str, ...]:
+def _allowed(name: str, pose: Mapping[str, str]) -> tuple[str, ...]:
     if name == "time":
         return ("s",)
     if name == "temperature":
         return ("K",)
     if name.startswith("load_"):
         # A force along a length, a moment about an angle; for another name either.
-        unit = pose_units.get(name.removeprefix("load_"))
+        unit = pose.get(name.removeprefix("load_"))
         return {"m": ("N",), "rad": ("N*m",)}.get(unit or "", ("N", "N*m"))
     if name.startswith("direction"):
         return ("1",)

@@ -1,8 +1,7 @@
-"""Tables with units: CSV in, CSV out."""
+"""Tables with units, and the way to write them as CSV."""
 
 from __future__ import annotations
 
-import csv
 import difflib
 import hashlib
 import io
@@ -16,9 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch._files import write_whole
 from ccnn_torch.errors import InputError
-from ccnn_torch.units import parse_header, to_si, write_hint
+from ccnn_torch.units import parse_header, split_header, to_si, write_hint
 
-__all__ = ["Table", "name_lines", "nearest", "read_table", "write_table"]
+__all__ = ["FILE", "Table", "name_lines", "nearest", "write_table"]
+
+FILE = "file"
+"""The column that numbers the files where there are several: 0, 1, …"""
 
 
 @dataclass(frozen=True)
@@ -26,11 +28,13 @@ class Table:
     """A table as it stands in the file: nothing is converted or judged until a column is asked for.
 
     Attributes:
-        path: the file, as given.
-        units: unit of each column as written, by name, in the file's order.
+        path: the file, as given; several with commas between them.
+        units: unit of each column as written, by name, in the file's order; empty where the header has none.
         values: `rows x columns`, in those units; NaN where a cell is empty or no number.
         lines: line of each row in the file, `rows`, int64 (the header is line 1).
         bad_cells: (row, column) -> text of the cells that are empty or no number.
+        parts: where rows are from, in order: file and number of its rows; empty for a single file.
+        notes: what a person should know of how the file was read, one sentence each.
     """
 
     path: str
@@ -38,6 +42,8 @@ class Table:
     values: NDArray[np.float64]
     lines: NDArray[np.int64]
     bad_cells: dict[tuple[int, int], str] = field(default_factory=dict)
+    parts: tuple[tuple[str, int], ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -57,6 +63,14 @@ class Table:
         digest.update(self.values.astype("<f8").tobytes())
         return digest.hexdigest()
 
+    def header(self, name: str) -> str:
+        """The column's header, ``name[unit]``; the bare name where it has no unit."""
+        return f"{name}[{self.units[name]}]" if self.units[name] else name
+
+    def name_rows(self, rows: Sequence[int] | NDArray[np.int64]) -> str:
+        """Rows (0-based) as a person finds them: "line 17 (row 16)", with the file where there are several."""
+        return name_lines(self.lines, rows, parts=self.parts)
+
     def raw(self, name: str) -> NDArray[np.float64]:
         """The column in its own unit, `rows`, NaN where a cell is empty or no number."""
         return self.values[:, self.names.index(name)]
@@ -66,14 +80,17 @@ class Table:
 
         Args:
             name: the column.
-            si_unit: the SI unit it must be in, or None for whatever it is.
+            si_unit: the SI unit it must be in, or None for whatever it is; without a unit it is then as written.
 
         Raises:
-            InputError: the column is missing (with the nearest name), has a wrong or unknown unit, or a cell that is
-                empty, no number, NaN or infinite (named by line).
+            InputError: the column is missing (with the nearest name), has no, a wrong or an unknown unit, or a cell
+                that is empty, no number, NaN or infinite (named by line).
         """
         if name not in self.units:
             raise InputError(f"{self.path}: there is no column '{name}'; {self._remedy(name, si_unit)}")
+        unit = self.units[name]
+        if not unit and si_unit is not None:
+            parse_header(name, self.path, si_unit)
         values = self.raw(name)
         wrong = np.flatnonzero(~np.isfinite(values))
         if len(wrong):
@@ -82,15 +99,16 @@ class Table:
             what = f"has '{text}'" if text else "is empty"
             more = f", and {len(wrong) - 1} more of its cells are not finite either" if len(wrong) > 1 else ""
             raise InputError(
-                f"{self.path}: column '{name}' {what} at {name_lines(self.lines, [row])}{more}; "
+                f"{self.path}: column '{name}' {what} at {self.name_rows([row])}{more}; "
                 "write a finite number or remove the row"
             )
-        return to_si(values, self.units[name], si_unit, f"{self.path}: column '{name}'", name)
+        return to_si(values, unit or "1", si_unit, f"{self.path}: column '{name}'", name)
 
     def _remedy(self, name: str, si_unit: str | None) -> str:
         near = nearest(name, self.names)
         if near is not None:
-            return f"'{near}' is the nearest there: rename it to '{name}' if it is meant"
+            mapped = f'columns: {{"{near}": "{name}[{self.units[near] or si_unit or "unit"}]"}}'
+            return f"'{near}' is the nearest there: rename it to '{name}' if it is meant, or write {mapped}"
         return write_hint(name, si_unit)
 
 
@@ -104,60 +122,30 @@ def nearest(name: str, candidates: Sequence[str], cutoff: float = 0.6) -> str | 
     return folded[near[0]] if near else None
 
 
-def name_lines(lines: NDArray[np.int64], rows: Sequence[int] | NDArray[np.int64], most: int = 5) -> str:
+def name_lines(
+    lines: NDArray[np.int64],
+    rows: Sequence[int] | NDArray[np.int64],
+    most: int = 5,
+    parts: Sequence[tuple[str, int]] = (),
+) -> str:
     """Name rows (given 0-based) for a person, at most `most` of them: "line 17 (row 16)".
 
-    The line is that of the file, whose first line is the header; the row counts the rows below it from 1.
+    The line is that of the file, whose first line is the header; the row counts the rows below it from 1. With `parts`
+    (files and the numbers of their rows) the file is named and the row counts in it: "line 17 (row 16) of day2.csv".
     """
-    plural = "s" if len(rows) > 1 else ""
     more = f" and {len(rows) - most} more" if len(rows) > most else ""
-    shown_lines = ", ".join(str(int(lines[row])) for row in rows[:most])
-    shown_rows = ", ".join(str(int(row) + 1) for row in rows[:most])
-    return f"line{plural} {shown_lines} (row{plural} {shown_rows}){more}"
-
-
-def read_table(path: str | Path, si_units: Mapping[str, str] | None = None) -> Table:
-    """Read a CSV file whose headers are ``name[unit]``.
-
-    The separator is a comma, a semicolon or a tab, as the header has it; with the latter two a decimal comma is
-    understood. A byte-order mark, blank lines and lines of separators alone (left by spreadsheets) are passed over.
-
-    Args:
-        path: the file.
-        si_units: SI unit of the columns for which it is known, by name; sharpens the error for a missing unit.
-
-    Raises:
-        InputError: the file cannot be read or is empty, a header lacks its unit or stands twice, or a row has another
-            number of cells than the header.
-    """
-    file = str(path)
-    text_lines = _read_text(file).split("\n")
-    filled = [number for number, line in enumerate(text_lines) if line.strip(" \t,;")]
-    if not filled:
-        raise InputError(f"{file}: the file is empty; line 1 must be the header, e.g. q1[rad],x[mm]")
-    header = text_lines[filled[0]]
-    separator = max(",;\t", key=header.count)
-    units: dict[str, str] = {}
-    for cell in next(csv.reader([header], delimiter=separator)):
-        name, unit = parse_header(cell, file, (si_units or {}).get(cell.strip()))
-        if name in units:
-            raise InputError(f"{file}: column '{name}' stands twice in the header; remove or rename one of them")
-        units[name] = unit
-    rows = [text_lines[number] for number in filled[1:]]
-    if not rows:
-        raise InputError(f"{file}: there is a header but no row below it")
-    if separator != "," and not any("." in row for row in rows):
-        rows = [row.replace(",", ".") for row in rows]
-    lines = np.array(filled[1:], dtype=np.int64) + 1
-    bad: dict[tuple[int, int], str] = {}
-    try:
-        values = np.loadtxt(rows, delimiter=separator, comments=None, quotechar='"', ndmin=2)
-        uniform = values.shape == (len(rows), len(units))
-    except ValueError:
-        uniform = False
-    if not uniform:
-        values, bad = _read_cells(rows, separator, len(units), file, lines)
-    return Table(file, units, values, lines, bad)
+    ends = np.cumsum([count for _, count in parts])
+    owners = np.searchsorted(ends, np.asarray(rows[:most], dtype=np.int64), side="right")
+    named = []
+    for owner in dict.fromkeys(owners.tolist()):
+        there = [int(row) for row, own in zip(rows[:most], owners, strict=True) if own == owner]
+        first = 0 if owner == 0 else int(ends[owner - 1])
+        plural = "s" if len(there) > 1 else ""
+        shown_lines = ", ".join(str(int(lines[row])) for row in there)
+        shown_rows = ", ".join(str(row - first + 1) for row in there)
+        file = f" of {parts[owner][0]}" if parts else ""
+        named.append(f"line{plural} {shown_lines} (row{plural} {shown_rows}){file}")
+    return " and ".join(named) + more
 
 
 def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
@@ -165,12 +153,12 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
 
     Args:
         path: the file; an existing one is replaced.
-        columns: header ``name[unit]`` -> values `rows`.
+        columns: header ``name[unit]``, or a bare name -> values `rows`.
 
     Raises:
-        InputError: a header is not of that form, columns differ in length, or the file cannot be written.
+        InputError: columns have one name or differ in length, or the file cannot be written.
     """
-    names = [parse_header(header, str(path))[0] for header in columns]
+    names = [split_header(header)[0] for header in columns]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
         raise InputError(f"{path}: column '{twice[0]}' would stand twice in the header")
@@ -182,33 +170,3 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
     if not Path(path).absolute().parent.is_dir():
         raise InputError(f"{path}: cannot be written (its folder is not there); make it, or correct the name")
     write_whole(path, buffer.getvalue())
-
-
-def _read_text(file: str) -> str:
-    try:
-        return Path(file).read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file; give the path of a CSV file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{file}: the file is not UTF-8 text; save it as 'CSV UTF-8'") from None
-    except OSError as reason:
-        raise InputError(f"{file}: cannot be read: {reason.strerror}") from None
-
-
-def _read_cells(
-    rows: list[str], separator: str, width: int, file: str, lines: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], dict[tuple[int, int], str]]:
-    """The slow way, cell by cell, for a file in which something is wrong: finds out what and where."""
-    values = np.full((len(rows), width), np.nan)
-    bad: dict[tuple[int, int], str] = {}
-    for row, cells in enumerate(csv.reader(rows, delimiter=separator)):
-        if len(cells) != width:
-            comma = "; with a decimal comma, separate the cells by semicolons" if separator == "," else ""
-            counts = f"has {len(cells)} cells, but the header names {width} columns"
-            raise InputError(f"{file}: {name_lines(lines, [row])} {counts}{comma}")
-        for column, cell in enumerate(cells):
-            try:
-                values[row, column] = float(cell.replace("_", "?"))
-            except ValueError:
-                bad[row, column] = cell.strip()
-    return values, bad

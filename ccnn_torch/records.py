@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -14,9 +12,13 @@ from torch import Tensor
 
 from ccnn_torch._covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES
 from ccnn_torch._covariates import choose_covariates
+from ccnn_torch._pose import HasCoordinates, check_joints, refuse_lost_orientation, unused_joints
+from ccnn_torch._pose import read_pose as read_pose
+from ccnn_torch._pose import stack_columns as stack_columns
+from ccnn_torch._read_table import read_table as read_table
+from ccnn_torch._sources import Source, read_source
 from ccnn_torch._table import Table as Table
 from ccnn_torch._table import name_lines as name_lines
-from ccnn_torch._table import read_table as read_table
 from ccnn_torch._table import write_table as write_table
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
@@ -36,25 +38,10 @@ __all__ = [
     "write_table",
 ]
 
-_ROTATION_VECTOR = ("rx", "ry", "rz")
-_QUATERNION = ("qw", "qx", "qy", "qz")
-# Two turns of a joint and one of a pose angle, rounded up so that 360 degrees written as 6.2832 passes.
-JOINT_LIMIT, _POSE_LIMIT = 12.6, 6.3
+# Two turns of a joint, rounded up as the limit of a pose angle is.
+JOINT_LIMIT = 12.6
 # The tool of an arm whose frames are unknown may lengthen its reach by this share.
 _TOOL_ALLOWANCE = 0.25
-
-
-class HasCoordinates(Protocol):
-    """What records need to know of a mechanism."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def joints(self) -> tuple[Coordinate, ...]: ...
-    @property
-    def pose(self) -> tuple[Coordinate, ...]: ...
-    @property
-    def orientations(self) -> tuple[str, ...]: ...
 
 
 @dataclass(frozen=True)
@@ -62,19 +49,20 @@ class Records:
     """Measured records in SI, rows in the order measured.
 
     Attributes:
-        path: the file.
+        path: the file; several with commas between them.
         joints: commanded joints, `rows x n`.
         pose: measured pose, `rows x p`, the columns as in `pose_coordinates`.
         covariates: further inputs, `rows x m`, the columns as in `covariate_coordinates`.
         joint_coordinates, pose_coordinates, covariate_coordinates: names and SI units. The pose is the mechanism's,
             less the orientation where it was not measured.
-        orientation: how a serial arm's orientation was measured: ``rotation_vector``, ``quaternion`` (converted) or
-            ``none``; None for a mechanism whose pose has fixed columns.
+        orientation: how a serial arm's orientation was measured: ``rotation_vector``; ``quaternion``, ``kuka``,
+            ``fanuc`` or ``staubli`` (converted); or ``none``. None for a mechanism whose pose has fixed columns.
         columns: every column that is neither joint nor pose, `rows` each, in SI, NaN where a cell is empty.
-        units: unit of each column as written in the file.
-        notes: what was dropped or ignored, one sentence each.
+        units: unit of each column as written in the file; empty where it has none.
+        notes: what was dropped, ignored or guessed, one sentence each.
         lines: line of each row in the file, `rows`, int64.
         data_hash: SHA-256 of headers and values.
+        parts: where rows are from, in order: file and number of its rows; empty for a single file.
     """
 
     path: str
@@ -90,6 +78,7 @@ class Records:
     notes: list[str]
     lines: NDArray[np.int64]
     data_hash: str
+    parts: tuple[tuple[str, int], ...] = ()
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -113,33 +102,51 @@ class Records:
 
     def name_rows(self, rows: Sequence[int] | NDArray[np.int64]) -> str:
         """Rows (0-based) as a person finds them in the file, e.g. "line 17 (row 16)"."""
-        return name_lines(self.lines, rows)
+        return name_lines(self.lines, rows, parts=self.parts)
 
 
 def load_records(
-    path: str | Path, mechanism: HasCoordinates, covariates: Sequence[str] | None = None, learns: bool = True
+    source: Source | Records,
+    mechanism: HasCoordinates,
+    covariates: Sequence[str] | None = None,
+    learns: bool = True,
+    columns: Mapping[str, str] | None = None,
 ) -> Records:
     """Load records for a mechanism.
 
     Joint and pose columns are named as the mechanism names them. A serial arm (one that lists `orientations`) may have
-    its orientation as a rotation vector `rx, ry, rz`, as a quaternion `qw, qx, qy, qz` or not at all; where a file has
-    both, the rotation vector counts. The covariates are by default the columns `time`, `temperature`, `load_*`,
-    `direction*` and `speed*` that are there; `covariates` replaces this choice by names or patterns ([] = none). A
-    constant covariate is dropped with a note.
+    its orientation as a rotation vector `rx, ry, rz`, as a quaternion `qw, qx, qy, qz`, as Euler angles
+    (`kuka_a, kuka_b, kuka_c`, `fanuc_w, fanuc_p, fanuc_r`, `staubli_rx, staubli_ry, staubli_rz`) or not at all; where a
+    file has several, the first of these counts. The covariates are by default the columns `time`, `temperature`,
+    `load_*`, `direction*` and `speed*` that are there; `covariates` replaces this choice by names or patterns
+    ([] = none). A constant covariate is dropped with a note. A column that is not used needs no unit.
 
     Args:
+        source: a CSV file or an .xlsx workbook; several of them, whose rows stand one file after the other and whose
+            column `file` numbers them; a pandas DataFrame with headers as in a file; or records that are loaded
+            already, which stay as they are.
         learns: whether a learner is trained on the rows: fewer than a linear fit of the inputs needs, twice, are then
             refused. How many an identification needs, its number of parameters tells.
+        columns: header in the file -> ``name[unit]``, or ``ignore``.
 
     Raises:
         InputError: a column is missing, stands twice, or has no unit or one of a wrong dimension; a cell is not a
-            finite number; values in rad look like degrees; too few rows; no input varies.
+            finite number; values in rad look like degrees; columns look like an orientation that is not read; files
+            differ in their columns; too few rows; no input varies.
     """
-    table = read_table(path, {c.name: c.unit for c in (*mechanism.joints, *mechanism.pose)})
+    if isinstance(source, Records):
+        return _loaded(source, mechanism, covariates, columns)
+    table = read_source(source, columns)
+    check_joints(table, mechanism.joints)
     joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
-    pose, coordinates, orientation = read_pose(table, mechanism)
-    measured = (*coordinates, *(Coordinate(name, "1") for name in _QUATERNION if orientation is not None))
+    pose, coordinates, orientation, read = read_pose(table, mechanism)
+    used = {joint.name for joint in mechanism.joints} | set(read)
+    # Of an arm, no other form of the pose may be an input either: no command can know it.
+    measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
     chosen, notes = choose_covariates(table, mechanism.joints, measured, covariates)
+    unused = [name for name in table.names if name not in used | {c.name for c in chosen}]
+    if orientation == "none":
+        refuse_lost_orientation(table, mechanism, unused)
     if learns:
         _check_enough(table, len(mechanism.joints) + len(chosen))
     still = [joint.name for k, joint in enumerate(mechanism.joints) if np.ptp(joints[:, k]) == 0]
@@ -148,8 +155,12 @@ def load_records(
             f"{table.path}: no input varies: {', '.join(still)} are constant and there is no covariate that changes; "
             "record configurations that differ"
         )
-    notes = [f"joint '{name}' is constant and tells the learner nothing" for name in still] + notes
-    others = {name for name in table.names if name not in {c.name for c in (*mechanism.joints, *measured)}}
+    notes = [*(f"joint '{name}' is constant and tells the learner nothing" for name in still), *notes, *table.notes]
+    alike = unused_joints(table, mechanism.joints, unused)
+    if alike:
+        notes.append(
+            f"columns {', '.join(alike)} look like joints and are not used; {mechanism.name} has no such joint"
+        )
     return Records(
         path=table.path,
         joints=torch.from_numpy(joints),
@@ -159,11 +170,12 @@ def load_records(
         pose_coordinates=coordinates,
         covariate_coordinates=chosen,
         orientation=orientation,
-        columns={name: _leniently(table, name, notes) for name in table.names if name in others},
+        columns={name: _leniently(table, name, notes) for name in table.names if name not in used},
         units=dict(table.units),
         notes=notes,
         lines=table.lines,
         data_hash=table.data_hash,
+        parts=table.parts,
     )
 
 
@@ -205,46 +217,23 @@ def check_rows(records: Records, mechanism: HasCoordinates) -> None:
         )
 
 
-def stack_columns(table: Table, coordinates: Sequence[Coordinate], angle_limit: float = np.inf) -> NDArray[np.float64]:
-    """Columns side by side, `rows x len(coordinates)`; refuses angles in rad beyond `angle_limit`."""
-    values = np.empty((len(table), len(coordinates)))
-    for k, coordinate in enumerate(coordinates):
-        values[:, k] = table.column(coordinate.name, coordinate.unit)
-        far = np.flatnonzero(np.abs(values[:, k]) > angle_limit)
-        if table.units[coordinate.name] == "rad" and len(far):
-            raise InputError(
-                f"{table.path}: column '{coordinate.name}[rad]' has {values[far[0], k]:g} at "
-                f"{name_lines(table.lines, far[:1])}, which looks like degrees; write '{coordinate.name}[deg]'"
-            )
-    return values
-
-
-def read_pose(
-    table: Table, mechanism: HasCoordinates
-) -> tuple[NDArray[np.float64], tuple[Coordinate, ...], str | None]:
-    """Pose `rows x p` [SI], its coordinates, and how the orientation was measured."""
-    if not mechanism.orientations:
-        return stack_columns(table, mechanism.pose, _POSE_LIMIT), tuple(mechanism.pose), None
-    position = tuple(c for c in mechanism.pose if c.name not in _ROTATION_VECTOR)
-    full = (*position, *(Coordinate(name, "rad") for name in _ROTATION_VECTOR))
-    if any(name in table for name in _ROTATION_VECTOR):
-        return stack_columns(table, full, _POSE_LIMIT), full, "rotation_vector"
-    if not any(name in table for name in _QUATERNION):
-        return stack_columns(table, position), position, "none"
-    quaternion = stack_columns(table, [Coordinate(name, "1") for name in _QUATERNION])
-    norm = np.linalg.norm(quaternion, axis=1)
-    # Written with three digits a unit quaternion is within 0.001 of norm 1; ten times that is no quaternion.
-    wrong = np.flatnonzero(np.abs(norm - 1) > 0.01)
-    if len(wrong):
+def _loaded(
+    records: Records,
+    mechanism: HasCoordinates,
+    covariates: Sequence[str] | None,
+    columns: Mapping[str, str] | None,
+) -> Records:
+    """Records as they are, where they are of this mechanism."""
+    names, wanted = ([c.name for c in joints] for joints in (records.joint_coordinates, mechanism.joints))
+    if names != wanted:
         raise InputError(
-            f"{table.path}: the quaternion qw, qx, qy, qz at {name_lines(table.lines, wrong)} has norm "
-            f"{norm[wrong[0]]:.3g} instead of 1; correct it, or give the orientation as rx[rad], ry[rad], rz[rad]"
+            f"{records.path}: these records have the joints {', '.join(names)}, and {mechanism.name} has "
+            f"{', '.join(wanted)}; load them with this mechanism"
         )
-    # Only here: few files give quaternions, and the import takes long.
-    from scipy.spatial.transform import Rotation
-
-    vector = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_rotvec()
-    return np.concatenate([stack_columns(table, position), vector], axis=1), full, "quaternion"
+    if covariates or columns:
+        key = "covariates" if covariates else "columns"
+        raise InputError(f"{key}: the records are loaded already; give it to load_records instead")
+    return records
 
 
 def _check_enough(table: Table, inputs: int) -> None:
@@ -259,7 +248,7 @@ def _check_enough(table: Table, inputs: int) -> None:
 def _leniently(table: Table, name: str, notes: list[str]) -> NDArray[np.float64]:
     """A column that is perhaps never used: not judged, and left as written if its unit is not known."""
     try:
-        return to_si(table.raw(name), table.units[name], where=f"column '{name}'")
+        return to_si(table.raw(name), table.units[name] or "1", where=f"column '{name}'")
     except InputError as reason:
         notes.append(f"{reason}; its values are kept as written")
         return table.raw(name).copy()

@@ -1,6 +1,6 @@
 """Rows for training, for choosing a model, and for the figures that are reported.
 
-Three kinds, each a function of the rows and one seed:
+Four kinds, each a function of the rows and one seed:
 
 * ``random``: single rows at random. Rows of one target pose may stand on both sides, which flatters the figures.
 * ``group``: whole groups at random. `by` is a column or ``position:5mm``, the default: rows whose measured positions
@@ -10,6 +10,10 @@ Three kinds, each a function of the rows and one seed:
   cells. Where the commanded target is recorded, grouping by its columns is the stricter split.
 * ``block``: whole groups (same `by`), sorted by their mean along the first principal direction of the positions; the
   far end is held out, so that the figures are those of extrapolation.
+* ``column``: the rows whose column `by` has one of `test_values`.
+
+The test rows may also be given one by one. Then, and with ``column``, they are the same for every seed, and single rows
+(``group``: groups) of the rest are drawn for validation.
 
 The training rows come first in the draw or along the direction, then the validation rows, last the test rows: a model
 is chosen on rows of the same kind as those it is judged on, in a block split on the block beside the test block.
@@ -34,9 +38,11 @@ from ccnn_torch.units import to_si
 
 __all__ = ["DEFAULT_BY", "KINDS", "Column", "Split", "fold_splits", "split_rows"]
 
-KINDS = ("random", "group", "block")
+KINDS = ("random", "group", "block", "column")
 DEFAULT_BY = "position:5mm"
 
+# Values that a sentence lists.
+_FEW = 8
 _FOLDS = 1
 """Beside the seed of a repeat, so that folds are not drawn like the split."""
 
@@ -65,9 +71,10 @@ def split_rows(
     kind: str = "random",
     by: str | Sequence[str] | None = None,
     columns: Mapping[str, Column] | None = None,
-    test: float = 0.3,
+    test: float | Tensor = 0.3,
     validation: float = 0.2,
     seed: int = 0,
+    test_values: Sequence[float] | None = None,
 ) -> Split:
     """Split rows.
 
@@ -78,28 +85,42 @@ def split_rows(
 
     Args:
         positions: `rows x d` [m]; d may be 0 where `by` names columns.
-        kind: ``random``, ``group`` or ``block``.
+        kind: ``random``, ``group``, ``block`` or ``column``.
         by: what makes a group, see above; one entry or several.
         columns: the columns that `by` may name, `rows` each.
-        test: share of the rows (``group``: of the groups) that is held out, between 0 and 1.
+        test: share of the rows (``group``: of the groups) that is held out, between 0 and 1; or which rows are, `rows`
+            bool (``random`` and ``group``).
         validation: share of the rest, from 0.
         seed: seed of the draw; a block split draws nothing.
+        test_values: values of the column `by` whose rows are held out (``column``), as they stand in `columns`.
 
     Raises:
-        InputError: an unknown kind or column, a share out of range, or too few rows or groups for the shares.
+        InputError: an unknown kind or column, a share out of range, a value that does not occur, or too few rows or
+            groups for the shares.
     """
     rows = len(positions)
-    for key, share, low in (("test", test, 0.0), ("validation", validation, -1e-300)):
+    given = isinstance(test, Tensor)
+    for key, share, low in (("test", 0.5 if given else test, 0.0), ("validation", validation, -1e-300)):
         if not low < share < 1:
             raise InputError(f"split.{key}: {share:g} is not a share; write a number between 0 and 1, e.g. 0.2")
-    if kind == "random":
-        if by is not None:
-            raise InputError(f"split.by: '{by}' has no meaning with split.kind=random; write split.kind=group")
-        return _draw(np.arange(rows), test, validation, seed, "rows")
     if kind not in KINDS:
         near = nearest(kind, KINDS)
         raise InputError(f"split.kind: '{kind}' is not one of {', '.join(KINDS)}" + (f"; '{near}'?" if near else ""))
+    if (kind == "column") != (test_values is not None) or (given and kind in ("block", "column")):
+        raise InputError(
+            "split: test_values go with split.kind=column, test rows that are given with split.kind=random or group"
+        )
+    if kind == "column":
+        return _hold_out(_having(by, test_values or [], columns or {}), None, validation, seed)
+    if kind == "random":
+        if by is not None:
+            raise InputError(f"split.by: '{by}' has no meaning with split.kind=random; write split.kind=group")
+        if isinstance(test, Tensor):
+            return _hold_out(test.numpy(), None, validation, seed)
+        return _draw(np.arange(rows), test, validation, seed, "rows")
     groups = _groups(positions, DEFAULT_BY if by is None else by, columns or {})
+    if isinstance(test, Tensor):
+        return _hold_out(test.numpy(), groups, validation, seed)
     if kind == "group":
         return replace(_draw(groups, test, validation, seed, "groups"), groups=torch.from_numpy(groups))
     return _block(positions.numpy(), groups, test, validation)
@@ -149,6 +170,46 @@ def _draw(groups: _Integers, test: float, validation: float, seed: int, what: st
     part = np.empty(count, dtype=np.int64)
     part[order[:trained]], part[order[trained:kept]], part[order[kept:]] = 0, 1, 2
     return _collect(part[groups], validation, f"{count} {what}")
+
+
+def _hold_out(held: NDArray[np.bool_], groups: _Integers | None, validation: float, seed: int) -> Split:
+    """The rows that are to be held out; of the others whole groups at random for validation. held: `rows`."""
+    rest = np.flatnonzero(~held)
+    numbers = np.arange(len(rest)) if groups is None else np.unique(groups[rest], return_inverse=True)[1].reshape(-1)
+    count = int(numbers.max(initial=-1)) + 1
+    order = np.random.default_rng(seed).permutation(count)
+    chosen = np.ones(count, dtype=np.int64)
+    chosen[order[: _first(1 - validation, count)]] = 0
+    part = np.full(len(held), 2, dtype=np.int64)
+    part[rest] = chosen[numbers]
+    split = _collect(part, validation, f"{count} {'rows' if groups is None else 'groups'} beside the test rows")
+    return split if groups is None else replace(split, groups=torch.from_numpy(groups))
+
+
+def _having(
+    by: str | Sequence[str] | None, values: Sequence[float], columns: Mapping[str, Column]
+) -> NDArray[np.bool_]:
+    """Which rows have one of some values in a column, `rows`."""
+    names = [by] if isinstance(by, str) else list(by or [])
+    if len(names) != 1:
+        raise InputError("split.by: split.kind=column goes by one column; write e.g. split.by=set")
+    column = _column(names[0], columns)
+    held = np.zeros(len(column), dtype=bool)
+    there = ", ".join(f"{value:g}" for value in np.unique(column)[:_FEW])
+    for value in values:
+        # A value that was converted to SI differs from the one asked for in its last digits.
+        found = np.isclose(column, value, rtol=1e-9, atol=0.0)
+        if not found.any():
+            more = " …" if len(np.unique(column)) > _FEW else ""
+            raise InputError(
+                f"split.test_values: no row has {value:g} in '{names[0]}', which has {there}{more} (in SI)"
+            )
+        held |= found
+    if held.all():
+        raise InputError(
+            f"split.test_values: every row has one of them in '{names[0]}', and none is left to train on; remove one"
+        )
+    return held
 
 
 def _block(positions: NDArray[np.float64], groups: _Integers, test: float, validation: float) -> Split:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["from_si", "parse_header", "si_unit_of", "to_si", "write_hint"]
+__all__ = ["from_si", "parse_header", "si_unit_of", "split_header", "to_si", "write_hint"]
 
 # What a measured quantity is usually written in, for the remedy in an error, and what it is called.
 _EXAMPLES = {
@@ -45,12 +45,17 @@ _NAMED = ("1", "N", "N*m", "N/m", "N*m/rad", "Pa", "W", "V", "m/s", "rad/s", "m/
 _SYMBOLS = {"meter": "m", "radian": "rad", "second": "s", "kelvin": "K", "kilogram": "kg", "ampere": "A", "mole": "mol"}
 _COMMON = ("m", "mm", "um", "cm", "in", "rad", "mrad", "deg", "arcsec", "s", "min", "ms", "degC", "K", "N", "N*m", "1")
 
+_PARENTHESES = re.compile(r"\s*(?P<name>[^()\[\]]*?)\s*\((?P<unit>[^()\[\]]*)\)\s*")
 _HEADER = re.compile(r"\s*(?P<name>[^\[\]]*?)\s*\[(?P<unit>[^\[\]]*)\]\s*")
 _FACTOR = r"(?:[A-Za-zµμΩÅ_]+|%|°C?)(?:(?:\^|\*\*)-?[1-9]|⁻?[²³¹])?"
 _EXPRESSION = re.compile(rf"(?:1|{_FACTOR})(?:\s*[*/·⋅.\s]\s*{_FACTOR})*")
 # pint would read these as something that no record of a robot means: textile number metre, megametre.
 _ALIASES = {"Nm": "N*m", "Nmm": "N*mm"}
-_REFUSED = {"Mm": "megametres; for millimetres write mm"}
+_REFUSED = {
+    "Mm": "megametres; for millimetres write mm",
+    "Grad": "gigaradians; for degrees write deg",
+    "grad": "a 400th of a turn to some and a degree to others; write gon or deg",
+}
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,21 @@ class _Unit:
 
 class _UnknownUnit(Exception):
     """The reason, as the end of a sentence."""
+
+
+def split_header(header: str) -> tuple[str, str]:
+    """Name and unit of a column header; the unit is empty where the header has none.
+
+    Beside ``name[unit]`` this takes ``name (unit)`` where the parentheses hold a unit that is known; anything else is a
+    name as it stands.
+    """
+    match = _HEADER.fullmatch(header)
+    if match is not None:
+        return match["name"], match["unit"].strip()
+    match = _PARENTHESES.fullmatch(header)
+    if match is not None and match["name"] and _is_unit(match["unit"].strip()):
+        return match["name"], match["unit"].strip()
+    return header.strip(), ""
 
 
 def parse_header(header: str, file: str, si_unit: str | None = None) -> tuple[str, str]:
@@ -204,6 +224,14 @@ def _canonical(base: frozenset[tuple[str, float]]) -> str:
         symbol = _SYMBOLS.get(key, key) + ("" if abs(power) == 1 else f"^{abs(power):g}")
         text += f"{'/' if power < 0 else '*' if text else ''}{symbol}"
     return text if not text.startswith("/") else f"1{text}"
+
+
+def _is_unit(text: str) -> bool:
+    """Whether a text is a unit that is known; a bare number, as in ``probe (1)``, is none."""
+    try:
+        return text != "1" and _lookup(text) is not None
+    except _UnknownUnit:
+        return False
 
 
 def _not_known(unit: str) -> str:

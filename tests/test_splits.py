@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.splits import Split, split_rows
+from ccnn_torch.splits import Split, fold_splits, split_rows
 
 
 def sets(split: Split) -> tuple[set[int], set[int], set[int]]:
@@ -123,6 +123,33 @@ def test_every_row_once_and_no_group_torn(
     assert sets(again) == parts
 
 
+@pytest.mark.parametrize("by_column", [False, True])
+def test_rows_that_are_held_out_by_name(by_column: bool) -> None:
+    robot = np.arange(200.0) % 4
+    wanted: dict[str, object] = {"test": torch.from_numpy((robot == 1) | (robot == 3))}
+    if by_column:
+        wanted = {"kind": "column", "by": ["robot"], "columns": {"robot": robot}, "test_values": [3.0, 1.0]}
+    first, second = (split_rows(positions(), **wanted, seed=seed) for seed in (0, 1))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(first.test.numpy(), np.flatnonzero(robot % 2 == 1))
+    assert torch.equal(first.test, second.test) and not torch.equal(first.validation, second.validation)
+    assert (len(first.train), len(first.validation)) == (80, 20)
+    assert sorted(torch.cat([first.train, first.validation, first.test]).tolist()) == list(range(200))
+    folds = fold_splits(first, "random", 5, seed=0)
+    assert all(torch.equal(fold.test, first.test) for fold in folds)
+    held = torch.cat([fold.validation for fold in folds])
+    assert sorted(held.tolist()) == np.flatnonzero(robot % 2 == 0).tolist()
+
+
+def test_groups_stay_whole_beside_the_test_rows() -> None:
+    groups = np.arange(200.0) // 10
+    held = torch.arange(200) >= 150
+    split = split_rows(positions(), "group", "g", {"g": groups}, test=held, seed=3)
+    assert torch.equal(split.test, torch.arange(150, 200)) and len(split.validation) == 30
+    assert not set(groups[split.train]) & set(groups[split.validation])
+    for fold in fold_splits(split, "group", 3, seed=0):
+        assert not set(groups[fold.train]) & set(groups[fold.validation])
+
+
 def test_global_random_state_is_left_alone() -> None:
     np.random.seed(0)  # noqa: NPY002 - the global state is what this test watches
     before = np.random.get_state()[1].tolist()  # noqa: NPY002
@@ -134,7 +161,7 @@ def test_global_random_state_is_left_alone() -> None:
     "keys, parts",
     [
         ({"kind": "grup"}, ("split.kind", "'grup'", "'group'")),
-        ({"kind": "time"}, ("split.kind", "'time'", "random, group, block")),
+        ({"kind": "time"}, ("split.kind", "'time'", "random, group, block, column")),
         ({"kind": "random", "by": "robot"}, ("split.by", "'robot'", "split.kind=group")),
         ({"kind": "group", "by": "robott"}, ("split.by", "'robott'", "'robot'")),
         ({"kind": "group", "by": "zzz"}, ("split.by", "'zzz'", "robot, gaps")),
@@ -144,6 +171,15 @@ def test_global_random_state_is_left_alone() -> None:
         ({"kind": "group", "by": "position:mm"}, ("split.by", "position:5mm")),
         ({"kind": "group", "by": "position:0mm"}, ("split.by", "position:5mm")),
         ({"kind": "group", "by": "position:5deg"}, ("split.by", "'deg'", "a length")),
+        ({"kind": "column", "by": "robot", "test_values": [7.0]}, ("no row has 7 in 'robot'", "0, 1, 2, 3, 4, 5, 6")),
+        ({"kind": "column", "by": "one", "test_values": [1.0]}, ("every row has one of them in 'one'",)),
+        ({"kind": "column", "by": "gaps", "test_values": [1.0]}, ("split.by", "'gaps'", "row 3")),
+        ({"kind": "column", "by": "robott", "test_values": [1.0]}, ("split.by", "did you mean 'robot'")),
+        ({"kind": "column", "by": ["robot", "one"], "test_values": [1.0]}, ("one column",)),
+        ({"kind": "column", "by": "robot"}, ("test_values go with split.kind=column",)),
+        ({"kind": "group", "test_values": [1.0]}, ("test_values go with split.kind=column",)),
+        ({"kind": "block", "test": torch.arange(200) < 9}, ("test rows that are given",)),
+        ({"test": torch.arange(200) < 200}, ("0 rows beside the test rows", "no training row")),
         ({"test": 0.0}, ("split.test", "0 is not a share")),
         ({"test": 1.0}, ("split.test", "1 is not a share")),
         ({"test": float("nan")}, ("split.test", "nan is not a share")),

@@ -28,13 +28,14 @@ def configured(
 ) -> DiagnoseConfig:
     """The config file with what the command line says over it."""
     from ccnn_torch.runs._noise import read_noise
+    from ccnn_torch.runs._overrides import listed_files
     from ccnn_torch.runs.diagnose_config import load_diagnose_config
 
     told = [] if noise is None else [f"noise={json.dumps(read_noise(noise))}"]
     wanted = load_diagnose_config(config, [*(overrides or []), *told])
     names = None if effects is None else [e.strip() for e in effects.split(",") if e.strip()]
     given = {
-        "records": None if records is None else str(records),
+        "records": None if records is None else listed_files(str(records), Path()),
         "mechanism": mechanism,
         "effects": names,
         "seed": seed,

@@ -109,7 +109,7 @@ def compensate(
             raise InputError(f"--sd: {model} is identified geometry, which has no standard deviation of a command")
         added |= _named("deviation_sd", loaded, found["deviation_sd"], units)
     names = {header.partition("[")[0] for header in added}
-    kept = {f"{name}[{unit}]": table.raw(name) for name, unit in table.units.items() if name not in names}
+    kept = {table.header(name): table.raw(name) for name in table.names if name not in names}
     write_table(output, kept | added)
     if not quiet:
         _tell(output, inside, trained=bool(loaded.covariates) or "deviation_sd" in found)
@@ -174,7 +174,7 @@ def _joints_of_poses(loaded: Model, mechanism: Mechanism, table: Table) -> Array
     from ccnn_torch.coordinates import Coordinate
     from ccnn_torch.records import JOINT_LIMIT, name_lines, read_pose, stack_columns
 
-    values, coordinates, _ = read_pose(table, mechanism)
+    values, coordinates, *_ = read_pose(table, mechanism)
     if len(coordinates) != len(mechanism.pose):
         missing = [c.header for c in mechanism.pose if c.name not in {k.name for k in coordinates}]
         raise InputError(f"{table.path}: the poses of {mechanism.name} need the columns {', '.join(missing)}, too")

@@ -44,8 +44,8 @@ def diagnose(
 
     The verdict comes first; then a network is trained on what the effects leave, to say what it would still gain
     (seconds; --no-network leaves that out). The folder gets diagnosis.json, report.html and next_measurements.csv, the
-    rows that would tell most. Keys: records, mechanism, out, mechanism_keys, covariates, noise, effects, gravity,
-    network, seed.
+    rows that would tell most. Keys: records, columns, mechanism, out, mechanism_keys, covariates, noise, effects,
+    gravity, network, seed.
 
     Examples:
 
@@ -111,7 +111,8 @@ def _tell(wanted: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -
             return with_network(found, wanted.seed, lambda share: tell(f"{100 * share:.0f} %"))
 
         found = watched("training a network on what the effects leave …", train, quiet)
-    about = {"name": folder.name, "mechanism": str(wanted.mechanism), "records": str(wanted.records)}
+    records = wanted.records if isinstance(wanted.records, str) else ", ".join(wanted.records or [])
+    about = {"name": folder.name, "mechanism": str(wanted.mechanism), "records": records}
     path = write_diagnosis(folder, found, about, wanted.seed)
     if quiet:
         return

@@ -13,7 +13,7 @@ from ccnn_torch.effects import Situation
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import BlackBox, Framed, Mechanism
 from ccnn_torch.records import Records
-from ccnn_torch.units import si_unit_of
+from ccnn_torch.units import parse_header, si_unit_of
 
 __all__ = ["refuse_lost_rows", "told"]
 
@@ -72,6 +72,8 @@ def refuse_lost_rows(records: Records, situation: Situation) -> None:
 def _column(records: Records, condition: Condition) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     values, unit = records.columns[condition.name], records.units[condition.name]
     where = f"{records.path}: column '{condition.name}'"
+    if not unit:
+        parse_header(condition.name, records.path, condition.unit)
     if si_unit_of(unit, where) != si_unit_of(condition.unit):
         raise InputError(f"{where} is in '{unit}', and the simulator takes it in {condition.unit}")
     empty = np.flatnonzero(~np.isfinite(values))

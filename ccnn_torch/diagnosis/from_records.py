@@ -6,11 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from ccnn_torch._covariates import DEFAULT_COVARIATES
+from ccnn_torch._read_table import Frame
+from ccnn_torch._sources import FILE, is_frame
 from ccnn_torch.diagnosis._distance import size_of
 from ccnn_torch.diagnosis._network import with_network
 from ccnn_torch.diagnosis._told import refuse_lost_rows, told
@@ -19,7 +22,7 @@ from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Effect, Situation, default_gravity
 from ccnn_torch.errors import InputError, RowsError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
-from ccnn_torch.records import Records
+from ccnn_torch.records import Records, load_records
 
 __all__ = ["diagnose", "naming", "noise_of", "situation_of"]
 
@@ -30,7 +33,7 @@ _TURN = {"rx": 3, "ry": 4, "rz": 5}
 
 
 def diagnose(
-    records: Records,
+    records: Records | Frame,
     mechanism: Mechanism,
     *,
     noise: float | Mapping[str, float] | None = None,
@@ -42,7 +45,7 @@ def diagnose(
     """Which effect makes the gap between a model and measured records, where it lies, how far it shrinks.
 
     Args:
-        records: as `load_records` reads them.
+        records: as `load_records` reads them, or a pandas DataFrame with headers ``name[unit]``.
         mechanism: the nominal machine.
         noise: standard deviation of the measured pose [SI]: one number for every channel, or by pose coordinate;
             estimated from the rows when None.
@@ -54,6 +57,8 @@ def diagnose(
     Raises:
         InputError: too few rows, most of them out of reach, or noise of a coordinate that there is not.
     """
+    if is_frame(records) and isinstance(mechanism, Mechanism):
+        records = load_records(cast(Frame, records), mechanism, learns=False)
     if not isinstance(records, Records) or not isinstance(mechanism, Mechanism):
         raise InputError(
             "diagnose takes records as load_records gives them and a mechanism: mechanism = load_mechanism(name), then "
@@ -71,6 +76,7 @@ def _unread(records: Records, situation: Situation) -> list[str]:
     mechanism = situation.mechanism
     known = [*DEFAULT_COVARIATES, *situation.covariates, *(condition.name for condition in mechanism.takes)]
     known += [*mechanism.frame_per, *mechanism.tool_per] if isinstance(mechanism, SerialArm) else []
+    known += [FILE] if records.parts else []
     names = [name for name in records.columns if not any(fnmatchcase(name, pattern) for pattern in known)]
     if not names:
         return []

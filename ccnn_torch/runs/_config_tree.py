@@ -6,14 +6,23 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.runs._keys import explain
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
 from ccnn_torch.runs._yaml import read_yaml
 
-__all__ = ["Names", "Section", "config_from_file", "config_from_keys", "config_from_options", "validated"]
+__all__ = [
+    "Columns",
+    "Files",
+    "Names",
+    "Section",
+    "config_from_file",
+    "config_from_keys",
+    "config_from_options",
+    "validated",
+]
 
 Config = TypeVar("Config", bound=BaseModel)
 
@@ -24,6 +33,28 @@ def _listed(value: Any) -> Any:
 
 
 Names = Annotated[list[str], BeforeValidator(_listed)]
+
+
+def _files(value: Any) -> Any:
+    if not (isinstance(value, str) or (isinstance(value, list) and value and all(isinstance(v, str) for v in value))):
+        raise ValueError(
+            f"must be a file of records or a list of them, e.g. day1.csv or [day1.csv, day2.csv], not {value}"
+        )
+    return value
+
+
+Files = Annotated[str | list[str], BeforeValidator(_files)]
+"""Records: a file, or several with the same columns."""
+
+Columns = Annotated[
+    dict[str, str],
+    Field(
+        default={},
+        description='columns under other names than ours: header in the file: "name[unit]", or ignore, e.g. '
+        '{A1: "q1[deg]", X: "x[mm]", Note: ignore}',
+    ),
+]
+"""What the headers of records mean."""
 
 
 class Section(BaseModel):

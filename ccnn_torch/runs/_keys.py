@@ -18,7 +18,7 @@ from ccnn_torch.runs._yaml import read_yaml
 __all__ = ["explain", "list_keys"]
 
 # Wrong keys that one sentence names.
-_FEW = 4
+_FEW = 8
 
 
 def list_keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, str]]:
@@ -84,7 +84,10 @@ def explain(error: ValidationError, model: type[BaseModel], file: str, given: Ma
     other = _other_command(file, model)
     if other:
         return f"{file}: this looks like {other}"
-    said = list(parts)
+    said: list[str] = []
+    for part in parts:
+        head, _, keys_there = part.partition("; the keys ")
+        said.append(head if keys_there and any(part.endswith(keys_there) for part in said) else part)
     return f"{file}: " + "; ".join(said[:_FEW]) + (f"; and {len(said) - _FEW} more" if len(said) > _FEW else "")
 
 

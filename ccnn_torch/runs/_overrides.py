@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,16 @@ from typing import Any
 from ccnn_torch.errors import InputError
 from ccnn_torch.runs._yaml import parse_yaml
 
-__all__ = ["apply_overrides", "resolve_paths"]
+__all__ = ["apply_overrides", "listed_files", "resolve_paths"]
 
 # Keys whose value is text however it looks: a path may hold a colon, a name may be 2024.
 _TEXT = ("name", "out", "records", "transfer", "mechanism")
 
 # What a file stands behind in `effects`.
 _FROM = "from:"
+
+# A share that stands in quotes is no file.
+_NUMBER = re.compile(r"[+-]?\d*\.?\d*(e[+-]?\d+)?", re.IGNORECASE)
 
 _PLUGINS = ("methods", "auto.methods", "effects")
 
@@ -59,6 +63,10 @@ def resolve_paths(tree: dict[str, Any], folder: Path) -> None:
 
 
 def _resolve(key: str, value: Any, folder: Path) -> Any:
+    if key == "records":
+        return _resolve_files(value, folder)
+    if key == "split" and isinstance(value, dict) and "test" in value:
+        return {**value, "test": _resolve("split.test", value["test"], folder)}
     if key == "auto" and isinstance(value, dict):
         return {name: _resolve(f"auto.{name}", entry, folder) for name, entry in value.items()}
     if key in _PLUGINS and isinstance(value, list):
@@ -70,9 +78,29 @@ def _resolve(key: str, value: Any, folder: Path) -> Any:
     return os.path.abspath(folder / Path(value).expanduser())
 
 
+def listed_files(text: str, folder: Path) -> str | list[str]:
+    """Records as a text: one file, or several as ``a.csv,b.csv``, also in brackets."""
+    if (folder / Path(text).expanduser()).exists():
+        return text
+    parts = [part.strip(" '\"") for part in text.strip().removeprefix("[").removesuffix("]").split(",")]
+    return parts if len(parts) > 1 and all(Path(part).suffix for part in parts) else text
+
+
+def _resolve_files(value: Any, folder: Path) -> Any:
+    """Records: one file as a text, several as a list."""
+    value = listed_files(value, folder) if isinstance(value, str) else value
+    files = value if isinstance(value, list) else [value]
+    if not all(isinstance(file, str | Path) and str(file) for file in files):
+        return value
+    paths = [os.path.abspath(folder / Path(file).expanduser()) for file in files]
+    return paths[0] if len(paths) == 1 else paths
+
+
 def _is_path(key: str, value: str) -> bool:
-    if key in ("out", "records", "transfer"):
+    if key in ("out", "transfer"):
         return value != ""
+    if key == "split.test":
+        return Path(value).suffix != "" and not _NUMBER.fullmatch(value.strip())
     if key == "mechanism":
         return ".py:" in value or Path(value).suffix.lower() in (".yaml", ".yml", ".urdf")
     return key in _PLUGINS and ".py:" in value

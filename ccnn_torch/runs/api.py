@@ -7,9 +7,11 @@ from typing import Any
 from ccnn_torch.runs.calibrate import Calibration
 from ccnn_torch.runs.calibrate import calibrate as _calibrate
 from ccnn_torch.runs.config import make_config
+from ccnn_torch.runs.held_out import given_records, name_given
 from ccnn_torch.runs.identification import Identification
 from ccnn_torch.runs.identification import identify as _identify
 from ccnn_torch.runs.identify_config import make_identify_config
+from ccnn_torch.runs.prepare import prepare
 
 __all__ = ["calibrate", "identify"]
 
@@ -18,7 +20,8 @@ def calibrate(**keys: Any) -> Calibration:
     """Train on measured records or on a case study, judge on held-out rows; nothing is written.
 
     Args:
-        keys: those of a config (`ccnn keys` lists them), for example `records="robot.csv", mechanism="robot.yaml"`,
+        keys: those of a config (`ccnn keys` lists them); `records` may also be a pandas DataFrame with headers
+            ``name[unit]``, or what `load_records` gave. For example `records="robot.csv", mechanism="robot.yaml"`,
             `case="tripod"`, `seed=3`, `split={"kind": "group"}`, `ccnn={"generations": 200}`.
 
     Returns:
@@ -27,14 +30,20 @@ def calibrate(**keys: Any) -> Calibration:
     Raises:
         InputError: a key, the records or the mechanism cannot be used; the sentence says what to change.
     """
-    return _calibrate(make_config(**keys))
+    given = given_records(keys.get("records"))
+    if given is None:
+        return _calibrate(make_config(**keys))
+    config = make_config(**{**keys, "records": name_given(given)})
+    config = config.model_copy(update={"records": name_given(given)})
+    return _calibrate(config, prepared=prepare(config, given))
 
 
 def identify(**keys: Any) -> Identification:
     """Identify geometric parameters from measured records or simulated machines; nothing is written.
 
     Args:
-        keys: those of a config (`ccnn identify --keys` lists them), for example `mechanism="five_bar",
+        keys: those of a config (`ccnn identify --keys` lists them); `records` may also be a pandas DataFrame with
+            headers ``name[unit]``, or what `load_records` gave. For example `mechanism="five_bar",
             simulate={"machines": 10, "poses": 36}`, or `mechanism="arm.yaml", records="measured.csv", methods=["lm"]`.
 
     Returns:
@@ -43,4 +52,8 @@ def identify(**keys: Any) -> Identification:
     Raises:
         InputError: a key, the records or the mechanism cannot be used; the sentence says what to change.
     """
-    return _identify(make_identify_config(**keys))
+    given = given_records(keys.get("records"))
+    if given is None:
+        return _identify(make_identify_config(**keys))
+    config = make_identify_config(**{**keys, "records": name_given(given)})
+    return _identify(config.model_copy(update={"records": name_given(given)}), given=given)

@@ -18,9 +18,10 @@ from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.enn import ENNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
-from ccnn_torch.runs._config_tree import Names, Section, config_from_file, config_from_keys
+from ccnn_torch.runs._config_tree import Columns, Files, Names, Section, config_from_file, config_from_keys
 from ccnn_torch.runs._keys import list_keys
 from ccnn_torch.runs._yaml import dump_yaml
+from ccnn_torch.runs.split_config import SplitConfig
 
 __all__ = [
     "METHODS",
@@ -51,20 +52,6 @@ Numbers = Annotated[list[Annotated[float, Field(gt=0)]], BeforeValidator(_one)]
 
 class _Part(Section):
     model_config = ConfigDict(coerce_numbers_to_str=True)
-
-
-class SplitConfig(_Part):
-    """Which rows are held out; see `ccnn_torch.splits`."""
-
-    kind: Literal["random", "group", "block"] = Field(default="random", description="random, group or block")
-    by: Names | None = Field(
-        default=None,
-        description="what makes a group: columns or patterns (goal_*), or position:5mm, the default",
-    )
-    test: float = Field(
-        default=0.3, gt=0, lt=1, description="share of the rows (group: of the groups) that is held out"
-    )
-    validation: float = Field(default=0.2, ge=0, lt=1, description="share of the rest that chooses the model")
 
 
 class TrainingConfig(_Part):
@@ -188,7 +175,11 @@ class RunConfig(_Part):
     order: Literal["raster", "shuffled"] | None = Field(
         default=None, description="order in which a case visits its poses: raster or shuffled; default raster"
     )
-    records: str | None = Field(default=None, description="measured records, a CSV file with headers name[unit]")
+    records: Files | None = Field(
+        default=None,
+        description="measured records, a CSV file (or .xlsx) with headers name[unit], or a list of such files",
+    )
+    columns: Columns
     mechanism: str | None = Field(
         default=None,
         description="mechanism of the records: tripod, machine_tool, a DH file (.yaml), a URDF, or file.py:Name",
@@ -286,6 +277,10 @@ class RunConfig(_Part):
             raise ValueError("order: a realistic machine visits random poses; remove the key")
         if self.order is not None and self.case is None:
             raise ValueError("order: records have the order in which they were measured; remove the key")
+        if self.case is not None and self.split.test_file is not None:
+            raise ValueError("split.test: a case makes its own rows and takes no file; write a share, e.g. 0.3")
+        if self.case is not None and self.columns:
+            raise ValueError("columns: a case reads no file; remove the key")
         if self.case is not None and self.geometry != "none":
             raise ValueError("geometry: a case is there to compare learners; write geometry=none, or take records")
         if self.case is not None and self.effects != "none":

@@ -150,5 +150,6 @@ def _loaded(config: DiagnoseConfig) -> tuple[Records, Mechanism, Sequence[str] |
         if getattr(config, key) is None:
             raise InputError(f"{key}: is missing; give --{key}, or the key in a config")
     mechanism = load_mechanism(str(config.mechanism), **config.mechanism_keys)
-    records = load_records(str(config.records), mechanism, config.covariates, learns=False)
+    assert config.records is not None
+    records = load_records(config.records, mechanism, config.covariates, learns=False, columns=config.columns)
     return records, mechanism, config.effects

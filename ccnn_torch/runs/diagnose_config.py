@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.runs._config_tree import Names, Section, config_from_options
+from ccnn_torch.runs._config_tree import Columns, Files, Names, Section, config_from_options
 from ccnn_torch.runs._keys import list_keys
 from ccnn_torch.runs._noise import Noise
 from ccnn_torch.runs._sizes import size
@@ -38,7 +38,11 @@ def _deviation(value: Any) -> Any:
 class DiagnoseConfig(Section):
     """What `ccnn diagnose` and `ccnn check` may be told."""
 
-    records: str | None = Field(default=None, description="CSV of the records; the same as --records")
+    records: Files | None = Field(
+        default=None,
+        description="CSV (or .xlsx) of the records, or a list of such files; the same as --records",
+    )
+    columns: Columns
     mechanism: str | None = Field(default=None, description="the nominal machine; the same as --mechanism")
     out: str | None = Field(default=None, description="folder to write; the same as --out")
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")

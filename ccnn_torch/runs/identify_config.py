@@ -12,15 +12,15 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from ccnn_torch._table import nearest
-from ccnn_torch.runs._config_tree import Names, Section, config_from_file, config_from_keys
+from ccnn_torch.runs._config_tree import Columns, Files, Names, Section, config_from_file, config_from_keys
 from ccnn_torch.runs._keys import list_keys
 from ccnn_torch.runs._yaml import dump_yaml
+from ccnn_torch.runs.split_config import HeldOutConfig
 
 __all__ = [
     "IDENTIFY_METHODS",
     "ConstraintConfig",
     "FrameConfig",
-    "HeldOutConfig",
     "IdentifyConfig",
     "ParameterConfig",
     "SimulateConfig",
@@ -88,16 +88,6 @@ class ConstraintConfig(Section):
     where: dict[str, float] = Field(
         default={}, description="values that a row's columns must have to take part, e.g. {robot: 1}"
     )
-
-
-class HeldOutConfig(Section):
-    """Which measured rows are held out; see `ccnn_torch.splits`."""
-
-    kind: Literal["random", "group", "block"] = Field(default="random", description="random, group or block")
-    by: Names | None = Field(
-        default=None, description="what makes a group: columns or patterns, or position:5mm, the default"
-    )
-    test: float = Field(default=0.3, gt=0, lt=1, description="share of the rows (group: of the groups) held out")
 
 
 class SimulateConfig(Section):
@@ -170,7 +160,11 @@ class IdentifyConfig(Section):
         "(six), which can also tilt parallel axes",
     )
     frame: FrameConfig = Field(default_factory=FrameConfig)
-    records: str | None = Field(default=None, description="measured records, a CSV file with headers name[unit]")
+    records: Files | None = Field(
+        default=None,
+        description="measured records, a CSV file (or .xlsx) with headers name[unit], or a list of such files",
+    )
+    columns: Columns
     simulate: SimulateConfig | None = Field(default=None, description="simulated machines instead of records")
     constraint: ConstraintConfig | None = Field(
         default=None, description="what holds the tool in the records, which then have no measured pose"
@@ -253,6 +247,12 @@ class IdentifyConfig(Section):
             self._constrained(self.constraint)
         if self.transfer is not None and self.records is None:
             raise ValueError("transfer: needs measured records; write records=FILE.csv, or remove the key")
+        if self.transfer is not None and self.split.test_file is not None:
+            raise ValueError(
+                "transfer: its rows are split as the records are, and split.test names a file; write a share"
+            )
+        if self.simulate is not None and (self.columns or self.split.test_file is not None):
+            raise ValueError("columns and a file in split.test: simulated machines read no file; remove the key")
         if self.simulate is not None and (self.noise is not None or self.joint_noise is not None):
             raise ValueError("noise: simulated data has simulate.noise and simulate.joint_noise; remove the key")
         if self.simulate is not None and self.simulate.points and self.residual == "forward":

@@ -22,9 +22,10 @@ from ccnn_torch.runs.config import RunConfig
 from ccnn_torch.runs.dataset import Dataset
 from ccnn_torch.runs.effects import KnownEffects, fit_effects, verdict_of
 from ccnn_torch.runs.geometry import Fitted, Identified, fit_machine
+from ccnn_torch.runs.held_out import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.runs.machines import build_machine
 from ccnn_torch.runs.simulation import CaseSimulation, Simulation, simulate_realistic
-from ccnn_torch.splits import Column, Split, split_rows
+from ccnn_torch.splits import Column, Split
 
 __all__ = ["Prepared", "prepare"]
 
@@ -89,8 +90,11 @@ class Prepared:
         return self.parameters[repeat, 0]
 
 
-def prepare(config: RunConfig) -> Prepared:
+def prepare(config: RunConfig, given: Given | None = None) -> Prepared:
     """Build the rows of a run.
+
+    Args:
+        given: records that Python has, in place of the config's file.
 
     Raises:
         InputError: the config names no data, or the data cannot be used; the sentence says what to change.
@@ -100,7 +104,7 @@ def prepare(config: RunConfig) -> Prepared:
         return _from_realistic(config, seeds)
     if config.case is not None:
         return _from_case(config, seeds)
-    return _from_records(config, seeds)
+    return _from_records(config, seeds, given)
 
 
 def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
@@ -186,7 +190,7 @@ def _choose(there: list[Coordinate], wanted: list[str] | None, what: str) -> lis
     return [coordinate for coordinate in there if any(fnmatchcase(coordinate.name, p) for p in wanted)]
 
 
-def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
+def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> Prepared:
     if config.records is None or config.mechanism is None:
         missing = "records" if config.records is None else "mechanism"
         raise InputError(
@@ -195,11 +199,13 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         )
     mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
     verdict = None if config.effects == "none" else verdict_of(config.effects, mechanism)
-    records = load_records(config.records, mechanism, config.covariates)
+    source = with_test_file(config.records if given is None else given, config.split)
+    records = load_records(source, mechanism, config.covariates, columns=config.columns)
     check_rows(records, mechanism)
     if isinstance(mechanism, SerialArm) and records.orientation == "none":
         mechanism = mechanism.with_orientation("none")
-    splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds)
+    held = rows_of_test_file(config.split, records.parts)
+    splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds, held)
     fitted = fit_machine(mechanism, records, splits, config.geometry == "identify")
     settings = _pseudoerror_settings(config, mechanism)
 
@@ -238,7 +244,7 @@ def _from_records(config: RunConfig, seeds: list[int]) -> Prepared:
         identified=fitted.geometry,
         geometry=identified,
         effects=effects,
-        notes=[*notes, *deviations.notes()],
+        notes=[*held_out_notes(config.split, len(splits[0].test)), *notes, *deviations.notes()],
     )
 
 
@@ -262,9 +268,11 @@ def _pseudoerror_settings(config: RunConfig, mechanism: Mechanism) -> dict[str, 
     }
 
 
-def _splits(config: RunConfig, positions: Tensor, columns: Mapping[str, Column], seeds: list[int]) -> list[Split]:
+def _splits(
+    config: RunConfig, positions: Tensor, columns: Mapping[str, Column], seeds: list[int], held: Tensor | None = None
+) -> list[Split]:
     split = config.split
-    return [split_rows(positions, split.kind, split.by, columns, split.test, split.validation, seed) for seed in seeds]
+    return [split_by(split, positions, columns, seed, split.validation, held) for seed in seeds]
 
 
 def _dataset(

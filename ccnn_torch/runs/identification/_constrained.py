@@ -12,6 +12,7 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Progress
 from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
+from ccnn_torch.runs.held_out import Given, held_out_notes
 from ccnn_torch.runs.identification._assemble import Known, parameter_blocks, versions
 from ccnn_torch.runs.identification._constraint_fit import ConstraintFit, fit_constraint, held_distance
 from ccnn_torch.runs.identification._constraint_rows import ConstraintRows, read_constraint
@@ -31,7 +32,7 @@ _AS_PRIOR = 0.9
 
 
 def identify_by_constraint(
-    config: IdentifyConfig, progress: Progress | None = None
+    config: IdentifyConfig, progress: Progress | None = None, given: Given | None = None
 ) -> tuple[Measured, dict[str, Outcome], dict[str, Any], dict[str, Tensor]]:
     """Identify the machine of a config with a constraint.
 
@@ -42,7 +43,7 @@ def identify_by_constraint(
         InputError: the mechanism or the records cannot be used, or the rows are too few.
     """
     mechanism, notes = _machine(config)
-    rows = read_constraint(config, mechanism)
+    rows = read_constraint(config, mechanism, given)
     begun = time.perf_counter()
     found = fit_constraint(config, mechanism, rows, progress)
     outcome = Outcome(
@@ -54,6 +55,7 @@ def identify_by_constraint(
         message=found.fit.message,
     )
     held = rows.weights == 0
+    notes = [*held_out_notes(config.split, int(held.sum())), *notes]
     measured = Measured(
         mechanism=mechanism,
         kinematics=Kinematics(mechanism),

@@ -10,12 +10,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ccnn_torch._pose import check_joints
+from ccnn_torch._sources import read_source
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.records import Table, read_table, stack_columns
+from ccnn_torch.records import Records, Table, stack_columns
+from ccnn_torch.runs.held_out import Given, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.runs.identify_config import ConstraintConfig, IdentifyConfig
-from ccnn_torch.splits import split_rows
 
 __all__ = ["ConstraintRows", "read_constraint"]
 
@@ -54,7 +56,7 @@ class ConstraintRows:
         return number
 
 
-def read_constraint(config: IdentifyConfig, mechanism: Mechanism) -> ConstraintRows:
+def read_constraint(config: IdentifyConfig, mechanism: Mechanism, given: Given | None = None) -> ConstraintRows:
     """Read, select and split the records of a config with a constraint.
 
     Raises:
@@ -63,21 +65,20 @@ def read_constraint(config: IdentifyConfig, mechanism: Mechanism) -> ConstraintR
     """
     about = config.constraint
     assert about is not None and config.records is not None
-    table = read_table(config.records, {c.name: c.unit for c in mechanism.joints})
+    source = with_test_file(config.records if given is None else given, config.split)
+    if isinstance(source, Records):
+        raise InputError("records: a constraint has columns of its own; give the path of its file, or a DataFrame")
+    table = read_source(source, config.columns)
+    check_joints(table, mechanism.joints)
     there = _taking_part(table, about.where)
     joints = torch.from_numpy(stack_columns(table, mechanism.joints, _ANGLE_LIMIT))[there]
     group, labels = _groups(table, about, there)
     said = torch.from_numpy(stack_columns(table, _columns(table, about)))[there]
     said = said if said.shape[-1] else torch.zeros(len(joints), 1, dtype=torch.float64)
-    train = split_rows(
-        torch.empty(len(joints), 0, dtype=torch.float64),
-        config.split.kind,
-        config.split.by,
-        {name: table.raw(name)[there.numpy()] for name in table.names},
-        test=config.split.test,
-        validation=0.0,
-        seed=config.seed,
-    ).train
+    columns = {name: table.raw(name)[there.numpy()] for name in table.names}
+    held = rows_of_test_file(config.split, table.parts)
+    nowhere = torch.empty(len(joints), 0, dtype=torch.float64)
+    train = split_by(config.split, nowhere, columns, config.seed, 0.0, None if held is None else held[there]).train
     weights = torch.zeros(len(joints), dtype=torch.float64)
     weights[train] = 1.0
     rows = ConstraintRows(joints, said, group, labels, weights, table.data_hash)

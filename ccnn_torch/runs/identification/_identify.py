@@ -12,10 +12,13 @@ import torch
 from torch import Tensor
 
 from ccnn_torch._files import write_whole
+from ccnn_torch._sources import read_source
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Fit, Progress, bootstrap
 from ccnn_torch.mechanisms import Framed, Mechanism
+from ccnn_torch.records import Records, write_table
 from ccnn_torch.runs._begun import facts_of, refuse_changes
+from ccnn_torch.runs.held_out import Given
 from ccnn_torch.runs.identification._assemble import assemble
 from ccnn_torch.runs.identification._constrained import identify_by_constraint
 from ccnn_torch.runs.identification._counts import count_study
@@ -60,6 +63,7 @@ class Identification:
     outcomes: Mapping[str, Outcome]
     results: dict[str, Any]
     arrays: dict[str, Tensor]
+    given: Given | None = None
 
     def mechanism(self, machine: int = 0, method: str | None = None) -> Mechanism:
         """The mechanism with the identified parameters of one machine; by default the first method's."""
@@ -67,7 +71,7 @@ class Identification:
         return self.measured.mechanism.with_nominal(outcome.values[machine])
 
     def save(self, folder: str | Path) -> None:
-        """Write what `ccnn identify` writes into a folder, which is made.
+        """Write what `ccnn identify` writes into a folder, which is made; a DataFrame's rows as `records.csv`.
 
         Raises:
             InputError: a class of a mechanism stands in no file, so that nobody could build it again.
@@ -75,7 +79,14 @@ class Identification:
         from ccnn_torch.runs.identification._outputs import write_outputs
 
         folder = Path(folder)
-        write_whole(folder / "config.yaml", dump_identify_config(self.config))
+        folder.mkdir(parents=True, exist_ok=True)
+        config = self.config
+        if self.given is not None and not isinstance(self.given, Records):
+            # What Python gave has no file that the config could name.
+            table = read_source(self.given)
+            write_table(folder / "records.csv", {table.header(name): table.raw(name) for name in table.names})
+            config = config.model_copy(update={"records": "records.csv"})
+        write_whole(folder / "config.yaml", dump_identify_config(config))
         write_outputs(self, folder)
 
     def nominal(self) -> dict[str, float]:
@@ -84,8 +95,8 @@ class Identification:
         return dict(zip(names, self.measured.start[0].tolist(), strict=True))
 
 
-def prepare(config: IdentifyConfig) -> tuple[Mechanism, Measured]:
-    """Mechanism and rows of a config.
+def prepare(config: IdentifyConfig, given: Given | None = None) -> tuple[Mechanism, Measured]:
+    """Mechanism and rows of a config; the rows of `given` where Python has them.
 
     Raises:
         InputError: the mechanism or the data cannot be used.
@@ -93,24 +104,28 @@ def prepare(config: IdentifyConfig) -> tuple[Mechanism, Measured]:
     mechanism = nominal_machine(config)
     if config.frame.base or config.frame.tool:
         mechanism = Framed(mechanism, base=config.frame.base, tool=config.frame.tool)
-    measured = from_records(config, mechanism) if config.records is not None else simulate(config, mechanism)
+    measured = from_records(config, mechanism, given) if config.records is not None else simulate(config, mechanism)
     return mechanism, frames_first(measured, config)
 
 
-def identify(config: IdentifyConfig, store: Path | None = None, watch: Watch | None = None) -> Identification:
+def identify(
+    config: IdentifyConfig, store: Path | None = None, watch: Watch | None = None, given: Given | None = None
+) -> Identification:
     """Identify the parameters of a config by every method.
 
     Args:
         store: folder beside config.yaml in which each method's outcome is kept, and from which finished ones are
             taken.
         watch: where progress goes.
+        given: records that Python has, in place of the config's file.
 
     Raises:
         InputError: the config, the mechanism or the data cannot be used; one sentence.
     """
     if config.constraint is not None:
-        return Identification(config, *identify_by_constraint(config, None if watch is None else watch("lm")))
-    mechanism, measured = prepare(config)
+        progress = None if watch is None else watch("lm")
+        return Identification(config, *identify_by_constraint(config, progress, given), given=given)
+    mechanism, measured = prepare(config, given)
     elsewhere = read_elsewhere(config, mechanism)
     for method in config.methods:  # what cannot be solved is said before anything takes minutes
         solver_of(method, config)
@@ -131,7 +146,7 @@ def identify(config: IdentifyConfig, store: Path | None = None, watch: Watch | N
     done = assemble(config, measured, outcomes, counts, _bootstrap(config, measured, outcomes))
     if elsewhere is not None:
         done.results["transfer"] = transferred(config, elsewhere, next(iter(outcomes.values())).values[0])
-    return Identification(config, measured, outcomes, done.results, done.arrays)
+    return Identification(config, measured, outcomes, done.results, done.arrays, given)
 
 
 def _bootstrap(config: IdentifyConfig, measured: Measured, outcomes: dict[str, Outcome]) -> Tensor | None:

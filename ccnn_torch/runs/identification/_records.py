@@ -9,22 +9,23 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.runs._sizes import size, sizes_by_name, sizes_of_pose
+from ccnn_torch.runs.held_out import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.runs.identification._kinematics import Kinematics
 from ccnn_torch.runs.identification._measured import Measured, Rows
 from ccnn_torch.runs.identify_config import IdentifyConfig
-from ccnn_torch.splits import split_rows
 
 __all__ = ["from_records", "read_records", "split_records"]
 
 
-def from_records(config: IdentifyConfig, mechanism: Mechanism) -> Measured:
-    """Load and split the records of a config.
+def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | None = None) -> Measured:
+    """Load and split the records of a config, or those that Python has.
 
     Raises:
         InputError: the records cannot be used, or the arm has frames per group of rows, which are no geometry.
     """
     assert config.records is not None
-    records, mechanism = read_records(config, config.records, mechanism)
+    source = with_test_file(config.records if given is None else given, config.split)
+    records, mechanism = read_records(config, source, mechanism)
     train, test = split_records(config, records)
     start, unknown = _frames(mechanism, train)
     far = []
@@ -42,17 +43,17 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism) -> Measured:
         joint_noise=_joint_noise(config, mechanism),
         unknown_frame=unknown,
         data_hash=records.data_hash,
-        notes=[*_notes(records), *far],
+        notes=[*held_out_notes(config.split, test.joints.shape[1]), *_notes(records), *far],
     )
 
 
-def read_records(config: IdentifyConfig, path: str, mechanism: Mechanism) -> tuple[Records, Mechanism]:
+def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tuple[Records, Mechanism]:
     """Records that fit a mechanism, and the mechanism as it was measured there (with or without orientation).
 
     Raises:
         InputError: the records cannot be used.
     """
-    records = load_records(path, mechanism, [], learns=False)
+    records = load_records(source, mechanism, [], learns=False, columns=config.columns)
     if isinstance(mechanism, SerialArm):
         if mechanism.frame_per or mechanism.tool_per:
             raise InputError(
@@ -72,15 +73,8 @@ def read_records(config: IdentifyConfig, path: str, mechanism: Mechanism) -> tup
 
 def split_records(config: IdentifyConfig, records: Records) -> tuple[Rows, Rows]:
     """Rows to identify from, and rows that judge."""
-    split = split_rows(
-        records.positions,
-        config.split.kind,
-        config.split.by,
-        records.columns,
-        test=config.split.test,
-        validation=0.0,
-        seed=config.seed,
-    )
+    held = rows_of_test_file(config.split, records.parts)
+    split = split_by(config.split, records.positions, records.columns, config.seed, 0.0, held)
     train, test = (Rows(records.joints[None, i], records.pose[None, i]) for i in (split.train, split.test))
     return train, test
 
@@ -105,4 +99,5 @@ def _joint_noise(config: IdentifyConfig, mechanism: Mechanism) -> Tensor | None:
 
 
 def _notes(records: Records) -> list[str]:
-    return [note for note in records.notes if note.startswith("joint")]
+    """Without those of columns that are no inputs here."""
+    return [note for note in records.notes if not note.startswith(("ignored columns", "column '"))]
