@@ -14,10 +14,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ccnn_torch._display import is_shown, visible
+from ccnn_torch._reading import read_text
 from ccnn_torch.errors import InputError
-from ccnn_torch.units import parse_header, to_si, write_hint
+from ccnn_torch.units import LARGEST, parse_header, to_si, write_hint
 
 __all__ = ["Table", "name_lines", "nearest", "read_table", "write_table"]
+
+# Bytes; a million rows of twenty columns. Read, it takes some ten times that in memory.
+_LARGEST_FILE = 500_000_000
+_LONGEST_HEADER = 100
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,7 @@ class Table:
 
         Raises:
             InputError: the column is missing (with the nearest name), has a wrong or unknown unit, or a cell that is
-                empty, no number, NaN or infinite (named by line).
+                empty, no number, NaN, infinite, or larger than anything that is measured (named by line).
         """
         if name not in self.units:
             raise InputError(f"{self.path}: there is no column '{name}'; {self._remedy(name, si_unit)}")
@@ -77,14 +83,22 @@ class Table:
         wrong = np.flatnonzero(~np.isfinite(values))
         if len(wrong):
             row = int(wrong[0])
-            text = self.bad_cells.get((row, self.names.index(name)), f"{values[row]:g}")
+            text = visible(self.bad_cells.get((row, self.names.index(name)), f"{values[row]:g}"), 40)
             what = f"has '{text}'" if text else "is empty"
             more = f", and {len(wrong) - 1} more of its cells are not finite either" if len(wrong) > 1 else ""
             raise InputError(
                 f"{self.path}: column '{name}' {what} at {name_lines(self.lines, [row])}{more}; "
                 "write a finite number or remove the row"
             )
-        return to_si(values, self.units[name], si_unit, f"{self.path}: column '{name}'", name)
+        converted = to_si(values, self.units[name], si_unit, f"{self.path}: column '{name}'", name)
+        far = np.flatnonzero(np.abs(converted) > LARGEST)
+        if len(far):
+            raise InputError(
+                f"{self.path}: column '{name}' has {values[far[0]]:g} {self.units[name]} at "
+                f"{name_lines(self.lines, far)}, larger than anything that is measured; correct or remove "
+                f"{'it' if len(far) == 1 else 'them'}, or check the unit"
+            )
+        return converted
 
     def _remedy(self, name: str, si_unit: str | None) -> str:
         near = nearest(name, self.names)
@@ -130,14 +144,15 @@ def read_table(path: str | Path, si_units: Mapping[str, str] | None = None) -> T
             number of cells than the header.
     """
     file = str(path)
-    text_lines = _read_text(file).split("\n")
+    text_lines = read_text(file, _LARGEST_FILE, "give the path of a CSV file").split("\n")
     filled = [number for number, line in enumerate(text_lines) if line.strip(" \t,;")]
     if not filled:
         raise InputError(f"{file}: the file is empty; line 1 must be the header, e.g. q1[rad],x[mm]")
     header = text_lines[filled[0]]
     separator = max(",;\t", key=header.count)
     units: dict[str, str] = {}
-    for cell in next(csv.reader([header], delimiter=separator)):
+    for number, cell in enumerate(_cells([header], separator, file, np.array([filled[0] + 1]))[0], 1):
+        _check_header(cell, number, file)
         name, unit = parse_header(cell, file, (si_units or {}).get(cell.strip()))
         if name in units:
             raise InputError(f"{file}: column '{name}' stands twice in the header; remove or rename one of them")
@@ -184,24 +199,13 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
         raise InputError(f"{path}: cannot be written: {reason.strerror}") from None
 
 
-def _read_text(file: str) -> str:
-    try:
-        return Path(file).read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file; give the path of a CSV file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{file}: the file is not UTF-8 text; save it as 'CSV UTF-8'") from None
-    except OSError as reason:
-        raise InputError(f"{file}: cannot be read: {reason.strerror}") from None
-
-
 def _read_cells(
     rows: list[str], separator: str, width: int, file: str, lines: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], dict[tuple[int, int], str]]:
     """The slow way, cell by cell, for a file in which something is wrong: finds out what and where."""
     values = np.full((len(rows), width), np.nan)
     bad: dict[tuple[int, int], str] = {}
-    for row, cells in enumerate(csv.reader(rows, delimiter=separator)):
+    for row, cells in enumerate(_cells(rows, separator, file, lines)):
         if len(cells) != width:
             comma = "; with a decimal comma, separate the cells by semicolons" if separator == "," else ""
             counts = f"has {len(cells)} cells, but the header names {width} columns"
@@ -212,3 +216,31 @@ def _read_cells(
             except ValueError:
                 bad[row, column] = cell.strip()
     return values, bad
+
+
+def _cells(rows: list[str], separator: str, file: str, lines: NDArray[np.int64]) -> list[list[str]]:
+    """Each row's cells; a line of the file is a row, also where a quote is opened and not closed."""
+    found = []
+    for number, row in enumerate(rows):
+        try:
+            found.append(next(csv.reader([row], delimiter=separator), []))
+        except csv.Error as reason:
+            raise InputError(f"{file}: {name_lines(lines, [number])} is no line of a CSV file: {reason}") from None
+    return found
+
+
+def _check_header(header: str, number: int, file: str) -> None:
+    """Refuse what cannot stand on a screen, or would be a formula in the spreadsheet that opens what we write."""
+    name = header.strip()
+    if len(name) > _LONGEST_HEADER:
+        raise InputError(
+            f"{file}: the header of column {number} has {len(name)} characters, '{visible(name, 40)}'; "
+            "is line 1 the header? Give names as q1[rad]"
+        )
+    if not all(map(is_shown, name)):
+        raise InputError(f"{file}: the header '{visible(name)}' of column {number} has a control character; remove it")
+    if name.startswith(("=", "+", "-", "@")):
+        raise InputError(
+            f"{file}: the header '{name}' of column {number} begins like a formula, which a spreadsheet would run; "
+            "begin the name with a letter"
+        )

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners.ccnn import CCNNSettings
-from ccnn_torch.runs._yaml import dump_yaml, parse_yaml
+from ccnn_torch._yaml import dump_yaml, parse_yaml
 from ccnn_torch.runs.config import (
     METHODS,
     RunConfig,

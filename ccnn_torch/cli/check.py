@@ -41,7 +41,7 @@ def check(
     """
     from ccnn_torch.report.table_form import print_table
     from ccnn_torch.runs.diagnose import check_table, check_text, run_check, write_check
-    from ccnn_torch.runs.screen import stdout
+    from ccnn_torch.runs.screen import say, stdout
 
     with if_stopped(NOTHING_WRITTEN):
         wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)
@@ -51,6 +51,6 @@ def check(
     if quiet:
         return
     for line in check_text(found):
-        typer.echo(line)
+        say(line)
     if found.confusable:
         print_table(check_table(found), stdout)

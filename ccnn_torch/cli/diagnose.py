@@ -88,11 +88,12 @@ def _tell(wanted: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -
     from ccnn_torch.diagnosis import with_network
     from ccnn_torch.report.diagnosis_data import about_of, load_labels
     from ccnn_torch.report.diagnosis_report import print_diagnosis
+    from ccnn_torch.report.table_form import print_text
     from ccnn_torch.runs.diagnose import write_diagnosis
-    from ccnn_torch.runs.screen import stdout
+    from ccnn_torch.runs.screen import say_place, stdout
 
     if not quiet:
-        stdout.print(found.verdict["text"], style="bold", markup=False)
+        print_text(found.verdict["text"], stdout, "bold")
     if wanted.network:
 
         def train(tell: Callable[[str], None]) -> Diagnosis:
@@ -104,4 +105,4 @@ def _tell(wanted: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -
     if quiet:
         return
     print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False)
-    typer.echo(f"Written: {path} and report.html beside it")
+    say_place(f"Written: {path} and report.html beside it")

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 
 from ccnn_torch.report.comparison_tables import comparison_table, method_label, pose_by_method_table, reach_table
 from ccnn_torch.report.csv_file import write_csv
 from ccnn_torch.report.display import count_text, display_unit, interval_text, number_text, removed_percent
 from ccnn_torch.report.paper_tables import PAPER, PaperCase
-from ccnn_torch.report.table_form import Table, print_table
+from ccnn_torch.report.table_form import Table, print_table, print_text
 
 __all__ = [
     "Table",
@@ -82,10 +81,10 @@ def print_tables(results: Results, console: Console) -> None:
     for table in result_tables(results):
         print_table(table, console)
     for sentence in cautions(results):
-        console.print(escape(sentence), style="yellow")
+        print_text(sentence, console, "yellow")
     for note in results.get("notes", []):
-        console.print(escape(note), style="dim")
-    console.print(escape(verdict(results)), style="bold")
+        print_text(note, console, "dim")
+    print_text(verdict(results), console, "bold")
 
 
 def markdown_table(table: Table) -> str:

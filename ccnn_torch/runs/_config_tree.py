@@ -8,10 +8,10 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
+from ccnn_torch._yaml import read_yaml
 from ccnn_torch.errors import InputError
 from ccnn_torch.runs._keys import explain
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
-from ccnn_torch.runs._yaml import read_yaml
 
 __all__ = ["Names", "Section", "config_from_file", "config_from_keys", "config_from_options", "validated"]
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from ccnn_torch._yaml import check_values, parse_yaml
 from ccnn_torch.errors import InputError
-from ccnn_torch.runs._yaml import parse_yaml
 
 __all__ = ["apply_overrides", "resolve_paths"]
 
@@ -39,6 +39,7 @@ def apply_overrides(tree: dict[str, Any], overrides: Iterable[str], folder: Path
             raise InputError(f"'{override}': write key=value, e.g. seed=1 or split.test=0.2")
         plain = key in _TEXT or (key == "effects" and text.startswith(_FROM))
         value = text if plain and text not in ("", "null", "~") else parse_yaml(text, f"'{override}'")
+        check_values([key, value], f"'{override}'")
         node = tree
         for depth, step in enumerate(steps[:-1]):
             if node.get(step) is None:

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from ccnn_torch._table import nearest
+from ccnn_torch._yaml import dump_yaml
 from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.enn import ENNSettings
@@ -20,7 +21,6 @@ from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.runs._config_tree import Names, Section, config_from_file, config_from_keys
 from ccnn_torch.runs._keys import list_keys
-from ccnn_torch.runs._yaml import dump_yaml
 
 __all__ = [
     "METHODS",

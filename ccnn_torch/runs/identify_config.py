@@ -12,9 +12,9 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from ccnn_torch._table import nearest
+from ccnn_torch._yaml import dump_yaml
 from ccnn_torch.runs._config_tree import Names, Section, config_from_file, config_from_keys
 from ccnn_torch.runs._keys import list_keys
-from ccnn_torch.runs._yaml import dump_yaml
 
 __all__ = [
     "IDENTIFY_METHODS",

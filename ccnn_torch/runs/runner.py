@@ -14,7 +14,7 @@ from ccnn_torch.runs.config import RunConfig, dump_config, load_config
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.outputs import write_outputs
 from ccnn_torch.runs.prepare import Prepared, prepare
-from ccnn_torch.runs.screen import note, stdout
+from ccnn_torch.runs.screen import note, say_place, stdout
 from ccnn_torch.runs.watch import HeldOut, ProgressBar
 from ccnn_torch.training import Callback, Scaling, past_of
 
@@ -80,4 +80,4 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, 
     write_outputs(calibration, folder)
     if tables and not quiet:
         print_tables(calibration.results, stdout)
-        stdout.print(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")
+        say_place(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")

@@ -11,18 +11,18 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from ccnn_torch._yaml import read_yaml
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.suite import compare, write_suite
 from ccnn_torch.report.suite_tables import case_line, print_suite
 from ccnn_torch.runs._config_tree import validated
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
-from ccnn_torch.runs._yaml import read_yaml
 from ccnn_torch.runs.calibrate import makers
 from ccnn_torch.runs.config import RunConfig, load_config
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.runner import resume_run, start_run
-from ccnn_torch.runs.screen import note, stdout
+from ccnn_torch.runs.screen import note, say_place, stdout
 
 __all__ = ["Suite", "load_suite", "run_suite"]
 
@@ -126,7 +126,7 @@ def run_suite(suite: Suite, quiet: bool = False) -> Path:
     path = write_suite(suite.out, comparison)
     if not quiet:
         print_suite(comparison, stdout)
-        stdout.print(f"Everything is in {suite.out}")
+        say_place(f"Everything is in {suite.out}")
     return path
 
 

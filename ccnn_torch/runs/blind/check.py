@@ -19,7 +19,7 @@ from ccnn_torch.report.json_files import read_json, write_json
 from ccnn_torch.runs.blind.folder import BlindFolder
 from ccnn_torch.runs.blind.machines import MACHINES
 from ccnn_torch.runs.blind.plan import KINDS, plan_cases
-from ccnn_torch.runs.screen import note, stdout
+from ccnn_torch.runs.screen import note, say_place, stdout
 
 __all__ = ["Diagnoser", "run_blind_check"]
 
@@ -96,7 +96,7 @@ def run_blind_check(
     path = write_blind(folder.path, found)
     if not quiet:
         print_blind(found, stdout)
-        stdout.print(f"Everything is in {folder.path}")
+        say_place(f"Everything is in {folder.path}")
     return path
 
 

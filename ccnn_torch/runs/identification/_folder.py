@@ -15,7 +15,7 @@ from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.identification._identify import Identification, identify
 from ccnn_torch.runs.identification._outputs import RESULTS, write_outputs
 from ccnn_torch.runs.identify_config import IdentifyConfig, dump_identify_config, load_identify_config
-from ccnn_torch.runs.screen import note, stderr, stdout
+from ccnn_torch.runs.screen import note, say_place, stderr, stdout
 
 __all__ = ["resume_identification", "start_identification"]
 
@@ -66,7 +66,7 @@ def _run(config: IdentifyConfig, path: Path, quiet: bool) -> Identification:
     write_outputs(found, path)
     if not quiet:
         print_identified(found.results, stdout)
-        stdout.print(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
+        say_place(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
     if found.results["methods"][found.results["method"]]["converged"] == 0:
         raise MethodFailedError(
             f"{not_settled(found.results)} What was written to {path} is there to look into it, not to use; more rows, "
@@ -83,7 +83,7 @@ class _Bars:
 
     def __post_init__(self) -> None:
         self._bar = Bar(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             TaskProgressColumn(),
             TimeRemainingColumn(),
