@@ -79,7 +79,5 @@ def _column(records: Records, condition: Condition) -> np.ndarray[tuple[int], np
         raise InputError(f"{where} is empty at {records.name_rows(empty[:1])}, and the simulator takes it; fill it in")
     far = np.flatnonzero(np.abs(values) > LARGEST)
     if len(far):
-        raise InputError(
-            f"{where} has {values[far[0]]:g} at {records.name_rows(far[:1])}, larger than what is measured"
-        )
+        raise InputError(f"{where} has {values[far[0]]:g} at {records.name_rows(far[:1])}, which is nothing measured")
     return np.array(values, dtype=np.float64).reshape(-1)

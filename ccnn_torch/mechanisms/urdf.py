@@ -112,10 +112,8 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
     joints = root.findall("joint")
     parent_joint = {_link(path, j, "child"): j for j in joints}
     if len(parent_joint) < len(joints):
-        children = Counter(_link(path, j, "child") for j in joints)
-        raise InputError(
-            f"{path}: link '{children.most_common(1)[0][0]}' is the child of several joints; a chain has one"
-        )
+        twice = Counter(_link(path, j, "child") for j in joints).most_common(1)[0][0]
+        raise InputError(f"{path}: link '{twice}' is the child of several joints; a chain has one")
     parents = {_link(path, j, "parent") for j in joints}
     known = [str(link.get("name")) for link in root.findall("link")]
     for link in (base, tip):
@@ -134,9 +132,7 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
         chain.append(parent_joint[link])
         link = _link(path, parent_joint[link], "parent")
     if len(chain) > len(joints):
-        raise InputError(
-            f"{path}: the joints above link '{tip}' form a loop; a chain begins at a link without a parent"
-        )
+        raise InputError(f"{path}: the joints above link '{tip}' form a loop; a chain begins at a link with no parent")
     if base is not None and link != base:
         raise InputError(f"{path}: link '{tip}' does not hang on link '{base}'; give another base= or tip=")
     return chain[::-1]
