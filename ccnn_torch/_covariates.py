@@ -16,7 +16,7 @@ from ccnn_torch.units import si_unit_of, to_si
 __all__ = ["DEFAULT_COVARIATES", "choose_covariates"]
 
 # A cell so many times farther from the column's median than every other one leaves nothing of the others to learn.
-_GIANT = 1e4
+_GIANT = 1e3
 # A column that varies by less than this share is constant but for how its numbers were written.
 _SAME = 1e-14
 
@@ -78,7 +78,7 @@ def _refuse_lone_giant(values: NDArray[np.float64], name: str, table: Table) -> 
     if first > _GIANT * second > 0:
         row = int(order[-1])
         raise InputError(
-            f"{table.path}: column '{name}' has {table.raw(name)[row]:g} {table.units[name]} at "
+            f"{table.path}: column '{name}' has {table.cell(name, row)} at "
             f"{name_lines(table.lines, [row])}, {first / second:.0e} times as far from the rest as any other cell; "
             "correct the cell or remove the row"
         )

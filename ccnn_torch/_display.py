@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import unicodedata
+from pathlib import PurePath
 
-__all__ = ["count_text", "display_unit", "is_shown", "number_text", "unit_text", "visible"]
+__all__ = ["count_text", "display_unit", "is_shown", "number_text", "short_path", "unit_text", "visible"]
 
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
@@ -66,3 +67,8 @@ def visible(text: str, longest: int = 200) -> str:
 def is_shown(character: str) -> bool:
     """Whether a character is one that a person sees, or a space."""
     return character.isprintable() or unicodedata.category(character) == "Zs"
+
+
+def short_path(path: str) -> str:
+    """A file's folder and name: enough to know it by, and nothing of the machine on which a page was made."""
+    return "/".join(PurePath(path).parts[-2:])

@@ -66,6 +66,11 @@ class Table:
         """The column in its own unit, `rows`, NaN where a cell is empty or no number."""
         return self.values[:, self.names.index(name)]
 
+    def cell(self, name: str, row: int) -> str:
+        """A number of the column as written, with its unit."""
+        unit = self.units[name]
+        return f"{self.raw(name)[row]:g}{'' if unit == '1' else ' ' + unit}"
+
     def column(self, name: str, si_unit: str | None = None) -> NDArray[np.float64]:
         """A column in SI, `rows`, every value finite.
 
@@ -94,7 +99,7 @@ class Table:
         far = np.flatnonzero(np.abs(converted) > LARGEST)
         if len(far):
             raise InputError(
-                f"{self.path}: column '{name}' has {values[far[0]]:g} {self.units[name]} at "
+                f"{self.path}: column '{name}' has {self.cell(name, int(far[0]))} at "
                 f"{name_lines(self.lines, far)}, larger than anything that is measured; correct or remove "
                 f"{'it' if len(far) == 1 else 'them'}, or check the unit"
             )

@@ -222,7 +222,7 @@ def test_bad_override(tmp_path: Path, override: str, parts: tuple[str, ...]) -> 
         ("case: tripod\ncase: tripod", ("line 2", "duplicate key")),
         ("case: [tripod", ("line 1", "not valid YAML")),
         ("case: tripod\n\tseed: 1", ("line 2", "not valid YAML")),
-        ("case: !!python/name:os.system x", ("not valid YAML",)),
+        ("case: !!python/name:os.system x", ("line 1", "tags such as",)),
         ("name: 2026-13-45", ("not valid YAML",)),
         ("name: \x00", ("not valid YAML",)),
     ],
@@ -233,7 +233,7 @@ def test_bad_file(tmp_path: Path, text: str, parts: tuple[str, ...]) -> None:
 
 
 def test_unreadable_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.yaml: cannot be read: No such file"):
+    with pytest.raises(InputError, match=r"none\.yaml: there is no such file"):
         load_config(tmp_path / "none.yaml")
     (tmp_path / "latin.yaml").write_bytes("name: é".encode("latin-1"))
     with pytest.raises(InputError, match="not UTF-8"):

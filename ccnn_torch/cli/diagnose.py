@@ -85,6 +85,7 @@ def _search(wanted: DiagnoseConfig, quiet: bool) -> Diagnosis:
 
 def _tell(wanted: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -> None:
     """The verdict at once, then all that takes longer."""
+    from ccnn_torch._display import short_path
     from ccnn_torch.diagnosis import with_network
     from ccnn_torch.report.diagnosis_data import about_of, load_labels
     from ccnn_torch.report.diagnosis_report import print_diagnosis
@@ -100,7 +101,8 @@ def _tell(wanted: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -
             return with_network(found, wanted.seed, lambda share: tell(f"{100 * share:.0f} %"))
 
         found = watched("training a network on what the effects leave …", train, quiet)
-    about = {"name": folder.name, "mechanism": str(wanted.mechanism), "records": str(wanted.records)}
+    machine, rows = (short_path(str(name)) for name in (wanted.mechanism, wanted.records))
+    about = {"name": folder.name, "mechanism": machine, "records": rows}
     path = write_diagnosis(folder, found, about, wanted.seed)
     if quiet:
         return

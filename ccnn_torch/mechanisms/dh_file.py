@@ -147,5 +147,5 @@ class _Table:
 
 def _number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
-        raise InputError(f"{where} must be a finite number up to {LARGEST:g}, got {visible(repr(value))}")
+        raise InputError(f"{where} must be a finite number, got {visible(repr(value))}")
     return float(value)

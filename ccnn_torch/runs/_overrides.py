@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from ccnn_torch._yaml import check_values, parse_yaml
 from ccnn_torch.errors import InputError
 
-__all__ = ["apply_overrides", "resolve_paths"]
+__all__ = ["apply_overrides", "relate_paths", "resolve_paths"]
 
 # Keys whose value is text however it looks: a path may hold a colon, a name may be 2024.
 _TEXT = ("name", "out", "records", "transfer", "mechanism")
@@ -59,16 +59,34 @@ def resolve_paths(tree: dict[str, Any], folder: Path) -> None:
         tree[key] = _resolve(key, tree[key], folder)
 
 
+def relate_paths(tree: dict[str, Any], folder: Path) -> None:
+    """Make the paths in a tree relative to `folder`, in place: a folder that is moved with its data is still right."""
+    start = os.path.realpath(folder)
+
+    def related(path: str) -> str:
+        # Links above the file are followed, as `..` would; the file itself may be one and keeps its name.
+        above, name = os.path.split(os.path.abspath(path))
+        return Path(os.path.relpath(os.path.join(os.path.realpath(above), name), start)).as_posix()
+
+    for key in tree:
+        tree[key] = _changed(key, tree[key], related)
+
+
 def _resolve(key: str, value: Any, folder: Path) -> Any:
+    return _changed(key, value, lambda path: os.path.abspath(folder / Path(path).expanduser()))
+
+
+def _changed(key: str, value: Any, change: Callable[[str], str]) -> Any:
+    """The value of a key with each path in it changed."""
     if key == "auto" and isinstance(value, dict):
-        return {name: _resolve(f"auto.{name}", entry, folder) for name, entry in value.items()}
+        return {name: _changed(f"auto.{name}", entry, change) for name, entry in value.items()}
     if key in _PLUGINS and isinstance(value, list):
-        return [_resolve(key, entry, folder) for entry in value]
+        return [_changed(key, entry, change) for entry in value]
     if key == "effects" and isinstance(value, str) and value.startswith(_FROM):
-        return _FROM + os.path.abspath(folder / Path(value.removeprefix(_FROM).strip()).expanduser())
+        return _FROM + change(value.removeprefix(_FROM).strip())
     if not isinstance(value, str) or not _is_path(key, value):
         return value
-    return os.path.abspath(folder / Path(value).expanduser())
+    return change(value)
 
 
 def _is_path(key: str, value: str) -> bool:

@@ -13,13 +13,12 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from ccnn_torch._table import nearest
-from ccnn_torch._yaml import dump_yaml
 from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.enn import ENNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
-from ccnn_torch.runs._config_tree import Names, Section, config_from_file, config_from_keys
+from ccnn_torch.runs._config_tree import Names, Section, config_from_file, config_from_keys, written
 from ccnn_torch.runs._keys import list_keys
 
 __all__ = [
@@ -322,9 +321,9 @@ def make_config(**keys: Any) -> RunConfig:
     return config_from_keys(RunConfig, keys)
 
 
-def dump_config(config: RunConfig) -> str:
-    """The resolved config as YAML, every key written out; `load_config` of it gives an equal config."""
-    return dump_yaml(config.model_dump(mode="json"))
+def dump_config(config: RunConfig, folder: Path | None = None) -> str:
+    """The resolved config as YAML; `load_config` of it gives an equal config. Paths are relative to `folder` if given."""
+    return written(config, folder)
 
 
 def method_names(config: RunConfig) -> list[str]:

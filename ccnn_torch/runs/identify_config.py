@@ -12,8 +12,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from ccnn_torch._table import nearest
-from ccnn_torch._yaml import dump_yaml
-from ccnn_torch.runs._config_tree import Names, Section, config_from_file, config_from_keys
+from ccnn_torch.runs._config_tree import Names, Section, config_from_file, config_from_keys, written
 from ccnn_torch.runs._keys import list_keys
 
 __all__ = [
@@ -311,9 +310,9 @@ def make_identify_config(**keys: Any) -> IdentifyConfig:
     return config_from_keys(IdentifyConfig, keys)
 
 
-def dump_identify_config(config: IdentifyConfig) -> str:
-    """The resolved config as YAML, every key written out; `load_identify_config` of it gives an equal config."""
-    return dump_yaml(config.model_dump(mode="json"))
+def dump_identify_config(config: IdentifyConfig, folder: Path | None = None) -> str:
+    """The resolved config as YAML; `load_identify_config` of it gives an equal config. Paths are relative to `folder` if given."""
+    return written(config, folder)
 
 
 def describe_identify_keys() -> list[tuple[str, str, str]]:

@@ -34,7 +34,7 @@ def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> Ru
     makers(config)
     prepared = prepare(config)
     folder = RunFolder.create(config.out, config.name)
-    folder.write_text("config.yaml", dump_config(config))
+    folder.write_text("config.yaml", dump_config(config, folder.path))
     _run(config, prepared, folder, quiet, tables)
     return folder
 

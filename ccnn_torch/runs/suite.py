@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
@@ -74,7 +75,7 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
     path = Path(path)
     tree = read_yaml(path)
     tree.setdefault("name", path.stem)
-    resolve_paths(tree, path.absolute().parent)
+    resolve_paths(tree, Path(os.path.realpath(path.parent)))
     overrides = list(overrides)
     own = [text for text in overrides if text.partition("=")[0].strip() in _OWN]
     given = apply_overrides(tree, own, Path.cwd())
@@ -85,7 +86,7 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
     for number, keys in enumerate(file.cases, 1):
         name = _name(keys, f"{path}: case {number}", cases)
         case = _merged(_DEFAULTS, _merged(file.base, keys)) | {"name": name}
-        resolve_paths(case, path.absolute().parent)
+        resolve_paths(case, Path(os.path.realpath(path.parent)))
         changed = apply_overrides(case, others, Path.cwd())
         cases[name] = validated(RunConfig, case | {"out": str(out / name)}, f"{path}, case '{name}'", changed)
     return Suite(file.name, out, cases)

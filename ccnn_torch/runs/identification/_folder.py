@@ -29,7 +29,7 @@ def start_identification(config: IdentifyConfig, quiet: bool = False) -> Path:
     """
     folder = RunFolder.create(config.out, config.name, "ccnn identify --resume")
     try:
-        folder.write_text("config.yaml", dump_identify_config(config))
+        folder.write_text("config.yaml", dump_identify_config(config, folder.path))
         _run(config, folder.path, quiet)
     except InputError:
         # Nothing was computed: the next try may take the same name.

@@ -75,7 +75,7 @@ class Identification:
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / "config.yaml", dump_identify_config(self.config).encode())
+        write_whole(folder / "config.yaml", dump_identify_config(self.config, folder).encode())
         write_outputs(self, folder)
 
     def nominal(self) -> dict[str, float]:
