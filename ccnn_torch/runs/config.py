@@ -322,7 +322,7 @@ def make_config(**keys: Any) -> RunConfig:
 
 
 def dump_config(config: RunConfig, folder: Path | None = None) -> str:
-    """The resolved config as YAML; `load_config` of it gives an equal config. Paths are relative to `folder` if given."""
+    """The resolved config as YAML, its paths relative to `folder` if given; `load_config` of it gives an equal one."""
     return written(config, folder)
 
 

@@ -172,8 +172,8 @@ def fit_effects(
         care = settled_effects(there, moving[0], names, limit, margin, weight, damping).care
     named = ", ".join(k.effect.name for k in known)
     notes.append(
-        f"Effects of {short_path(verdict.path)}: {named}. Their coefficients were fitted anew to the training rows of each repeat; "
-        "their periods and other shapes are the file's, which may have seen the held-out rows."
+        f"Effects of {short_path(verdict.path)}: {named}. Their coefficients were fitted anew to the training rows of "
+        "each repeat; their periods and other shapes are the file's, which may have seen the held-out rows."
     )
     found = KnownEffects(short_path(verdict.path), situations, moving, acting, names, care)
     return found, None if torch.equal(changed, base_all) else changed, notes
