@@ -10,18 +10,18 @@ __all__ = ["count_text", "display_unit", "is_shown", "number_text", "short_path"
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 
-def display_unit(unit: str, magnitude: float) -> tuple[float, str]:
+def display_unit(unit: str, magnitude: float | None) -> tuple[float, str]:
     """The prefixed unit for numbers of about this magnitude.
 
     Args:
         unit: `m` or `rad`; any other SI unit stays, written as in print.
         magnitude: a typical number [unit]; 1e-3 and more is shown in mm or mrad, less in µm or µrad, less than 1e-7 in
-            nm or nrad.
+            nm or nrad; None where it is not known.
 
     Returns:
         Divide a number by the first to have it in the second.
     """
-    if unit not in ("m", "rad"):
+    if unit not in ("m", "rad") or magnitude is None:
         return 1.0, unit_text(unit)
     wanted = (10.0, 1e-3, 1e-7, 0.0)
     scale, prefix = next(

@@ -116,6 +116,8 @@ def _text(block: Block | None, key: str, scale: float = 1.0, digits: int = 3) ->
 
 
 def _with_unit(block: Block, key: str) -> str:
+    if block[key] is None:
+        return "unknown"
     scale, unit = display_unit(block["unit"], block[key])
     return f"{number_text(block[key] / scale, 3)} {unit}"
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from rich.console import Console
 
+from ccnn_torch._display import visible
 from ccnn_torch.report.comparison_tables import comparison_table, method_label, pose_by_method_table, reach_table
 from ccnn_torch.report.csv_file import write_csv
 from ccnn_torch.report.display import count_text, display_unit, interval_text, number_text, removed_percent
@@ -90,7 +91,8 @@ def print_tables(results: Results, console: Console) -> None:
 def markdown_table(table: Table) -> str:
     """One table as Markdown: title, rows, and the sentence below."""
     head, *lines = (
-        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (table.columns, *table.rows)
+        "| " + " | ".join(visible(cell).replace("|", "\\|") for cell in line) + " |"
+        for line in (table.columns, *table.rows)
     )
     rule = "| " + " | ".join(["---", *["---:"] * (len(table.columns) - 1)]) + " |"
     return "\n\n".join([f"## {table.title}", "\n".join([head, rule, *lines]), *([table.note] if table.note else [])])

@@ -311,7 +311,7 @@ def make_identify_config(**keys: Any) -> IdentifyConfig:
 
 
 def dump_identify_config(config: IdentifyConfig, folder: Path | None = None) -> str:
-    """The resolved config as YAML, its paths relative to `folder` if given; `load_identify_config` of it gives an equal one."""
+    """The resolved config as YAML, paths relative to `folder` if given; `load_identify_config` gives an equal one."""
     return written(config, folder)
 
 
