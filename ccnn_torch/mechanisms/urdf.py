@@ -15,7 +15,7 @@ from ccnn_torch._display import visible
 from ccnn_torch._reading import read_bytes
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._links import compose
-from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.mechanisms.serial import MOST_JOINTS, SerialArm
 from ccnn_torch.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_rotation_vector
 from ccnn_torch.units import LARGEST
 
@@ -46,6 +46,8 @@ def read_urdf(
     """
     root = _parsed(path)
     chain = _chain(path, root, base, tip)
+    if len(chain) > 2 * MOST_JOINTS:
+        raise InputError(f"{path}: the chain has {len(chain)} joints; up to {MOST_JOINTS} that move can be handled")
     links: list[list[float]] = []
     axes: list[list[float]] = []
     types: list[str] = []
