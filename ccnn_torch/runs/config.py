@@ -156,7 +156,7 @@ class RunConfig(_Part):
     """A run: data, split, methods and their settings."""
 
     name: str = Field(default="run", min_length=1, description="name of the run; default: the config file's name")
-    seed: int = Field(default=0, ge=0, lt=2**53, description="seed of the first repeat; repeat k has seed + k")
+    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the first repeat; repeat k has seed + k")
     repeats: int = Field(
         default=1, ge=1, description="independent repeats, side by side: new noise, split and start each"
     )

@@ -156,7 +156,7 @@ class IdentifyConfig(Section):
     name: str = Field(
         default="identification", min_length=1, description="name of the run; default: the config file's name"
     )
-    seed: int = Field(default=0, ge=0, lt=2**53, description="seed of the first machine; machine k has seed + k")
+    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the first machine; machine k has seed + k")
     out: str | None = Field(default=None, description="folder to write; default runs/NAME-STAMP")
     mechanism: str = Field(
         default="",
