@@ -255,7 +255,11 @@ def test_make_config_is_checked_too() -> None:
 @settings(deadline=None)
 @given(
     st.recursive(
-        st.none() | st.booleans() | st.floats(allow_nan=False) | st.integers() | st.text(st.characters(codec="utf-8")),
+        st.none()
+        | st.booleans()
+        | st.floats(allow_nan=False)
+        | st.integers()
+        | st.text(st.characters(codec="utf-8", exclude_characters="\0")),
         lambda part: st.lists(part, max_size=3) | st.dictionaries(st.text("abc_.", min_size=1), part, max_size=3),
         max_leaves=8,
     )
