@@ -5,12 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ccnn_torch._table import FILE, Table, nearest
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.units import parse_header, si_unit_of, to_si
 
 __all__ = ["DEFAULT_COVARIATES", "choose_covariates"]
+
+# A cell so many times farther from the column's median than every other one leaves nothing of the others to learn.
+_GIANT = 1e3
+# A column that varies by less than this share is constant but for how its numbers were written.
+_SAME = 1e-14
 
 DEFAULT_COVARIATES = ("time", "temperature", "load_*", "direction*", "speed*")
 
@@ -30,7 +38,8 @@ def choose_covariates(
         Covariates in the file's order, constant ones left out, and notes on what was left out and why.
 
     Raises:
-        InputError: a wanted column is missing, is a joint or a pose column, or a column has the wrong dimension.
+        InputError: a wanted column is missing, is a joint or a pose column, or a column has the wrong dimension; one
+            cell dwarfs all others of its column.
     """
     taken = {coordinate.name for coordinate in joints} | set(pose)
     free = [name for name in table.names if name not in taken]
@@ -44,7 +53,8 @@ def choose_covariates(
     for name in chosen:
         coordinate = Coordinate(name, _si_unit(name, table, pose))
         values = table.column(name, coordinate.unit)
-        if values.min() == values.max():
+        _refuse_lone_giant(values, name, table)
+        if np.ptp(values) <= _SAME * max(np.abs(values).max(), 1.0):
             notes.append(f"covariate '{name}' is constant ({table.raw(name)[0]:g} {table.units[name]}) and was dropped")
         else:
             covariates.append(coordinate)
@@ -57,6 +67,22 @@ def choose_covariates(
         if wanted is None and meant is not None and meant not in table:
             notes.append(f"the ignored column '{name}' looks like '{meant}'; rename it if that is meant")
     return tuple(covariates), notes
+
+
+def _refuse_lone_giant(values: NDArray[np.float64], name: str, table: Table) -> None:
+    """Refuse a column of which one cell decides alone: scaled to it, all others are the same."""
+    if len(values) < 3:
+        return
+    away = np.abs(values - np.median(values))
+    order = np.argsort(away)
+    first, second = away[order[-1]], away[order[-2]]
+    if first > _GIANT * second > 0:
+        row = int(order[-1])
+        raise InputError(
+            f"{table.path}: column '{name}' has {table.cell(name, row)} at "
+            f"{table.name_rows([row])}, {first / second:.0e} times as far from the rest as any other cell; "
+            "correct the cell or remove the row"
+        )
 
 
 def _matches(name: str, patterns: Sequence[str]) -> bool:

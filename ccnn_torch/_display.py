@@ -1,24 +1,27 @@
-"""SI numbers as people read them: the unit that gives 1 to 999, four digits."""
+"""SI numbers as people read them: the unit that gives 1 to 999, four digits; and text that may be shown at all."""
 
 from __future__ import annotations
 
-__all__ = ["count_text", "display_unit", "number_text", "unit_text"]
+import unicodedata
+from pathlib import PurePath
+
+__all__ = ["count_text", "display_unit", "is_shown", "number_text", "short_path", "unit_text", "visible"]
 
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 
-def display_unit(unit: str, magnitude: float) -> tuple[float, str]:
+def display_unit(unit: str, magnitude: float | None) -> tuple[float, str]:
     """The prefixed unit for numbers of about this magnitude.
 
     Args:
         unit: `m` or `rad`; any other SI unit stays, written as in print.
         magnitude: a typical number [unit]; 1e-3 and more is shown in mm or mrad, less in µm or µrad, less than 1e-7 in
-            nm or nrad.
+            nm or nrad; None where it is not known.
 
     Returns:
         Divide a number by the first to have it in the second.
     """
-    if unit not in ("m", "rad"):
+    if unit not in ("m", "rad") or magnitude is None:
         return 1.0, unit_text(unit)
     wanted = (10.0, 1e-3, 1e-7, 0.0)
     scale, prefix = next(
@@ -48,3 +51,24 @@ def number_text(value: float | None, digits: int = 4) -> str:
 def count_text(count: int, word: str) -> str:
     """`1 repeat`, `30 repeats`."""
     return f"{count} {word}" if count == 1 else f"{count} {word}s"
+
+
+def visible(text: str, longest: int = 200) -> str:
+    """Text from outside as it may stand on a screen or a page: what a terminal would obey is shown as its code.
+
+    Control characters, marks that turn the direction of writing, and halves of pairs become \\x1b or \\u202e; of a text
+    that is too long the middle is left out, since a sentence has the place at its begin and the remedy at its end.
+    """
+    if len(text) > longest:
+        text = f"{text[: longest * 2 // 3]} … {text[len(text) - longest // 3 :]}"
+    return "".join(c if is_shown(c) else c.encode("unicode_escape").decode() for c in text)
+
+
+def is_shown(character: str) -> bool:
+    """Whether a character is one that a person sees, or a space."""
+    return character.isprintable() or unicodedata.category(character) == "Zs"
+
+
+def short_path(path: str) -> str:
+    """A file's folder and name: enough to know it by, and nothing of the machine on which a page was made."""
+    return "/".join(PurePath(path).parts[-2:])

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from ccnn_torch._display import is_shown, visible
 from ccnn_torch._table import nearest
 from ccnn_torch.errors import InputError
 from ccnn_torch.units import si_unit_of, split_header, to_si
 
 __all__ = ["IGNORE", "Header", "read_header"]
 
+# Characters of a name.
+_LONGEST = 100
 IGNORE = "ignore"
 """What a map of columns says of a column that is to be left out."""
 
@@ -60,6 +63,7 @@ def read_header(cells: Sequence[str], file: str, columns: Mapping[str, str] | No
         elif not name and unit:
             raise InputError(f"{file}: the header '{cell}' has a unit but no name; write name[{unit}]")
         name = name or f"column {k + 1}"
+        _check_name(name, k + 1, file)
         if name in units:
             if targets:
                 raise InputError(
@@ -71,6 +75,21 @@ def read_header(cells: Sequence[str], file: str, columns: Mapping[str, str] | No
         first[name] = cell.strip()
         kept.append(k)
     return Header(units, kept, len(cells))
+
+
+def _check_name(name: str, number: int, file: str) -> None:
+    """Refuse what cannot stand on a screen, or would be a formula in the spreadsheet that opens what we write."""
+    wrong = ""
+    if len(name) > _LONGEST:
+        wrong = f"has {len(name)} characters; is line 1 the header?"
+    elif not all(map(is_shown, name)):
+        wrong = "has a control character"
+    elif name.startswith(("=", "+", "-", "@")):
+        wrong = "begins like a formula, which a spreadsheet would run"
+    if wrong:
+        raise InputError(
+            f"{file}: the header '{visible(name, 40)}' of column {number} {wrong}; give it a name such as q1[rad]"
+        )
 
 
 def _targets(cells: Sequence[str], file: str, columns: Mapping[str, str]) -> dict[int, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import io
 import re
 import warnings
 import zlib
@@ -16,11 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch._headers import Header, read_header
+from ccnn_torch._reading import read_bytes
 from ccnn_torch._table import Table, name_lines
 from ccnn_torch.errors import InputError
 
 __all__ = ["Frame", "read_frame", "read_table"]
 
+# Bytes; a million rows of twenty columns. Read, it takes some ten times that in memory.
+_LARGEST_FILE = 500_000_000
 # What a damaged workbook makes openpyxl, zipfile and the XML parser raise.
 _DAMAGED = (
     *(BadZipFile, EOFError, KeyError, IndexError, ValueError, TypeError, AttributeError, SyntaxError, zlib.error),
@@ -69,7 +73,7 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Ta
         raise InputError(f"{file}: the file is empty; line 1 must be the header, e.g. q1[rad],x[mm]")
     first = text_lines[filled[0]]
     separator = max(",;\t", key=first.count)
-    header = read_header(next(_split([first], separator, file)), file, columns)
+    header = read_header(next(_split([first], separator, file, [filled[0] + 1])), file, columns)
     rows = [text_lines[number] for number in filled[1:]]
     if not rows:
         raise InputError(f"{file}: there is a header but no row below it")
@@ -83,15 +87,19 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Ta
     except ValueError:
         uniform = False
     if not uniform:
-        values, bad = _read_cells(_split(rows, separator, file), header, file, lines, separator)
+        values, bad = _read_cells(_split(rows, separator, file, lines), header, file, lines, separator)
     return _kept(file, header, values, lines, bad, notes)
 
 
-def _split(rows: Sequence[str], separator: str, file: str) -> Iterator[list[str]]:
-    try:
-        yield from csv.reader(rows, delimiter=separator)
-    except csv.Error as reason:
-        raise InputError(f"{file}: this is no CSV that can be read: {reason}") from None
+def _split(
+    rows: Sequence[str], separator: str, file: str, lines: Sequence[int] | NDArray[np.int64]
+) -> Iterator[list[str]]:
+    """Each row's cells; a line of the file is a row, also where a quote is opened and not closed."""
+    for line, row in zip(lines, rows, strict=True):
+        try:
+            yield next(csv.reader([row], delimiter=separator), [])
+        except csv.Error as reason:
+            raise InputError(f"{file}: line {line} is no line of a CSV file: {reason}") from None
 
 
 def read_frame(frame: Frame, columns: Mapping[str, str] | None = None) -> Table:
@@ -138,7 +146,8 @@ def _sheet_with_header(file: str) -> tuple[str, list[tuple[int, _Cells]]] | None
             # Of styles and extensions that it passes over.
             warnings.simplefilter("ignore", UserWarning)
             # Formulas count by the values that were last calculated.
-            book = openpyxl.load_workbook(file, read_only=True, data_only=True)
+            content = io.BytesIO(read_bytes(file, _LARGEST_FILE, "give the path of a CSV file or a workbook"))
+            book = openpyxl.load_workbook(content, read_only=True, data_only=True)
             for sheet in book.worksheets:
                 # Some programs write a wrong extent.
                 sheet.reset_dimensions()
@@ -147,10 +156,6 @@ def _sheet_with_header(file: str) -> tuple[str, list[tuple[int, _Cells]]] | None
                 if filled and all(isinstance(cell, str) for cell in filled[0][1] if _filled(cell)):
                     return sheet.title, filled
         return None
-    except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file; give the path of a CSV file or a workbook") from None
-    except OSError as reason:
-        raise InputError(f"{file}: cannot be read: {reason.strerror or reason}") from None
     except _DAMAGED:
         raise InputError(f"{file}: this is no workbook that openpyxl can read; save the sheet as CSV") from None
 
@@ -179,12 +184,7 @@ def _kept(
 
 def _read_text(file: str) -> tuple[str, list[str]]:
     """The text of a file, and a note where its code page had to be guessed."""
-    try:
-        data = Path(file).read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file; give the path of a CSV file") from None
-    except OSError as reason:
-        raise InputError(f"{file}: cannot be read: {reason.strerror}") from None
+    data = read_bytes(file, _LARGEST_FILE, "give the path of a CSV file")
     code = next((name for mark, name in _MARKS if data.startswith(mark)), None)
     if code is None and b"\0" in data:
         raise InputError(f"{file}: this is no text file; save it as CSV, or as a workbook with the ending .xlsx")

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ccnn_torch._display import visible
 from ccnn_torch._files import write_whole
 from ccnn_torch.errors import InputError
-from ccnn_torch.units import parse_header, split_header, to_si, write_hint
+from ccnn_torch.units import LARGEST, parse_header, split_header, to_si, write_hint
 
 __all__ = ["FILE", "Table", "name_lines", "nearest", "write_table"]
 
@@ -75,6 +76,11 @@ class Table:
         """The column in its own unit, `rows`, NaN where a cell is empty or no number."""
         return self.values[:, self.names.index(name)]
 
+    def cell(self, name: str, row: int) -> str:
+        """A number of the column as written, with its unit."""
+        unit = self.units[name]
+        return f"{self.raw(name)[row]:g}{'' if unit == '1' else ' ' + unit}"
+
     def column(self, name: str, si_unit: str | None = None) -> NDArray[np.float64]:
         """A column in SI, `rows`, every value finite.
 
@@ -84,7 +90,7 @@ class Table:
 
         Raises:
             InputError: the column is missing (with the nearest name), has no, a wrong or an unknown unit, or a cell
-                that is empty, no number, NaN or infinite (named by line).
+                that is empty, no number, NaN, infinite, or larger than anything that is measured (named by line).
         """
         if name not in self.units:
             raise InputError(f"{self.path}: there is no column '{name}'; {self._remedy(name, si_unit)}")
@@ -95,14 +101,22 @@ class Table:
         wrong = np.flatnonzero(~np.isfinite(values))
         if len(wrong):
             row = int(wrong[0])
-            text = self.bad_cells.get((row, self.names.index(name)), f"{values[row]:g}")
+            text = visible(self.bad_cells.get((row, self.names.index(name)), f"{values[row]:g}"), 40)
             what = f"has '{text}'" if text else "is empty"
             more = f", and {len(wrong) - 1} more of its cells are not finite either" if len(wrong) > 1 else ""
             raise InputError(
                 f"{self.path}: column '{name}' {what} at {self.name_rows([row])}{more}; "
                 "write a finite number or remove the row"
             )
-        return to_si(values, unit or "1", si_unit, f"{self.path}: column '{name}'", name)
+        converted = to_si(values, unit or "1", si_unit, f"{self.path}: column '{name}'", name)
+        far = np.flatnonzero(np.abs(converted) > LARGEST)
+        if len(far):
+            raise InputError(
+                f"{self.path}: column '{name}' has {self.cell(name, int(far[0]))} at "
+                f"{self.name_rows(far)}, larger than anything that is measured; correct or remove "
+                f"{'it' if len(far) == 1 else 'them'}, or check the unit"
+            )
+        return converted
 
     def _remedy(self, name: str, si_unit: str | None) -> str:
         near = nearest(name, self.names)

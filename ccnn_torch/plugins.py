@@ -16,6 +16,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
+from ccnn_torch._reading import CONFIG_LIMIT, read_text
 from ccnn_torch.errors import CcnnError, InputError
 
 __all__ = ["class_hint", "code_refused", "failure", "file_that_names", "is_plugin", "load_plugin"]
@@ -58,11 +59,13 @@ def file_that_names() -> str | None:
 def class_hint(file: str) -> str:
     """What to write for a Python file that was named without a class; the file is read, not run."""
     try:
-        tree = ast.parse(Path(file).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError):
-        return f"{file}: there is no such file; write path/to/file.py:Name"
+        tree = ast.parse(read_text(file, CONFIG_LIMIT, "write path/to/file.py:Name"))
+    except InputError as reason:
+        return str(reason)
     except SyntaxError as error:
         return f"{file} line {error.lineno} is no valid Python: {error.msg}"
+    except (ValueError, RecursionError, MemoryError):
+        return f"{file} is no valid Python: it has a NUL, or is nested too deeply"
     names = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
     for node in tree.body:
         # NAME = Simulator(…) and what makes one.

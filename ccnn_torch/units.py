@@ -17,7 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["from_si", "parse_header", "si_unit_of", "split_header", "to_si", "write_hint"]
+__all__ = ["LARGEST", "from_si", "parse_header", "si_unit_of", "split_header", "to_si", "write_hint"]
+
+LARGEST = 1e12
+"""No number of a record or a geometry file is larger in SI: it is 7 times the Earth's distance from the Sun in m, a
+stiffness or a pressure beyond steel's, and its square still adds up without loss of what stands beside it."""
 
 # What a measured quantity is usually written in, for the remedy in an error, and what it is called.
 _EXAMPLES = {

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from ccnn_torch._yaml import dump_yaml, parse_yaml
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners.ccnn import CCNNSettings
-from ccnn_torch.runs._yaml import dump_yaml, parse_yaml
 from ccnn_torch.runs.config import (
     METHODS,
     RunConfig,
@@ -222,7 +222,13 @@ def test_bad_override(tmp_path: Path, override: str, parts: tuple[str, ...]) -> 
         ("case: tripod\ncase: tripod", ("line 2", "duplicate key")),
         ("case: [tripod", ("line 1", "not valid YAML")),
         ("case: tripod\n\tseed: 1", ("line 2", "not valid YAML")),
-        ("case: !!python/name:os.system x", ("not valid YAML",)),
+        (
+            "case: !!python/name:os.system x",
+            (
+                "line 1",
+                "tags such as",
+            ),
+        ),
         ("name: 2026-13-45", ("not valid YAML",)),
         ("name: \x00", ("not valid YAML",)),
     ],
@@ -233,7 +239,7 @@ def test_bad_file(tmp_path: Path, text: str, parts: tuple[str, ...]) -> None:
 
 
 def test_unreadable_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.yaml: cannot be read: No such file"):
+    with pytest.raises(InputError, match=r"none\.yaml: there is no such file"):
         load_config(tmp_path / "none.yaml")
     (tmp_path / "latin.yaml").write_bytes("name: é".encode("latin-1"))
     with pytest.raises(InputError, match="not UTF-8"):
@@ -249,7 +255,11 @@ def test_make_config_is_checked_too() -> None:
 @settings(deadline=None)
 @given(
     st.recursive(
-        st.none() | st.booleans() | st.floats(allow_nan=False) | st.integers() | st.text(st.characters(codec="utf-8")),
+        st.none()
+        | st.booleans()
+        | st.floats(allow_nan=False)
+        | st.integers()
+        | st.text(st.characters(codec="utf-8", exclude_characters="\0")),
         lambda part: st.lists(part, max_size=3) | st.dictionaries(st.text("abc_.", min_size=1), part, max_size=3),
         max_leaves=8,
     )

@@ -20,10 +20,10 @@ import torch
 from safetensors.torch import load_file
 from test_cli import tripod_records
 
+from ccnn_torch._yaml import read_yaml
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import load_schema
 from ccnn_torch.runs import RunConfig, calibrate, load_config, resume_run, start_run
-from ccnn_torch.runs._yaml import read_yaml
 from ccnn_torch.runs.config import make_config
 from ccnn_torch.runs.folder import RunFolder
 from ccnn_torch.runs.identify_config import load_identify_config

@@ -28,6 +28,8 @@ SHIPPED = ROOT / "checkpoints" / "tripod"
 FLOORS = [
     [
         "errors",
+        "_reading",
+        "_yaml",
         "coordinates",
         "batching",
         "plugins",

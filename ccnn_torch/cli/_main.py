@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from ccnn_torch import __version__
+from ccnn_torch._display import visible
 from ccnn_torch.cli._stopped import Stopped
 from ccnn_torch.cli.blind_check import blind_check
 from ccnn_torch.cli.check import check
@@ -25,6 +26,9 @@ from ccnn_torch.cli.suite import suite
 from ccnn_torch.errors import InputError, MethodFailedError
 
 __all__ = ["main"]
+
+# Characters of a sentence. The longest of our own, which lists all wrong keys of a config, has some hundreds.
+_LONGEST = 2000
 
 app = typer.Typer(
     name="ccnn",
@@ -80,5 +84,6 @@ def main() -> None:
 
 
 def _say(sentence: str) -> int:
-    typer.echo(" ".join(sentence.split()), err=True)
+    """One line on stderr, whatever the file said that it quotes."""
+    typer.echo(visible(" ".join(sentence.split()), _LONGEST), err=True)
     return 2

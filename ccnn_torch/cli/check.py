@@ -41,14 +41,14 @@ def check(
     """
     from ccnn_torch.report.table_form import print_table
     from ccnn_torch.runs.diagnose import check_table, check_text, run_check, write_check
-    from ccnn_torch.runs.screen import stdout
+    from ccnn_torch.runs.screen import say, stdout
 
     with if_stopped(NOTHING_WRITTEN):
         wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)
         found = watched("looking at what the rows can show …", lambda tell: run_check(wanted), quiet)
     if not quiet:
         for line in check_text(found):
-            typer.echo(line)
+            say(line)
         if found.confusable:
             print_table(check_table(found), stdout)
     if wanted.out is not None:

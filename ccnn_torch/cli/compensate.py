@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -77,12 +78,13 @@ def compensate(
     if sd and back:
         raise InputError("--sd and --back exclude each other: --sd tells how sure a command is, --back takes commands")
     for file, what in ((input, "IN.csv"), (model, "the model")):
-        if output.resolve() == file.resolve():
+        if os.path.realpath(output) == os.path.realpath(file):
             raise InputError(f"{output}: OUT.csv is {what} itself, which would be overwritten; name another file")
     import numpy as np
 
     from ccnn_torch.compensation import load_compensation
     from ccnn_torch.records import name_lines, read_table, stack_columns, write_table
+    from ccnn_torch.runs.screen import say
 
     loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
     table = read_table(input)
@@ -114,7 +116,7 @@ def compensate(
     if not quiet:
         _tell(output, inside, trained=bool(loaded.covariates) or "deviation_sd" in found)
         if mechanism is not None and _chooses_branch(loaded, mechanism, table):
-            typer.echo(
+            say(
                 "An arm takes a pose on several branches (elbow, wrist): these are the joints nearest to those of the "
                 "row before, and may be on another branch than meant; give "
                 f"{_guess_headers(loaded)} near the joints wanted."
@@ -248,8 +250,10 @@ def _named(what: str, loaded: Model, values: Array, units: dict[str, str]) -> di
 
 
 def _tell(output: Path, inside: NDArray[Any], trained: bool) -> None:
+    from ccnn_torch.runs.screen import say
+
     outside = len(inside) - int(inside.sum())
-    typer.echo(f"{output}: {len(inside)} rows written.")
+    say(f"{output}: {len(inside)} rows written.")
     if outside:
         what = (
             "outside the domain that the model was trained on" if trained else "out of the identified machine's reach"
@@ -259,4 +263,4 @@ def _tell(output: Path, inside: NDArray[Any], trained: bool) -> None:
             if trained
             else "their joints are as they were"
         )
-        typer.echo(f"{outside} of them {'is' if outside == 1 else 'are'} {what} (inside_domain = 0): {then}.")
+        say(f"{outside} of them {'is' if outside == 1 else 'are'} {what} (inside_domain = 0): {then}.")

@@ -97,24 +97,27 @@ def _search(wanted: DiagnoseConfig, quiet: bool) -> Diagnosis:
 
 def _tell(wanted: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -> None:
     """The verdict at once, then all that takes longer."""
+    from ccnn_torch._display import short_path
     from ccnn_torch.diagnosis import with_network
     from ccnn_torch.report.diagnosis_data import about_of, load_labels
     from ccnn_torch.report.diagnosis_report import print_diagnosis
+    from ccnn_torch.report.table_form import print_text
     from ccnn_torch.runs.diagnose import write_diagnosis
-    from ccnn_torch.runs.screen import stdout
+    from ccnn_torch.runs.screen import say_place, stdout
 
     if not quiet:
-        stdout.print(found.verdict["text"], style="bold", markup=False)
+        print_text(found.verdict["text"], stdout, "bold")
     if wanted.network:
 
         def train(tell: Callable[[str], None]) -> Diagnosis:
             return with_network(found, wanted.seed, lambda share: tell(f"{100 * share:.0f} %"))
 
         found = watched("training a network on what the effects leave …", train, quiet)
-    records = wanted.records if isinstance(wanted.records, str) else ", ".join(wanted.records or [])
-    about = {"name": folder.name, "mechanism": str(wanted.mechanism), "records": records}
+    records = wanted.records if isinstance(wanted.records, list) else [wanted.records]
+    rows = ", ".join(short_path(str(file)) for file in records)
+    about = {"name": folder.name, "mechanism": short_path(str(wanted.mechanism)), "records": rows}
     path = write_diagnosis(folder, found, about, wanted.seed)
     if quiet:
         return
     print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False)
-    typer.echo(f"Written: {path} and report.html beside it")
+    say_place(f"Written: {path} and report.html beside it")

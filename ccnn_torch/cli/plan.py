@@ -42,10 +42,10 @@ def plan(
     from ccnn_torch.report.table_form import print_table
     from ccnn_torch.runs.plan_config import load_plan_config
     from ccnn_torch.runs.planning import make_plan, write_plan
-    from ccnn_torch.runs.screen import stderr, stdout
+    from ccnn_torch.runs.screen import say, say_place, stderr, stdout
 
     wanted = load_plan_config(config, [*(overrides or []), *([f"seed={seed}"] if seed is not None else [])])
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeRemainingColumn())
     with Progress(*columns, console=stderr, disable=quiet or not stderr.is_terminal, transient=True) as bar:
         task = bar.add_task("poses", total=1.0)
         machine, plans = make_plan(mechanism, poses, wanted, lambda done: bar.update(task, completed=done))
@@ -55,8 +55,8 @@ def plan(
             print_table(parameter_table(part), stdout)
             print_table(gain_table(part, short=True), stdout)
             if said := left_out_sentence(part):
-                typer.echo(said)
-            typer.echo(plan_sentence(part, wanted.least_gain))
+                say(said)
+            say(plan_sentence(part, wanted.least_gain))
     files = write_plan(out, machine, plans, wanted.least_gain)
     if not quiet:
-        typer.echo(f"Written: {', '.join(str(file) for file in files)}")
+        say_place(f"Written: {', '.join(str(file) for file in files)}")

@@ -53,7 +53,7 @@ def simulate(
     """
     from ccnn_torch.report.table_form import print_table
     from ccnn_torch.runs._noise import read_noise
-    from ccnn_torch.runs.screen import stdout
+    from ccnn_torch.runs.screen import say, say_place, stdout
     from ccnn_torch.runs.simulate_config import load_simulate_config
     from ccnn_torch.runs.simulating import injected_table, simulate_records, write_simulated
 
@@ -66,5 +66,5 @@ def simulate(
     if made.injected:
         print_table(injected_table(made), stdout)
     else:
-        typer.echo("Nothing was injected: the machine is as its model says.")
-    typer.echo(f"Written: {out}")
+        say("Nothing was injected: the machine is as its model says.")
+    say_place(f"Written: {out}")

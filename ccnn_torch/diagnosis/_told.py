@@ -13,7 +13,7 @@ from ccnn_torch.effects import Situation
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import BlackBox, Framed, Mechanism
 from ccnn_torch.records import Records
-from ccnn_torch.units import parse_header, si_unit_of
+from ccnn_torch.units import LARGEST, parse_header, si_unit_of
 
 __all__ = ["refuse_lost_rows", "told"]
 
@@ -79,4 +79,7 @@ def _column(records: Records, condition: Condition) -> np.ndarray[tuple[int], np
     empty = np.flatnonzero(~np.isfinite(values))
     if len(empty):
         raise InputError(f"{where} is empty at {records.name_rows(empty[:1])}, and the simulator takes it; fill it in")
+    far = np.flatnonzero(np.abs(values) > LARGEST)
+    if len(far):
+        raise InputError(f"{where} has {values[far[0]]:g} at {records.name_rows(far[:1])}, which is nothing measured")
     return np.array(values, dtype=np.float64).reshape(-1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ccnn_torch._reading import parse_json, read_text
 from ccnn_torch.effects import EFFECTS, OUTLIER, Coefficient, Effect, Shape, Situation, make_effect
 from ccnn_torch.errors import InputError
+from ccnn_torch.units import LARGEST
 
 __all__ = ["Known", "Verdict", "not_held_notes", "one_row_at_a_time", "read_verdict"]
+
+# A diagnosis has some 100 kB.
+_LARGEST = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -121,12 +125,7 @@ def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Ver
         InputError: there is no such file, it is none of `ccnn diagnose`, it is of another machine, or its verdict names
             no effect that could be compensated.
     """
-    try:
-        told = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as reason:
-        raise InputError(f"{path}: cannot be read: {reason.strerror}; give effects=from:DIR/diagnosis.json") from None
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        raise InputError(f"{path}: is no JSON; give the diagnosis.json that ccnn diagnose wrote") from None
+    told = parse_json(read_text(path, _LARGEST, "give effects=from:DIR/diagnosis.json"), str(path))
     try:
         verdict = told["verdict"]
         names, outside, nothing = list(verdict["effects"]), bool(verdict["outside_library"]), bool(verdict["none"])
@@ -137,7 +136,7 @@ def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Ver
         gravity = None if machine.get("gravity") is None else [_number(g) for g in machine["gravity"]]
         theirs = [str(j) for j in machine.get("joints") or joints]
         covariates = tuple(str(c) for c in told.get("where", {}).get("covariates", {}))
-    except (KeyError, TypeError, AttributeError, ValueError):
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError):
         raise InputError(f"{path}: is no diagnosis; give the diagnosis.json that ccnn diagnose wrote") from None
     if machine and (machine.get("name") != mechanism or theirs != [*joints]):
         raise InputError(
@@ -210,8 +209,8 @@ def _named(parameters: Iterable[Coefficient | Shape]) -> set[str]:
 
 
 def _number(value: Any) -> float:
-    """A finite number, or ValueError."""
+    """A finite number of a plausible size, or ValueError."""
     number = float(value)
-    if number != number or number in (float("inf"), -float("inf")):
+    if not abs(number) <= LARGEST:
         raise ValueError(value)
     return number

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError
-
+from ccnn_torch._display import visible
+from ccnn_torch._reading import CONFIG_LIMIT, read_text
+from ccnn_torch._yaml import parse_yaml
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.mechanisms.serial import MOST_JOINTS, SerialArm
+from ccnn_torch.units import LARGEST
 
 __all__ = ["read_dh_file"]
 
@@ -39,8 +40,8 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
     """
     table = _Table(path)
     dof = table.number("dof")
-    if dof != int(dof) or dof < 1:
-        raise InputError(f"{path}: key 'dof' must be a whole number of joints, got {dof:g}")
+    if dof != int(dof) or not 1 <= dof <= MOST_JOINTS:
+        raise InputError(f"{path}: key 'dof' must be a whole number of joints, 1 to {MOST_JOINTS}, got {dof:g}")
     n = int(dof)
     stated = table.text("convention")
     convention = next((short for long, short in _CONVENTIONS.items() if stated.startswith(long)), "")
@@ -60,7 +61,7 @@ def read_dh_file(path: str, orientation: str = "rotation_vector") -> SerialArm:
     base, tool = table.frame("base_frame", scales), table.frame("tool_frame", scales)
     offset = table.frame("tool_offset", scales[:3]) if "tool_offset" in table.content else None
     return SerialArm(
-        name=str(table.content.get("robot", Path(path).stem)),
+        name=visible(str(table.content.get("robot", Path(path).stem)), 60),
         convention=convention,
         links=[list(row) for row in links],
         joint_types=types,
@@ -81,15 +82,7 @@ class _Table:
 
     def __init__(self, path: str) -> None:
         self.path = path
-        try:
-            content = YAML(typ="safe").load(Path(path).read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise InputError(f"{path}: there is no such file; give the path of the arm's geometry") from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: cannot be read as a text file: {error}") from error
-        except MarkedYAMLError as error:
-            line = error.problem_mark.line + 1 if error.problem_mark else 1
-            raise InputError(f"{path}: line {line} is no valid YAML: {error.problem}") from error
+        content = parse_yaml(read_text(path, CONFIG_LIMIT, "give the path of the arm's geometry"), path)
         if not isinstance(content, Mapping):
             raise InputError(f"{path}: must hold keys such as dof, convention, a, alpha, d, theta")
         self.content: Mapping[str, Any] = content
@@ -153,6 +146,6 @@ class _Table:
 
 
 def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value or abs(value) == float("inf"):
-        raise InputError(f"{where} must be a finite number, got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
+        raise InputError(f"{where} must be a finite number, got {visible(repr(value))}")
     return float(value)

@@ -11,14 +11,16 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError
 
+from ccnn_torch._display import visible
+from ccnn_torch._reading import CONFIG_LIMIT, read_text
+from ccnn_torch._yaml import parse_yaml
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.units import LARGEST
 
 __all__ = ["MechanismFile", "mechanism_text", "read_mechanism_file"]
 
@@ -57,8 +59,9 @@ class MechanismFile:
         for name, unit in known.items():
             entry = self._entries[name]
             value = entry.get(what) if isinstance(entry, Mapping) else None
-            if isinstance(value, bool) or not isinstance(value, int | float) or value - value != 0:
-                raise InputError(f"{self.path}: parameters.{name}.{what}: must be a finite number, not {value!r}")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+                shown = visible(repr(value))
+                raise InputError(f"{self.path}: parameters.{name}.{what}: must be a finite number, not {shown}")
             if entry.get("unit") != unit:
                 raise InputError(f"{self.path}: parameters.{name}.unit: must be {unit}, not {entry.get('unit')!r}")
             found[name] = float(value)
@@ -76,9 +79,9 @@ def read_mechanism_file(path: str, content: bytes | None = None) -> MechanismFil
         InputError: it has the key `mechanism` and lacks another one.
     """
     try:
-        text = (Path(path).read_bytes() if content is None else content).decode("utf-8")
-        tree = YAML(typ="safe", pure=True).load(text)
-    except (OSError, UnicodeDecodeError, MarkedYAMLError):
+        text = read_text(path, CONFIG_LIMIT) if content is None else content.decode("utf-8")
+        tree = parse_yaml(text, path)
+    except (InputError, UnicodeDecodeError):
         # Whoever asked knows what else the file should have been, and says so.
         return None
     if not isinstance(tree, Mapping) or "mechanism" not in tree:

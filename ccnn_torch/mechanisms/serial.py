@@ -18,7 +18,10 @@ from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms._numeric import carry_derivative, least_norm
 from ccnn_torch.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
 
-__all__ = ["SerialArm"]
+__all__ = ["MOST_JOINTS", "SerialArm"]
+
+MOST_JOINTS = 100
+"""Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
 
 _FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
@@ -86,6 +89,8 @@ class SerialArm(Mechanism):
                 f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector' or 'none'; "
                 f"got '{convention}', '{orientation}'"
             )
+        if not 1 <= len(links) <= MOST_JOINTS:
+            raise InputError(f"arm '{name}': has {len(links)} joints that move; 1 to {MOST_JOINTS} can be handled")
         unknown = set(unknown_frames)
         if orientation == "none" and tool_offset is not None:
             tool = (0.0,) * 6 if isinstance(tool_offset, str) else (*tool_offset, 0.0, 0.0, 0.0)

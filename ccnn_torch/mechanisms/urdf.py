@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import torch
 from torch import Tensor
 
+from ccnn_torch._display import visible
+from ccnn_torch._reading import read_bytes
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._links import compose
-from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.mechanisms.serial import MOST_JOINTS, SerialArm
 from ccnn_torch.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_rotation_vector
+from ccnn_torch.units import LARGEST
 
 __all__ = ["read_urdf"]
+
+# Bytes; with inertias and meshes named, a robot has some 100 kB.
+_LARGEST = 20_000_000
 
 _MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 
@@ -37,13 +44,10 @@ def read_urdf(
         InputError: one sentence that names the file and the joint or link: a branch without `tip`, an unknown link, a
             mimic, floating or planar joint in the chain, a number that is none.
     """
-    try:
-        root = ElementTree.parse(path).getroot()
-    except OSError:
-        raise InputError(f"{path}: there is no such file, or it cannot be read; give the path of a URDF") from None
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path}: is no valid XML: {error}") from error
+    root = _parsed(path)
     chain = _chain(path, root, base, tip)
+    if len(chain) > 2 * MOST_JOINTS:
+        raise InputError(f"{path}: the chain has {len(chain)} joints; up to {MOST_JOINTS} that move can be handled")
     links: list[list[float]] = []
     axes: list[list[float]] = []
     types: list[str] = []
@@ -67,7 +71,7 @@ def read_urdf(
     if not links:
         raise InputError(f"{path}: the chain has no joint that moves; give base=LINK and tip=LINK")
     return SerialArm(
-        name=root.get("name", Path(path).stem),
+        name=visible(root.get("name", Path(path).stem), 60),
         convention="urdf",
         links=links,
         joint_types=types,
@@ -79,6 +83,28 @@ def read_urdf(
     )
 
 
+class _WithoutDoctype(ElementTree.TreeBuilder):
+    """Entities are declared in a document type, which no URDF has and which can unfold to gigabytes or name a file."""
+
+    def doctype(self, name: str, pubid: str, system: str) -> None:
+        """Called before anything of it is unfolded."""
+        raise InputError("has a document type (<!DOCTYPE …>), which is not read; remove it")
+
+
+def _parsed(path: str) -> Element:
+    content = read_bytes(path, _LARGEST, "give the path of a URDF")
+    parser = ElementTree.XMLParser(target=_WithoutDoctype())
+    try:
+        parser.feed(content)
+        root: Element = parser.close()
+    except InputError as reason:
+        raise InputError(f"{path}: {reason}") from None
+    # An encoding that is unknown or has several bytes a character is no error of the parser's own.
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise InputError(f"{path}: is no valid XML in UTF-8: {error}") from None
+    return root
+
+
 _Transform = tuple[Tensor, Tensor]
 _IDENTITY: _Transform = (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
@@ -87,6 +113,9 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
     """Joints from base to tip, found from the tip upwards."""
     joints = root.findall("joint")
     parent_joint = {_link(path, j, "child"): j for j in joints}
+    if len(parent_joint) < len(joints):
+        twice = Counter(_link(path, j, "child") for j in joints).most_common(1)[0][0]
+        raise InputError(f"{path}: link '{twice}' is the child of several joints; a chain has one")
     parents = {_link(path, j, "parent") for j in joints}
     known = [str(link.get("name")) for link in root.findall("link")]
     for link in (base, tip):
@@ -104,6 +133,8 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
     while link != base and link in parent_joint and len(chain) <= len(joints):
         chain.append(parent_joint[link])
         link = _link(path, parent_joint[link], "parent")
+    if len(chain) > len(joints):
+        raise InputError(f"{path}: the joints above link '{tip}' form a loop; a chain begins at a link with no parent")
     if base is not None and link != base:
         raise InputError(f"{path}: link '{tip}' does not hang on link '{base}'; give another base= or tip=")
     return chain[::-1]
@@ -124,7 +155,7 @@ def _triple(path: str, joint: Element, tag: str, attribute: str, default: str) -
         values = [float(v) for v in text.split()]
     except ValueError:
         values = []
-    if len(values) != 3 or not all(map(math.isfinite, values)):
+    if len(values) != 3 or not all(abs(v) <= LARGEST for v in values):
         raise InputError(
             f"{path}: joint '{joint.get('name', '?')}' needs three numbers in {tag} {attribute}, got '{text}'"
         )
@@ -153,7 +184,10 @@ def _limit(path: str, joint: Element, kind: str) -> list[float]:
     try:
         low, high = (float(element.get(k, d)) for k, d in zip(("lower", "upper"), default, strict=True))
     except ValueError:
-        raise InputError(f"{path}: joint '{joint.get('name', '?')}' has a limit that is no number") from None
+        low = high = math.nan
+    if not -LARGEST <= low <= high <= LARGEST:
+        name = joint.get("name", "?")
+        raise InputError(f"{path}: joint '{name}' has limits that are no numbers, or the upper one below the lower one")
     return [low, high]
 
 

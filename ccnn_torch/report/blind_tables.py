@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 
 from ccnn_torch.report.display import count_text, number_text
-from ccnn_torch.report.table_form import Table, print_table
+from ccnn_torch.report.table_form import Table, print_table, print_text
 from ccnn_torch.report.tables import markdown_table
 
 __all__ = ["blind_markdown", "blind_tables", "case_line", "print_blind"]
@@ -47,7 +46,7 @@ def print_blind(found: Mapping[str, Any], console: Console) -> None:
         if table.rows:
             print_table(table, console)
     for sentence in _sentences(found):
-        console.print(escape(sentence), style="yellow")
+        print_text(sentence, console, "yellow")
 
 
 def case_line(machine: str, answer: Mapping[str, Any], withheld: bool) -> str:

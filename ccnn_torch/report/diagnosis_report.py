@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.markup import escape
 from torch import Tensor
 
 from ccnn_torch._files import write_whole
@@ -43,7 +42,7 @@ from ccnn_torch.report.plots import Plot, inline_svg, save_figure
 from ccnn_torch.report.plots._diagnosis import gap_plot, probability_plot
 from ccnn_torch.report.plots._diagnosis_places import remainder_map, where_plot
 from ccnn_torch.report.plots._diagnosis_signature import signature_plot
-from ccnn_torch.report.table_form import Table, print_table
+from ccnn_torch.report.table_form import Table, print_table, print_text
 from ccnn_torch.report.tables import markdown_table
 
 __all__ = ["NEXT", "Section", "diagnosis_markdown", "print_diagnosis", "write_diagnosis_report"]
@@ -162,11 +161,11 @@ def print_diagnosis(results: Block, console: Console, about: About | None = None
     why = results.get("why_set_aside") or ["for a reason that is not told"] * len(aside)
     told = aside_text(aside, why, about.lines)
     for sentence in ([told] if told else []) + _notes(results, about):
-        console.print(escape(sentence), style="yellow")
+        print_text(sentence, console, "yellow")
     if order_table(results) is None and (text := network_text(results)):
-        console.print(escape(text))
+        print_text(text, console)
     if verdict:
-        console.print(escape(verdict_text(results)), style="bold")
+        print_text(verdict_text(results), console, "bold")
 
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:

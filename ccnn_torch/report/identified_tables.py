@@ -8,13 +8,12 @@ from statistics import median
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.display import count_text, display_unit, number_text
 from ccnn_torch.report.identified_constraint import BEFORE_SAYS, constraint_table, holder
 from ccnn_torch.report.identified_paper import paper_tables
-from ccnn_torch.report.table_form import Table, print_table
+from ccnn_torch.report.table_form import Table, print_table, print_text
 from ccnn_torch.report.tables import markdown_table
 
 __all__ = [
@@ -95,8 +94,8 @@ def print_identified(results: Block, console: Console) -> None:
     for table in identified_tables(results):
         print_table(table, console)
     for sentence in (*unknown_sentences(results), *results["notes"]):
-        console.print(escape(sentence), style="yellow")
-    console.print(escape(identified_verdict(results)), style="bold")
+        print_text(sentence, console, "yellow")
+    print_text(identified_verdict(results), console, "bold")
 
 
 def unknown_sentences(results: Block) -> list[str]:
@@ -119,6 +118,8 @@ def _text(block: Block | None, key: str, scale: float = 1.0, digits: int = 3) ->
 
 
 def _with_unit(block: Block, key: str) -> str:
+    if block[key] is None:
+        return "unknown"
     scale, unit = display_unit(block["unit"], block[key])
     return f"{number_text(block[key] / scale, 3)} {unit}"
 

@@ -14,9 +14,13 @@ import numpy as np
 import torch
 
 from ccnn_torch._files import write_whole
+from ccnn_torch._reading import parse_json, read_text
 from ccnn_torch.errors import InputError
 
 __all__ = ["load_schema", "plain", "read_json", "write_json"]
+
+# Results with all their repeats have some MB.
+_LARGEST = 500_000_000
 
 
 def plain(value: Any) -> Any:
@@ -54,13 +58,7 @@ def read_json(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: there is no such file, or it holds no JSON object.
     """
-    path = Path(path)
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path} is not there; give the folder of a finished run.") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path} is no JSON file: {error}.") from None
+    value = parse_json(read_text(path, _LARGEST, "give the folder of a finished run"), str(path))
     if not isinstance(value, dict):
         raise InputError(f"{path} must hold one JSON object, not a {type(value).__name__}.")
     return value

@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 
 from ccnn_torch.report.display import count_text, display_unit, interval_text, number_text
-from ccnn_torch.report.table_form import Table, print_table
+from ccnn_torch.report.table_form import Table, print_table, print_text
 from ccnn_torch.report.tables import markdown_table
 
 __all__ = ["case_line", "print_suite", "suite_markdown", "suite_tables"]
@@ -37,9 +36,9 @@ def print_suite(comparison: Mapping[str, Any], console: Console) -> None:
     for table in suite_tables(comparison):
         print_table(table, console)
     for sentence in _failures(comparison):
-        console.print(escape(sentence), style="yellow")
+        print_text(sentence, console, "yellow")
     if _WATCHED in comparison["methods"]:
-        console.print(escape(verdict(comparison)), style="bold")
+        print_text(verdict(comparison), console, "bold")
 
 
 def verdict(comparison: Mapping[str, Any]) -> str:

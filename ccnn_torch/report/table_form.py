@@ -6,12 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table as RichTable
+from rich.text import Text
 
-__all__ = ["Table", "print_table"]
+from ccnn_torch._display import visible
+
+__all__ = ["Table", "print_table", "print_text"]
 
 _LONGEST_NAME = 28
+# Characters of a line; no sentence of ours is as long.
+_LONGEST = 5000
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,23 @@ class Table:
     words: tuple[str, ...] = ()
 
 
+def print_text(text: str, console: Console, style: str = "", wrap: bool = True) -> None:
+    """Show a sentence as it is: what looks like markup is none, and nothing in it is obeyed by the terminal.
+
+    Args:
+        text: what to show.
+        console: where.
+        style: rich's, of all of it.
+        wrap: break it between words at the terminal's edge; in a file or a pipe a line stays a line.
+    """
+    console.print(_plain(text), style=style, soft_wrap=not (wrap and console.is_terminal))
+
+
+def _plain(text: str) -> Text:
+    """Text that no part of is read as markup; its line breaks are ours."""
+    return Text("\n".join(visible(line, _LONGEST) for line in text.split("\n")))
+
+
 def print_table(table: Table, console: Console) -> None:
     """Show a table, in parts where the terminal is too narrow; each part repeats the first column."""
     # Measured as on a terminal without an edge: a width is else never more than there is.
@@ -42,10 +63,10 @@ def print_table(table: Table, console: Console) -> None:
             parts.append([0, column])
     for i, part in enumerate(parts):
         # Beside the table, not in it: a title or a note is then as wide as the terminal, not as a narrow part.
-        console.print(escape(table.title + (", continued" if i else "")), style="bold")
+        print_text(table.title + (", continued" if i else ""), console, "bold")
         console.print(_shown(table, part))
     if table.note:
-        console.print(escape(table.note), style="italic dim")
+        print_text(table.note, console, "italic dim")
 
 
 def _shown(table: Table, columns: Sequence[int]) -> RichTable:
@@ -53,11 +74,11 @@ def _shown(table: Table, columns: Sequence[int]) -> RichTable:
     for i in columns:
         left = i == 0 or table.columns[i] in table.words
         shown.add_column(
-            escape(table.columns[i]), justify="left" if left else "right", overflow="fold", max_width=_width(table, i)
+            _plain(table.columns[i]), justify="left" if left else "right", overflow="fold", max_width=_width(table, i)
         )
     for row in table.rows:
         # The interval below its median: three such columns then fit into 80 characters.
-        shown.add_row(*(escape(row[i].replace(" [", "\n[") if i else row[i]) for i in columns))
+        shown.add_row(*(_plain(row[i].replace(" [", "\n[") if i else row[i]) for i in columns))
     return shown
 
 

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 
+from ccnn_torch._display import visible
 from ccnn_torch._files import write_whole
 from ccnn_torch.report.comparison_tables import comparison_table, method_label, pose_by_method_table, reach_table
 from ccnn_torch.report.csv_file import write_csv
 from ccnn_torch.report.display import count_text, display_unit, interval_text, number_text, removed_percent
 from ccnn_torch.report.paper_tables import PAPER, PaperCase
-from ccnn_torch.report.table_form import Table, print_table
+from ccnn_torch.report.table_form import Table, print_table, print_text
 
 __all__ = [
     "Table",
@@ -83,16 +83,17 @@ def print_tables(results: Results, console: Console) -> None:
     for table in result_tables(results):
         print_table(table, console)
     for sentence in cautions(results):
-        console.print(escape(sentence), style="yellow")
+        print_text(sentence, console, "yellow")
     for note in results.get("notes", []):
-        console.print(escape(note), style="dim")
-    console.print(escape(verdict(results)), style="bold")
+        print_text(note, console, "dim")
+    print_text(verdict(results), console, "bold")
 
 
 def markdown_table(table: Table) -> str:
     """One table as Markdown: title, rows, and the sentence below."""
     head, *lines = (
-        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (table.columns, *table.rows)
+        "| " + " | ".join(visible(cell).replace("|", "\\|") for cell in line) + " |"
+        for line in (table.columns, *table.rows)
     )
     rule = "| " + " | ".join(["---", *["---:"] * (len(table.columns) - 1)]) + " |"
     return "\n\n".join([f"## {table.title}", "\n".join([head, rule, *lines]), *([table.note] if table.note else [])])

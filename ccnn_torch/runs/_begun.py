@@ -23,7 +23,7 @@ _MOST = 3
 def facts_of(config: BaseModel, data: str | None = None) -> dict[str, Any]:
     """Version, keys of the config, and the hash of the data where it is known; JSON-able."""
     keys = {key: value for key, value in config.model_dump(mode="json").items() if key not in _FREE}
-    facts = {"version": __version__, "config": json.loads(json.dumps(keys))}
+    facts = {"version": __version__, "config": _place_free(json.loads(json.dumps(keys)))}
     return facts if data is None else {**facts, "data": data}
 
 
@@ -59,12 +59,14 @@ def _changed(now: Any, then: Any, key: str) -> Iterator[str]:
     if isinstance(now, dict) and isinstance(then, dict):
         for name in sorted({*now, *then}):
             yield from _changed(now.get(name), then.get(name), f"{key}.{name}" if key else name)
-    elif _place_free(now) != _place_free(then):
+    elif now != then:
         yield f"{key} is {json.dumps(now)}, the checkpoint was made with {key} {json.dumps(then)}"
 
 
 def _place_free(value: Any) -> Any:
     """A file by its name alone: it may have been moved with the folder, and what it holds has a hash of its own."""
+    if isinstance(value, dict):
+        return {key: _place_free(one) for key, one in value.items()}
     if isinstance(value, list):
         return [_place_free(one) for one in value]
     return value.replace("\\", "/").rpartition("/")[2] if isinstance(value, str) else value

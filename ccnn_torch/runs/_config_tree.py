@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
+from ccnn_torch._yaml import dump_yaml, read_yaml
 from ccnn_torch.errors import InputError
 from ccnn_torch.runs._keys import explain
-from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
-from ccnn_torch.runs._yaml import read_yaml
+from ccnn_torch.runs._overrides import apply_overrides, relate_paths, resolve_paths
 
 __all__ = [
     "Columns",
@@ -22,6 +23,7 @@ __all__ = [
     "config_from_keys",
     "config_from_options",
     "validated",
+    "written",
 ]
 
 Config = TypeVar("Config", bound=BaseModel)
@@ -72,7 +74,8 @@ def config_from_file(model: type[Config], path: str | Path, overrides: Iterable[
     path = Path(path)
     tree = read_yaml(path)
     tree.setdefault("name", path.stem)
-    resolve_paths(tree, path.absolute().parent)
+    # As the system goes up from a folder that is a link, and as `written` counts.
+    resolve_paths(tree, Path(os.path.realpath(path.parent)))
     given = apply_overrides(tree, overrides, Path.cwd())
     return validated(model, tree, str(path), given)
 
@@ -118,3 +121,17 @@ def validated(model: type[Config], tree: Mapping[str, Any], source: str, given: 
         return model.model_validate(tree)
     except ValidationError as error:
         raise InputError(explain(error, model, source, given)) from None
+
+
+def written(config: BaseModel, folder: Path | None) -> str:
+    """A resolved config as YAML, every key written out.
+
+    Args:
+        config: what to write.
+        folder: where the file will stand; paths are written relative to it, so that both can be moved. Absolute when
+            None.
+    """
+    tree = config.model_dump(mode="json")
+    if folder is not None:
+        relate_paths(tree, folder)
+    return dump_yaml(tree)

@@ -13,7 +13,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from ccnn_torch._table import nearest
-from ccnn_torch.runs._yaml import read_yaml
+from ccnn_torch._yaml import read_yaml
 
 __all__ = ["explain", "list_keys"]
 
@@ -61,7 +61,7 @@ def _attributes(text: str) -> dict[str, str]:
 
 
 def _yaml(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
+    return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
 def explain(error: ValidationError, model: type[BaseModel], file: str, given: Mapping[str, str]) -> str:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from ccnn_torch._yaml import check_values, parse_yaml
 from ccnn_torch.errors import InputError
-from ccnn_torch.runs._yaml import parse_yaml
 
-__all__ = ["apply_overrides", "listed_files", "resolve_paths"]
+__all__ = ["apply_overrides", "listed_files", "relate_paths", "resolve_paths"]
 
 # Keys whose value is text however it looks: a path may hold a colon, a name may be 2024.
 _TEXT = ("name", "out", "records", "transfer", "mechanism")
@@ -43,6 +43,7 @@ def apply_overrides(tree: dict[str, Any], overrides: Iterable[str], folder: Path
             raise InputError(f"'{override}': write key=value, e.g. seed=1 or split.test=0.2")
         plain = key in _TEXT or (key == "effects" and text.startswith(_FROM))
         value = text if plain and text not in ("", "null", "~") else parse_yaml(text, f"'{override}'")
+        check_values([key, value], f"'{override}'")
         node = tree
         for depth, step in enumerate(steps[:-1]):
             if node.get(step) is None:
@@ -62,20 +63,40 @@ def resolve_paths(tree: dict[str, Any], folder: Path) -> None:
         tree[key] = _resolve(key, tree[key], folder)
 
 
+def relate_paths(tree: dict[str, Any], folder: Path) -> None:
+    """Make the paths in a tree relative to `folder`, in place: a folder that is moved with its data is still right."""
+    start = os.path.realpath(folder)
+
+    def related(path: str) -> str:
+        # Links above the file are followed, as `..` would; the file itself may be one and keeps its name.
+        above, name = os.path.split(os.path.abspath(path))
+        return Path(os.path.relpath(os.path.join(os.path.realpath(above), name), start)).as_posix()
+
+    for key in tree:
+        tree[key] = _changed(key, tree[key], related)
+
+
 def _resolve(key: str, value: Any, folder: Path) -> Any:
+    if key == "records" and isinstance(value, str):
+        value = listed_files(value, folder)
+    return _changed(key, value, lambda path: os.path.abspath(folder / Path(path).expanduser()))
+
+
+def _changed(key: str, value: Any, change: Callable[[str], str]) -> Any:
+    """The value of a key with each path in it changed."""
     if key == "records":
-        return _resolve_files(value, folder)
+        return _changed_files(value, change)
     if key == "split" and isinstance(value, dict) and "test" in value:
-        return {**value, "test": _resolve("split.test", value["test"], folder)}
+        return {**value, "test": _changed("split.test", value["test"], change)}
     if key == "auto" and isinstance(value, dict):
-        return {name: _resolve(f"auto.{name}", entry, folder) for name, entry in value.items()}
+        return {name: _changed(f"auto.{name}", entry, change) for name, entry in value.items()}
     if key in _PLUGINS and isinstance(value, list):
-        return [_resolve(key, entry, folder) for entry in value]
+        return [_changed(key, entry, change) for entry in value]
     if key == "effects" and isinstance(value, str) and value.startswith(_FROM):
-        return _FROM + os.path.abspath(folder / Path(value.removeprefix(_FROM).strip()).expanduser())
+        return _FROM + change(value.removeprefix(_FROM).strip())
     if not isinstance(value, str) or not _is_path(key, value):
         return value
-    return os.path.abspath(folder / Path(value).expanduser())
+    return change(value)
 
 
 def listed_files(text: str, folder: Path) -> str | list[str]:
@@ -86,13 +107,12 @@ def listed_files(text: str, folder: Path) -> str | list[str]:
     return parts if len(parts) > 1 and all(Path(part).suffix for part in parts) else text
 
 
-def _resolve_files(value: Any, folder: Path) -> Any:
+def _changed_files(value: Any, change: Callable[[str], str]) -> Any:
     """Records: one file as a text, several as a list."""
-    value = listed_files(value, folder) if isinstance(value, str) else value
     files = value if isinstance(value, list) else [value]
     if not all(isinstance(file, str | Path) and str(file) for file in files):
         return value
-    paths = [os.path.abspath(folder / Path(file).expanduser()) for file in files]
+    paths = [change(str(file)) for file in files]
     return paths[0] if len(paths) == 1 else paths
 
 

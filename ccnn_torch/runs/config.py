@@ -18,9 +18,8 @@ from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.enn import ENNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
-from ccnn_torch.runs._config_tree import Columns, Files, Names, Section, config_from_file, config_from_keys
+from ccnn_torch.runs._config_tree import Columns, Files, Names, Section, config_from_file, config_from_keys, written
 from ccnn_torch.runs._keys import list_keys
-from ccnn_torch.runs._yaml import dump_yaml
 from ccnn_torch.runs.split_config import SplitConfig
 
 __all__ = [
@@ -144,7 +143,7 @@ class RunConfig(_Part):
     """A run: data, split, methods and their settings."""
 
     name: str = Field(default="run", min_length=1, description="name of the run; default: the config file's name")
-    seed: int = Field(default=0, ge=0, description="seed of the first repeat; repeat k has seed + k")
+    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the first repeat; repeat k has seed + k")
     repeats: int = Field(
         default=1, ge=1, description="independent repeats, side by side: new noise, split and start each"
     )
@@ -317,9 +316,9 @@ def make_config(**keys: Any) -> RunConfig:
     return config_from_keys(RunConfig, keys)
 
 
-def dump_config(config: RunConfig) -> str:
-    """The resolved config as YAML, every key written out; `load_config` of it gives an equal config."""
-    return dump_yaml(config.model_dump(mode="json"))
+def dump_config(config: RunConfig, folder: Path | None = None) -> str:
+    """The resolved config as YAML, its paths relative to `folder` if given; `load_config` of it gives an equal one."""
+    return written(config, folder)
 
 
 def method_names(config: RunConfig) -> list[str]:

@@ -65,7 +65,7 @@ class DiagnoseConfig(Section):
     network: bool = Field(
         default=True, description="whether to say what a network on the remainder would still gain; takes seconds"
     )
-    seed: int = Field(default=0, ge=0, description="seed of folds and resampling")
+    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of folds and resampling")
 
 
 def load_diagnose_config(path: Path | None, overrides: Iterable[str] = ()) -> DiagnoseConfig:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ccnn_torch._display import short_path
 from ccnn_torch.compensation import Care, PhysicalEffects, effect_deviation, expand_effects, settled_effects
 from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.diagnosis.from_file import Known, Verdict, one_row_at_a_time, read_verdict
@@ -171,10 +172,10 @@ def fit_effects(
         care = settled_effects(there, moving[0], names, limit, margin, weight, damping).care
     named = ", ".join(k.effect.name for k in known)
     notes.append(
-        f"Effects of {verdict.path}: {named}. Their coefficients were fitted anew to the training rows of each repeat; "
-        "their periods and other shapes are the file's, which may have seen the held-out rows."
+        f"Effects of {short_path(verdict.path)}: {named}. Their coefficients were fitted anew to the training rows of "
+        "each repeat; their periods and other shapes are the file's, which may have seen the held-out rows."
     )
-    found = KnownEffects(verdict.path, situations, moving, acting, names, care)
+    found = KnownEffects(short_path(verdict.path), situations, moving, acting, names, care)
     return found, None if torch.equal(changed, base_all) else changed, notes
 
 

@@ -12,9 +12,8 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from ccnn_torch._table import nearest
-from ccnn_torch.runs._config_tree import Columns, Files, Names, Section, config_from_file, config_from_keys
+from ccnn_torch.runs._config_tree import Columns, Files, Names, Section, config_from_file, config_from_keys, written
 from ccnn_torch.runs._keys import list_keys
-from ccnn_torch.runs._yaml import dump_yaml
 from ccnn_torch.runs.split_config import HeldOutConfig
 
 __all__ = [
@@ -147,7 +146,7 @@ class IdentifyConfig(Section):
     name: str = Field(
         default="identification", min_length=1, description="name of the run; default: the config file's name"
     )
-    seed: int = Field(default=0, ge=0, description="seed of the first machine; machine k has seed + k")
+    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the first machine; machine k has seed + k")
     out: str | None = Field(default=None, description="folder to write; default runs/NAME-STAMP")
     mechanism: str = Field(
         default="",
@@ -311,9 +310,9 @@ def make_identify_config(**keys: Any) -> IdentifyConfig:
     return config_from_keys(IdentifyConfig, keys)
 
 
-def dump_identify_config(config: IdentifyConfig) -> str:
-    """The resolved config as YAML, every key written out; `load_identify_config` of it gives an equal config."""
-    return dump_yaml(config.model_dump(mode="json"))
+def dump_identify_config(config: IdentifyConfig, folder: Path | None = None) -> str:
+    """The resolved config as YAML, paths relative to `folder` if given; `load_identify_config` gives an equal one."""
+    return written(config, folder)
 
 
 def describe_identify_keys() -> list[tuple[str, str, str]]:

@@ -71,7 +71,7 @@ class PlanConfig(Section):
         ge=0,
         description="poses stay in reach of machines whose parameters are off by so many plausible errors",
     )
-    seed: int = Field(default=0, ge=0, description="seed of the candidates")
+    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the candidates")
 
 
 def load_plan_config(path: Path | None, overrides: Iterable[str] = ()) -> PlanConfig:

@@ -17,6 +17,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import check_rows, load_records
+from ccnn_torch.runs._memory import check_memory
 from ccnn_torch.runs.cases import build_case
 from ccnn_torch.runs.config import RunConfig
 from ccnn_torch.runs.dataset import Dataset
@@ -28,6 +29,9 @@ from ccnn_torch.runs.simulation import CaseSimulation, Simulation, simulate_real
 from ccnn_torch.splits import Column, Split
 
 __all__ = ["Prepared", "prepare"]
+
+# Of the realistic machines.
+_MOST_JOINTS = 6
 
 
 @dataclass(frozen=True)
@@ -111,6 +115,7 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
     assert config.case is not None
     case = build_case(config.case, config.variant or "printed", config.order or "raster")
     mechanism = case.mechanism
+    doubts = check_memory(config, len(case.time), len(mechanism.joints))
     columns = {"t": (case.time, Coordinate("t", "1"))}
     unknown = [name for name in config.covariates or [] if name not in columns]
     if unknown:
@@ -128,7 +133,7 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
         **_pseudoerror_settings(config, mechanism),
     )
     splits = _splits(config, mechanism.frame(case.pose)[0], {"t": case.time}, seeds)
-    notes = deviations.notes()
+    notes = [*doubts, *deviations.notes()]
     if config.covariates is None:
         notes.append("The time t is not given to the learner; covariates=[t] adds it.")
     return Prepared(
@@ -149,6 +154,7 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
 
 def _from_realistic(config: RunConfig, seeds: list[int]) -> Prepared:
     about = config.realistic
+    doubts = check_memory(config, about.rows, _MOST_JOINTS)
     machine = build_machine(about.machine, about.cause, about.strength, about.rows, about.noise, seeds)
     mechanism, joints = machine.mechanism, machine.joints
     chosen = _choose(list(machine.columns), config.covariates, f"{about.machine} with the cause {about.cause}")
@@ -175,7 +181,7 @@ def _from_realistic(config: RunConfig, seeds: list[int]) -> Prepared:
         dataset=_dataset(mechanism, joints, covariates, deviations, splits, seeds, jacobian, machine.turns_far),
         data_hash=_hash(joints, covariates, machine.measured),
         simulation=simulate_realistic(machine, lambda pose: solved(pose).deviation, deviations.deviation),
-        notes=deviations.notes(),
+        notes=[*doubts, *deviations.notes()],
     )
 
 
@@ -201,6 +207,7 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     verdict = None if config.effects == "none" else verdict_of(config.effects, mechanism)
     source = with_test_file(config.records if given is None else given, config.split)
     records = load_records(source, mechanism, config.covariates, columns=config.columns)
+    doubts = check_memory(config, len(records), len(mechanism.joints))
     check_rows(records, mechanism)
     if isinstance(mechanism, SerialArm) and records.orientation == "none":
         mechanism = mechanism.with_orientation("none")
@@ -214,7 +221,7 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
 
     total = deviations = solved(fitted.parameters)
     learned, identified, effects, margin = fitted.parameters, None, None, config.compensation.margin
-    identify, notes = config.geometry == "identify", [*records.notes, *fitted.notes]
+    identify, notes = config.geometry == "identify", [*doubts, *records.notes, *fitted.notes]
     beside: Fitted | None = fitted if identify else None
     if verdict is not None:
         about = (splits, fitted.parameters, total.deviation, total.usable, identify, margin)

@@ -17,7 +17,7 @@ from ccnn_torch.runs.config import RunConfig, dump_config, load_config
 from ccnn_torch.runs.folder import RunFolder, kept_for
 from ccnn_torch.runs.outputs import write_outputs
 from ccnn_torch.runs.prepare import Prepared, prepare
-from ccnn_torch.runs.screen import note, stdout
+from ccnn_torch.runs.screen import note, say_place, stdout
 from ccnn_torch.runs.watch import HeldOut, ProgressBar
 from ccnn_torch.training import Callback, Scaling, past_of
 
@@ -38,7 +38,7 @@ def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> Ru
     makers(config)
     prepared = prepare(config)
     with RunFolder.fresh(config.out, config.name) as folder:
-        folder.write("config.yaml", dump_config(config))
+        folder.write("config.yaml", dump_config(config, folder.path))
         _run(config, prepared, folder, quiet, tables)
     return folder
 
@@ -99,4 +99,4 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, 
             raise
     if tables and not quiet:
         print_tables(calibration.results, stdout)
-        stdout.print(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")
+        say_place(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
@@ -12,6 +13,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from ccnn_torch._files import sweep
+from ccnn_torch._yaml import read_yaml
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.suite import compare, write_suite
@@ -19,12 +21,11 @@ from ccnn_torch.report.suite_tables import case_line, print_suite
 from ccnn_torch.runs._config_tree import validated
 from ccnn_torch.runs._lock import locked
 from ccnn_torch.runs._overrides import apply_overrides, resolve_paths
-from ccnn_torch.runs._yaml import read_yaml
 from ccnn_torch.runs.calibrate import makers
 from ccnn_torch.runs.config import RunConfig, load_config
 from ccnn_torch.runs.folder import RunFolder, kept_for
 from ccnn_torch.runs.runner import resume_run, start_run
-from ccnn_torch.runs.screen import note, stdout
+from ccnn_torch.runs.screen import note, say_place, stdout
 
 __all__ = ["Suite", "load_suite", "run_suite"]
 
@@ -76,7 +77,7 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
     path = Path(path)
     tree = read_yaml(path)
     tree.setdefault("name", path.stem)
-    resolve_paths(tree, path.absolute().parent)
+    resolve_paths(tree, Path(os.path.realpath(path.parent)))
     overrides = list(overrides)
     own = [text for text in overrides if text.partition("=")[0].strip() in _OWN]
     given = apply_overrides(tree, own, Path.cwd())
@@ -87,7 +88,7 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
     for number, keys in enumerate(file.cases, 1):
         name = _name(keys, f"{path}: case {number}", cases)
         case = _merged(_DEFAULTS, _merged(file.base, keys)) | {"name": name}
-        resolve_paths(case, path.absolute().parent)
+        resolve_paths(case, Path(os.path.realpath(path.parent)))
         changed = apply_overrides(case, others, Path.cwd())
         cases[name] = validated(RunConfig, case | {"out": str(out / name)}, f"{path}, case '{name}'", changed)
     return Suite(file.name, out, cases)
@@ -137,7 +138,7 @@ def _run_cases(suite: Suite, quiet: bool) -> Path:
     with kept_for("the same command"):
         path = write_suite(suite.out, comparison)
     if not quiet:
-        stdout.print(f"Everything is in {suite.out}")
+        say_place(f"Everything is in {suite.out}")
     return path
 
 

@@ -28,11 +28,11 @@ class ProgressBar:
     def __init__(self, label: str, quiet: bool) -> None:
         self._label = label
         self._progress = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
+            TextColumn("{task.fields[note]}", markup=False),
             console=stderr,
             disable=quiet or not stderr.is_terminal,
         )

@@ -35,8 +35,8 @@ from ccnn_torch.mechanisms import load_mechanism, read_dh_file, read_urdf
         ("tool_frame: unknown", "tool_frame: [1, 2, 3, 4, 5, x]", "key 'tool_frame', entry 6"),
         ("tool_frame: unknown", "frame_per: robot", "key 'frame_per' must be a list of names"),
         ("tool_frame: unknown", "joint_types: [revolute]", "key 'joint_types' must list 6 times"),
-        ("dof: 6", "dof: 6\ndof: 6", "line 3 is no valid YAML"),
-        ("dof: 6", "dof: [6", "no valid YAML"),
+        ("dof: 6", "dof: 6\ndof: 6", "line 3: not valid YAML"),
+        ("dof: 6", "dof: [6", "not valid YAML"),
     ],
 )
 def test_dh_file_mistakes(tmp_path, old, new, said):
@@ -82,7 +82,7 @@ def test_tool_offset_replaces_the_tool_for_positions_only(tmp_path):
         ('xyz="0 0.1 0"', 'xyz="0 0.1"', "joint 'slide' needs three numbers in origin xyz, got '0 0.1'"),
         ('axis xyz="0 0 2"', 'axis xyz="0 0 0"', "joint 'pan' has the axis 0 0 0"),
         ('<parent link="rail"/>', "", "joint 'slide' lacks <parent"),
-        ('lower="-0.4"', 'lower="low"', "joint 'slide' has a limit that is no number"),
+        ('lower="-0.4"', 'lower="low"', "joint 'slide' has limits that are no numbers"),
         ("</robot>", "", "no valid XML"),
     ],
 )

@@ -171,7 +171,7 @@ def test_a_bad_json_file_is_named(tmp_path: Path, text: str, words: str) -> None
     (tmp_path / "results.json").write_text(text)
     with pytest.raises(InputError, match=words):
         read_json(tmp_path / "results.json")
-    with pytest.raises(InputError, match="not there"):
+    with pytest.raises(InputError, match="there is no such file"):
         read_json(tmp_path / "other.json")
 
 

@@ -22,7 +22,7 @@ from ccnn_torch.runs.blind.folder import BlindFolder
 from ccnn_torch.runs.blind.machines import MACHINES
 from ccnn_torch.runs.blind.plan import KINDS, plan_cases
 from ccnn_torch.runs.folder import kept_for
-from ccnn_torch.runs.screen import note, stdout
+from ccnn_torch.runs.screen import note, say_place, stdout
 
 __all__ = ["Diagnoser", "run_blind_check"]
 
@@ -107,7 +107,7 @@ def _checked(folder: BlindFolder, settings: dict[str, Any], diagnose: Diagnoser,
         print_blind(found, stdout)
     path = write_blind(folder.path, found)
     if not quiet:
-        stdout.print(f"Everything is in {folder.path}")
+        say_place(f"Everything is in {folder.path}")
     return path
 
 

@@ -16,7 +16,7 @@ from ccnn_torch.runs.folder import RunFolder, kept_for
 from ccnn_torch.runs.identification._identify import Identification, identify
 from ccnn_torch.runs.identification._outputs import RESULTS, write_outputs
 from ccnn_torch.runs.identify_config import IdentifyConfig, dump_identify_config, load_identify_config
-from ccnn_torch.runs.screen import note, stderr, stdout
+from ccnn_torch.runs.screen import note, say_place, stderr, stdout
 
 __all__ = ["resume_identification", "start_identification"]
 
@@ -30,7 +30,7 @@ def start_identification(config: IdentifyConfig, quiet: bool = False) -> Path:
     """
     with RunFolder.fresh(config.out, config.name, "ccnn identify --resume") as folder:
         try:
-            folder.write("config.yaml", dump_identify_config(config))
+            folder.write("config.yaml", dump_identify_config(config, folder.path))
             _run(config, folder.path, quiet)
         except InputError:
             # Nothing was computed: the next try may take the same name.
@@ -70,7 +70,7 @@ def _run(config: IdentifyConfig, path: Path, quiet: bool) -> Identification:
     with kept_for(f"ccnn identify --resume {path}"):
         write_outputs(found, path)
     if not quiet:
-        stdout.print(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
+        say_place(f"Everything is in {path}" + (f"; open {path / 'report.html'}" if config.save_report else ""))
     if found.results["methods"][found.results["method"]]["converged"] == 0:
         raise MethodFailedError(
             f"{not_settled(found.results)} What was written to {path} is there to look into it, not to use; more rows, "
@@ -87,7 +87,7 @@ class _Bars:
 
     def __post_init__(self) -> None:
         self._bar = Bar(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             TaskProgressColumn(),
             TimeRemainingColumn(),

@@ -85,8 +85,8 @@ class Identification:
             # What Python gave has no file that the config could name.
             table = read_source(self.given)
             write_table(folder / "records.csv", {table.header(name): table.raw(name) for name in table.names})
-            config = config.model_copy(update={"records": "records.csv"})
-        write_whole(folder / "config.yaml", dump_identify_config(config))
+            config = config.model_copy(update={"records": str(folder / "records.csv")})
+        write_whole(folder / "config.yaml", dump_identify_config(config, folder))
         write_outputs(self, folder)
 
     def nominal(self) -> dict[str, float]:

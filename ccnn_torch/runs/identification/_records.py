@@ -68,7 +68,19 @@ def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) ->
         raise InputError(f"{records.path}: {mechanism.name} needs the columns {', '.join(missing)}, too")
     if not config.frame.base and not config.frame.tool:
         check_rows(records, mechanism)
+        _check_joints(records, mechanism)
     return records, mechanism
+
+
+def _check_joints(records: Records, mechanism: Mechanism) -> None:
+    """Refuse rows whose joints the nominal machine cannot take: no residual is known there, and no error before."""
+    reached = mechanism.forward_kinematics(records.joints, guess=records.pose)
+    lost = torch.nonzero(~torch.isfinite(reached).all(-1)).squeeze(-1).numpy()
+    if len(lost):
+        raise InputError(
+            f"{records.path}: {mechanism.name} has no pose for the joints at {records.name_rows(lost)}; correct or "
+            f"remove {'it' if len(lost) == 1 else 'them'}, or check the units and the order of the joints"
+        )
 
 
 def split_records(config: IdentifyConfig, records: Records) -> tuple[Rows, Rows]:
