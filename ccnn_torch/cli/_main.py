@@ -22,6 +22,7 @@ from ccnn_torch.cli.run import run
 from ccnn_torch.cli.sign import sign
 from ccnn_torch.cli.simulate import simulate
 from ccnn_torch.cli.suite import suite
+from ccnn_torch.cli.verify import verify
 from ccnn_torch.errors import InputError, MethodFailedError
 
 __all__ = ["main"]
@@ -50,7 +51,7 @@ def _common(
         typer.echo(context.get_help())
 
 
-for _command in (run, suite, identify, compensate, plan, simulate, diagnose, check, blind_check, picture, sign, keys):
+for _command in (run, suite, identify, compensate, verify, plan, simulate, diagnose, check, blind_check, picture, sign, keys):
     app.command()(_command)
 
 
