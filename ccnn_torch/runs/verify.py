@@ -195,7 +195,7 @@ def _settings(model: LoadedModel | IdentifiedGeometry, machine: Mechanism) -> di
 def _judge(
     rows: _Rows, compensated: bool, motions: list[Motion], settings: Mapping[str, float]
 ) -> tuple[PoseError, PoseError, Tensor, Tensor, Tensor]:
-    """Pose error before and after, `s`; joint deviation before and after, `s x n` [SI]; where there is one, `s` bool."""
+    """Pose error before and after, `s`; joint deviation before and after, `s x n` [SI]; rows with one, `s`."""
     machine = rows.mechanism
     if compensated:
         measured = motions[0].undone(machine, rows.pose)
