@@ -12,10 +12,12 @@ from ccnn_torch import __version__
 from ccnn_torch.cli._stopped import Stopped
 from ccnn_torch.cli.blind_check import blind_check
 from ccnn_torch.cli.check import check
+from ccnn_torch.cli.compare import compare
 from ccnn_torch.cli.compensate import compensate
 from ccnn_torch.cli.diagnose import diagnose
 from ccnn_torch.cli.identify import identify
 from ccnn_torch.cli.keys import keys
+from ccnn_torch.cli.new import new
 from ccnn_torch.cli.picture import picture
 from ccnn_torch.cli.plan import plan
 from ccnn_torch.cli.run import run
@@ -30,7 +32,6 @@ __all__ = ["main"]
 app = typer.Typer(
     name="ccnn",
     help="Neural compensation of robot kinematics: measured records in, corrected commands and a model file out.",
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -51,7 +52,23 @@ def _common(
         typer.echo(context.get_help())
 
 
-for _command in (run, suite, identify, compensate, verify, plan, simulate, diagnose, check, blind_check, picture, sign, keys):
+for _command in (
+    new,
+    run,
+    suite,
+    identify,
+    compensate,
+    verify,
+    compare,
+    plan,
+    simulate,
+    diagnose,
+    check,
+    blind_check,
+    picture,
+    sign,
+    keys,
+):
     app.command()(_command)
 
 

@@ -130,6 +130,7 @@ class Calibration:
             "metrics": metrics,
             "rotation_weight": self.config.rotation_weight,
             "damping": damping_of(self.config, self.prepared.mechanism),
+            "columns": self.config.columns,
         }
         save_model(Path(folder), compensator, about, method=name, forms=forms)
 

@@ -68,7 +68,7 @@ def verify_model(
     the nominal one: after = its distance from that, before = what the model says the machine would have missed by.
 
     Args:
-        records: what `load_records` takes.
+        records: what `load_records` takes. Headers that the model's records had and its run mapped are mapped alike.
         mechanism: name or file; the one that the model describes when None.
         refit_frames: a rigid motion of the measuring frame is fitted before rows are judged, to "before" and "after"
             each its own: the tracker was moved since the model was made.
@@ -78,7 +78,7 @@ def verify_model(
     """
     machine = _mechanism(model, mechanism)
     names = [c.name for c in model.covariates]
-    loaded = load_records(records, machine, names, learns=False)
+    loaded = load_records(records, machine, names, learns=False, columns=_columns(model, records))
     if isinstance(machine, SerialArm) and loaded.orientation == "none":
         machine = machine.with_orientation("none")
     if not refit_frames:
@@ -143,6 +143,16 @@ def _mechanism(model: LoadedModel | IdentifiedGeometry, spec: str | None) -> Mec
             )
     given.set_parameters(about["parameters"])
     return given
+
+
+def _columns(model: LoadedModel | IdentifiedGeometry, records: Any) -> dict[str, str]:
+    """The map of columns that the model's run had, as far as the new rows have these headers."""
+    known = {} if isinstance(model, IdentifiedGeometry) else model.card.get("columns") or {}
+    if not known or isinstance(records, Records):
+        return {}
+    table = read_source(records)
+    there = {*table.names, *(table.header(name) for name in table.names)}
+    return {header: meaning for header, meaning in known.items() if header in there}
 
 
 def _predict(model: LoadedModel | IdentifiedGeometry, machine: Mechanism, records: Records, compensated: bool) -> _Rows:
