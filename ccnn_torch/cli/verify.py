@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ccnn_torch.cli._complete import complete_mechanism
 from ccnn_torch.cli._stopped import NOTHING_WRITTEN, if_stopped
 
 __all__ = ["verify"]
@@ -17,7 +18,10 @@ def verify(
     records: Annotated[str, typer.Argument(metavar="RECORDS.csv", help="New rows: joints and measured poses.")],
     out: Annotated[Path, typer.Option(help="Folder to write verify.json and verify.html to.")],
     mechanism: Annotated[
-        str | None, typer.Option(help="The machine's name or file, where it is not where the model says.")
+        str | None,
+        typer.Option(
+            help="The machine's name or file, where it is not where the model says.", autocompletion=complete_mechanism
+        ),
     ] = None,
     compensated: Annotated[
         bool, typer.Option("--compensated", help="The model was in use while the rows were measured.")

@@ -11,7 +11,8 @@ import numpy as np
 from ccnn_torch._pose import EULER_ANGLES
 from ccnn_torch._table import Table
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import REGISTRY, Mechanism, load_mechanism
+from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.mechanisms._registry import REGISTRY
 from ccnn_torch.records import DEFAULT_COVARIATES
 from ccnn_torch.units import si_unit_of
 

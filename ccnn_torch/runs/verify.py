@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ccnn_torch._sources import read_source
 from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, PoseError, SerialArm, load_mechanism, mechanism_from_description
