@@ -157,7 +157,7 @@ def test_the_limit_is_passed_once_in_twenty() -> None:
 def test_rows_at_one_configuration_count_once() -> None:
     joints = torch.from_numpy(np.repeat(np.random.default_rng(0).uniform(-1, 1, (5, 3)), 30, axis=0))
     groups = configurations(joints, load_mechanism(DELTA).joints)
-    assert len(groups.unique()) == 5
+    assert int(groups.max()) == 4
     generator = torch.Generator().manual_seed(0)
     of_place = torch.rand(5, generator=generator, dtype=torch.float64)[groups]
     block = promise_block(PoseError(of_place, None), PoseError(of_place, None), groups)

@@ -94,11 +94,11 @@ def write_runs(path: Path, runs: Mapping[str, Results]) -> None:
     Raises:
         InputError: it ends in something else.
     """
-    forms = {".csv": runs_csv, ".md": lambda found: markdown_table(runs_table(found)) + "\n"}
-    form = forms.get(path.suffix.lower())
-    if form is None:
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".md"):
         raise InputError(f"--out {path}: write a name that ends in .csv or .md")
-    write_whole(path, form(runs).encode())
+    text = runs_csv(runs) if suffix == ".csv" else markdown_table(runs_table(runs)) + "\n"
+    write_whole(path, text.encode())
 
 
 def _marks(runs: Mapping[str, Results]) -> dict[str, str]:

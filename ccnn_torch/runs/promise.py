@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,8 +25,8 @@ _SHARE = 0.95
 def configurations(joints: Tensor, coordinates: Sequence[Coordinate]) -> Tensor:
     """Number of each row's configuration, `s`, from 0: rows at the same commanded joints `s x n` [SI] are one."""
     cells = torch.tensor([_CELL[c.unit] for c in coordinates], dtype=joints.dtype)
-    found: Tensor = torch.unique(torch.round(joints / cells), dim=0, return_inverse=True)[1]
-    return found
+    found = np.unique(torch.round(joints / cells).numpy(), axis=0, return_inverse=True)[1]
+    return torch.from_numpy(found.reshape(-1))
 
 
 def promise_block(before: PoseError, after: PoseError, groups: Tensor) -> dict[str, Any] | None:
@@ -33,13 +34,13 @@ def promise_block(before: PoseError, after: PoseError, groups: Tensor) -> dict[s
 
     Args:
         before, after: pose error of the held-out rows, `s`.
-        groups: configuration of each row, `s`.
+        groups: configuration of each row, `s`, numbered from 0 without a gap.
 
     Returns:
         `rows`, `configurations`, and `position` and `rotation` (None without), each `unit`, `before`, `rms` and
         `spread`: variance over squared mean of the squared error [1] of a configuration.
     """
-    count = len(groups.unique())
+    count = int(groups.max()) + 1
     if count < 2:
         return None
 
@@ -92,7 +93,7 @@ def paired_gain(before: Tensor, after: Tensor, groups: Tensor) -> bool:
     from scipy.stats import t
 
     gain = before.square() - after.square()
-    count = len(groups.unique())
+    count = int(groups.max()) + 1
     mean = float(gain.mean())
     if count < 2 or mean <= 0:
         return False

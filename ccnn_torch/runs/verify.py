@@ -92,7 +92,7 @@ def verify_model(
     before, after, measured, left, usable = _judge(rows, compensated, motions, _settings(model, machine))
     groups = configurations(rows.joints, machine.joints)
     promise = _promise(model)
-    count = len(groups.unique())
+    count = int(groups.max()) + 1
     blocks = {
         kind: _block(unit, first, last, promise and promised(promise, kind, count))
         for kind, unit, first, last in (
@@ -192,7 +192,7 @@ def _covariates(model: LoadedModel | IdentifiedGeometry, records: Records) -> np
     return np.stack([records.columns[c.name] for c in model.covariates], axis=-1)
 
 
-def _settings(model: LoadedModel | IdentifiedGeometry, machine: Mechanism) -> dict[str, float]:
+def _settings(model: LoadedModel | IdentifiedGeometry, machine: Mechanism) -> dict[str, Any]:
     """How the joint deviations of a run were found: as the card has it."""
     card = {} if isinstance(model, IdentifiedGeometry) else model.card
     damping = float(card.get("damping", _ARM_DAMPING if isinstance(machine, SerialArm) else 0.0))
@@ -204,7 +204,7 @@ def _settings(model: LoadedModel | IdentifiedGeometry, machine: Mechanism) -> di
 
 
 def _judge(
-    rows: _Rows, compensated: bool, motions: list[Motion], settings: Mapping[str, float]
+    rows: _Rows, compensated: bool, motions: list[Motion], settings: Mapping[str, Any]
 ) -> tuple[PoseError, PoseError, Tensor, Tensor, Tensor]:
     """Pose error before and after, `s`; joint deviation before and after, `s x n` [SI]; rows with one, `s`."""
     machine = rows.mechanism

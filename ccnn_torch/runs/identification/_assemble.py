@@ -158,7 +158,9 @@ def _promise(measured: Measured, before: PoseError, after: PoseError) -> dict[st
     """What the held-out rows promise for new ones; None with several machines, of which only one is written."""
     if measured.machines > 1:
         return None
-    first, last = (PoseError(*(None if e is None or e.numel() == 0 else e[0] for e in p)) for p in (before, after))
+    first, last = (
+        PoseError(error.position[0], None if error.rotation is None else error.rotation[0]) for error in (before, after)
+    )
     return promise_block(first, last, configurations(measured.test.joints[0], measured.mechanism.joints))
 
 
