@@ -43,8 +43,8 @@ def runs_table(runs: Mapping[str, Results]) -> Table:
     Runs are marked by a letter for the rows that they were judged on: only those of one letter are comparable.
     """
     marks = _marks(runs)
-    first = next(iter(runs.values()))["pose"]["position"]
-    scale, unit = display_unit(first["unit"], first["before"]["rms"]["median"] or 0.0)
+    largest = max(results["pose"]["position"]["before"]["rms"]["median"] or 0.0 for results in runs.values())
+    scale, unit = display_unit("m", largest)
     rows = []
     for folder, results in runs.items():
         best, position, counts = results.get("best_method"), results["pose"]["position"], results["rows"]
