@@ -29,6 +29,9 @@ def verify(
     refit_frames: Annotated[
         bool, typer.Option("--refit-frames", help="The measuring device was moved since the model was made.")
     ] = False,
+    allow_code: Annotated[
+        bool, typer.Option("--allow-code", help="Run the Python file that the model names, of a machine of your own.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
 ) -> None:
     """Judge a model on new measurements: does it keep what its held-out rows promised?
@@ -51,7 +54,8 @@ def verify(
         from ccnn_torch.report.verify_report import write_verify_report
         from ccnn_torch.runs.verify import verify_model
 
-        found = verify_model(load_compensation(model), records, mechanism, compensated, refit_frames)
+        loaded = load_compensation(model, allow_code=allow_code)
+        found = verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code)
         write_verify_report(out, found.results, found.arrays)
     results = found.results
     if not quiet:

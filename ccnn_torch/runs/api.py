@@ -68,6 +68,7 @@ def verify(
     mechanism: str | None = None,
     compensated: bool = False,
     refit_frames: bool = False,
+    allow_code: bool = False,
 ) -> dict[str, Any]:
     """Judge a model on rows that it has never seen, against what its held-out rows promised; nothing is written.
 
@@ -77,6 +78,7 @@ def verify(
         mechanism: name or file, where the machine's file is not where the model says.
         compensated: the machine was commanded by the model while it was measured; the joints are then those wanted.
         refit_frames: the measuring device was moved since the model was made.
+        allow_code: run the Python file that the model names for a user's own mechanism.
 
     Returns:
         The content of verify.json; its `kept` says whether the promise is kept.
@@ -84,4 +86,5 @@ def verify(
     Raises:
         InputError: the model or the rows cannot be used; the sentence says what to change.
     """
-    return verify_model(load_compensation(model), records, mechanism, compensated, refit_frames).results
+    loaded = load_compensation(model, allow_code=allow_code)
+    return verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code).results

@@ -16,6 +16,7 @@ from ccnn_torch._sources import read_source
 from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, PoseError, SerialArm, load_mechanism, mechanism_from_description
+from ccnn_torch.plugins import code_refused
 from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.report.arrays import RunArrays
@@ -60,6 +61,7 @@ def verify_model(
     mechanism: str | None = None,
     compensated: bool = False,
     refit_frames: bool = False,
+    allow_code: bool = False,
 ) -> Verified:
     """Judge a model on new rows.
 
@@ -73,11 +75,12 @@ def verify_model(
         mechanism: name or file; the one that the model describes when None.
         refit_frames: a rigid motion of the measuring frame is fitted before rows are judged, to "before" and "after"
             each its own: the tracker was moved since the model was made.
+        allow_code: run the Python file that the model names for a user's own mechanism.
 
     Raises:
         InputError: the rows lack a column, are not of this machine, or frames cannot be fitted to them.
     """
-    machine = _mechanism(model, mechanism)
+    machine = _mechanism(model, mechanism, allow_code)
     names = [c.name for c in model.covariates]
     loaded = load_records(records, machine, names, learns=False, columns=_columns(model, records))
     if isinstance(machine, SerialArm) and loaded.orientation == "none":
@@ -128,11 +131,14 @@ def verify_model(
     return Verified(results, _arrays(rows, measured, left, before, after))
 
 
-def _mechanism(model: LoadedModel | IdentifiedGeometry, spec: str | None) -> Mechanism:
+def _mechanism(model: LoadedModel | IdentifiedGeometry, spec: str | None, allow_code: bool) -> Mechanism:
     """The nominal machine that the model was made for, its frames as they were fitted then."""
     about = model.facts["mechanism"]
     if spec is None:
-        return model.nominal if isinstance(model, IdentifiedGeometry) else mechanism_from_description(about)
+        if isinstance(model, IdentifiedGeometry):
+            return model.nominal
+        with code_refused(f"{model.path}: its mechanism", allow_code):
+            return mechanism_from_description(about, allow_code=True)
     given = load_mechanism(spec)
     if isinstance(given, SerialArm) and len(about["pose"]) == 3:
         given = given.with_orientation("none")
