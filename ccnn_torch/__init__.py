@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ccnn_torch.records import load_records as load_records
     from ccnn_torch.runs.api import calibrate as calibrate
     from ccnn_torch.runs.api import identify as identify
+    from ccnn_torch.runs.api import verify as verify
 
 __version__ = "0.1.0"
 
@@ -33,6 +34,7 @@ _HOMES = {
     "load_model": "ccnn_torch.compensation",
     "load_records": "ccnn_torch.records",
     "save_model": "ccnn_torch.compensation",
+    "verify": "ccnn_torch.runs.api",
 }
 
 __all__ = [*_HOMES, "__version__"]

@@ -13,16 +13,19 @@ from ccnn_torch._display import visible
 from ccnn_torch.cli._stopped import Stopped
 from ccnn_torch.cli.blind_check import blind_check
 from ccnn_torch.cli.check import check
+from ccnn_torch.cli.compare import compare
 from ccnn_torch.cli.compensate import compensate
 from ccnn_torch.cli.diagnose import diagnose
 from ccnn_torch.cli.identify import identify
 from ccnn_torch.cli.keys import keys
+from ccnn_torch.cli.new import new
 from ccnn_torch.cli.picture import picture
 from ccnn_torch.cli.plan import plan
 from ccnn_torch.cli.run import run
 from ccnn_torch.cli.sign import sign
 from ccnn_torch.cli.simulate import simulate
 from ccnn_torch.cli.suite import suite
+from ccnn_torch.cli.verify import verify
 from ccnn_torch.errors import InputError, MethodFailedError
 
 __all__ = ["main"]
@@ -33,7 +36,6 @@ _LONGEST = 2000
 app = typer.Typer(
     name="ccnn",
     help="Neural compensation of robot kinematics: measured records in, corrected commands and a model file out.",
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -54,7 +56,23 @@ def _common(
         typer.echo(context.get_help())
 
 
-for _command in (run, suite, identify, compensate, plan, simulate, diagnose, check, blind_check, picture, sign, keys):
+for _command in (
+    new,
+    run,
+    suite,
+    identify,
+    compensate,
+    verify,
+    compare,
+    plan,
+    simulate,
+    diagnose,
+    check,
+    blind_check,
+    picture,
+    sign,
+    keys,
+):
     app.command()(_command)
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ccnn_torch.cli._complete import complete_mechanism
 from ccnn_torch.cli._diagnosed import configured, watched
 from ccnn_torch.cli._stopped import NOTHING_WRITTEN, if_stopped
 
@@ -16,7 +17,10 @@ __all__ = ["check"]
 def check(
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
     records: Annotated[Path | None, typer.Option(help="CSV of joints, measured poses and covariates.")] = None,
-    mechanism: Annotated[str | None, typer.Option(help="A mechanism's name, file, or path/to/file.py:Name.")] = None,
+    mechanism: Annotated[
+        str | None,
+        typer.Option(help="A mechanism's name, file, or path/to/file.py:Name.", autocompletion=complete_mechanism),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write check.json to; nothing when left out.")] = None,
     noise: Annotated[
         str | None,

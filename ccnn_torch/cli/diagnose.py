@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ccnn_torch.cli._complete import complete_mechanism
 from ccnn_torch.cli._diagnosed import configured, watched
 from ccnn_torch.cli._stopped import if_stopped
 from ccnn_torch.errors import InputError
@@ -22,7 +23,10 @@ __all__ = ["diagnose"]
 def diagnose(
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
     records: Annotated[Path | None, typer.Option(help="CSV of joints, measured poses and covariates.")] = None,
-    mechanism: Annotated[str | None, typer.Option(help="A mechanism's name, file, or path/to/file.py:Name.")] = None,
+    mechanism: Annotated[
+        str | None,
+        typer.Option(help="A mechanism's name, file, or path/to/file.py:Name.", autocompletion=complete_mechanism),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write diagnosis.json to.")] = None,
     noise: Annotated[
         str | None,

@@ -7,11 +7,18 @@ from typing import Annotated
 
 import typer
 
+from ccnn_torch.cli._complete import complete_mechanism
+
 __all__ = ["plan"]
 
 
 def plan(
-    mechanism: Annotated[str, typer.Option(help="A mechanism's name, a geometry file, or path/to/file.py:Name.")],
+    mechanism: Annotated[
+        str,
+        typer.Option(
+            help="A mechanism's name, a geometry file, or path/to/file.py:Name.", autocompletion=complete_mechanism
+        ),
+    ],
     poses: Annotated[int, typer.Option(help="How many poses to plan (per_leg: for each leg).")],
     out: Annotated[Path, typer.Option(help="CSV to write; a page .md and a picture .png, .svg are put beside it.")],
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,

@@ -7,13 +7,19 @@ from typing import Annotated
 
 import typer
 
+from ccnn_torch.cli._complete import complete_mechanism
 from ccnn_torch.cli._stopped import NOTHING_WRITTEN, if_stopped
 
 __all__ = ["simulate"]
 
 
 def simulate(
-    mechanism: Annotated[str, typer.Option(help="A mechanism's name, a geometry file, or path/to/file.py:Name.")],
+    mechanism: Annotated[
+        str,
+        typer.Option(
+            help="A mechanism's name, a geometry file, or path/to/file.py:Name.", autocompletion=complete_mechanism
+        ),
+    ],
     rows: Annotated[int, typer.Option(help="How many rows.")],
     noise: Annotated[
         str, typer.Option(help="Standard deviation of the pose: 1e-5 (SI), 10um, x=1e-5,y=20um or m=10um,rad=30urad.")

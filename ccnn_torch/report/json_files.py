@@ -68,7 +68,7 @@ def load_schema(name: str) -> dict[str, Any]:
     """A JSON Schema (draft 2020-12) of this package.
 
     Args:
-        name: `results`, `identified`, `suite`, `diagnosis` or `card`.
+        name: `results`, `identified`, `suite`, `diagnosis`, `card` or `verify`.
     """
     text = files("ccnn_torch.report").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
     schema: dict[str, Any] = json.loads(text)

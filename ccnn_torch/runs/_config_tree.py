@@ -34,7 +34,7 @@ def _listed(value: Any) -> Any:
     return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
 
 
-Names = Annotated[list[str], BeforeValidator(_listed)]
+Names = Annotated[list[str], BeforeValidator(_listed, json_schema_input_type=str | list[str])]
 
 
 def _files(value: Any) -> Any:
@@ -45,7 +45,7 @@ def _files(value: Any) -> Any:
     return value
 
 
-Files = Annotated[str | list[str], BeforeValidator(_files)]
+Files = Annotated[str | list[str], BeforeValidator(_files, json_schema_input_type=str | list[str])]
 """Records: a file, or several with the same columns."""
 
 Columns = Annotated[

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+from ccnn_torch.compensation import load_compensation
 from ccnn_torch.runs.calibrate import Calibration
 from ccnn_torch.runs.calibrate import calibrate as _calibrate
 from ccnn_torch.runs.config import make_config
@@ -12,8 +14,9 @@ from ccnn_torch.runs.identification import Identification
 from ccnn_torch.runs.identification import identify as _identify
 from ccnn_torch.runs.identify_config import make_identify_config
 from ccnn_torch.runs.prepare import prepare
+from ccnn_torch.runs.verify import verify_model
 
-__all__ = ["calibrate", "identify"]
+__all__ = ["calibrate", "identify", "verify"]
 
 
 def calibrate(**keys: Any) -> Calibration:
@@ -57,3 +60,31 @@ def identify(**keys: Any) -> Identification:
         return _identify(make_identify_config(**keys))
     config = make_identify_config(**{**keys, "records": name_given(given)})
     return _identify(config.model_copy(update={"records": name_given(given)}), given=given)
+
+
+def verify(
+    model: str | Path,
+    records: Any,
+    mechanism: str | None = None,
+    compensated: bool = False,
+    refit_frames: bool = False,
+    allow_code: bool = False,
+) -> dict[str, Any]:
+    """Judge a model on rows that it has never seen, against what its held-out rows promised; nothing is written.
+
+    Args:
+        model: a .safetensors or .onnx file, or identified.yaml.
+        records: new rows, as `load_records` takes them.
+        mechanism: name or file, where the machine's file is not where the model says.
+        compensated: the machine was commanded by the model while it was measured; the joints are then those wanted.
+        refit_frames: the measuring device was moved since the model was made.
+        allow_code: run the Python file that the model names for a user's own mechanism.
+
+    Returns:
+        The content of verify.json; its `kept` says whether the promise is kept.
+
+    Raises:
+        InputError: the model or the rows cannot be used; the sentence says what to change.
+    """
+    loaded = load_compensation(model, allow_code=allow_code)
+    return verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code).results

@@ -21,7 +21,8 @@ from ccnn_torch.runs.config import METHODS, RunConfig, method_names
 from ccnn_torch.runs.evaluate import Outcome, evaluate, pose_before
 from ccnn_torch.runs.fitting import fit_method, refit
 from ccnn_torch.runs.folder import RunFolder
-from ccnn_torch.runs.prepare import Prepared, prepare
+from ccnn_torch.runs.prepare import Prepared, damping_of, prepare
+from ccnn_torch.runs.promise import configurations, promise_block
 from ccnn_torch.training import Callback, Scaling
 
 __all__ = ["Calibration", "Watch", "calibrate", "makers"]
@@ -119,6 +120,8 @@ class Calibration:
         metrics = _of_repeat(self.results["methods"][method], repeat)
         # Seconds differ from run to run, and the model file of one config and seed may not.
         del metrics["seconds"]
+        compensator = self.compensator(method)
+        metrics["promise"] = self._promise(method, compensator)
         about = {
             "mechanism": self.mechanism(method).describe(),
             "method": method,
@@ -126,8 +129,28 @@ class Calibration:
             "seed": self.config.seed + repeat,
             "metrics": metrics,
             "rotation_weight": self.config.rotation_weight,
+            "damping": damping_of(self.config, self.prepared.mechanism),
+            "columns": self.config.columns,
         }
-        save_model(Path(folder), self.compensator(method), about, method=name, forms=forms)
+        save_model(Path(folder), compensator, about, method=name, forms=forms)
+
+    def _promise(self, method: str, compensator: Compensator) -> dict[str, Any] | None:
+        """What the held-out rows promise for new ones, with the compensator as it stands in the file.
+
+        With frames per group of rows the card has no frames to judge new rows by, and of a simulated machine the
+        commanded one is judged: both by the figures of the results.
+        """
+        prepared, repeat = self.prepared, self.repeat(method)
+        test = prepared.dataset.splits[repeat].test
+        found = (self.before, self.outcomes[method].after)
+        before, after = (_rows_of(error, len(prepared.joints), repeat, test) for error in found)
+        joints, covariates = prepared.joints[repeat, test], prepared.covariates[repeat, test]
+        if not prepared.simulated and (prepared.parameters is None or prepared.parameters.shape[1] == 1):
+            mechanism = self.mechanism(method)
+            with torch.no_grad():
+                ideal = compensator.back(joints, covariates)
+            after = mechanism.pose_error(prepared.pose[repeat, test], mechanism.forward_kinematics(ideal))
+        return promise_block(before, after, configurations(joints, prepared.mechanism.joints))
 
 
 def calibrate(
@@ -210,6 +233,13 @@ def _limit(config: RunConfig, joints: int) -> Tensor | None:
             f"compensation.limit has {len(given)} numbers; write one, or one for each of the {joints} joints"
         )
     return torch.tensor(given, dtype=torch.float64).expand(joints).clone()
+
+
+def _rows_of(error: PoseError, repeats: int, repeat: int, rows: Tensor) -> PoseError:
+    """Of one repeat and some rows; all repeats may share their figures."""
+    position, rotation = (None if e is None else e.expand(repeats, -1)[repeat, rows] for e in error)
+    assert position is not None
+    return PoseError(position, rotation)
 
 
 def _of_repeat(block: Any, repeat: int) -> Any:

@@ -46,7 +46,9 @@ def _one(value: Any) -> Any:
     return [value] if isinstance(value, int | float) else value
 
 
-Numbers = Annotated[list[Annotated[float, Field(gt=0)]], BeforeValidator(_one)]
+Numbers = Annotated[
+    list[Annotated[float, Field(gt=0)]], BeforeValidator(_one, json_schema_input_type=float | list[float])
+]
 
 
 class _Part(Section):

@@ -28,7 +28,7 @@ from ccnn_torch.runs.machines import build_machine
 from ccnn_torch.runs.simulation import CaseSimulation, Simulation, simulate_realistic
 from ccnn_torch.splits import Column, Split
 
-__all__ = ["Prepared", "prepare"]
+__all__ = ["Prepared", "damping_of", "prepare"]
 
 # Of the realistic machines.
 _MOST_JOINTS = 6
@@ -255,15 +255,20 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     )
 
 
+def damping_of(config: RunConfig, mechanism: Mechanism) -> float:
+    """Weight of the joint deviation beside the pose error that it explains [m/rad]: the config's, or the default."""
+    if config.damping is not None:
+        return config.damping
+    return 0.01 if isinstance(mechanism, SerialArm) else 0.0
+
+
 def _pseudoerror_settings(config: RunConfig, mechanism: Mechanism) -> dict[str, Any]:
     """Damping and bounds, by default those that suit the mechanism.
 
     Six-joint arms pass near singular poses all over their workspace: half of a UR10's rows have a condition number
     above 50. Damped, all of them can be learned from, and the deviation stays a smooth function of the joints.
     """
-    damping = config.damping
-    if damping is None:
-        damping = 0.01 if isinstance(mechanism, SerialArm) else 0.0
+    damping = damping_of(config, mechanism)
     bound = config.max_condition
     if bound is None:
         bound = math.inf if damping > 0 else 50.0

@@ -47,7 +47,7 @@ class HeldOutConfig(Section):
         description="what makes a group: columns or patterns (goal_*), or position:5mm, the default; with "
         "split.kind=column the column whose values split.test_values names",
     )
-    test: Annotated[float | str, BeforeValidator(_share_or_file)] = Field(
+    test: Annotated[float | str, BeforeValidator(_share_or_file, json_schema_input_type=float | str)] = Field(
         default=0.3,
         description="share of the rows (group: of the groups) that is held out; or another file of records with the "
         "same columns, all of whose rows are held out",

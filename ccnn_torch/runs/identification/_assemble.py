@@ -28,6 +28,7 @@ from ccnn_torch.runs.identification._solve import (
     select,
 )
 from ccnn_torch.runs.identify_config import IdentifyConfig
+from ccnn_torch.runs.promise import configurations, promise_block
 
 __all__ = ["Assembled", "Known", "assemble", "known_of", "parameter_blocks", "versions"]
 
@@ -138,6 +139,7 @@ def assemble(
         "parameters": parameter_blocks(measured, selection, main, known[first], resampled),
         "combinations_not_identifiable": known[first].combinations,
         "test": blocks[first]["test"],
+        "promise": _promise(measured, before, after),
         "methods": blocks,
         "compensation": blocks[first]["compensation"],
         "singular_values": known[first].singular_values,
@@ -150,6 +152,16 @@ def assemble(
         "versions": versions(),
     }
     return Assembled(results, arrays)
+
+
+def _promise(measured: Measured, before: PoseError, after: PoseError) -> dict[str, Any] | None:
+    """What the held-out rows promise for new ones; None with several machines, of which only one is written."""
+    if measured.machines > 1:
+        return None
+    first, last = (
+        PoseError(error.position[0], None if error.rotation is None else error.rotation[0]) for error in (before, after)
+    )
+    return promise_block(first, last, configurations(measured.test.joints[0], measured.mechanism.joints))
 
 
 def _doubts(config: IdentifyConfig, measured: Measured, test: dict[str, Any], known: Known) -> list[str]:

@@ -1,0 +1,67 @@
+"""`ccnn verify`: a model against rows that were measured after it was made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ccnn_torch.cli._complete import complete_mechanism
+from ccnn_torch.cli._stopped import NOTHING_WRITTEN, if_stopped
+
+__all__ = ["verify"]
+
+
+def verify(
+    model: Annotated[Path, typer.Argument(help="A .safetensors or .onnx file, or identified.yaml.")],
+    records: Annotated[str, typer.Argument(metavar="RECORDS.csv", help="New rows: joints and measured poses.")],
+    out: Annotated[Path, typer.Option(help="Folder to write verify.json and verify.html to.")],
+    mechanism: Annotated[
+        str | None,
+        typer.Option(
+            help="The machine's name or file, where it is not where the model says.", autocompletion=complete_mechanism
+        ),
+    ] = None,
+    compensated: Annotated[
+        bool, typer.Option("--compensated", help="The model was in use while the rows were measured.")
+    ] = False,
+    refit_frames: Annotated[
+        bool, typer.Option("--refit-frames", help="The measuring device was moved since the model was made.")
+    ] = False,
+    allow_code: Annotated[
+        bool, typer.Option("--allow-code", help="Run the Python file that the model names, of a machine of your own.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
+) -> None:
+    """Judge a model on new measurements: does it keep what its held-out rows promised?
+
+    Without --compensated the rows are of the machine as it is: joints commanded, pose measured. With --compensated
+    the joints are those wanted, the machine was commanded by the model, and the pose should be the nominal one.
+
+    Exit code 0: the promise is kept; 1: the RMS of position or rotation is above its limit at 95 %; 2: bad input.
+
+    Examples:
+
+    ccnn verify runs/ur10/model.safetensors next_week.csv --out runs/next_week
+
+    ccnn verify runs/ur10/model.safetensors with_it_on.csv --compensated --out runs/acceptance
+
+    ccnn verify runs/five_bar/identified.yaml other_day.csv --refit-frames --out runs/other_day
+    """
+    with if_stopped(NOTHING_WRITTEN):
+        from ccnn_torch.compensation import load_compensation
+        from ccnn_torch.report.verify_report import write_verify_report
+        from ccnn_torch.runs.verify import verify_model
+
+        loaded = load_compensation(model, allow_code=allow_code)
+        found = verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code)
+        write_verify_report(out, found.results, found.arrays)
+    results = found.results
+    if not quiet:
+        typer.echo(results["text"])
+        for note in results["notes"]:
+            typer.echo(note)
+        typer.echo(f"Everything is in {out}; open {out / 'verify.html'}")
+    if not results["kept"]:
+        raise typer.Exit(1)

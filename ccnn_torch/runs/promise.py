@@ -1,0 +1,110 @@
+"""What a model promises for rows that nobody has measured yet, by the rows that were held out when it was made."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.mechanisms import PoseError
+
+__all__ = ["configurations", "paired_gain", "promise_block", "promised"]
+
+# Rows whose commanded joints round to the same cell are one configuration, measured several times [SI].
+_CELL = {"m": 1e-4, "rad": 1e-3}
+# Squared length of independent normal errors in three directions: variance over squared mean.
+_LEAST_SPREAD = 2 / 3
+_SHARE = 0.95
+
+
+def configurations(joints: Tensor, coordinates: Sequence[Coordinate]) -> Tensor:
+    """Number of each row's configuration, `s`, from 0: rows at the same commanded joints `s x n` [SI] are one."""
+    cells = torch.tensor([_CELL[c.unit] for c in coordinates], dtype=joints.dtype)
+    found = np.unique(torch.round(joints / cells).numpy(), axis=0, return_inverse=True)[1]
+    return torch.from_numpy(found.reshape(-1))
+
+
+def promise_block(before: PoseError, after: PoseError, groups: Tensor) -> dict[str, Any] | None:
+    """What stands in a model's card under `metrics`, `promise`; None with fewer than two configurations.
+
+    Args:
+        before, after: pose error of the held-out rows, `s`.
+        groups: configuration of each row, `s`, numbered from 0 without a gap.
+
+    Returns:
+        `rows`, `configurations`, and `position` and `rotation` (None without), each `unit`, `before`, `rms` and
+        `spread`: variance over squared mean of the squared error [1] of a configuration.
+    """
+    count = int(groups.max()) + 1
+    if count < 2:
+        return None
+
+    def part(unit: str, first: Tensor | None, last: Tensor | None) -> dict[str, Any] | None:
+        if first is None or last is None:
+            return None
+        square = last.square()
+        return {
+            "unit": unit,
+            "before": float(first.square().mean().sqrt()),
+            "rms": float(square.mean().sqrt()),
+            "spread": max(_spread(square, groups), _LEAST_SPREAD),
+        }
+
+    return {
+        "rows": len(groups),
+        "configurations": count,
+        "position": part("m", before.position, after.position),
+        "rotation": part("rad", before.rotation, after.rotation),
+    }
+
+
+def promised(promise: Mapping[str, Any], kind: str, count: int) -> dict[str, float] | None:
+    """RMS that new rows should have, and the limits that it passes once in twenty on either side; None = no promise.
+
+    The mean of squared errors over C configurations is taken as a scaled chi-square with 2 C / spread degrees of
+    freedom (Satterthwaite 1946), that of the held-out rows as well, so that their ratio is an F variate. It holds for
+    rows that are drawn as the held-out ones were. Rows at one configuration count once; errors of neighbouring
+    configurations are alike, too, which is not counted: with rows in one small part of the workspace the limits are
+    too narrow.
+
+    Args:
+        promise: as `promise_block` gives it.
+        kind: `position` or `rotation`.
+        count: configurations among the new rows.
+    """
+    block = promise.get(kind)
+    if block is None:
+        return None
+    # Only here: a command that promises nothing need not wait for it.
+    from scipy.stats import f
+
+    freedom = [2 * n / block["spread"] for n in (count, promise["configurations"])]
+    low, high = (block["rms"] * math.sqrt(float(f.ppf(share, *freedom))) for share in (1 - _SHARE, _SHARE))
+    return {"rms": block["rms"], "low": low, "high": high}
+
+
+def paired_gain(before: Tensor, after: Tensor, groups: Tensor) -> bool:
+    """Whether squared errors fell: a paired t test over configurations, one-sided at 95 %; `s` each."""
+    from scipy.stats import t
+
+    gain = before.square() - after.square()
+    count = int(groups.max()) + 1
+    mean = float(gain.mean())
+    if count < 2 or mean <= 0:
+        return False
+    return mean > float(t.ppf(_SHARE, count - 1)) * mean * math.sqrt(_spread(gain, groups) / count)
+
+
+def _spread(values: Tensor, groups: Tensor) -> float:
+    """Variance of the mean of `s` rows in groups, over its square, times the number of groups [1]."""
+    count, mean = int(groups.max()) + 1, values.mean()
+    if mean == 0:
+        return 0.0
+    sums = torch.zeros(count, dtype=values.dtype).index_add_(0, groups, values - mean)
+    variance = sums.square().sum() / len(values) ** 2 * count / (count - 1)
+    return float(count * variance / mean**2)

@@ -1,0 +1,122 @@
+"""`ccnn new`: from a stranger's table to a config that runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ccnn_torch.cli._complete import MECHANISMS, complete_mechanism
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms._registry import REGISTRY
+from ccnn_torch.runs import load_config
+from ccnn_torch.runs.starter import starter_config
+
+Cli = Callable[..., tuple[int, str, str]]
+ARM = Path(__file__).parent.parent / "experiments" / "data" / "ur10.yaml"
+
+
+def write(path: Path, headers: list[str], values: np.ndarray, separator: str = ",") -> Path:
+    lines = [separator.join(headers), *(separator.join(f"{v:.9g}" for v in row) for row in values)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def delta(rows: int = 40) -> np.ndarray:
+    """Joints in degrees and poses in mm of a delta robot whose joints are off by 1 mrad."""
+    machine = load_mechanism("delta")
+    joints = machine.solve_inverse(machine.sample_workspace(rows, torch.Generator().manual_seed(0)))
+    pose = machine.forward_kinematics(joints + 1e-3)
+    return np.concatenate([np.rad2deg(joints.numpy()), 1e3 * pose.numpy()], axis=1)
+
+
+def arm(rows: int, places: int | None = None) -> np.ndarray:
+    """Six joints in degrees, position in mm and KUKA angles in degrees, of an arm; at so many places only."""
+    machine = load_mechanism(str(ARM))
+    joints = machine.sample_joints(places or rows, torch.Generator().manual_seed(1)) / 4
+    joints = joints.repeat(-(-rows // len(joints)), 1)[:rows]
+    pose = machine.forward_kinematics(joints).numpy()
+    return np.concatenate([np.rad2deg(joints.numpy()), 1e3 * pose[:, :3], np.zeros((rows, 3))], axis=1)
+
+
+def test_from_strange_headers_to_a_finished_run(tmp_path: Path, cli: Cli) -> None:
+    headers = ["No", "Axis_1", "Axis_2", "Axis_3", "X", "Y", "Z"]
+    values = np.concatenate([np.arange(40)[:, None], delta()], axis=1)
+    records, config = write(tmp_path / "mätning.csv", headers, values), tmp_path / "delta.yaml"
+    # Without units, and with nobody to ask, nothing is guessed.
+    code, _, err = cli("new", records, "--out", config)
+    assert code == 2 and "--units mm,deg" in err and "Axis_1" in err and not config.exists()
+    code, _, err = cli("new", records, "--units", "deg,mm", "--out", config)
+    assert code == 2 and "--units" in err
+    code, out, err = cli("new", records, "--units", "mm,deg", "--mechanism", "delta", "--out", config)
+    assert code == 0, err
+    assert f"ccnn run {config}" in out
+    text = config.read_text(encoding="utf-8")
+    assert '"Axis_1": "q1[deg]"' in text and '"X": "x[mm]"' in text and "Not used: No" in text
+    code, _, err = cli("run", config, "methods=[constant]", "geometry=none", "save_models=false", "save_report=false",
+                       "--out", tmp_path / "run", "--quiet")  # fmt: skip
+    assert code == 0, err
+    assert (tmp_path / "run" / "results.json").is_file()
+    # What is there is not lost.
+    code, _, err = cli("new", records, "--units", "mm,deg", "--mechanism", "delta", "--out", config)
+    assert code == 2 and "--force" in err
+    assert cli("new", records, "--units", "mm,deg", "--mechanism", "delta", "--out", config, "--force")[0] == 0
+
+
+def test_a_mechanism_is_guessed_only_where_one_fits(tmp_path: Path, cli: Cli) -> None:
+    headers = ["q1[deg]", "q2[deg]", "q3[deg]", "x[mm]", "y[mm]", "z[mm]"]
+    text, ready = starter_config(write(tmp_path / "a.csv", headers, delta()), tmp_path / "a.yaml")
+    assert ready and 'mechanism: "delta"' in text and "columns:" not in text
+    # Without units of the joints two built-in deltas fit.
+    bare = write(tmp_path / "b.csv", ["q1", "q2", "q3", "x", "y", "z"], delta())
+    text, ready = starter_config(bare, tmp_path / "b.yaml", units="mm,deg")
+    assert not ready and "delta, delta_linear would fit" in text and "# mechanism:" in text
+    (tmp_path / "b.yaml").write_text(text, encoding="utf-8")
+    code, _, err = cli("run", tmp_path / "b.yaml", "--out", tmp_path / "run")
+    assert code == 2 and "mechanism: records need it" in err
+    asked: list[str] = []
+
+    def answer(question: str) -> str:
+        asked.append(question)
+        return "delta" if "Mechanism" in question else "mm,deg"
+
+    text, ready = starter_config(bare, tmp_path / "b.yaml", ask=answer)
+    assert ready and len(asked) == 2 and '"q1": "q1[deg]"' in text
+    with pytest.raises(InputError, match="it has 2 joints"):
+        starter_config(bare, tmp_path / "b.yaml", mechanism="five_bar", units="mm,deg")
+
+
+def test_an_arms_controller_names_and_repeated_targets(tmp_path: Path) -> None:
+    headers = [*(f"A{k}[deg]" for k in range(1, 7)), "X[mm]", "Y[mm]", "Z[mm]", "A[deg]", "B[deg]", "C[deg]"]
+    records = write(tmp_path / "kuka.csv", headers, arm(60, places=15), separator=";")
+    text, ready = starter_config(records, tmp_path / "kuka.yaml", mechanism=str(ARM))
+    (tmp_path / "kuka.yaml").write_text(text, encoding="utf-8")
+    config = load_config(tmp_path / "kuka.yaml")
+    assert ready and config.columns["A1[deg]"] == "q1[deg]" and config.columns["C[deg]"] == "kuka_c[deg]"
+    assert config.split.kind == "group" and config.split.by == ["position:5mm"] and "KUKA" in text
+    once = write(tmp_path / "once.csv", headers, arm(60))
+    assert "kind: random" in starter_config(once, tmp_path / "once.yaml", mechanism=str(ARM))[0]
+    assert "# FILL IN" in starter_config(once, tmp_path / "once.yaml")[0]
+
+
+def test_tables_without_joints_or_with_strange_text(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="looks like a joint"):
+        starter_config(write(tmp_path / "a.csv", ["x[mm]", "y[mm]"], np.zeros((3, 2))), tmp_path / "a.yaml")
+    with pytest.raises(InputError, match="measured pose"):
+        starter_config(write(tmp_path / "b.csv", ["q1[deg]", "q2[deg]"], np.zeros((3, 2))), tmp_path / "b.yaml")
+    # A header cannot write keys of its own into the config.
+    headers = ["q1[deg]", "q2[deg]", "x[mm]", "y[mm]", "a\u2028out: /tmp/x", 'Time "s"']
+    values = np.random.default_rng(0).uniform(0.1, 1, (30, 6))
+    text, _ = starter_config(write(tmp_path / "c.csv", headers, values), tmp_path / "c.yaml")
+    (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
+    config = load_config(tmp_path / "c.yaml")
+    assert config.out is None and config.mechanism == "five_bar"
+
+
+def test_completion_knows_the_mechanisms() -> None:
+    assert set(MECHANISMS) == set(REGISTRY) - {"serial", "framed"}
+    assert complete_mechanism("del") == ["delta", "delta_linear"]

@@ -1,0 +1,166 @@
+"""`ccnn verify`: a model on new rows, against what its held-out rows promised."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import torch
+
+import ccnn_torch
+from ccnn_torch import calibrate
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import PoseError, load_mechanism
+from ccnn_torch.records import write_table
+from ccnn_torch.report.json_files import load_schema
+from ccnn_torch.rotations import rotation_vector_to_matrix
+from ccnn_torch.runs.promise import configurations, paired_gain, promise_block, promised
+
+Cli = Callable[..., tuple[int, str, str]]
+DELTA = "delta"
+NOISE = 2e-5
+OFFSET = torch.tensor([2e-3, -1e-3, 1.5e-3], dtype=torch.float64)
+
+
+def delta_rows(
+    path: Path, seed: int, rows: int = 80, noise: float = NOISE, joints: torch.Tensor | None = None,
+    command: torch.Tensor | None = None, moved: bool = False,
+) -> Path:  # fmt: skip
+    """Rows of a delta robot whose joints are off by OFFSET; `command` goes to the machine where it is not `joints`."""
+    machine = load_mechanism(DELTA)
+    generator = torch.Generator().manual_seed(seed)
+    joints = wanted(seed, rows) if joints is None else joints
+    pose = machine.forward_kinematics((joints if command is None else command) + OFFSET)
+    pose = pose + noise * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
+    if moved:
+        turn = rotation_vector_to_matrix(torch.tensor([0.02, -0.01, 0.03], dtype=torch.float64))
+        pose = pose @ turn.mT + torch.tensor([0.05, -0.02, 0.01], dtype=torch.float64)
+    names = [c.header for c in (*machine.joints, *machine.pose)]
+    write_table(path, dict(zip(names, torch.cat([joints, pose], -1).mT.numpy(), strict=True)))
+    return path
+
+
+def wanted(seed: int, rows: int) -> torch.Tensor:
+    machine = load_mechanism(DELTA)
+    pose = machine.sample_workspace(rows, torch.Generator().manual_seed(100 + seed))
+    return machine.solve_inverse(pose)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("model")
+    rows = delta_rows(folder / "rows.csv", seed=0)
+    found = calibrate(records=str(rows), mechanism=DELTA, methods=["constant"], geometry="none")
+    found.save(folder, forms=())
+    return folder / "model.safetensors"
+
+
+def read(folder: Path) -> dict:
+    found = json.loads((folder / "verify.json").read_text())
+    jsonschema.validate(found, load_schema("verify"))
+    return found
+
+
+def test_a_promise_is_kept_on_rows_of_the_same_machine(model: Path, tmp_path: Path, cli: Cli) -> None:
+    code, out, err = cli("verify", model, delta_rows(tmp_path / "new.csv", seed=1, rows=60), "--out", tmp_path / "v")
+    assert code == 0, err
+    found = read(tmp_path / "v")
+    position = found["position"]
+    assert found["kept"] and not found["compensated"] and found["rows"] == 60 and found["rotation"] is None
+    assert position["before"]["rms"] > 5 * position["after"]["rms"]
+    # Three directions of noise, and nothing else, are left.
+    assert position["after"]["rms"] == pytest.approx(3**0.5 * NOISE, rel=0.2)
+    assert position["promised"]["low"] < position["promised"]["rms"] < position["promised"]["high"]
+    assert found["joints"]["q1"]["before"] == pytest.approx(2e-3, rel=0.05)
+    assert found["joints"]["q1"]["after"] < 2e-4
+    page = (tmp_path / "v" / "verify.html").read_text()
+    assert found["text"] in page and page.count("<svg") == 4 and "<script" not in page
+    assert "The promise is kept" in out
+    assert ccnn_torch.verify(model, tmp_path / "new.csv")["position"] == position
+
+
+def test_a_machine_that_has_changed_is_told_by_exit_code_1(model: Path, tmp_path: Path, cli: Cli) -> None:
+    rows = delta_rows(tmp_path / "new.csv", seed=2, noise=4 * NOISE)
+    code, out, _ = cli("verify", model, rows, "--out", tmp_path / "v")
+    assert code == 1 and "not kept" in out
+    found = read(tmp_path / "v")
+    assert not found["kept"] and found["position"]["after"]["rms"] > found["position"]["promised"]["high"]
+
+
+def test_rows_measured_with_the_compensator_on(model: Path, tmp_path: Path) -> None:
+    joints = wanted(3, 50)
+    command = torch.from_numpy(ccnn_torch.load_model(model)(joints.numpy())["command"])
+    rows = delta_rows(tmp_path / "on.csv", seed=3, joints=joints, command=command)
+    found = ccnn_torch.verify(model, rows, compensated=True)
+    assert found["kept"] and found["compensated"]
+    assert found["position"]["before"]["rms"] > 5 * found["position"]["after"]["rms"]
+    assert found["position"]["after"]["rms"] == pytest.approx(3**0.5 * NOISE, rel=0.2)
+    # Were the compensator off, the same rows would keep nothing.
+    off = delta_rows(tmp_path / "off.csv", seed=3, joints=joints)
+    assert not ccnn_torch.verify(model, off, compensated=True)["kept"]
+
+
+def test_a_tracker_that_was_moved(model: Path, tmp_path: Path) -> None:
+    rows = delta_rows(tmp_path / "moved.csv", seed=4, moved=True)
+    found = ccnn_torch.verify(model, rows)
+    assert not found["kept"] and "seems to have moved" in " ".join(found["notes"])
+    found = ccnn_torch.verify(model, rows, refit_frames=True)
+    assert found["kept"] and found["frames"] == "fitted again" and "moved" not in " ".join(found["notes"])
+    assert found["position"]["after"]["rms"] == pytest.approx(3**0.5 * NOISE, rel=0.2)
+
+
+def test_what_cannot_be_verified(model: Path, tmp_path: Path, cli: Cli) -> None:
+    rows = delta_rows(tmp_path / "new.csv", seed=5, rows=20)
+    code, _, err = cli("verify", model, rows, "--mechanism", "tripod", "--out", tmp_path / "v")
+    assert code == 2 and "made for delta" in err and not (tmp_path / "v").exists()
+    assert cli("verify", model, tmp_path / "none.csv", "--out", tmp_path / "v")[0] == 2
+    with pytest.raises(InputError, match="too few to fit a frame"):
+        ccnn_torch.verify(model, delta_rows(tmp_path / "few.csv", seed=6, rows=3), refit_frames=True)
+
+
+def test_an_identified_machine(tmp_path: Path) -> None:
+    rows = delta_rows(tmp_path / "rows.csv", seed=7)
+    found = ccnn_torch.identify(mechanism=DELTA, records=str(rows), methods=["lm"], save_report=False)
+    found.save(tmp_path)
+    new = delta_rows(tmp_path / "new.csv", seed=8)
+    told = ccnn_torch.verify(tmp_path / "identified.yaml", new)
+    assert told["kept"] and told["position"]["promised"] is not None
+    assert told["position"]["after"]["rms"] < 0.2 * told["position"]["before"]["rms"]
+    # Without the figures beside it there is no promise: the error must have fallen.
+    (tmp_path / "identified.json").unlink()
+    told = ccnn_torch.verify(tmp_path / "identified.yaml", new)
+    assert told["kept"] and told["position"]["promised"] is None and "promises no figure" in told["text"]
+
+
+def test_the_limit_is_passed_once_in_twenty() -> None:
+    generator = torch.Generator().manual_seed(0)
+    groups = torch.arange(30)
+
+    def error(rows: int) -> PoseError:
+        return PoseError(torch.randn(rows, 3, generator=generator, dtype=torch.float64).norm(dim=-1), None)
+
+    passed, below = 0, 0
+    for _ in range(400):
+        block = promise_block(error(30), error(30), groups)
+        assert block is not None
+        limits, new = promised(block, "position", 20), error(20).position.square().mean().sqrt()
+        assert limits is not None
+        passed += float(new) > limits["high"]
+        below += float(new) < limits["low"]
+    assert 0.025 < passed / 400 < 0.085 and 0.025 < below / 400 < 0.085
+
+
+def test_rows_at_one_configuration_count_once() -> None:
+    joints = torch.from_numpy(np.repeat(np.random.default_rng(0).uniform(-1, 1, (5, 3)), 30, axis=0))
+    groups = configurations(joints, load_mechanism(DELTA).joints)
+    assert int(groups.max()) == 4
+    generator = torch.Generator().manual_seed(0)
+    of_place = torch.rand(5, generator=generator, dtype=torch.float64)[groups]
+    block = promise_block(PoseError(of_place, None), PoseError(of_place, None), groups)
+    assert block is not None and block["configurations"] == 5 and block["rows"] == 150
+    assert not paired_gain(of_place, 0.999 * of_place[torch.randperm(150, generator=generator)], groups)
+    assert paired_gain(of_place, 0.1 * of_place, groups)
