@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.display import display_unit, interval_text, number_text
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.table_form import Table
 from ccnn_torch.report.tables import markdown_table
-from ccnn_torch.training import write_whole
 
 __all__ = ["read_runs", "runs_csv", "runs_table", "write_runs"]
 

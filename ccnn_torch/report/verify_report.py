@@ -7,11 +7,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from ccnn_torch._files import write_whole
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.html import InlineFigure, page_text
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.report.verify_words import verify_tables
-from ccnn_torch.training import write_whole
 
 __all__ = ["write_verify_report"]
 
