@@ -109,7 +109,7 @@ def test_tables_without_joints_or_with_strange_text(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="measured pose"):
         starter_config(write(tmp_path / "b.csv", ["q1[deg]", "q2[deg]"], np.zeros((3, 2))), tmp_path / "b.yaml")
     # A header cannot write keys of its own into the config.
-    headers = ["q1[deg]", "q2[deg]", "x[mm]", "y[mm]", "a, out: /tmp/x", 'Time: "s" # out']
+    headers = ["q1[deg]", "q2[deg]", "x[mm]", "y[mm]", "a: 1 # out: /tmp/x", 'Time: "s" # out']
     values = np.random.default_rng(0).uniform(0.1, 1, (30, 6))
     text, _ = starter_config(write(tmp_path / "c.csv", headers, values), tmp_path / "c.yaml")
     (tmp_path / "c.yaml").write_text(text, encoding="utf-8")

@@ -31,6 +31,7 @@ from ccnn_torch.runs.uncertainty import coverage, inside_domain
 
 __all__ = ["assemble", "best_method", "by_score", "plan_of", "versions"]
 
+_NO_GEOMETRY = {"chosen": "none", "why": "A simulated case compares learners."}
 _PACKAGES = ("ccnn-torch", "torch", "numpy", "scipy", "onnx", "onnxruntime", "safetensors")
 
 
@@ -116,6 +117,7 @@ def assemble(
         "records": None if prepared.simulated else _records(prepared),
         **_effects(prepared, test),
         "data_sha256": prepared.data_hash,
+        "geometry": _NO_GEOMETRY if prepared.choice is None else prepared.choice.block,
         "notes": [*prepared.notes, *_notes(plan_of(config))],
         "versions": versions(),
     }

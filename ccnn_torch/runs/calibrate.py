@@ -174,7 +174,7 @@ def calibrate(
     before = pose_before(prepared)
     outcomes: dict[str, Outcome] = {}
     failed: dict[str, str] = {}
-    found = makers(config)
+    found = makers(config, prepared.default_method)
     comparison: Comparison | None = None
     if config.methods == ["auto"]:
         comparison = compare(
@@ -203,17 +203,20 @@ def calibrate(
     return Calibration(config, prepared, before, outcomes, failed, results)
 
 
-def makers(config: RunConfig) -> dict[str, Callable[[], Learner] | None]:
+def makers(config: RunConfig, default: str = "ccnn") -> dict[str, Callable[[], Learner] | None]:
     """What makes the learner of each method, by the name that results and files have for it.
 
     A user's `path/to/file.py:Name` is called `Name` there. None stands for a learner that `methods=all` or `auto`
     asks for and this version does not have.
 
+    Args:
+        default: the method where the config names none.
+
     Raises:
         InputError: a method that was named is not to be had.
     """
     found: dict[str, Callable[[], Learner] | None] = {}
-    for method in method_names(config):
+    for method in method_names(config, default):
         if config.methods in (["all"], ["auto"]) and method in METHODS and method not in LEARNERS:
             found[method] = None
             continue

@@ -150,11 +150,11 @@ class RunConfig(_Part):
         default=1, ge=1, description="independent repeats, side by side: new noise, split and start each"
     )
     out: str | None = Field(default=None, description="folder to write; default runs/NAME-STAMP")
-    methods: Names = Field(
-        default=["ccnn"],
+    methods: Names | None = Field(
+        default=None,
         min_length=1,
         description=f"learners: a list of {', '.join(METHODS)}; all = these; auto = the best of auto.methods "
-        "by cross-validation",
+        "by cross-validation; null = ccnn, and where geometry=auto compared a learner, what that comparison prefers",
     )
     device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?|mps)$", description="cpu, cuda, cuda:N or mps")
     covariates: Names | None = Field(
@@ -186,10 +186,11 @@ class RunConfig(_Part):
         description="mechanism of the records: tripod, machine_tool, a DH file (.yaml), a URDF, or file.py:Name",
     )
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
-    geometry: Literal["none", "identify"] = Field(
-        default="none",
+    geometry: Literal["auto", "identify", "none"] = Field(
+        default="auto",
         description="identify = find all geometric parameters on the training rows of records, and let the network "
-        "learn only what they leave; the model files hold both. none = the network learns everything",
+        "learn only what they leave; the model files hold both. none = the network learns everything. auto = what "
+        "cross-validation prefers of identified geometry alone, or either with a learner; none for cases and effects",
     )
     effects: str = Field(
         default="none",
@@ -244,9 +245,9 @@ class RunConfig(_Part):
 
     @field_validator("methods")
     @classmethod
-    def _known(cls, methods: list[str]) -> list[str]:
-        for method in _checked(methods, (*METHODS, "all", "auto")):
-            if method in ("all", "auto") and len(methods) > 1:
+    def _known(cls, methods: list[str] | None) -> list[str] | None:
+        for method in _checked(methods or [], (*METHODS, "all", "auto")):
+            if method in ("all", "auto") and len(methods or []) > 1:
                 raise ValueError(f"'{method}' stands alone; remove the other names or '{method}'")
         return methods
 
@@ -282,7 +283,7 @@ class RunConfig(_Part):
             raise ValueError("split.test: a case makes its own rows and takes no file; write a share, e.g. 0.3")
         if self.case is not None and self.columns:
             raise ValueError("columns: a case reads no file; remove the key")
-        if self.case is not None and self.geometry != "none":
+        if self.case is not None and self.geometry == "identify":
             raise ValueError("geometry: a case is there to compare learners; write geometry=none, or take records")
         if self.case is not None and self.effects != "none":
             raise ValueError("effects: a case is there to compare learners; write effects=none, or take records")
@@ -323,8 +324,10 @@ def dump_config(config: RunConfig, folder: Path | None = None) -> str:
     return written(config, folder)
 
 
-def method_names(config: RunConfig) -> list[str]:
-    """The methods to train: ``all`` and ``auto`` spelt out."""
+def method_names(config: RunConfig, default: str = "ccnn") -> list[str]:
+    """The methods to train: ``all`` and ``auto`` spelt out; `default` where the config names none and sets no ccnn."""
+    if config.methods is None:
+        return [default if config.ccnn == CCNNSettings() else "ccnn"]
     if config.methods == ["all"]:
         return list(METHODS)
     if config.methods == ["auto"]:

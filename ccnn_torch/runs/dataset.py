@@ -9,10 +9,12 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.learners import Learner, TrainingData
+from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.pseudoerror import Pseudoerror
 from ccnn_torch.splits import Split
 from ccnn_torch.training import Scaling
 
-__all__ = ["Dataset", "Rows", "pad_rows"]
+__all__ = ["Dataset", "Rows", "by_repeat", "dataset_of", "pad_rows"]
 
 _SMALLEST_TRAINING_SET = 8
 
@@ -143,3 +145,42 @@ class Dataset:
         scale = torch.cat([part.sqrt().unsqueeze(-1).expand(-1, 3) for part in parts], -1)[:, : jacobian.shape[-2]]
         scale = torch.where(scale > 0, scale, torch.ones_like(scale))
         return jacobian / scale[:, None, :, None] * scaling.deviation[:, None, None, :]
+
+
+def dataset_of(
+    mechanism: Mechanism,
+    joints: Tensor,
+    covariates: Tensor,
+    deviations: Pseudoerror,
+    splits: list[Split],
+    seeds: list[int],
+    jacobian: Tensor | None = None,
+    turns_far: Tensor | None = None,
+) -> Dataset:
+    """Put a dataset together.
+
+    Args:
+        joints, covariates: `[r x] s x n`, `[r x] s x m` [SI].
+        jacobian: `[r x] s x c x n`. Measured records and realistic machines are judged by the pose, so they bring it;
+            the paper's cases are judged by the joints alone.
+        turns_far: joints that move by more than a quarter turn, `n` bool; by the rows themselves when None.
+    """
+    repeats, rows = len(seeds), joints.shape[-2]
+    if turns_far is None:
+        turns_far = joints.amax(-2) - joints.amin(-2) > torch.pi / 2
+    turning = torch.tensor([joint.unit == "rad" for joint in mechanism.joints])
+    return Dataset(
+        inputs=by_repeat(torch.cat([joints, covariates], -1), seeds),
+        deviation=deviations.deviation.expand(repeats, rows, -1),
+        usable=deviations.usable.expand(repeats, rows),
+        splits=splits,
+        seeds=seeds,
+        periodic=torch.cat([turning & turns_far, torch.zeros(covariates.shape[-1], dtype=torch.bool)]),
+        # Singular rows are not trained on; their Jacobian must only not spoil sums with weight 0.
+        jacobian=None if jacobian is None else torch.nan_to_num(jacobian).expand(repeats, rows, -1, -1),
+    )
+
+
+def by_repeat(rows: Tensor, seeds: list[int]) -> Tensor:
+    """Rows of every repeat, `r x s x d`, whether they have repeats or share them."""
+    return rows.expand(len(seeds), *rows.shape[-2:])

@@ -16,13 +16,14 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
-from ccnn_torch.records import check_rows, load_records
+from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.runs._memory import check_memory
 from ccnn_torch.runs.cases import build_case
 from ccnn_torch.runs.config import RunConfig
-from ccnn_torch.runs.dataset import Dataset
+from ccnn_torch.runs.dataset import Dataset, by_repeat, dataset_of
 from ccnn_torch.runs.effects import KnownEffects, fit_effects, verdict_of
 from ccnn_torch.runs.geometry import Fitted, Identified, fit_machine
+from ccnn_torch.runs.geometry_choice import GeometryChoice, choose_geometry
 from ccnn_torch.runs.held_out import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.runs.machines import build_machine
 from ccnn_torch.runs.simulation import CaseSimulation, Simulation, simulate_realistic
@@ -51,6 +52,7 @@ class Prepared:
             geometric calibration would command by, to be compared with; None where it was not fitted.
         geometry: the same where it is a part of the compensator, so that the network learns what it leaves.
         effects: known effects that are a part of it, likewise.
+        choice: what `geometry` ended as; None for a case.
         simulation: the machine behind simulated rows, or None for measured records.
         notes: sentences for the person who reads the results.
     """
@@ -68,12 +70,18 @@ class Prepared:
     identified: Tensor | None = None
     geometry: Identified | None = None
     effects: KnownEffects | None = None
+    choice: GeometryChoice | None = None
     simulation: Simulation | None = None
     notes: list[str] = field(default_factory=list)
 
     @property
     def simulated(self) -> bool:
         return self.simulation is not None
+
+    @property
+    def default_method(self) -> str:
+        """The learner where the config names none."""
+        return "ccnn" if self.choice is None else self.choice.method
 
     @property
     def noise(self) -> Tensor | None:
@@ -139,13 +147,13 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
     return Prepared(
         mechanism=mechanism,
         parameters=None,
-        joints=_by_repeat(case.joints, seeds),
-        covariates=_by_repeat(covariates, seeds),
+        joints=by_repeat(case.joints, seeds),
+        covariates=by_repeat(covariates, seeds),
         covariate_coordinates=tuple(coordinate for _, coordinate in chosen),
         pose=pose,
         pseudoerror=deviations,
-        total=_by_repeat(deviations.deviation, seeds),
-        dataset=_dataset(mechanism, case.joints, covariates, deviations, splits, seeds),
+        total=by_repeat(deviations.deviation, seeds),
+        dataset=dataset_of(mechanism, case.joints, covariates, deviations, splits, seeds),
         data_hash=_hash(case.joints, covariates, pose),
         simulation=CaseSimulation(case, noise),
         notes=notes,
@@ -178,7 +186,7 @@ def _from_realistic(config: RunConfig, seeds: list[int]) -> Prepared:
         pose=machine.measured,
         pseudoerror=deviations,
         total=deviations.deviation,
-        dataset=_dataset(mechanism, joints, covariates, deviations, splits, seeds, jacobian, machine.turns_far),
+        dataset=dataset_of(mechanism, joints, covariates, deviations, splits, seeds, jacobian, machine.turns_far),
         data_hash=_hash(joints, covariates, machine.measured),
         simulation=simulate_realistic(machine, lambda pose: solved(pose).deviation, deviations.deviation),
         notes=[*doubts, *deviations.notes()],
@@ -213,15 +221,16 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
         mechanism = mechanism.with_orientation("none")
     held = rows_of_test_file(config.split, records.parts)
     splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds, held)
-    fitted = fit_machine(mechanism, records, splits, config.geometry == "identify")
     settings = _pseudoerror_settings(config, mechanism)
+    choice = _choice(config, mechanism, records, splits[0], settings)
+    fitted = fit_machine(mechanism, records, splits, choice.identify)
 
     def solved(parameters: Tensor | None) -> Pseudoerror:
         return joint_deviations(mechanism, records.joints, records.pose, parameters=parameters, **settings)
 
     total = deviations = solved(fitted.parameters)
     learned, identified, effects, margin = fitted.parameters, None, None, config.compensation.margin
-    identify, notes = config.geometry == "identify", [*doubts, *records.notes, *fitted.notes]
+    identify, notes = choice.identify, [*doubts, *records.notes, choice.why, *fitted.notes]
     beside: Fitted | None = fitted if identify else None
     if verdict is not None:
         about = (splits, fitted.parameters, total.deviation, total.usable, identify, margin)
@@ -234,25 +243,37 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
         deviations = solved(learned)
         identified = beside.beside(mechanism, records.joints, total.deviation, splits, margin)
     if effects is not None:
-        joints, whole = (_by_repeat(rows, seeds) for rows in (records.joints, deviations.deviation))
+        joints, whole = (by_repeat(rows, seeds) for rows in (records.joints, deviations.deviation))
         deviations = replace(deviations, deviation=effects.remainder(joints, whole))
     jacobian = mechanism.jacobian(records.joints, learned, guess=records.pose)
     return Prepared(
         mechanism=mechanism,
         parameters=fitted.parameters,
-        joints=_by_repeat(records.joints, seeds),
-        covariates=_by_repeat(records.covariates, seeds),
+        joints=by_repeat(records.joints, seeds),
+        covariates=by_repeat(records.covariates, seeds),
         covariate_coordinates=records.covariate_coordinates,
-        pose=_by_repeat(records.pose, seeds),
+        pose=by_repeat(records.pose, seeds),
         pseudoerror=deviations,
-        total=_by_repeat(total.deviation, seeds),
-        dataset=_dataset(mechanism, records.joints, records.covariates, deviations, splits, seeds, jacobian),
+        total=by_repeat(total.deviation, seeds),
+        dataset=dataset_of(mechanism, records.joints, records.covariates, deviations, splits, seeds, jacobian),
         data_hash=records.data_hash,
         identified=fitted.geometry,
         geometry=identified,
         effects=effects,
+        choice=choice,
         notes=[*held_out_notes(config.split, len(splits[0].test)), *notes, *deviations.notes()],
     )
+
+
+def _choice(
+    config: RunConfig, mechanism: Mechanism, records: Records, split: Split, settings: dict[str, Any]
+) -> GeometryChoice:
+    """What `geometry` comes to for these records."""
+    if config.geometry != "auto":
+        return GeometryChoice(config.geometry == "identify", "ccnn", f"geometry={config.geometry} was asked for.")
+    if config.effects != "none":
+        return GeometryChoice(False, "ccnn", "The effects of a diagnosis are taken in place of identified geometry.")
+    return choose_geometry(mechanism, records, split, config.split.kind, config.seed, settings)
 
 
 def damping_of(config: RunConfig, mechanism: Mechanism) -> float:
@@ -285,45 +306,6 @@ def _splits(
 ) -> list[Split]:
     split = config.split
     return [split_by(split, positions, columns, seed, split.validation, held) for seed in seeds]
-
-
-def _dataset(
-    mechanism: Mechanism,
-    joints: Tensor,
-    covariates: Tensor,
-    deviations: Pseudoerror,
-    splits: list[Split],
-    seeds: list[int],
-    jacobian: Tensor | None = None,
-    turns_far: Tensor | None = None,
-) -> Dataset:
-    """Put a dataset together.
-
-    Args:
-        joints, covariates: `[r x] s x n`, `[r x] s x m` [SI].
-        jacobian: `[r x] s x c x n`. Measured records and realistic machines are judged by the pose, so they bring it;
-            the paper's cases are judged by the joints alone.
-        turns_far: joints that move by more than a quarter turn, `n` bool; by the rows themselves when None.
-    """
-    repeats, rows = len(seeds), joints.shape[-2]
-    if turns_far is None:
-        turns_far = joints.amax(-2) - joints.amin(-2) > torch.pi / 2
-    turning = torch.tensor([joint.unit == "rad" for joint in mechanism.joints])
-    return Dataset(
-        inputs=_by_repeat(torch.cat([joints, covariates], -1), seeds),
-        deviation=deviations.deviation.expand(repeats, rows, -1),
-        usable=deviations.usable.expand(repeats, rows),
-        splits=splits,
-        seeds=seeds,
-        periodic=torch.cat([turning & turns_far, torch.zeros(covariates.shape[-1], dtype=torch.bool)]),
-        # Singular rows are not trained on; their Jacobian must only not spoil sums with weight 0.
-        jacobian=None if jacobian is None else torch.nan_to_num(jacobian).expand(repeats, rows, -1, -1),
-    )
-
-
-def _by_repeat(rows: Tensor, seeds: list[int]) -> Tensor:
-    """Rows of every repeat, `r x s x d`, whether they have repeats or share them."""
-    return rows.expand(len(seeds), *rows.shape[-2:])
 
 
 def _hash(*tensors: Tensor) -> str:

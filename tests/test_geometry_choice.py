@@ -1,0 +1,97 @@
+"""`geometry: auto`: what cross-validation in the training rows prefers, and what it says of it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from mechanisms.catalogue import make
+
+from ccnn_torch import calibrate
+from ccnn_torch.identification import fit_links
+from ccnn_torch.mechanisms import fit_frames, load_mechanism
+from ccnn_torch.records import write_table
+from ccnn_torch.rotations import matrix_to_rotation_vector, nearest_rotation
+from ccnn_torch.runs.config import make_config
+from ccnn_torch.runs.prepare import Prepared, prepare
+
+
+def _prepared(folder: Path, geometry_error: float, wave: float, **keys: object) -> Prepared:
+    """A tripod with errors of its parameters, a wave of its joints that no parameter has, and 5 µm of noise [m]."""
+    tripod = load_mechanism("tripod")
+    generator = torch.Generator().manual_seed(3)
+    truth = tripod.nominal + geometry_error
+    low = torch.tensor([-0.15, 0.45, -0.2], dtype=torch.float64)
+    high = torch.tensor([0.15, 0.65, 0.2], dtype=torch.float64)
+    wanted = low + (high - low) * torch.rand(200, 3, generator=generator, dtype=torch.float64)
+    joints = tripod.solve_inverse(wanted)
+    pose = tripod.forward_kinematics(joints + wave * torch.sin(20 * joints.roll(1, -1)), truth, wanted)
+    pose = pose + 5e-6 * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
+    names = [c.header for c in (*tripod.joints, *tripod.pose)]
+    write_table(folder / "rows.csv", dict(zip(names, torch.cat([joints, pose], -1).mT.numpy(), strict=True)))
+    return prepare(make_config(records=str(folder / "rows.csv"), mechanism="tripod", **keys))
+
+
+def test_wrong_parameters_alone_need_no_learner(tmp_path: Path) -> None:
+    found = _prepared(tmp_path, 3e-4, 0.0)
+    assert found.geometry is not None and found.default_method == "constant"
+    assert found.choice is not None and found.choice.why.startswith("Identified geometry alone is taken")
+    results = calibrate(records=str(tmp_path / "rows.csv"), mechanism="tripod").results
+    assert results["geometry"] == found.choice.block and list(results["methods"]) == ["constant"]
+    assert results["pose"]["position"]["after"]["rms"]["median"] < 1e-5
+    assert found.choice.why in results["notes"]
+
+
+def test_what_geometry_leaves_is_learned(tmp_path: Path) -> None:
+    found = _prepared(tmp_path, 3e-4, 1e-4)
+    assert found.geometry is not None and found.default_method == "gp"
+    assert "identified + learner" in found.choice.why
+
+
+def test_held_out_rows_do_not_choose(tmp_path: Path) -> None:
+    """The figures of the choice are the same whatever the test rows hold."""
+    first = _prepared(tmp_path, 3e-4, 1e-4).choice
+    lines = (tmp_path / "rows.csv").read_text().splitlines()
+    test = _prepared(tmp_path, 3e-4, 1e-4).dataset.splits[0].test.tolist()
+    for row in test:
+        cells = lines[row + 1].split(",")
+        cells[3] = repr(float(cells[3]) + 1e-3)
+        lines[row + 1] = ",".join(cells)
+    (tmp_path / "rows.csv").write_text("\n".join(lines))
+    assert prepare(make_config(records=str(tmp_path / "rows.csv"), mechanism="tripod")).choice == first
+
+
+def test_an_explicit_word_is_kept(tmp_path: Path) -> None:
+    for word in ("none", "identify"):
+        found = _prepared(tmp_path, 3e-4, 0.0, geometry=word)
+        assert (found.geometry is not None) == (word == "identify") and found.default_method == "ccnn"
+        assert found.choice.block == {"chosen": word, "why": f"geometry={word} was asked for."}
+    assert calibrate(case="tripod", methods=["constant"]).results["geometry"]["chosen"] == "none"
+
+
+@pytest.mark.parametrize("name", ["ur10_positions", "panda_positions"])
+def test_positions_alone_turn_no_joint_that_they_do_not_show(name: str, tmp_path: Path) -> None:
+    """With links of 1 mrad and a tool of 90 mm the identified orientation is no worse than the nominal one."""
+    kind = name.partition("_")[0]
+    arm = make(kind, tmp_path)
+    seen = type(arm)(**{**arm.recipe["keys"], "unknown_frames": ["base", "tool"]})
+    blind = seen.with_orientation("none")
+    generator = torch.Generator().manual_seed(2)
+    truth = seen.nominal.clone()
+    truth[-6:-3] = torch.tensor([0.0, 0.0, 0.09], dtype=torch.float64)
+    truth[6:-6] += 1e-3 * torch.randn(len(truth) - 12, generator=generator, dtype=torch.float64)
+    joints = seen.sample_joints(150, generator)
+    position, rotation = seen.forward_frame(joints, truth.expand(150, -1))
+    position = position + 3e-5 * torch.randn(position.shape, generator=generator, dtype=torch.float64)
+    frames = fit_frames(blind, joints[:100], position[:100])
+    links = fit_links(blind, joints[:100], position[:100], frames)
+
+    def turned(values: torch.Tensor) -> float:
+        """Of the held-out rows, once the tool's rotation, which no position shows, is taken out [rad]."""
+        gap = rotation[100:].mT @ blind.forward_frame(joints[100:], values.expand(50, -1))[1]
+        left = matrix_to_rotation_vector(gap @ nearest_rotation(gap.mean(0)).mT)
+        return math.sqrt(float(left.square().sum(-1).mean()))
+
+    assert turned(links) < 1.1 * turned(frames)
