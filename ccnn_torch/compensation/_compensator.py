@@ -22,6 +22,10 @@ from ccnn_torch.training import Scaling
 
 __all__ = ["Compensator", "Solution", "default_limit", "fit_compensator"]
 
+# Rounds of damping, and the share of what was learned below which a compensator is not worth having.
+_DAMPINGS = 6
+_LEAST_SHARE = 0.1
+
 Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
 
 
@@ -87,6 +91,8 @@ class Compensator(nn.Module):
         joints, covariates: coordinates in order.
         lipschitz: bound of |∂δ/∂q| with joints in units of their limits (maximum row sum), 1.
         iterations: smallest k with lipschitzᵏ · max|δ| below 1e-12 of the limit.
+        share: of what the network learned beside its mean that is applied [1]; below 1 where all of it was too steep.
+            It is in the scaling already, and a model file does not tell it.
         geometry: commanded joints `... x n` -> γ `... x n` [SI], bounded for finite joints; None without one.
         effects: commanded joints and covariates -> ε `... x n` [SI]; None without one.
     """
@@ -128,6 +134,7 @@ class Compensator(nn.Module):
         self.covariates = tuple(covariates)
         self.lipschitz = lipschitz
         self.iterations = iterations
+        self.share = 1.0
 
     def forward(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Command, δ at the command `... x n` [SI] each, and whether it is inside the domain `...`.
@@ -292,6 +299,8 @@ def fit_compensator(
 ) -> Compensator:
     """Put guard, limit and fixed point around a trained network, and identified geometry and effects beside it.
 
+    What the network learned is damped about its mean where δ is otherwise too steep for a command to be solved for.
+
     Args:
         network: features -> standardised deviation, of one repeat.
         scaling: of that repeat, without the leading dimension.
@@ -309,7 +318,7 @@ def fit_compensator(
 
     Raises:
         InputError: shapes do not fit together, or a limit or a scale is out of its range.
-        MethodFailedError: δ is so steep that the command cannot be solved for.
+        MethodFailedError: δ is too steep for that even where little of what was learned is left.
     """
     n = len(joints)
     if inputs.shape[-1] != n + len(covariates) or deviations.shape != (len(inputs), n):
@@ -339,19 +348,27 @@ def fit_compensator(
     domain = Domain.fit(inputs, reach, margin, transition)
     # A copy: what is compensated with does not change when the learner trains on.
     frozen = copy.deepcopy(network).requires_grad_(False)
-    compensator = Compensator(
-        frozen, scaling, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale, safe_sd, geometry, effects
-    )
     size = {} if geometry is None and effects is None else {"count": 512, "at_once": 1024}
-    found = steepest(compensator.deviation, inputs, domain, limit, **size)
-    if not math.isfinite(found.lipschitz):
-        raise MethodFailedError("the trained network gives values that are not finite within its domain")
-    if found.lipschitz > STEEPEST_DEVIATION:
-        raise MethodFailedError(
-            f"the learned deviation changes by up to {found.lipschitz:.2g} of a joint's motion, and above "
-            f"{STEEPEST_DEVIATION:g} the command cannot be solved for safely; train with more rows, fewer nodes or "
-            "regularisation, and leave out rows near singular poses (max_condition)"
+    share = 1.0
+    for _ in range(_DAMPINGS):
+        scaled = copy.deepcopy(scaling)
+        scaled.deviation.mul_(share)
+        compensator = Compensator(
+            *(frozen, scaled, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale / share, safe_sd),
+            *(geometry, effects),
         )
-    compensator.lipschitz = found.lipschitz
-    compensator.iterations = iterations_needed(found)
-    return compensator
+        found = steepest(compensator.deviation, inputs, domain, limit, **size)
+        if not math.isfinite(found.lipschitz):
+            raise MethodFailedError("the trained network gives values that are not finite within its domain")
+        if found.lipschitz <= STEEPEST_DEVIATION:
+            compensator.lipschitz, compensator.share = found.lipschitz, share
+            compensator.iterations = iterations_needed(found)
+            return compensator
+        share *= 0.9 * STEEPEST_DEVIATION / found.lipschitz
+        if share < _LEAST_SHARE:
+            break
+    raise MethodFailedError(
+        f"the learned deviation changes by up to {found.lipschitz:.2g} of a joint's motion, and above "
+        f"{STEEPEST_DEVIATION:g} the command cannot be solved for safely; train with more rows, fewer nodes or "
+        "regularisation, and leave out rows near singular poses (max_condition)"
+    )

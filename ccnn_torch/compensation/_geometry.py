@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation._contraction import STEEPEST_DEVIATION, steepest
+from ccnn_torch.compensation._contraction import GENTLE, steepest
 from ccnn_torch.compensation._domain import Domain
 from ccnn_torch.compensation._expanded_geometry import expand_geometry
 from ccnn_torch.compensation._serial_geometry import SerialGeometry
@@ -124,7 +124,7 @@ def settled_damping(
 
         def gentle(step: int, pair: tuple[Tensor, Tensor] = pair) -> bool:
             slope = _steepness(mechanism, pair, joints, limit, rotation_weight, margin, _DAMPINGS[step])
-            return slope <= _SHARE * STEEPEST_DEVIATION
+            return slope <= _SHARE * GENTLE
 
         # A repeat that needs no more damping than those before costs one look.
         if gentle(low):

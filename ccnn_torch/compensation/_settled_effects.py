@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation._contraction import STEEPEST_DEVIATION, steepest
+from ccnn_torch.compensation._contraction import GENTLE, steepest
 from ccnn_torch.compensation._domain import Domain
 from ccnn_torch.compensation._effects import Care, PhysicalEffects, expand_effects, gains
 from ccnn_torch.effects import Acting, Situation
@@ -82,7 +82,7 @@ def _settle(hold_back: Callable[[int], None], steepness: Callable[[], float]) ->
 
     def gentle(step: int) -> bool:
         hold_back(step)
-        return steepness() <= _SHARE * STEEPEST_DEVIATION
+        return steepness() <= _SHARE * GENTLE
 
     low, high = 0, len(_SHARES) - 1
     if gentle(low):

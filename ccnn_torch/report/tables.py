@@ -148,6 +148,11 @@ def failures(results: Results) -> list[str]:
         why = without.pop(best)
         said.append(f"The model files model.* and card.json are of {model['method']}, not of {best}: {why}.")
     said += [f"No model file of {name}: {why}." for name, why in without.items()]
+    said += [
+        f"The model files of {name} apply {share:.0%} of what it learned: all of it changes too fast for a command to "
+        "be solved for; the promise in their card is of what they apply, the figures here of all that was learned."
+        for name, share in model.get("damped", {}).items()
+    ]
     return said + [f"{name} failed: {m['failed']}" for name, m in results["methods"].items() if m["test"] is None]
 
 

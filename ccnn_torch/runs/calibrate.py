@@ -104,13 +104,16 @@ class Calibration:
         method: str | None = None,
         name: str = "model",
         forms: Collection[str] = FORMS,
-    ) -> None:
+    ) -> float:
         """Write model files and card of a method's compensator.
 
         Args:
             method: the best one when None.
             name: of the files.
             forms: which files; each takes a few seconds to export and check.
+
+        Returns:
+            The share of what was learned that the compensator applies, 1 unless all of it was too steep.
 
         Raises:
             MethodFailedError: the model cannot be exported; the sentence says why.
@@ -133,6 +136,7 @@ class Calibration:
             "columns": self.config.columns,
         }
         save_model(Path(folder), compensator, about, method=name, forms=forms)
+        return compensator.share
 
     def _promise(self, method: str, compensator: Compensator) -> dict[str, Any] | None:
         """What the held-out rows promise for new ones, with the compensator as it stands in the file.

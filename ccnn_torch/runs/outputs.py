@@ -48,19 +48,23 @@ def _save_models(calibration: Calibration, folder: RunFolder) -> dict[str, Any]:
     """Write every method's model files: `model.*` are those of the best method that can be written.
 
     Returns:
-        `method`, whose `model.*` are (None where no method has any), and `without`: why a method has none, by method.
+        `method`, whose `model.*` are (None where no method has any), `without`: why a method has none, by method, and
+        `damped`: the share of what was learned that is applied, of each method with which all of it was too steep.
     """
     chosen: str | None = None
     without: dict[str, str] = {}
+    damped: dict[str, float] = {}
     for method in by_score(calibration.outcomes):
         first = chosen is None
         try:
-            calibration.save(folder.path if first else folder.models, method, "model" if first else method)
+            share = calibration.save(folder.path if first else folder.models, method, "model" if first else method)
         except MethodFailedError as problem:
             without[method] = str(problem)
             continue
         chosen = chosen or method
-    return {"method": chosen, "without": without}
+        if share < 1:
+            damped[method] = share
+    return {"method": chosen, "without": without, "damped": damped}
 
 
 def _arrays(calibration: Calibration) -> RunArrays:

@@ -179,9 +179,27 @@ def test_iterations_count_the_largest_deviation() -> None:
     assert iterations_needed(Steepness(0.01, 0.0)) == 1
 
 
-def test_a_steep_deviation_is_refused_with_a_sentence() -> None:
-    with pytest.raises(MethodFailedError, match=r"above 0\.2 the command cannot be solved"):
-        tripod_compensator(gain=8.0, size=5e-2)
+def test_a_steep_deviation_is_solved_for_in_more_steps() -> None:
+    steep = tripod_compensator(gain=2.0, size=2e-2)
+    assert steep.share == 1 and 0.2 < steep.lipschitz <= 0.5 and steep.iterations > 17
+    joints = tripod_joints()
+    command, deviation, _ = steep(joints)
+    torch.testing.assert_close(command + steep.deviation(command), joints, rtol=0, atol=1e-12)
+    assert float(deviation.abs().max()) > 1e-3
+
+
+def test_a_steeper_one_is_damped_about_its_mean() -> None:
+    """Until a command can be solved for; the standard deviation of what is measured stays."""
+    gentle, damped = tripod_compensator(gain=2.0, size=2e-2), tripod_compensator(gain=4.0, size=3e-2)
+    assert gentle.share == 1 and 0.1 < damped.share < 1 and damped.lipschitz <= 0.5
+    joints = tripod_joints()
+    command, _, _ = damped(joints)
+    torch.testing.assert_close(command + damped.deviation(command), joints, rtol=0, atol=1e-12)
+
+
+def test_where_little_would_be_left_it_is_refused_with_a_sentence() -> None:
+    with pytest.raises(MethodFailedError, match=r"above 0\.5 the command cannot be solved"):
+        tripod_compensator(gain=40.0, size=5e-1)
 
 
 def test_a_network_that_gives_no_numbers_is_refused() -> None:
