@@ -1,7 +1,7 @@
 """YAML 1.2, so that 1e-4 is a number, `no` a word and a key that stands twice an error.
 
-Only its plain part is read: maps, lists and values. Aliases (`*a`) can refer to themselves or unfold to more than any
-memory holds, and tags (`!!set`) make what no key takes; files for this package need neither.
+Only its plain part is read: maps, lists and values. Aliases (`*a`, of an anchor `&a`) can refer to themselves or unfold
+to more than any memory holds, and tags (`!!set`) make what no key takes; files for this package need neither.
 """
 
 from __future__ import annotations
@@ -64,6 +64,8 @@ def _check_plain(yaml: YAML, text: str, where: str) -> None:
         line = event.start_mark.line + 1
         if isinstance(event, AliasEvent):
             raise InputError(f"{where}: line {line}: aliases such as *{event.anchor} are not read; write the value out")
+        if getattr(event, "anchor", None) is not None:
+            raise InputError(f"{where}: line {line}: anchors such as &{event.anchor} are not read; remove it")
         if getattr(event, "ctag", None) is not None:
             raise InputError(f"{where}: line {line}: tags such as {event.ctag} are not read; write the plain value")
         depth += isinstance(event, (MappingStartEvent, SequenceStartEvent))

@@ -151,7 +151,7 @@ def test_what_is_plotted_needs_two_methods() -> None:
 @pytest.mark.parametrize("width", [80, 110])
 def test_tables_fit_the_terminal_without_folding_numbers(results: dict[str, Any], width: int) -> None:
     screen = io.StringIO()
-    print_tables(results, Console(file=screen, width=width))
+    print_tables(results, Console(file=screen, width=width, force_terminal=True, color_system=None))
     lines = screen.getvalue().splitlines()
     assert max(len(line) for line in lines) <= width
     mse = next(table for table in result_tables(results) if table.title.startswith("Mean squared"))

@@ -167,7 +167,7 @@ def _moved_away(rows: Path) -> None:
         (_moved_away, "80 of 80 rows are outside the reach of five_bar"),
         (lambda rows: rows.write_text(""), "the file is empty; line 1 must be the header"),
         (Path.unlink, "there is no such file; give the path of a CSV file"),
-        (lambda rows: (rows.unlink(), rows.mkdir()), "cannot be read: Is a directory"),
+        (lambda rows: (rows.unlink(), rows.mkdir()), "is a folder and no file"),
     ],
 )
 @pytest.mark.parametrize("command", ["diagnose", "check"])

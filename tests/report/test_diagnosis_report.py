@@ -338,7 +338,7 @@ def test_what_is_not_as_promised_is_named(tmp_path: Path) -> None:
         load_diagnosis_arrays(tmp_path)
     with pytest.raises(InputError, match="'about' holds 'colour', which is not known"):
         about_of({"about": {"colour": "red"}})
-    with pytest.raises(InputError, match=r"diagnosis\.json is not there"):
+    with pytest.raises(InputError, match=r"diagnosis\.json: there is no such file"):
         write_diagnosis_report(tmp_path)
 
 

@@ -41,7 +41,7 @@ def test_a_folder_with_numbers_only_still_gets_its_tables(tmp_path: Path) -> Non
     write_json(tmp_path / "results.json", arm_run()[0])
     page = write_report(tmp_path).read_text()
     assert "<svg" not in page and "µrad" in page and "held-out rows, 4 not usable" in page
-    with pytest.raises(InputError, match=r"results\.json is not there"):
+    with pytest.raises(InputError, match=r"results\.json: there is no such file"):
         write_report(tmp_path / "plots")
 
 

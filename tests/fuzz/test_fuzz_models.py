@@ -1,0 +1,122 @@
+"""Model files and their cards that went wrong, and inputs of every kind of model."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fuzz.conftest import ARM
+from fuzz.mutate import TOKENS, bytes_changes, change_bytes, change_table, table_changes, text_changes
+from fuzz.mutate import change_text as change
+from fuzz.oracle import columns, judged
+
+pytestmark = pytest.mark.fuzz
+CASES = 25
+OPTIONS = [[], ["--pose"], ["--back"], ["--sd"]]
+
+
+@pytest.fixture(scope="session")
+def models(bases, tmp_path_factory):
+    """Folders of models by kind, each with files of its own and the cells of a valid IN.csv."""
+    home = tmp_path_factory.mktemp("models")
+    (home / "arm.yaml").write_text(ARM)
+    for name, cells in bases.items():
+        (home / f"{name}.csv").write_text("\n".join(",".join(row) for row in cells))
+    (home / "c.yaml").write_text("name: fuzz\n")
+    quick = ["save_report=false", "--quiet"]
+    runs = {
+        "plain": ("tripod", ["methods=[grnn]", "geometry=none", "covariates=[]"]),
+        "covariates": ("five_bar", ["methods=[gp]", "gp.steps=3", "geometry=none", "covariates=[time,temperature]"]),
+        "geometry": ("arm", ["methods=[constant]", "geometry=identify", "covariates=[]"]),
+    }
+    found = {}
+    for kind, (name, words) in runs.items():
+        mechanism = "arm.yaml" if name == "arm" else name
+        judged(["run", "c.yaml", f"records={name}.csv", f"mechanism={mechanism}", f"out={kind}", *words, *quick], home)
+        found[kind] = (home / kind, ["model.safetensors", "model.onnx"], bases[name])
+    judged(
+        ["identify", "c.yaml", "records=tripod.csv", "mechanism=tripod", "methods=[lm]", "out=identified", *quick], home
+    )
+    found["identified"] = (home / "identified", ["identified.yaml"], bases["tripod"])
+    return found
+
+
+def compensated(folder: Path, model: str, words: list[str]) -> None:
+    """OUT.csv of exit 0 holds finite commands and deviations within the card's limits."""
+    outcome = judged(["compensate", model, "IN.csv", "OUT.csv", *words], folder)
+    if outcome.code != 0:
+        return
+    card = folder / "card.json"
+    limits = json.loads(card.read_text()).get("limits", {}) if card.is_file() else {}
+    for name, values in columns(folder / "OUT.csv").items():
+        if name.startswith(("command_", "ideal_q", "deviation_")):
+            assert all(map(math.isfinite, values)), name
+        joint = name.removeprefix("deviation_")
+        if joint != name and joint in limits:
+            assert max(map(abs, values)) <= limits[joint]["limit"] * (1 + 1e-6), name
+
+
+KINDS = st.sampled_from(["plain", "covariates", "geometry", "identified"])
+
+
+@given(kind=KINDS, which=st.integers(0, 1), options=st.sampled_from(OPTIONS), changes=bytes_changes)
+def test_model_bytes(models, fresh, kind, which, options, changes) -> None:
+    source, files, cells = models[kind]
+    model = files[which % len(files)]
+    with fresh() as folder:
+        if (source / "card.json").is_file():
+            shutil.copy(source / "card.json", folder)
+        (folder / model).write_bytes(change_bytes((source / model).read_bytes(), changes))
+        (folder / "IN.csv").write_text("\n".join(",".join(row) for row in cells))
+        compensated(folder, model, options)
+
+
+@given(kind=KINDS, which=st.integers(0, 1), options=st.sampled_from(OPTIONS), changes=text_changes)
+def test_cards(models, fresh, kind, which, options, changes) -> None:
+    source, files, cells = models[kind]
+    model = files[which % len(files)]
+    text = "identified.yaml" if kind == "identified" else "card.json"
+    with fresh() as folder:
+        shutil.copy(source / model, folder)
+        (folder / text).write_text(change((source / text).read_text(), changes), encoding="utf-8", errors="replace")
+        (folder / "IN.csv").write_text("\n".join(",".join(row) for row in cells))
+        judged(["compensate", model, "IN.csv", "OUT.csv", *options], folder)
+
+
+@given(kind=KINDS, which=st.integers(0, 1), path=st.lists(st.integers(0, 50), min_size=1, max_size=5), data=st.data())
+def test_forged_cards(models, fresh, kind, which, path, data) -> None:
+    """One value of the card is another, with the card still JSON."""
+    source, files, cells = models[kind]
+    if kind == "identified":
+        return
+    card = json.loads((source / "card.json").read_text())
+    node = card
+    for step in path:
+        keys = list(node) if isinstance(node, dict) else list(range(len(node)))
+        key = keys[step % len(keys)] if keys else None
+        if key is None or not isinstance(node[key], dict | list) or not node[key]:
+            break
+        node = node[key]
+    if key is not None:
+        node[key] = data.draw(st.sampled_from([*TOKENS, 0, -1, 1e300, 0.5, None, True, [], {}, [1.0]]))
+    with fresh() as folder:
+        (folder / "card.json").write_text(json.dumps(card))
+        shutil.copy(source / files[which % len(files)], folder)
+        (folder / "IN.csv").write_text("\n".join(",".join(row) for row in cells))
+        judged(["compensate", files[which % len(files)], "IN.csv", "OUT.csv"], folder)
+
+
+@given(kind=KINDS, which=st.integers(0, 1), options=st.sampled_from(OPTIONS), changes=table_changes)
+def test_inputs(models, fresh, kind, which, options, changes) -> None:
+    source, files, cells = models[kind]
+    with fresh() as folder:
+        shutil.copytree(source, folder, dirs_exist_ok=True)
+        text = "\n".join(",".join(row) for row in change_table(cells, changes))
+        (folder / "IN.csv").write_text(text, encoding="utf-8", errors="replace")
+        compensated(folder, files[which % len(files)], options)
