@@ -58,7 +58,7 @@ def change_table(cells: list[list[str]], changes: list[tuple[str, int, int, str]
             cells.insert(row, [token])
         if kind == "drop_rows":
             cells = cells[: 1 + a % len(cells)]
-        if row >= len(cells) or any(column >= len(line) for line in cells):
+        if row >= len(cells) or any(len(line) != len(cells[0]) for line in cells):
             continue
         if kind == "cell":
             cells[row][column] = token

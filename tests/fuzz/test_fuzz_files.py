@@ -11,7 +11,7 @@ from fuzz.mutate import change_text, text_changes
 from fuzz.oracle import judged
 
 pytestmark = pytest.mark.fuzz
-CASES = 25
+CASES = 10
 
 RUN = """\
 name: fuzz

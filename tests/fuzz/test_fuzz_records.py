@@ -10,7 +10,7 @@ from fuzz.mutate import change_table, table_changes
 from fuzz.oracle import judged
 
 pytestmark = pytest.mark.fuzz
-CASES = 25
+CASES = 12
 
 _QUICK = ["save_models=false", "save_report=false", "--quiet"]
 COMMANDS = [
