@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import socket
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -189,7 +188,6 @@ def no_file(kind: str, folder: Path) -> Path:
     return path
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="pipes and sockets in folders are of POSIX")
 @pytest.mark.parametrize("kind", ["pipe", "folder", "loop", "device", "socket", "nothing"])
 def test_what_is_no_file(kind: str, tmp_path: Path, cli: Cli) -> None:
     path = no_file(kind, tmp_path)

@@ -83,6 +83,11 @@ def test_a_promise_is_kept_on_rows_of_the_same_machine(model: Path, tmp_path: Pa
     assert ccnn_torch.verify(model, tmp_path / "new.csv")["position"] == position
 
 
+def test_rows_that_it_was_made_from_are_no_test(model: Path, tmp_path: Path) -> None:
+    found = ccnn_torch.verify(model, model.parent / "rows.csv", mechanism=DELTA)
+    assert found["text"].startswith("These are the rows that the model was made from, so this is no test.")
+
+
 def test_a_machine_that_has_changed_is_told_by_exit_code_1(model: Path, tmp_path: Path, cli: Cli) -> None:
     rows = delta_rows(tmp_path / "new.csv", seed=2, noise=4 * NOISE)
     code, out, _ = cli("verify", model, rows, "--out", tmp_path / "v")
