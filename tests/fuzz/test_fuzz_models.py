@@ -59,6 +59,7 @@ def compensated(folder: Path, model: str, words: list[str]) -> None:
             assert max(map(abs, values)) <= limits[joint]["limit"] * (1 + 1e-6), name
 
 
+VALUES = st.sampled_from([*TOKENS, 0, -1, 1e300, 0.5, None, True, [], {}, [1.0]])
 KINDS = st.sampled_from(["plain", "covariates", "geometry", "identified"])
 
 
@@ -86,8 +87,8 @@ def test_cards(models, fresh, kind, which, options, changes) -> None:
         judged(["compensate", model, "IN.csv", "OUT.csv", *options], folder)
 
 
-@given(kind=KINDS, which=st.integers(0, 1), path=st.lists(st.integers(0, 50), min_size=1, max_size=5), data=st.data())
-def test_forged_cards(models, fresh, kind, which, path, data) -> None:
+@given(kind=KINDS, which=st.integers(0, 1), path=st.lists(st.integers(0, 50), min_size=1, max_size=5), value=VALUES)
+def test_forged_cards(models, fresh, kind, which, path, value) -> None:
     """One value of the card is another, with the card still JSON."""
     source, files, cells = models[kind]
     if kind == "identified":
@@ -101,7 +102,7 @@ def test_forged_cards(models, fresh, kind, which, path, data) -> None:
             break
         node = node[key]
     if key is not None:
-        node[key] = data.draw(st.sampled_from([*TOKENS, 0, -1, 1e300, 0.5, None, True, [], {}, [1.0]]))
+        node[key] = value
     with fresh() as folder:
         (folder / "card.json").write_text(json.dumps(card))
         shutil.copy(source / files[which % len(files)], folder)
