@@ -38,7 +38,7 @@ def judge_frames(
         arm: with unknown frames; one whose frames are known is not judged.
         joints: `s x n` [SI].
         pose: measured, `s x p` [SI].
-        values: parameters with fitted frames, `r x k`, `k`, or one set a row, `r x s x k` [SI].
+        values: parameters with fitted frames, `k` or `r x 1 x k`, or one set a row, `s x k` or `r x s x k` [SI].
         weights: `r x s` or `s` [1]; 0 = a row that was not fitted to; all 1 when None.
         where: the file, which opens the sentence.
         name_rows: says rows (0-based) as a person finds them; they are only counted when None.
@@ -51,13 +51,12 @@ def judge_frames(
     """
     if not arm.unknown_frames:
         return []
-    by_row = values if values.dim() > 1 and values.shape[-2] == len(joints) else values[..., None, :]
-    error = arm.pose_error(arm.forward_kinematics(joints, by_row), pose)
+    error = arm.pose_error(arm.forward_kinematics(joints, values), pose)
     used = (torch.ones(len(joints)) if weights is None else weights) > 0
     median = _median(error.position, used)
     turned = None if error.rotation is None else _median(error.rotation, used)
     rotation, place = arm.flange(joints)
-    tool = place + (rotation @ by_row[..., -6:-3, None])[..., 0]
+    tool = place + (rotation @ values[..., -6:-3, None])[..., 0]
     motion = float((tool - tool.mean(-2, keepdim=True)).norm(dim=-1).square().mean(-1).sqrt().max())
     limit = min(_SHARE * arm.reach, _OF_MOTION * motion)
     length = error.position if error.rotation is None else torch.hypot(error.position, ROTATION_WEIGHT * error.rotation)

@@ -106,10 +106,10 @@ def fit_machine(mechanism: Mechanism, records: Records, splits: list[Split], ide
     parameters = geometry = None
     if arm is not None and arm.unknown_frames:
         parameters = fit_frames(arm, records.joints, records.pose, weights, columns=records.columns)
-        about = (records.joints, records.pose, parameters, weights, records.path, records.name_rows)
-        notes += judge_frames(arm, *about)
         if not grouped:
             parameters = parameters.unsqueeze(-2)
+        about = (records.joints, records.pose, parameters, weights, records.path, records.name_rows)
+        notes += judge_frames(arm, *about)
         frames = " and ".join(arm.unknown_frames)
         notes.append(f"Frames fitted first, on the training rows of each repeat: {frames}.")
     if identify or (parameters is not None and not grouped):

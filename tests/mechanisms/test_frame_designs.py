@@ -128,3 +128,14 @@ def test_a_model_of_another_robot_is_refused(mistake, tmp_path):
         arm = read_dh_file(str(path))
     with pytest.raises(InputError, match=r"R\.csv: with base and tool frame fitted, .* still misses half of"):
         judge_frames(arm, joints, pose, fit_frames(arm, joints, pose), where="R.csv")
+
+
+def test_as_many_repeats_as_rows_are_judged_each_by_itself(tmp_path):
+    arm, generator = _arm("ur10", tmp_path), torch.Generator().manual_seed(8)
+    joints = arm.sample_joints(20, generator)
+    pose, _ = _measured(arm, joints, generator)
+    fitted = fit_frames(arm, joints, pose, torch.ones(20, 20, dtype=torch.float64))
+    assert judge_frames(arm, joints, pose, fitted[:, None], torch.ones(20, 20)) == []
+    fitted[3, :3] += 1.0
+    with pytest.raises(InputError, match="misses half of"):
+        judge_frames(arm, joints, pose, fitted[:, None], torch.ones(20, 20))
