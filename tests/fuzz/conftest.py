@@ -43,6 +43,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         )
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """A kill takes three processes: tests/test_run.py has some in the ordinary run, these are there on demand."""
+    if config.getoption("--fuzz-cases") is None:
+        items[:] = [item for item in items if item.name != "test_a_kill_at_any_moment"]
+
+
 def rows_of(name: str, folder: Path, rows: int, noise: float = 1e-5) -> list[list[str]]:
     """Records as cells: joints off by 0.1 mm or mrad, poses with noise, time and temperature beside them."""
     mechanism = load_mechanism(name)
