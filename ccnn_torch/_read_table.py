@@ -28,7 +28,7 @@ _LARGEST_FILE = 500_000_000
 # What a damaged workbook makes openpyxl, zipfile and the XML parser raise.
 _DAMAGED = (
     *(BadZipFile, EOFError, KeyError, IndexError, ValueError, TypeError, AttributeError, SyntaxError, zlib.error),
-    *(NotImplementedError, RuntimeError, OverflowError),
+    *(RuntimeError, OverflowError),
 )
 _WORKBOOKS = (".xlsx", ".xlsm")
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
