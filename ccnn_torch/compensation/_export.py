@@ -19,8 +19,10 @@ from torch import Tensor, nn
 
 from ccnn_torch.compensation._compensator import Compensator
 from ccnn_torch.compensation._contraction import TOLERANCE, Steepness, iterations_needed
+from ccnn_torch.compensation._serial_geometry import SerialGeometry
 from ccnn_torch.compensation._session import METADATA_KEY, OUTPUTS, Array, check_graph, open_onnx, run_onnx
 from ccnn_torch.compensation._to_onnx import quiet_exporter, to_onnx
+from ccnn_torch.compensation._unroll import unroll_onnx, unroll_program
 from ccnn_torch.errors import MethodFailedError
 
 __all__ = [
@@ -65,7 +67,7 @@ class _Graph(nn.Module):
 
 
 def trace(compensator: Compensator) -> torch.export.ExportedProgram:
-    """The whole compensator in float64 as one graph, batch dynamic, for both file forms.
+    """The compensator in float64 as one graph, with one step of its fixed point, batch dynamic, for both file forms.
 
     Inputs `joints` (`s x n`, ideal, SI) and, where there are any, `covariates` (`s x m`, SI). Outputs `command`,
     `deviation`, `inside_domain`, for the way back `ideal` and `ideal_inside_domain`: the ideal joints, were the input a
@@ -77,7 +79,7 @@ def trace(compensator: Compensator) -> torch.export.ExportedProgram:
     example = (points[:, :n].contiguous(), points[:, n:].contiguous())[: 2 if compensator.covariates else 1]
     shapes = {name: {0: batch} for name, _ in zip(("joints", "covariates"), example, strict=False)}
     with quiet_exporter():
-        program = torch.export.export(_Graph(compensator), example, dynamic_shapes=shapes)
+        program = torch.export.export(_Graph(_one_step(compensator)), example, dynamic_shapes=shapes)
     for node in program.graph.nodes:
         # Where in the source a step came from: paths of the machine that wrote the file.
         for key in ("stack_trace", "source_fn_stack", "nn_module_stack", "from_node", "torch_fn"):
@@ -96,6 +98,8 @@ def export_onnx(compensator: Compensator, program: torch.export.ExportedProgram,
         MethodFailedError: the file does not give the eager model's numbers, see `verify`, or cannot be run.
     """
     model = to_onnx(program, None, OUTPUTS, _OPSET, metadata, _plain(compensator))
+    ideal = next(node for node in model.graph.node if "ideal" in node.output)
+    unroll_onnx(model, ideal.input[1], "deviation", compensator.iterations)
     # What is read back must not be refused.
     check_graph(model)
     content: bytes = model.SerializeToString(deterministic=True)
@@ -114,8 +118,12 @@ def export_pt2(compensator: Compensator, program: torch.export.ExportedProgram, 
     """The traced compensator as a verified `torch.export` file; arguments and errors as `export_onnx`.
 
     Nothing in the file is pickled: it carries no example inputs, which are the one thing torch would pickle here. What
-    is verified is the program that is written, since opening such a file can run code that stands in it.
+    is verified is the program that is written, since opening such a file can run code that stands in it. All steps of
+    the fixed point are put into the program itself, which no other form can be made of afterwards.
     """
+    outputs: Any = program.graph.output_node().args[0]
+    found = dict(zip(OUTPUTS, outputs, strict=True))
+    unroll_program(program, found["ideal"].args[1], found["deviation"], compensator.iterations)
     module = program.module()
 
     def run(joints: Array, covariates: Array | None) -> dict[str, Array]:
@@ -140,18 +148,20 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     back is ideal = joints + `back_deviation`. `guard` and `back_guard` are 1 inside the domain and fall to 0 outside.
 
     Raises:
-        MethodFailedError: the file is not right to 1e-5 of the limit, or the model holds physical effects, whose code
-            computes in double.
+        MethodFailedError: the file is not right to 1e-5 of the limit, or the model holds physical effects or the links
+            of an arm, which are computed in double: a length of 1 m is rounded by as much as a deviation.
     """
-    if compensator.effects is not None:
-        raise MethodFailedError("the physical effects are worked out in double precision; use the float64 file")
+    if compensator.effects is not None or isinstance(compensator.geometry, SerialGeometry):
+        what = "links of the arm" if compensator.effects is None else "physical effects"
+        raise MethodFailedError(f"the {what} need double precision; use the float64 file")
     twin = copy.deepcopy(compensator)
     twin.iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), _TOLERANCE_FLOAT32 / 10)
     twin = twin.float()
     joints, covariates = probe_points(compensator)
     given = [v.float() for v in (joints, covariates) if v is not None]
     example = tuple(v[:1] for v in given)
-    model = to_onnx(_Single(twin), example, _OUTPUTS_FLOAT32, _OPSET_FLOAT32, metadata, _plain(compensator))
+    model = to_onnx(_Single(_one_step(twin)), example, _OUTPUTS_FLOAT32, _OPSET_FLOAT32, metadata, _plain(compensator))
+    unroll_onnx(model, "back_deviation", "deviation", twin.iterations)
     content: bytes = model.SerializeToString(deterministic=True)
     session = open_onnx(content)
     with torch.no_grad():
@@ -224,6 +234,13 @@ def probe_points(compensator: Compensator, count: int = 256) -> tuple[Tensor, Te
     points = torch.cat([spread, *rows])
     n = len(compensator.joints)
     return points[:, :n].contiguous(), points[:, n:].contiguous() if compensator.covariates else None
+
+
+def _one_step(compensator: Compensator) -> Compensator:
+    """What is traced, since further steps are copies of the first."""
+    traced = copy.copy(compensator)
+    traced.iterations = 1
+    return traced
 
 
 def _plain(compensator: Compensator) -> bool:
