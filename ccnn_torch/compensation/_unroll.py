@@ -60,7 +60,7 @@ def unroll_program(program: torch.export.ExportedProgram, start: Node, end: Node
         renamed: dict[Node, Node] = {start: value}
         with graph.inserting_before(first):
             for k in step:
-                renamed[nodes[k]] = graph.node_copy(nodes[k], lambda n, known=renamed: known.get(n, n))  # type: ignore[misc]
+                renamed[nodes[k]] = graph.node_copy(nodes[k], lambda n, known=renamed: known.get(n, n))
         value = renamed[end]
     for k in step:
         nodes[k].replace_input_with(start, value)
