@@ -167,7 +167,7 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
 
     Args:
         path: the file; an existing one is replaced.
-        columns: header ``name[unit]``, or a bare name -> values `rows`.
+        columns: header ``name[unit]``, or a bare name -> values `rows`; NaN is written as an empty cell.
 
     Raises:
         InputError: columns have one name or differ in length, or the file cannot be written.
@@ -180,7 +180,7 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
     if len({array.shape for array in arrays}) != 1 or arrays[0].ndim != 1:
         raise InputError(f"{path}: the columns to write must be one-dimensional and of one length")
     buffer = io.StringIO()
-    np.savetxt(buffer, np.stack(arrays, axis=1), fmt="%.17g", delimiter=",", header=",".join(columns), comments="")
+    np.savetxt(buffer, np.stack(arrays, axis=1), fmt="%.17g", delimiter=",")
     if not Path(path).absolute().parent.is_dir():
         raise InputError(f"{path}: cannot be written (its folder is not there); make it, or correct the name")
-    write_whole(path, buffer.getvalue())
+    write_whole(path, ",".join(columns) + "\n" + buffer.getvalue().replace("nan", ""))

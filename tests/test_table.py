@@ -141,6 +141,13 @@ def test_write_refuses_what_could_not_be_read_back(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_missing_value_is_an_empty_cell(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    write_table(path, {"q1[m]": [1.0, 2.0], "note": [np.nan, 3.0]})
+    assert path.read_text() == "q1[m],note\n1,\n2,3\n"
+    np.testing.assert_array_equal(read_table(path).raw("note"), [np.nan, 3.0])
+
+
 def test_ten_thousand_rows_are_quick(tmp_path: Path) -> None:
     values = np.random.default_rng(0).normal(size=(10_000, 30))
     write_table(tmp_path / "t.csv", {f"c{k}[1]": column for k, column in enumerate(values.T)})

@@ -95,7 +95,7 @@ def finite_files(folder: Path) -> Iterator[str]:
             if any(word in text for word in ("NaN", "Infinity")):
                 yield str(path)
             json.loads(text)
-        elif path.name in ("results.csv", "OUT.csv"):
+        elif path.name == "results.csv":
             with path.open(newline="") as file:
                 yield from (
                     f"{path}: {row}" for row in csv.reader(file) if {"nan", "inf", "-inf"} & {*map(str.lower, row)}

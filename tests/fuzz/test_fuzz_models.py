@@ -52,7 +52,7 @@ def compensated(folder: Path, model: str, words: list[str]) -> None:
     card = folder / "card.json"
     limits = json.loads(card.read_text()).get("limits", {}) if card.is_file() else {}
     for name, values in columns(folder / "OUT.csv").items():
-        if name.startswith(("command_", "ideal_q", "deviation_")):
+        if name.startswith(("command_", "ideal_q", "deviation_", "inside_")):
             assert all(map(math.isfinite, values)), name
         joint = name.removeprefix("deviation_")
         if joint != name and joint in limits:

@@ -66,5 +66,6 @@ def test_one_gross_outlier_in_training_moves_no_figure(bases, fresh, row, channe
         place = cells[0].index(["x[m]", "y[m]", "z[m]"][channel])
         cells[row + 1][place] = repr(float(cells[row + 1][place]) + size)
         moved = figures(folder, "\n".join(",".join(line) for line in cells), "arm")
-    # Held out it stands in the figures as it was measured, which only makes them larger.
-    assert moved[0] == pytest.approx(plain[0], rel=0.05) or moved[0] > 0.9 * abs(size) / math.sqrt(9)
+    # In training, a fit has one row in 21 less, which moves a figure by some per cent; held out, the row stands in the
+    # figures as it was measured, which only makes them larger.
+    assert moved[0] == pytest.approx(plain[0], rel=0.15) or moved[0] > 0.9 * abs(size) / math.sqrt(9)
