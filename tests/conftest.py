@@ -5,9 +5,13 @@ One thread: the tensors are small, and threads of two processes would wait for e
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
+
+# Before numpy is loaded, which reads it once; processes that tests start inherit it.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch

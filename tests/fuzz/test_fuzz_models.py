@@ -6,17 +6,21 @@ import json
 import math
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ccnn_torch import calibrate, identify
 from fuzz.mutate import TOKENS, bytes_changes, change_bytes, change_table, table_changes, text_changes
 from fuzz.mutate import change_text as change
 from fuzz.oracle import columns, judged
 
 pytestmark = pytest.mark.fuzz
 CASES = 8
+FORMS = ["model.safetensors", "model.onnx"]
+SHIPPED = Path(__file__).parents[2] / "checkpoints" / "tripod"
 OPTIONS = [[], ["--pose"], ["--back"], ["--sd"]]
 
 
@@ -26,20 +30,20 @@ def models(bases, tmp_path_factory):
     home = tmp_path_factory.mktemp("models")
     for name, cells in bases.items():
         (home / f"{name}.csv").write_text("\n".join(",".join(row) for row in cells))
-    (home / "c.yaml").write_text("name: fuzz\n")
-    quick = ["save_report=false", "--quiet"]
-    runs = {
-        "plain": ("tripod", ["methods=[grnn]", "geometry=none", "covariates=[]"]),
-        "covariates": ("five_bar", ["methods=[gp]", "gp.steps=3", "geometry=none", "covariates=[time,temperature]"]),
-        "geometry": ("tripod", ["methods=[constant]", "geometry=identify", "covariates=[]"]),
+    # A compensator as it is shipped, one with covariates, and one with identified geometry.
+    (home / "plain").mkdir()
+    for name in ("card.json", *FORMS):
+        shutil.copy(SHIPPED / name, home / "plain")
+    rows = {"mechanism": "five_bar", "records": home / "five_bar.csv", "geometry": "none"}
+    with_covariates = calibrate(**rows, methods=["gp"], gp={"steps": 3}, covariates=["time", "temperature"])
+    with_covariates.save(home / "covariates", forms=["safetensors", "onnx"])
+    rows = {"mechanism": "tripod", "records": home / "tripod.csv", "geometry": "identify"}
+    calibrate(**rows, methods=["constant"], covariates=[]).save(home / "geometry", forms=["safetensors", "onnx"])
+    found = {
+        kind: (home / kind, FORMS, bases[name])
+        for kind, name in (("plain", "tripod"), ("covariates", "five_bar"), ("geometry", "tripod"))
     }
-    found = {}
-    for kind, (name, words) in runs.items():
-        judged(["run", "c.yaml", f"records={name}.csv", f"mechanism={name}", f"out={kind}", *words, *quick], home)
-        found[kind] = (home / kind, ["model.safetensors", "model.onnx"], bases[name])
-    judged(
-        ["identify", "c.yaml", "records=tripod.csv", "mechanism=tripod", "methods=[lm]", "out=identified", *quick], home
-    )
+    identify(mechanism="tripod", records=home / "tripod.csv", methods=["lm"]).save(home / "identified")
     found["identified"] = (home / "identified", ["identified.yaml"], bases["tripod"])
     return found
 
@@ -94,15 +98,13 @@ def test_forged_cards(models, fresh, kind, which, path, value) -> None:
     if kind == "identified":
         return
     card = json.loads((source / "card.json").read_text())
-    node = card
-    for step in path:
-        keys = list(node) if isinstance(node, dict) else list(range(len(node)))
-        key = keys[step % len(keys)] if keys else None
-        if key is None or not isinstance(node[key], dict | list) or not node[key]:
+    node: Any = card
+    for deeper, step in enumerate(path, 1):
+        key = list(node)[step % len(node)] if isinstance(node, dict) else step % len(node)
+        if deeper == len(path) or not isinstance(node[key], dict | list) or not node[key]:
+            node[key] = value
             break
         node = node[key]
-    if key is not None:
-        node[key] = value
     with fresh() as folder:
         (folder / "card.json").write_text(json.dumps(card))
         shutil.copy(source / files[which % len(files)], folder)

@@ -15,6 +15,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from ccnn_torch._files import write_whole
@@ -30,6 +32,7 @@ SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 RASTER_ABOVE = 3000
 """Points above which a layer is drawn as pixels inside the SVG, which would else grow to megabytes."""
 
+_PNG_DPI = 150
 _STYLE: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 9.5,
@@ -52,7 +55,6 @@ _STYLE: Any = {
     "legend.fontsize": 9,
     "figure.facecolor": "white",
     "figure.dpi": 100,
-    "savefig.dpi": 150,
     "lines.linewidth": 1.6,
     "axes.formatter.useoffset": False,
     "svg.hashsalt": "ccnn_torch",
@@ -101,9 +103,14 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
     # The layout is found once and kept: finding it again for each file costs more than the drawing.
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    for path, form, about in ((png, "png", {"Software": None}), (svg, "svg", {"Date": None, "Creator": None})):
+    # Written by the canvases themselves: `savefig` draws everything once more beforehand, to find the layout.
+    figure.set_dpi(_PNG_DPI)
+    for path, print_to, about in (
+        (png, FigureCanvasAgg(figure).print_png, {"Software": None}),
+        (svg, FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None}),
+    ):
         content = io.BytesIO()
-        figure.savefig(content, format=form, metadata=about)
+        print_to(content, metadata=about)
         write_whole(path, content.getvalue())
     return [png, svg]
 
