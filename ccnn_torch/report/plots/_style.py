@@ -101,8 +101,10 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
     """
     png, svg = Path(path).with_suffix(".png"), Path(path).with_suffix(".svg")
     # The layout is found once and kept: finding it again for each file costs more than the drawing.
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")
+    layout = figure.get_layout_engine()
+    if layout is not None:
+        layout.execute(figure)
+        figure.set_layout_engine("none")
     # Written by the canvases themselves: `savefig` draws everything once more beforehand, to find the layout.
     figure.set_dpi(_PNG_DPI)
     for path, print_to, about in (
