@@ -175,11 +175,9 @@ def test_own_records_train_compensate_and_come_back(cli: Cli, tmp_path: Path) ->
 
 def test_the_real_robot_runs_from_the_shipped_records(cli: Cli, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    words = [f"out={out}", "--quiet", *FAST, "ccnn.refinement_iterations=8", NO_REPORT]
+    words = [f"out={out}", "--quiet", *FAST, "ccnn.refinement_iterations=8", "save_models=false", NO_REPORT]
     code, _, err = cli("run", EXPERIMENTS / "ur10.yaml", *words)
     assert code == 0, err
-    for name in ("model.safetensors", "model.onnx", "model.pt2"):
-        assert (out / name).is_file(), name
     results = json.loads((out / "results.json").read_text())
     assert results["rows"]["train"] + results["rows"]["validation"] == 350
     # Damped by default, so that rows near a singularity are learned from like all others.
