@@ -22,7 +22,7 @@ from sklearn.linear_model import BayesianRidge
 from ccnn_torch.diagnosis import diagnose_rows, engine
 from ccnn_torch.diagnosis._alone import fit_alone, own_products
 from ccnn_torch.effects import Situation, default_gravity
-from ccnn_torch.runs.simulating import simulate_records
+from ccnn_torch.simulation.job import simulate_records
 
 _MACHINES = ("five_bar", "delta", "tripod", "stewart")
 _CAUSES = ((), ("thermal",), ("compliance",), ("backlash", "joint_gain"), ("frame", "friction"))

@@ -31,8 +31,8 @@ from scipy.optimize import least_squares
 
 from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.identification import Problem, inverse_problem, solve_lm, what_is_known
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.numerics.least_squares import jacobian_of
 
 Array = NDArray[np.float64]
 NOISE = 1e-4

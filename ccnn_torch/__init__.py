@@ -8,7 +8,12 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ccnn_torch.version import __version__
+
 if TYPE_CHECKING:
+    from ccnn_torch.api import calibrate as calibrate
+    from ccnn_torch.api import identify as identify
+    from ccnn_torch.api import verify as verify
     from ccnn_torch.compensation import Compensator as Compensator
     from ccnn_torch.compensation import load_model as load_model
     from ccnn_torch.compensation import save_model as save_model
@@ -17,24 +22,19 @@ if TYPE_CHECKING:
     from ccnn_torch.mechanisms import load_mechanism as load_mechanism
     from ccnn_torch.pseudoerror import joint_deviations as joint_deviations
     from ccnn_torch.records import load_records as load_records
-    from ccnn_torch.runs.api import calibrate as calibrate
-    from ccnn_torch.runs.api import identify as identify
-    from ccnn_torch.runs.api import verify as verify
-
-__version__ = "0.1.0"
 
 _HOMES = {
     "Compensator": "ccnn_torch.compensation",
     "Mechanism": "ccnn_torch.mechanisms",
-    "calibrate": "ccnn_torch.runs.api",
+    "calibrate": "ccnn_torch.api",
     "diagnose": "ccnn_torch.diagnosis",
-    "identify": "ccnn_torch.runs.api",
+    "identify": "ccnn_torch.api",
     "joint_deviations": "ccnn_torch.pseudoerror",
     "load_mechanism": "ccnn_torch.mechanisms",
     "load_model": "ccnn_torch.compensation",
     "load_records": "ccnn_torch.records",
     "save_model": "ccnn_torch.compensation",
-    "verify": "ccnn_torch.runs.api",
+    "verify": "ccnn_torch.api",
 }
 
 __all__ = [*_HOMES, "__version__"]

@@ -16,8 +16,8 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch._reading import CONFIG_LIMIT, read_text
 from ccnn_torch.errors import CcnnError, InputError
+from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 
 __all__ = ["class_hint", "code_refused", "failure", "file_that_names", "is_plugin", "load_plugin"]
 

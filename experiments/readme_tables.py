@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.report.display import interval_text, number_text
-from ccnn_torch.report.paper_tables import PAPER
+from ccnn_torch.calibration.page.paper_tables import PAPER
+from ccnn_torch.display import interval_text, number_text
 
 Results = dict[str, Any]
 

@@ -15,19 +15,19 @@ from test_run import short
 from test_uncertainty import linear_dataset
 from toy import Descent
 
+from ccnn_torch.calibration.calibrate import calibrate
+from ccnn_torch.calibration.dataset import Dataset
+from ccnn_torch.calibration.early_stop import Plan
+from ccnn_torch.calibration.method_choice import Comparison, compare
+from ccnn_torch.calibration.page.tables import markdown_text
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner
 from ccnn_torch.learners.constant import Constant
 from ccnn_torch.report.json_files import load_schema, plain
-from ccnn_torch.report.tables import markdown_text
-from ccnn_torch.runs import calibrate
-from ccnn_torch.runs.auto import Comparison, compare
-from ccnn_torch.runs.choosing import Plan
-from ccnn_torch.runs.dataset import Dataset
-from ccnn_torch.runs.folder import RunFolder
+from ccnn_torch.run_folder.folder import RunFolder
 
 # The package has a function of the module's name.
-CALIBRATE: Any = sys.modules["ccnn_torch.runs.calibrate"]
+CALIBRATE: Any = sys.modules["ccnn_torch.calibration.calibrate"]
 PLAN = Plan(True, None, 5, folds=5)
 
 
@@ -167,7 +167,7 @@ def test_a_run_killed_on_its_way_resumes_to_the_same_result(
         if moment == "between":
             patched.setattr(CALIBRATE, "refit", kill)
         else:
-            patched.setattr("ccnn_torch.runs.choosing.sd_scale", kill)
+            patched.setattr("ccnn_torch.calibration.early_stop.sd_scale", kill)
         with pytest.raises(Killed):
             calibrate(chosen, RunFolder(tmp_path / "killed"))
     killed = RunFolder(tmp_path / "killed")

@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from ccnn_torch.calibration.config import load_config
+from ccnn_torch.calibration.prepare import prepare
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.evolution._gauss_newton import dense_jacobian, network_of
 from ccnn_torch.evolution.network import forward
 from ccnn_torch.learners import TrainingData
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings, _nguyen_widrow
-from ccnn_torch.runs.config import load_config
-from ccnn_torch.runs.prepare import prepare
 from ccnn_torch.training import train
 
 

@@ -14,13 +14,13 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_run import short
 
+from ccnn_torch.calibration.job import start_run
+from ccnn_torch.calibration.page.figure_progress import progress_plot
+from ccnn_torch.calibration.page.reach import reach_block
+from ccnn_torch.calibration.page.tables import print_tables, result_tables
 from ccnn_torch.report.arrays import load_history
 from ccnn_torch.report.csv_file import tidy_rows
 from ccnn_torch.report.json_files import load_schema
-from ccnn_torch.report.plots import progress_plot
-from ccnn_torch.report.reach import reach_block
-from ccnn_torch.report.tables import print_tables, result_tables
-from ccnn_torch.runs import start_run
 
 COUNTING = """
 import importlib.util

@@ -9,10 +9,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from ccnn_torch._yaml import dump_yaml, parse_yaml
-from ccnn_torch.errors import InputError
-from ccnn_torch.learners.ccnn import CCNNSettings
-from ccnn_torch.runs.config import (
+from ccnn_torch.calibration.config import (
     METHODS,
     RunConfig,
     describe_keys,
@@ -22,6 +19,9 @@ from ccnn_torch.runs.config import (
     make_config,
     method_names,
 )
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import dump_yaml, parse_yaml
+from ccnn_torch.learners.ccnn import CCNNSettings
 
 TRIPOD = """
 case: tripod

@@ -188,15 +188,15 @@ def test_stopped_before_the_verdict_it_says_that_nothing_was_written(
     cli: Cli, rows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("--records", rows, "--mechanism", "five_bar", "--out", tmp_path / "found")
-    monkeypatch.setattr("ccnn_torch.runs.diagnose.diagnose", _stop)
-    monkeypatch.setattr("ccnn_torch.runs.diagnose.check_rows", _stop)
+    monkeypatch.setattr("ccnn_torch.diagnosis.job.diagnose", _stop)
+    monkeypatch.setattr("ccnn_torch.diagnosis.job.check_rows", _stop)
     assert cli("diagnose", *words) == (130, "", "interrupted before there was a verdict; nothing was written\n")
     assert cli("check", *words) == (130, "", "interrupted; nothing was written\n")
     assert not (tmp_path / "found").exists()
 
 
 def test_a_stopped_blind_check_says_how_to_go_on(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccnn_torch.runs.blind.check.run_blind_check", _stop)
+    monkeypatch.setattr("ccnn_validation.blind.check.run_blind_check", _stop)
     sentence = f"interrupted; what is done is kept in {tmp_path / 'b'}, and the same command goes on from there\n"
     assert cli("blind-check", "--cases", 6, "--out", tmp_path / "b") == (130, "", sentence)
 

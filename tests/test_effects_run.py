@@ -16,6 +16,8 @@ from torch import Tensor
 from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
+from ccnn_torch.calibration.config import load_config, make_config
+from ccnn_torch.calibration.prepare import prepare
 from ccnn_torch.cli._main import app
 from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
 from ccnn_torch.compensation._networks import describe_network, network_from_description
@@ -28,8 +30,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
 from ccnn_torch.report.json_files import load_schema
-from ccnn_torch.runs.config import load_config, make_config
-from ccnn_torch.runs.prepare import prepare
 
 Cli = Callable[..., tuple[int, str, str]]
 ARM = str(Path(__file__).parent / "effects" / "arm.yaml")

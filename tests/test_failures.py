@@ -10,11 +10,11 @@ import jsonschema
 import pytest
 from test_run import short
 
+from ccnn_torch.calibration.calibrate import calibrate
+from ccnn_torch.calibration.job import start_run
+from ccnn_torch.calibration.page.tables import failures, markdown_text
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.report.json_files import load_schema, plain
-from ccnn_torch.report.tables import failures, markdown_text
-from ccnn_torch.runs import calibrate
-from ccnn_torch.runs.runner import start_run
 
 LEARNERS = '''
 import torch

@@ -18,13 +18,13 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ccnn_torch._files import write_whole
+from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback
 from ccnn_torch.errors import InputError, WriteError
+from ccnn_torch.files.write import write_whole
 from ccnn_torch.records import write_table
 from ccnn_torch.report.event_file import EventFile
-from ccnn_torch.report.tensorboard import TensorBoardCallback
-from ccnn_torch.runs._lock import locked
-from ccnn_torch.runs.folder import RunFolder
+from ccnn_torch.run_folder.folder import RunFolder
+from ccnn_torch.run_folder.lock import locked
 
 ROOT = Path(__file__).parent.parent
 Cli = Callable[..., tuple[int, str, str]]
@@ -79,7 +79,7 @@ def test_nothing_in_the_package_writes_files_in_another_way() -> None:
     package = ROOT / "ccnn_torch"
     found = {str(p.relative_to(package)) for p in package.rglob("*.py") if ways.search(p.read_text(encoding="utf-8"))}
     # A private key is made with its own rights, and never in the place of another.
-    assert found == {"_files.py", "report/event_file.py", "compensation/_signature.py"}
+    assert found == {"files/write.py", "report/event_file.py", "compensation/_signature.py"}
 
 
 def test_a_full_disk_keeps_the_old_commands(cli: Cli, tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_curves_end_where_the_disk_is_full_and_the_run_goes_on(tmp_path: Path) -
 HOLD = """
 import os, signal, sys
 from pathlib import Path
-from ccnn_torch.runs._lock import locked
+from ccnn_torch.run_folder.lock import locked
 with locked(Path(sys.argv[1])):
     sys.stdout.write("held")
     sys.stdout.flush()

@@ -10,12 +10,12 @@ import torch
 from mechanisms.catalogue import make
 
 from ccnn_torch import calibrate
+from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.prepare import Prepared, prepare
 from ccnn_torch.identification import fit_links
 from ccnn_torch.mechanisms import fit_frames, load_mechanism
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation
 from ccnn_torch.records import write_table
-from ccnn_torch.rotations import matrix_to_rotation_vector, nearest_rotation
-from ccnn_torch.runs.config import make_config
-from ccnn_torch.runs.prepare import Prepared, prepare
 
 
 def _prepared(folder: Path, geometry_error: float, wave: float, **keys: object) -> Prepared:

@@ -10,14 +10,14 @@ import torch
 from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
+from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.prepare import prepare
 from ccnn_torch.cli._main import app
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, stack_columns, write_table
-from ccnn_torch.runs.config import make_config
-from ccnn_torch.runs.prepare import prepare
 
 DATA = Path(__file__).parent.parent / "experiments" / "data"
 UR10 = {"records": str(DATA / "ur10_b_500.csv"), "mechanism": str(DATA / "ur10.yaml"), "covariates": []}

@@ -14,12 +14,12 @@ import torch
 from test_geometry_run import tripod_records
 
 from ccnn_torch import calibrate, diagnose, identify, load_mechanism, load_records
+from ccnn_torch.calibration.config import load_config, make_config
+from ccnn_torch.calibration.job import resume_run
 from ccnn_torch.errors import InputError
+from ccnn_torch.identification.config import make_identify_config
+from ccnn_torch.identification.job import resume_identification
 from ccnn_torch.records import read_table, write_table
-from ccnn_torch.runs import load_config, resume_run
-from ccnn_torch.runs.config import make_config
-from ccnn_torch.runs.identification import resume_identification
-from ccnn_torch.runs.identify_config import make_identify_config
 
 Cli = Callable[..., tuple[int, str, str]]
 NAMES = {"J1": "q1[m]", "J2": "q2[m]", "J3": "q3[m]", "Y": "y[m]", "Z": "z[m]", "Winkel": "phi[rad]"}

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from ccnn_torch.least_squares import jacobian_of, levenberg_marquardt
+from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
 
 
 def _rosenbrock(x):

@@ -12,14 +12,14 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.prepare import Prepared, prepare
 from ccnn_torch.errors import InputError
-from ccnn_torch.runs.config import make_config
-from ccnn_torch.runs.machines import CAUSES, MACHINES, RealisticMachine, build_machine
-from ccnn_torch.runs.machines._structure import GRAVITY
-from ccnn_torch.runs.machines.arm import ArmStructure
-from ccnn_torch.runs.machines.causes import _GRID, _follow
-from ccnn_torch.runs.machines.legs import LegStructure
-from ccnn_torch.runs.prepare import Prepared, prepare
+from ccnn_torch.simulation.machines.arm import ArmStructure
+from ccnn_torch.simulation.machines.causes import _GRID, CAUSES, _follow
+from ccnn_torch.simulation.machines.legs import LegStructure
+from ccnn_torch.simulation.machines.realistic import MACHINES, RealisticMachine, build_machine
+from ccnn_torch.simulation.machines.structure import GRAVITY
 
 ROWS = 24
 

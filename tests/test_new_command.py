@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from ccnn_torch.calibration.config import load_config
 from ccnn_torch.cli._complete import MECHANISMS, complete_mechanism
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms._registry import REGISTRY
-from ccnn_torch.runs import load_config
-from ccnn_torch.runs.starter import starter_config
+from ccnn_torch.starter.job import starter_config
 
 Cli = Callable[..., tuple[int, str, str]]
 ARM = Path(__file__).parent.parent / "experiments" / "data" / "ur10.yaml"

@@ -10,8 +10,8 @@ import torch
 from test_records import ROWS, Arm, Slide, arm_columns, slide_columns
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import Records, load_records, write_table
-from ccnn_torch.rotations import rotation_vector_to_matrix
 
 ANGLES = np.random.default_rng(8).uniform([-170, -80, -170], [170, 80, 170], (ROWS, 3))
 

@@ -11,9 +11,9 @@ import torch
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.planning.config import PlanConfig, describe_plan_keys, load_plan_config
+from ccnn_torch.planning.job import make_plan
 from ccnn_torch.records import load_records, read_table
-from ccnn_torch.runs.plan_config import PlanConfig, describe_plan_keys, load_plan_config
-from ccnn_torch.runs.planning import make_plan
 
 Cli = Callable[..., tuple[int, str, str]]
 FAST = ("candidates=400", "noise=1e-4")

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ccnn_torch import rotations
+from ccnn_torch.numerics import rotations
 
 _vectors = st.lists(st.floats(-3, 3, allow_subnormal=False), min_size=3, max_size=3)
 

@@ -20,14 +20,15 @@ import torch
 from safetensors.torch import load_file
 from test_cli import tripod_records
 
-from ccnn_torch._yaml import read_yaml
+from ccnn_torch.calibration.calibrate import calibrate
+from ccnn_torch.calibration.config import RunConfig, load_config, make_config
+from ccnn_torch.calibration.job import resume_run, start_run
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import read_yaml
+from ccnn_torch.identification.config import load_identify_config
 from ccnn_torch.report.json_files import load_schema
-from ccnn_torch.runs import RunConfig, calibrate, load_config, resume_run, start_run
-from ccnn_torch.runs.config import make_config
-from ccnn_torch.runs.folder import RunFolder
-from ccnn_torch.runs.identify_config import load_identify_config
-from ccnn_torch.runs.suite import load_suite
+from ccnn_torch.run_folder.folder import RunFolder
+from ccnn_torch.suite.job import load_suite
 
 Cli = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parent.parent

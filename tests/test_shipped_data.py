@@ -11,7 +11,7 @@ from test_records import Arm
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.records import check_rows, load_records, read_table, write_table
-from ccnn_torch.splits import split_rows
+from ccnn_torch.records.splits import split_rows
 
 DATA = Path(__file__).parent.parent / "experiments" / "data"
 UR10 = Arm("ur10", tuple(Coordinate(f"q{k}", "rad") for k in range(1, 7)), reach=1.684)

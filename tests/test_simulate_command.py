@@ -13,8 +13,8 @@ from ccnn_torch.effects import EFFECTS, Situation, default_gravity, make_effect,
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records, read_table
-from ccnn_torch.runs.simulate_config import SimulateConfig, describe_simulate_keys, load_simulate_config
-from ccnn_torch.runs.simulating import simulate_records
+from ccnn_torch.simulation.config import SimulateConfig, describe_simulate_keys, load_simulate_config
+from ccnn_torch.simulation.job import simulate_records
 
 Cli = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parent.parent

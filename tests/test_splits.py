@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.splits import Split, fold_splits, split_rows
+from ccnn_torch.records.splits import Split, fold_splits, split_rows
 
 
 def sets(split: Split) -> tuple[set[int], set[int], set[int]]:

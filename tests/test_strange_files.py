@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from ccnn_torch._display import visible
-from ccnn_torch._reading import parse_json, read_bytes
-from ccnn_torch._yaml import dump_yaml, parse_yaml
+from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.read import parse_json, read_bytes
+from ccnn_torch.files.yaml_file import dump_yaml, parse_yaml
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
 
@@ -350,7 +350,7 @@ def test_a_run_that_is_moved_with_its_data(tmp_path: Path, cli: Cli, monkeypatch
 def test_brackets_are_shown_on_the_screen() -> None:
     from rich.console import Console
 
-    from ccnn_torch.report.table_form import Table, print_table, print_text
+    from ccnn_torch.report.table import Table, print_table, print_text
 
     screen = Console(width=80, force_terminal=True, record=True)
     print_text("a note [t] in [bold]brackets[/bold] \x1b[2J", screen, "dim")

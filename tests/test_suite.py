@@ -12,13 +12,13 @@ import jsonschema
 import pytest
 from rich.console import Console
 
+from ccnn_torch.calibration.config import dump_config
+from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import load_schema
-from ccnn_torch.report.results import spread
-from ccnn_torch.report.suite import compare, write_suite
-from ccnn_torch.report.suite_tables import print_suite, suite_markdown
-from ccnn_torch.runs.config import dump_config
-from ccnn_torch.runs.suite import load_suite, run_suite
+from ccnn_torch.suite.job import load_suite, run_suite
+from ccnn_torch.suite.page import compare, write_suite
+from ccnn_torch.suite.tables import print_suite, suite_markdown
 
 ROOT = Path(__file__).parent.parent
 TINY = """

@@ -10,13 +10,13 @@ from test_run import short
 from torch import Tensor
 from toy import Descent
 
+from ccnn_torch.calibration.calibrate import calibrate
+from ccnn_torch.calibration.dataset import Dataset
+from ccnn_torch.calibration.early_stop import Plan
+from ccnn_torch.calibration.fitting import Fitted, fit_method
+from ccnn_torch.calibration.uncertainty import coverage, inside_domain, sd_scale
 from ccnn_torch.errors import MethodFailedError
-from ccnn_torch.runs import calibrate
-from ccnn_torch.runs.choosing import Plan
-from ccnn_torch.runs.dataset import Dataset
-from ccnn_torch.runs.fitting import Fitted, fit_method
-from ccnn_torch.runs.uncertainty import coverage, inside_domain, sd_scale
-from ccnn_torch.splits import Split
+from ccnn_torch.records.splits import Split
 
 
 def draw(kind: str, *shape: int, seed: int = 0) -> Tensor:

@@ -15,10 +15,10 @@ import ccnn_torch
 from ccnn_torch import calibrate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import PoseError, load_mechanism
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import write_table
 from ccnn_torch.report.json_files import load_schema
-from ccnn_torch.rotations import rotation_vector_to_matrix
-from ccnn_torch.runs.promise import configurations, paired_gain, promise_block, promised
+from ccnn_torch.verification.promise import configurations, paired_gain, promise_block, promised
 
 Cli = Callable[..., tuple[int, str, str]]
 DELTA = "delta"

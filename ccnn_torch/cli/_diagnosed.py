@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
-    from ccnn_torch.runs.diagnose_config import DiagnoseConfig
+    from ccnn_torch.diagnosis.config import DiagnoseConfig
 
 __all__ = ["configured", "watched"]
 
@@ -27,9 +27,9 @@ def configured(
     network: bool | None = None,
 ) -> DiagnoseConfig:
     """The config file with what the command line says over it."""
-    from ccnn_torch.runs._noise import read_noise
-    from ccnn_torch.runs._overrides import listed_files
-    from ccnn_torch.runs.diagnose_config import load_diagnose_config
+    from ccnn_torch.config.noise import read_noise
+    from ccnn_torch.config.overrides import listed_files
+    from ccnn_torch.diagnosis.config import load_diagnose_config
 
     told = [] if noise is None else [f"noise={json.dumps(read_noise(noise))}"]
     wanted = load_diagnose_config(config, [*(overrides or []), *told])
@@ -47,7 +47,7 @@ def configured(
 
 def watched(text: str, work: Callable[[Callable[[str], None]], _Found], quiet: bool) -> _Found:
     """Work that says how far it is, where a person is looking."""
-    from ccnn_torch.runs.screen import stderr
+    from ccnn_torch.report.screen import stderr
 
     if quiet or not stderr.is_terminal:
         return work(lambda how_far: None)

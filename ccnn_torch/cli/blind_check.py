@@ -40,9 +40,10 @@ def blind_check(
 
     ccnn blind-check --cases 500 --out runs/pairs --kinds pair --mechanism five_bar,stewart --seed 7
     """
+    from ccnn_validation.blind.check import run_blind_check
+    from ccnn_validation.blind.machines import MACHINES
+
     from ccnn_torch.diagnosis import diagnose
-    from ccnn_torch.runs.blind.check import run_blind_check
-    from ccnn_torch.runs.blind.machines import MACHINES
 
     with if_stopped(f"interrupted; what is done is kept in {out}, and the same command goes on from there"):
         run_blind_check(

@@ -43,9 +43,9 @@ def check(
 
     ccnn check --records measured.csv --mechanism my_simulator.py:PRESS
     """
-    from ccnn_torch.report.table_form import print_table
-    from ccnn_torch.runs.diagnose import check_table, check_text, run_check, write_check
-    from ccnn_torch.runs.screen import say, stdout
+    from ccnn_torch.diagnosis.job import check_table, check_text, run_check, write_check
+    from ccnn_torch.report.screen import say, stdout
+    from ccnn_torch.report.table import print_table
 
     with if_stopped(NOTHING_WRITTEN):
         wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)

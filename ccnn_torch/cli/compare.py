@@ -25,9 +25,9 @@ def compare(
 
     ccnn compare runs/* --out runs.csv
     """
-    from ccnn_torch.report.runs_table import read_runs, runs_table, write_runs
-    from ccnn_torch.report.table_form import print_table
-    from ccnn_torch.runs.screen import stdout
+    from ccnn_torch.comparison.table import read_runs, runs_table, write_runs
+    from ccnn_torch.report.screen import stdout
+    from ccnn_torch.report.table import print_table
 
     found = read_runs(runs)
     if out is not None:

@@ -84,7 +84,7 @@ def compensate(
 
     from ccnn_torch.compensation import load_compensation
     from ccnn_torch.records import name_lines, read_table, stack_columns, write_table
-    from ccnn_torch.runs.screen import say
+    from ccnn_torch.report.screen import say
 
     loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
     table = read_table(input)
@@ -250,7 +250,7 @@ def _named(what: str, loaded: Model, values: Array, units: dict[str, str]) -> di
 
 
 def _tell(output: Path, inside: NDArray[Any], trained: bool) -> None:
-    from ccnn_torch.runs.screen import say
+    from ccnn_torch.report.screen import say
 
     outside = len(inside) - int(inside.sum())
     say(f"{output}: {len(inside)} rows written.")

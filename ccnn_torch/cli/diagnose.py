@@ -15,7 +15,7 @@ from ccnn_torch.errors import InputError
 
 if TYPE_CHECKING:
     from ccnn_torch.diagnosis import Diagnosis
-    from ccnn_torch.runs.diagnose_config import DiagnoseConfig
+    from ccnn_torch.diagnosis.config import DiagnoseConfig
 
 __all__ = ["diagnose"]
 
@@ -66,11 +66,11 @@ def diagnose(
         if wanted.out is None:
             raise InputError("name the folder to write with --out DIR")
         found = _search(wanted, quiet)
-    from ccnn_torch._files import sweep
-    from ccnn_torch.report.diagnosis_report import print_diagnosis
-    from ccnn_torch.runs._lock import locked
-    from ccnn_torch.runs.diagnose import write_result
-    from ccnn_torch.runs.screen import stdout
+    from ccnn_torch.diagnosis.job import write_result
+    from ccnn_torch.diagnosis.page.report import print_diagnosis
+    from ccnn_torch.files.write import sweep
+    from ccnn_torch.report.screen import stdout
+    from ccnn_torch.run_folder.lock import locked
 
     folder = Path(wanted.out)
     try:
@@ -88,8 +88,8 @@ def diagnose(
 
 def _search(wanted: DiagnoseConfig, quiet: bool) -> Diagnosis:
     """The verdict."""
+    from ccnn_torch.diagnosis.job import run_diagnosis
     from ccnn_torch.mechanisms import simulated_rows
-    from ccnn_torch.runs.diagnose import run_diagnosis
 
     def search(tell: Callable[[str], None]) -> Diagnosis:
         with simulated_rows(lambda n: tell(f"{n:,} rows simulated")):
@@ -101,13 +101,13 @@ def _search(wanted: DiagnoseConfig, quiet: bool) -> Diagnosis:
 
 def _tell(wanted: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -> None:
     """The verdict at once, then all that takes longer."""
-    from ccnn_torch._display import short_path
     from ccnn_torch.diagnosis import with_network
-    from ccnn_torch.report.diagnosis_data import about_of, load_labels
-    from ccnn_torch.report.diagnosis_report import print_diagnosis
-    from ccnn_torch.report.table_form import print_text
-    from ccnn_torch.runs.diagnose import write_diagnosis
-    from ccnn_torch.runs.screen import say_place, stdout
+    from ccnn_torch.diagnosis.job import write_diagnosis
+    from ccnn_torch.diagnosis.page.data import about_of, load_labels
+    from ccnn_torch.diagnosis.page.report import print_diagnosis
+    from ccnn_torch.display import short_path
+    from ccnn_torch.report.screen import say_place, stdout
+    from ccnn_torch.report.table import print_text
 
     if not quiet:
         print_text(found.verdict["text"], stdout, "bold")

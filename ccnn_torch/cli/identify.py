@@ -41,8 +41,8 @@ def identify(
 
     ccnn compensate runs/arm/identified.yaml poses.csv commands.csv --pose
     """
-    from ccnn_torch.runs.identification import resume_identification, start_identification
-    from ccnn_torch.runs.identify_config import describe_identify_keys, load_identify_config
+    from ccnn_torch.identification.config import describe_identify_keys, load_identify_config
+    from ccnn_torch.identification.job import resume_identification, start_identification
 
     if keys:
         for key, default, description in describe_identify_keys():

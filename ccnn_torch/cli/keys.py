@@ -38,7 +38,7 @@ def keys(
 
     ccnn keys --schema > ccnn.schema.json
     """
-    from ccnn_torch.runs.all_configs import config_schema, keys_by_section
+    from ccnn_torch.config.commands import config_schema, keys_by_section
 
     if schema:
         typer.echo(json.dumps(config_schema(command.value), indent=2, ensure_ascii=False))

@@ -39,8 +39,8 @@ def new(
     """
     if out.exists() and not force:
         raise InputError(f"{out} is there already; name another file, or give --force to write over it")
-    from ccnn_torch._files import write_whole
-    from ccnn_torch.runs.starter import starter_config
+    from ccnn_torch.files.write import write_whole
+    from ccnn_torch.starter.job import starter_config
 
     ask = (lambda question: str(typer.prompt(question, default="", show_default=False))) if _asks(quiet) else None
     text, ready = starter_config(records, out, mechanism, units, ask)

@@ -22,8 +22,8 @@ def picture(
 
     ccnn picture runs/tripod docs/picture.png --joint q3
     """
-    from ccnn_torch.report.run_report import make_picture
-    from ccnn_torch.runs.screen import say
+    from ccnn_torch.calibration.page.report import make_picture
+    from ccnn_torch.report.screen import say
 
     caption = make_picture(run_dir, out, joint)
     if not quiet:

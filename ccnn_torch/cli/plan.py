@@ -45,11 +45,11 @@ def plan(
     """
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from ccnn_torch.report.plan import gain_table, left_out_sentence, parameter_table, plan_sentence
-    from ccnn_torch.report.table_form import print_table
-    from ccnn_torch.runs.plan_config import load_plan_config
-    from ccnn_torch.runs.planning import make_plan, write_plan
-    from ccnn_torch.runs.screen import say, say_place, stderr, stdout
+    from ccnn_torch.planning.config import load_plan_config
+    from ccnn_torch.planning.job import make_plan, write_plan
+    from ccnn_torch.planning.page import gain_table, left_out_sentence, parameter_table, plan_sentence
+    from ccnn_torch.report.screen import say, say_place, stderr, stdout
+    from ccnn_torch.report.table import print_table
 
     wanted = load_plan_config(config, [*(overrides or []), *([f"seed={seed}"] if seed is not None else [])])
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeRemainingColumn())

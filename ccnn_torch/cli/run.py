@@ -34,7 +34,8 @@ def run(
 
     ccnn run --resume runs/tripod30
     """
-    from ccnn_torch.runs import load_config, resume_run, start_run
+    from ccnn_torch.calibration.config import load_config
+    from ccnn_torch.calibration.job import resume_run, start_run
 
     if resume is not None:
         if config is not None or overrides or out is not None or seed is not None:

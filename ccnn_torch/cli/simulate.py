@@ -57,11 +57,11 @@ def simulate(
     ccnn simulate --mechanism my_simulator.py:PRESS --effect "parameter spring1:spring1=-6000" --rows 200 --noise 1e-5
     --out r.csv
     """
-    from ccnn_torch.report.table_form import print_table
-    from ccnn_torch.runs._noise import read_noise
-    from ccnn_torch.runs.screen import say, say_place, stdout
-    from ccnn_torch.runs.simulate_config import load_simulate_config
-    from ccnn_torch.runs.simulating import injected_table, simulate_records, write_simulated
+    from ccnn_torch.config.noise import read_noise
+    from ccnn_torch.report.screen import say, say_place, stdout
+    from ccnn_torch.report.table import print_table
+    from ccnn_torch.simulation.config import load_simulate_config
+    from ccnn_torch.simulation.job import injected_table, simulate_records, write_simulated
 
     with if_stopped(NOTHING_WRITTEN):
         wanted = load_simulate_config(config, overrides or [])

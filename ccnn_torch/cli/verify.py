@@ -51,8 +51,8 @@ def verify(
     """
     with if_stopped(NOTHING_WRITTEN):
         from ccnn_torch.compensation import load_compensation
-        from ccnn_torch.report.verify_report import write_verify_report
-        from ccnn_torch.runs.verify import verify_model
+        from ccnn_torch.verification.job import verify_model
+        from ccnn_torch.verification.page import write_verify_report
 
         loaded = load_compensation(model, allow_code=allow_code)
         found = verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code)

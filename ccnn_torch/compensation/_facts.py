@@ -11,13 +11,13 @@ from typing import Any
 
 from torch import Tensor
 
-from ccnn_torch import __version__
 from ccnn_torch.compensation._compensator import Compensator
 from ccnn_torch.compensation._networks import describe_network
 from ccnn_torch.compensation._session import TAKE_AGAIN
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.training import tensor_digest
+from ccnn_torch.version import __version__
 
 __all__ = [
     "FORMAT",

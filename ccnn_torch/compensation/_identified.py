@@ -9,13 +9,13 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from ccnn_torch._files import write_whole
 from ccnn_torch.compensation._card import MODEL_FORMS, card_of, read_model
 from ccnn_torch.compensation._loaded import LoadedModel, load_model
 from ccnn_torch.compensation._promise import Promise, as_matrix, kept
 from ccnn_torch.compensation._signature import check_signature, sign_content, signature_path
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError
+from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism, mechanism_of_file
 from ccnn_torch.mechanisms.mechanism_file import MechanismFile, read_mechanism_file
 

@@ -10,12 +10,12 @@ from typing import Any
 
 from safetensors.torch import save
 
-from ccnn_torch._files import write_whole
 from ccnn_torch.compensation._compensator import Compensator
 from ccnn_torch.compensation._export import export_float32, export_onnx, export_pt2, trace
 from ccnn_torch.compensation._facts import facts_of, to_json
 from ccnn_torch.compensation._session import METADATA_KEY
 from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.files.write import write_whole
 
 __all__ = ["FORMS", "card_name", "save_model"]
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ccnn_torch.mechanisms import SerialArm
-from ccnn_torch.rotations import rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 __all__ = ["SerialGeometry"]
 

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch._display import number_text
 from ccnn_torch.diagnosis._analysis import Analysis
 from ccnn_torch.diagnosis._belonging import Belonging
 from ccnn_torch.diagnosis._dictionary import covariance
 from ccnn_torch.diagnosis._distance import distance, size_of
 from ccnn_torch.diagnosis._shrink import Gap
 from ccnn_torch.diagnosis._verdict import Judgement
+from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Situation
 
 __all__ = ["Caution", "cautions", "row_cautions"]

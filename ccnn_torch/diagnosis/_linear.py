@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis._atoms import scales
 from ccnn_torch.effects import Acting, Effect, Situation, reached
-from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 __all__ = ["moved", "remainder", "signature_at", "tangent"]
 

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch._reading import parse_json, read_text
 from ccnn_torch.effects import EFFECTS, OUTLIER, Coefficient, Effect, Shape, Situation, make_effect
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.read import parse_json, read_text
 from ccnn_torch.units import LARGEST
 
 __all__ = ["Known", "Verdict", "not_held_notes", "one_row_at_a_time", "read_verdict"]

@@ -11,9 +11,6 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from ccnn_torch._covariates import DEFAULT_COVARIATES
-from ccnn_torch._read_table import Frame
-from ccnn_torch._sources import FILE, is_frame
 from ccnn_torch.diagnosis._distance import size_of
 from ccnn_torch.diagnosis._network import with_network
 from ccnn_torch.diagnosis._told import refuse_lost_rows, told
@@ -23,6 +20,9 @@ from ccnn_torch.effects import Effect, Situation, default_gravity
 from ccnn_torch.errors import InputError, RowsError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
 from ccnn_torch.records import Records, load_records
+from ccnn_torch.records.covariates import DEFAULT_COVARIATES
+from ccnn_torch.records.read_table import Frame
+from ccnn_torch.records.sources import FILE, is_frame
 
 __all__ = ["diagnose", "naming", "noise_of", "situation_of"]
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ccnn_torch._display import count_text, display_unit, number_text
-from ccnn_torch._table import name_lines
 from ccnn_torch.coordinates import Condition
+from ccnn_torch.display import count_text, display_unit, number_text
+from ccnn_torch.records.table import name_lines
 
 __all__ = [
     "SURE",

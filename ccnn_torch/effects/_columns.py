@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
-from ccnn_torch.rotations import skew
+from ccnn_torch.numerics.rotations import skew
 
 __all__ = [
     "TWIST",

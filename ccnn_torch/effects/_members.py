@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ccnn_torch.effects._columns import own_parameters
 from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.rotations import rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 __all__ = ["Member", "arm_axes", "members"]
 

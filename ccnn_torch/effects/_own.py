@@ -9,11 +9,11 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import leading_shape
 from ccnn_torch.effects._protocol import Coefficient, Effect, Kind, Shape, missing_verbs
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.plugins import failure
 
 __all__ = ["OwnEffect", "label_of", "of_library", "owned"]

@@ -9,9 +9,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.rotations import rotation_vector_to_matrix
+from ccnn_torch.numerics.least_squares import jacobian_of
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 __all__ = ["PLATFORM_WEIGHT", "WEIGHTS", "Situation", "default_gravity"]
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.effects._protocol import Effect
 from ccnn_torch.effects._situation import Situation
-from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 __all__ = ["Acting", "measured_pose", "pose_residual", "reached", "signature"]
 

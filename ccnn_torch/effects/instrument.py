@@ -11,7 +11,7 @@ from ccnn_torch.effects._columns import shown_columns
 from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects._situation import Situation
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.rotations import matrix_to_rotation_vector
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
 __all__ = ["Instrument"]
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._pose import Frame, frame_jacobian
-from ccnn_torch.rotations import matrix_to_rotation_vector
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
 __all__ = ["central_slope", "differentiable_pose"]
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.mechanisms._pose import Frame
-from ccnn_torch.rotations import matrix_to_rotation_vector, nearest_rotation, rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation, rotation_vector_to_matrix
 
 __all__ = ["best_closed_form", "closed_form_frames", "rigid_body_frame"]
 

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from torch import Tensor, nn
-
-if TYPE_CHECKING:
-    from ccnn_torch.mechanisms._mechanism import Mechanism
 
 __all__ = ["InverseKinematics"]
 
 
 class InverseKinematics(nn.Module):
-    """The module that torch forward hooks sit on; it only calls `mechanism.solve_inverse`."""
+    """The module that torch forward hooks sit on; it only calls `solve_inverse` of its mechanism."""
 
-    def __init__(self, mechanism: Mechanism) -> None:
+    def __init__(self, solve_inverse: Callable[..., Tensor]) -> None:
         super().__init__()
-        # A bound method, not the module itself: a child that holds its parent as a submodule would never end.
-        self._solve = mechanism.solve_inverse
+        # A bound method, not the mechanism: a child that holds its parent as a submodule would never end.
+        self._solve = solve_inverse
 
     def forward(
         self,

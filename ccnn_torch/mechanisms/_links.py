@@ -7,8 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import stack_last
-from ccnn_torch.rotations import euler_zyx_to_matrix, rotation_vector_to_matrix
+from ccnn_torch.numerics.batching import stack_last
+from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, rotation_vector_to_matrix
 
 __all__ = ["LINKS", "LinkTransform", "compose"]
 

@@ -10,7 +10,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from ccnn_torch.batching import expand_leading
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import _numeric
@@ -22,7 +21,8 @@ from ccnn_torch.mechanisms._pose import (
     frame_jacobian,
     pose_error,
 )
-from ccnn_torch.rotations import matrix_to_rotation_vector, wrap_angle
+from ccnn_torch.numerics.batching import expand_leading
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, wrap_angle
 
 __all__ = ["Mechanism"]
 
@@ -85,7 +85,7 @@ class Mechanism(nn.Module):
         self.register_buffer("home_pose", middle if home_pose is None else _tensor(home_pose))
         self.register_buffer("home_joints", torch.zeros(len(self.joints), dtype=torch.float64))
         self.home_joints.copy_(self.solve_inverse(self.home_pose) if home_joints is None else _tensor(home_joints))
-        self.inverse_kinematics = InverseKinematics(self)
+        self.inverse_kinematics = InverseKinematics(self.solve_inverse)
         # How to build it again: `spec` and `keys` of `load_mechanism`, which fills this in.
         self.recipe: dict[str, Any] = {}
 
@@ -338,7 +338,7 @@ class Mechanism(nn.Module):
         """A copy with other nominal parameters, `k` [SI] (fitted frames, identified geometry), without any hook."""
         twin = copy.deepcopy(self)
         twin.nominal.copy_(parameters)
-        twin.inverse_kinematics = InverseKinematics(twin)
+        twin.inverse_kinematics = InverseKinematics(twin.solve_inverse)
         twin._follow_nominal()
         return twin
 

@@ -12,7 +12,7 @@ import torch
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._mujoco_numbers import Array, ModelNumbers, ModelParameter
-from ccnn_torch.rotations import matrix_to_rotation_vector
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
 __all__ = ["MujocoMachine"]
 

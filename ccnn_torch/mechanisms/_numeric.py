@@ -7,8 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import leading_shape
-from ccnn_torch.least_squares import Solution, jacobian_of, levenberg_marquardt
+from ccnn_torch.numerics.batching import leading_shape
+from ccnn_torch.numerics.least_squares import Solution, jacobian_of, levenberg_marquardt
 
 __all__ = ["carry_derivative", "least_norm", "solve"]
 

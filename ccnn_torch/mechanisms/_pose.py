@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
-from ccnn_torch.least_squares import jacobian_of
-from ccnn_torch.rotations import geodesic_angle, rotation_vector_rate, rotation_vector_to_matrix, skew
+from ccnn_torch.numerics.least_squares import jacobian_of
+from ccnn_torch.numerics.rotations import geodesic_angle, rotation_vector_rate, rotation_vector_to_matrix, skew
 
 __all__ = ["Frame", "PoseError", "coordinates_jacobian", "frame_from_coordinates", "frame_jacobian", "pose_error"]
 

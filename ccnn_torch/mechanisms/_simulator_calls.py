@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ccnn_torch._display import count_text
-from ccnn_torch.batching import leading_shape
 from ccnn_torch.coordinates import Condition
+from ccnn_torch.display import count_text
 from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms.simulator import Simulator
+from ccnn_torch.numerics.batching import leading_shape
 
 __all__ = ["Calls", "described", "simulated_rows"]
 

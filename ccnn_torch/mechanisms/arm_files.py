@@ -14,7 +14,7 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms._links import compose
 from ccnn_torch.mechanisms.serial import SerialArm
-from ccnn_torch.rotations import matrix_to_euler_zyx, rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, rotation_vector_to_matrix
 
 __all__ = ["dh_text", "urdf_text"]
 

@@ -9,10 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import leading_shape
 from ccnn_torch.coordinates import Condition, Coordinate, plausible_error
 from ccnn_torch.errors import InputError
-from ccnn_torch.least_squares import levenberg_marquardt
 from ccnn_torch.mechanisms._differences import central_slope, differentiable_pose
 from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms._numeric import carry_derivative
@@ -20,7 +18,9 @@ from ccnn_torch.mechanisms._pose import Frame, frame_from_coordinates
 from ccnn_torch.mechanisms._simulator_calls import Calls, described
 from ccnn_torch.mechanisms._simulator_trial import try_simulator
 from ccnn_torch.mechanisms.simulator import Simulator
-from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.numerics.batching import leading_shape
+from ccnn_torch.numerics.least_squares import levenberg_marquardt
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 __all__ = ["BlackBox"]
 

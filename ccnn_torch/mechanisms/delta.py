@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import stack_last
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.mechanisms._closed_forms import crank_angle, meeting_point, real_sqrt
 from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.numerics.batching import stack_last
 
 __all__ = ["Delta", "DeltaLinear"]
 

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch._display import visible
-from ccnn_torch._reading import CONFIG_LIMIT, read_text
-from ccnn_torch._yaml import parse_yaml
+from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.read import CONFIG_LIMIT, read_text
+from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms.serial import MOST_JOINTS, SerialArm
 from ccnn_torch.units import LARGEST
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import stack_last
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.mechanisms._closed_forms import real_acos, real_sqrt, upward_angle
 from ccnn_torch.mechanisms._inscribed import inscribed_circle
 from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.numerics.batching import stack_last
 
 __all__ = ["FiveBar"]
 

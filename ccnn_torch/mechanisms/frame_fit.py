@@ -10,7 +10,7 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames import ROTATION_WEIGHT
 from ccnn_torch.mechanisms.serial import SerialArm
-from ccnn_torch.outliers import inlying
+from ccnn_torch.numerics.outliers import inlying
 
 __all__ = ["judge_frames"]
 

@@ -9,16 +9,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import expand_leading
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.least_squares import jacobian_of, levenberg_marquardt
 from ccnn_torch.mechanisms._frame_start import best_closed_form, rigid_body_frame
 from ccnn_torch.mechanisms._links import compose
 from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms._numeric import carry_derivative
 from ccnn_torch.mechanisms._pose import Frame
-from ccnn_torch.rotations import matrix_to_rotation_vector, nearest_rotation, rotation_vector_to_matrix, skew
+from ccnn_torch.numerics.batching import expand_leading
+from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation, rotation_vector_to_matrix, skew
 
 __all__ = ["Framed"]
 

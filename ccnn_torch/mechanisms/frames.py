@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.least_squares import levenberg_marquardt
 from ccnn_torch.mechanisms._frame_start import closed_form_frames
 from ccnn_torch.mechanisms._pose import frame_jacobian
 from ccnn_torch.mechanisms.serial import SerialArm
-from ccnn_torch.outliers import FAR, inlying, residual_scale
-from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix, skew
+from ccnn_torch.numerics.least_squares import levenberg_marquardt
+from ccnn_torch.numerics.outliers import FAR, inlying, residual_scale
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix, skew
 
 __all__ = ["ROTATION_WEIGHT", "TOOL_SPREAD", "fit_frames"]
 

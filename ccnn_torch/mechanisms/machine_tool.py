@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import stack_last
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.numerics.batching import stack_last
 
 __all__ = ["MachineTool"]
 

@@ -7,15 +7,15 @@ import math
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import expand_leading, stack_last
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import _numeric
 from ccnn_torch.mechanisms._closed_forms import crank_angle
 from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms._pose import frame_jacobian
-from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.numerics.batching import expand_leading, stack_last
+from ccnn_torch.numerics.least_squares import jacobian_of
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 __all__ = ["Overconstrained2Dof"]
 

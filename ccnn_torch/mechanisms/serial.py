@@ -9,14 +9,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import expand_leading
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.least_squares import levenberg_marquardt
 from ccnn_torch.mechanisms._links import LINKS, compose
 from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms._numeric import carry_derivative, least_norm
-from ccnn_torch.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.numerics.batching import expand_leading
+from ccnn_torch.numerics.least_squares import levenberg_marquardt
+from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
 
 __all__ = ["MOST_JOINTS", "SerialArm"]
 

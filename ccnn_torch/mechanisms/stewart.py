@@ -11,7 +11,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.mechanisms._mechanism import Mechanism
 from ccnn_torch.mechanisms._numeric import solve
-from ccnn_torch.rotations import rotation_vector_rate, rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import rotation_vector_rate, rotation_vector_to_matrix
 
 __all__ = ["Stewart"]
 

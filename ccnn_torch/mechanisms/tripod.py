@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ccnn_torch.batching import expand_leading, stack_last
 from ccnn_torch.coordinates import Coordinate, Parameter
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms._mechanism import Mechanism
+from ccnn_torch.numerics.batching import expand_leading, stack_last
+from ccnn_torch.numerics.least_squares import jacobian_of
 
 __all__ = ["Tripod"]
 

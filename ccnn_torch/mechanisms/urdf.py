@@ -11,12 +11,12 @@ from xml.etree.ElementTree import Element
 import torch
 from torch import Tensor
 
-from ccnn_torch._display import visible
-from ccnn_torch._reading import read_bytes
+from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.read import read_bytes
 from ccnn_torch.mechanisms._links import compose
 from ccnn_torch.mechanisms.serial import MOST_JOINTS, SerialArm
-from ccnn_torch.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_rotation_vector
+from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_rotation_vector
 from ccnn_torch.units import LARGEST
 
 __all__ = ["read_urdf"]

@@ -35,9 +35,9 @@ from numpy.typing import ArrayLike, NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from ccnn_torch._files import write_whole
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import write_whole
 
 __all__ = ["ARRAYS_FILE", "RunArrays", "load_arrays", "load_history", "save_arrays", "save_history"]
 

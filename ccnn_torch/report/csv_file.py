@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch._files import write_whole
+from ccnn_torch.files.write import write_whole
 
 __all__ = ["tidy_rows", "write_csv", "write_rows"]
 

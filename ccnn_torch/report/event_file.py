@@ -41,7 +41,9 @@ class EventFile:
         self._records = RecordWriter(self._pending)
         self._file: io.FileIO | None = None
         self.failed: str | None = None
-        name = f"events.out.tfevents.{int(time.time()):010}.{socket.gethostname()}.{os.getpid()}.{next(_numbers)}"
+        # TensorBoard reads the files of a folder in the order of their names, and two may begin within a second.
+        seconds, rest = divmod(time.time_ns(), 1_000_000_000)
+        name = f"events.out.tfevents.{seconds:010}.{rest:09}.{socket.gethostname()}.{os.getpid()}.{next(_numbers):06}"
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._file = io.FileIO(folder / name, "w")

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ccnn_torch.report.table_form import Table
-from ccnn_torch.report.tables import cautions, result_tables, verdict
+from ccnn_torch.report.table import Table
 
-__all__ = ["InlineFigure", "html_text", "page_text", "render", "trusted"]
+__all__ = ["InlineFigure", "page_text", "render", "trusted"]
 
 
 class InlineFigure(NamedTuple):
@@ -20,31 +19,6 @@ class InlineFigure(NamedTuple):
     name: str
     caption: str
     svg: str
-
-
-def html_text(
-    results: Mapping[str, Any], figures: Sequence[InlineFigure] = (), config: str = "", files: Sequence[str] = ()
-) -> str:
-    """The report of a run.
-
-    Args:
-        results: as in `results.json`.
-        figures: in reading order.
-        config: the resolved configuration, as text.
-        files: names of files in the run folder to link to.
-    """
-    optional: dict[str, Any] = {"case": None, "best_method": None, "notes": [], "versions": {}}
-    return page_text(
-        "report",
-        optional | dict(results),
-        verdict(results),
-        result_tables(results),
-        cautions(results),
-        figures,
-        config,
-        files,
-        results.get("best_method"),
-    )
 
 
 def page_text(

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ccnn_torch._files import write_whole
-from ccnn_torch._reading import parse_json, read_text
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.read import parse_json, read_text
+from ccnn_torch.files.write import write_whole
 
 __all__ = ["load_schema", "plain", "read_json", "write_json"]
 

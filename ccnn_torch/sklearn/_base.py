@@ -15,8 +15,8 @@ from sklearn.utils import check_array, check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 from torch import Tensor, nn
 
+from ccnn_torch.calibration.uncertainty import sd_scale
 from ccnn_torch.learners import Learner, TrainingData
-from ccnn_torch.runs.uncertainty import sd_scale
 from ccnn_torch.training import Scaling, Training, train
 
 __all__ = ["LearnerRegressor", "SteppedRegressor"]

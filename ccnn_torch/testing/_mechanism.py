@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 from ccnn_torch.mechanisms._branch import jump_sentence
-from ccnn_torch.rotations import vee
+from ccnn_torch.numerics.rotations import vee
 
 __all__ = ["check_mechanism"]
 

@@ -11,8 +11,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from ccnn_torch._files import write_whole
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import write_whole
 
 __all__ = ["load_checkpoint", "save_checkpoint", "tensor_digest"]
 

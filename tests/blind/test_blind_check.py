@@ -12,18 +12,18 @@ import jsonschema
 import pytest
 from blind.stand_in import Said, StandIn
 from blind.test_blind_machines import planned
+from ccnn_validation.blind.check import _generator, run_blind_check
+from ccnn_validation.blind.explain import Judge
+from ccnn_validation.blind.folder import BlindFolder
+from ccnn_validation.blind.generator import judge_cases, open_cases, write_cases
+from ccnn_validation.blind.judge import judged
+from ccnn_validation.blind.report import share, summary
+from ccnn_validation.blind.simulate import simulate
+from ccnn_validation.blind.tables import blind_markdown
 
 from ccnn_torch.cli import main
 from ccnn_torch.errors import InputError
-from ccnn_torch.report.blind import share, summary
-from ccnn_torch.report.blind_tables import blind_markdown
 from ccnn_torch.report.json_files import load_schema, read_json, write_json
-from ccnn_torch.runs.blind.check import _generator, run_blind_check
-from ccnn_torch.runs.blind.explain import Judge
-from ccnn_torch.runs.blind.folder import BlindFolder
-from ccnn_torch.runs.blind.generator import judge_cases, open_cases, write_cases
-from ccnn_torch.runs.blind.judge import judged
-from ccnn_torch.runs.blind.simulate import simulate
 
 TRUE_SHRINK = (1.0, 0.9, 1.0)
 
@@ -32,7 +32,7 @@ TRUE_SHRINK = (1.0, 0.9, 1.0)
 def beside(monkeypatch: pytest.MonkeyPatch) -> None:
     """The generating side without a process of its own, which takes seconds to start."""
     sides = {"write": write_cases, "open": open_cases, "judge": judge_cases}
-    monkeypatch.setattr("ccnn_torch.runs.blind.check._generator", lambda what, folder: sides[what](folder))
+    monkeypatch.setattr("ccnn_validation.blind.check._generator", lambda what, folder: sides[what](folder))
 
 
 def check(out: Path, diagnose: StandIn, cases: int = 9) -> Path:

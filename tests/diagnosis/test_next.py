@@ -15,11 +15,11 @@ from torch import Tensor
 from ccnn_torch.diagnosis import Diagnosis, diagnose_rows
 from ccnn_torch.diagnosis._dictionary import Found, covariance
 from ccnn_torch.diagnosis._next import _candidates, _columns, _possible
+from ccnn_torch.diagnosis.page.data import About
+from ccnn_torch.diagnosis.page.localisation import write_next_csv
 from ccnn_torch.effects import Situation
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.records import read_table, stack_columns
-from ccnn_torch.report.diagnosis_data import About
-from ccnn_torch.report.diagnosis_places import write_next_csv
 
 EXACT = torch.full((3,), NOISE, dtype=torch.float64)
 # A wrong length of a rod, which in a small workspace looks like an offset, a gain or sag.

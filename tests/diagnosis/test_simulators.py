@@ -14,10 +14,10 @@ import torch
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, situation_of
 from ccnn_torch.diagnosis.check import check_rows
+from ccnn_torch.diagnosis.job import check_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records, write_table
-from ccnn_torch.runs.diagnose import check_text
 
 Cli = Callable[..., tuple[int, str, str]]
 FILE = Path(__file__).parents[2] / "experiments" / "my_simulator.py"

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects import Situation, default_gravity, make_effect, pose_residual, signature
-from ccnn_torch.runs.machines import RealisticMachine, build_machine
+from ccnn_torch.simulation.machines.realistic import RealisticMachine, build_machine
 
 # Share of the root mean square that is left over; with the textbook form alone it is the second figure or more.
 LEFT = [

@@ -18,7 +18,7 @@ from ccnn_torch.diagnosis import diagnose_rows, noise_of, situation_of
 from ccnn_torch.diagnosis.check import check_rows
 from ccnn_torch.effects import Effect, make_effect, owned
 from ccnn_torch.errors import InputError
-from ccnn_torch.runs.simulating import simulate_records
+from ccnn_torch.simulation.job import simulate_records
 from ccnn_torch.testing import check_effect
 
 Cli = Callable[..., tuple[int, str, str]]

@@ -22,7 +22,7 @@ from ccnn_torch.identification import (
     what_is_known,
 )
 from ccnn_torch.mechanisms import SerialArm
-from ccnn_torch.rotations import rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 HALF = math.pi / 2
 LINKS = [[0.05, HALF, 0.4, 0], [-0.5, 0, 0, 0], [-0.05, HALF, 0.1, 0], [0, -HALF, 0.4, 0], [0, HALF, 0, 0]]

@@ -19,7 +19,7 @@ from ccnn_torch.identification import (
     what_is_known,
 )
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
-from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 HALF = math.pi / 2
 LINKS = [

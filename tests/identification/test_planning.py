@@ -16,7 +16,8 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import ParameterChoice, Problem, inverse_problem, solve_lm
-from ccnn_torch.identification.planning import (
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.planning import (
     INDICES,
     choose_poses,
     draw_candidates,
@@ -24,8 +25,8 @@ from ccnn_torch.identification.planning import (
     plan_poses,
     recommended_count,
 )
-from ccnn_torch.identification.planning._candidates import identification_rows
-from ccnn_torch.identification.planning._design import (
+from ccnn_torch.planning.candidates import identification_rows
+from ccnn_torch.planning.design import (
     _exchange_gain,
     add_best,
     exchange,
@@ -34,8 +35,7 @@ from ccnn_torch.identification.planning._design import (
     removal_loss,
     tightest_bound,
 )
-from ccnn_torch.identification.planning._small import forward_substitute, log_determinant, small_cholesky
-from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.planning.small_matrices import forward_substitute, log_determinant, small_cholesky
 
 
 def draw(seed: int, *shape: int) -> Tensor:

@@ -14,9 +14,9 @@ from scipy.optimize import dual_annealing, least_squares
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Problem
-from ccnn_torch.identification._lockstep import run_side_by_side
-from ccnn_torch.identification._objective import FORBIDDEN, make_objective
-from ccnn_torch.identification.solvers import SOLVERS, get_solver
+from ccnn_torch.identification.solvers.lockstep import run_side_by_side
+from ccnn_torch.identification.solvers.objective import FORBIDDEN, make_objective
+from ccnn_torch.identification.solvers.registry import SOLVERS, get_solver
 
 SHORT: dict[str, dict[str, Any]] = {
     "hga": {"generations": 40},

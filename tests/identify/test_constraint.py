@@ -14,16 +14,16 @@ from ccnn_torch.cli import main
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import tool_points
-from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.records import read_table, write_table
-from ccnn_torch.report.json_files import load_schema
-from ccnn_torch.runs.identification import Identification, identify
-from ccnn_torch.runs.identify_config import (
+from ccnn_torch.identification.config import (
     describe_identify_keys,
     dump_identify_config,
     load_identify_config,
     make_identify_config,
 )
+from ccnn_torch.identification.identify import Identification, identify
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.records import read_table, write_table
+from ccnn_torch.report.json_files import load_schema
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 SOCKETS, DATA, ARM = (EXPERIMENTS / n for n in ("sockets.yaml", "data/sockets.csv", "data/sockets_arm.yaml"))

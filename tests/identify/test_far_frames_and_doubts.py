@@ -8,10 +8,11 @@ import torch
 
 import ccnn_torch
 from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.identification.config import make_identify_config
+from ccnn_torch.identification.identify import Identification
+from ccnn_torch.identification.job import start_identification
 from ccnn_torch.mechanisms import Framed, load_mechanism
 from ccnn_torch.records import write_table
-from ccnn_torch.runs.identification import Identification, start_identification
-from ccnn_torch.runs.identify_config import make_identify_config
 
 FAR = {"base_x": 2.0, "base_y": -1.0, "base_z": 0.5, "base_rx": 0.3, "base_ry": -0.2, "base_rz": 2.5}
 FIVE_BAR_FREE = {"fixed": ["A*", "gamma*"]}
@@ -108,7 +109,7 @@ def test_a_search_that_did_not_converge_identifies_nothing(tmp_path: Path, capsy
 
 
 def test_some_machines_that_did_not_converge_are_named_first() -> None:
-    from ccnn_torch.report.identified_tables import identified_verdict
+    from ccnn_torch.identification.page.tables import identified_verdict
 
     found = ccnn_torch.identify(mechanism="five_bar", simulate={"machines": 4, "noise": 1e-6}, save_report=False)
     results = found.results

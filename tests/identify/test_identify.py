@@ -11,12 +11,12 @@ from scipy.optimize import approx_fprime, least_squares
 
 import ccnn_torch
 from ccnn_torch.errors import InputError
+from ccnn_torch.identification.identify import Identification
+from ccnn_torch.identification.measured.kinematics import make_kinematics
+from ccnn_torch.identification.simulated.instrument import PointsView
+from ccnn_torch.identification.simulated.places import Places
 from ccnn_torch.mechanisms import Framed, SerialArm, load_mechanism
 from ccnn_torch.records import write_table
-from ccnn_torch.runs.identification import Identification
-from ccnn_torch.runs.identification._instrument import PointsView
-from ccnn_torch.runs.identification._kinematics import make_kinematics
-from ccnn_torch.runs.identification._places import Places
 
 FIVE_BAR: dict[str, Any] = {
     "machines": 60,

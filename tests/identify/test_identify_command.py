@@ -11,12 +11,12 @@ import torch
 
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.errors import InputError, ModelFileError
+from ccnn_torch.identification.config import load_identify_config
+from ccnn_torch.identification.job import resume_identification, start_identification
+from ccnn_torch.identification.page.report import write_identified_report
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
-from ccnn_torch.report.identified_report import write_identified_report
 from ccnn_torch.report.json_files import load_schema
-from ccnn_torch.runs.identification import resume_identification, start_identification
-from ccnn_torch.runs.identify_config import load_identify_config
 
 CONFIG = """\
 mechanism: five_bar

@@ -5,16 +5,16 @@ from pathlib import Path
 import pytest
 import torch
 
+from ccnn_torch.config.sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.runs._sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
-from ccnn_torch.runs.identification import identify
-from ccnn_torch.runs.identify_config import (
+from ccnn_torch.identification.config import (
     describe_identify_keys,
     dump_identify_config,
     load_identify_config,
     make_identify_config,
 )
+from ccnn_torch.identification.identify import identify
+from ccnn_torch.mechanisms import load_mechanism
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 

@@ -11,7 +11,6 @@ import torch
 
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import (
     BlackBox,
     FiveBar,
@@ -22,6 +21,7 @@ from ccnn_torch.mechanisms import (
     rowwise,
     simulated_rows,
 )
+from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.testing import check_mechanism
 
 EXAMPLES = Path(__file__).parents[2] / "experiments"

@@ -9,8 +9,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import FiveBar, Framed, SerialArm, Stewart, load_mechanism, mechanism_from_description
+from ccnn_torch.numerics.least_squares import jacobian_of
 
 BASE = [0.3, -0.2, 0.5, 0.4, -0.3, 1.0]
 TOOL = [0.02, 0.01, 0.03, 0.1, 0.2, -0.1]

@@ -7,8 +7,8 @@ from catalogue import PANDA, UR10, make
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import fit_frames, read_dh_file
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.pseudoerror import joint_deviations
-from ccnn_torch.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 
 def _random_frames(generator):

@@ -9,9 +9,9 @@ from scipy.optimize import brentq, least_squares
 from scipy.spatial.transform import Rotation
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import Overconstrained2Dof, load_mechanism
 from ccnn_torch.mechanisms._closed_forms import crank_angle
+from ccnn_torch.numerics.least_squares import jacobian_of
 
 A, H, L, H_S = 0.150, 0.402, 0.317, 0.080
 DEGREE = math.pi / 180

@@ -8,8 +8,8 @@ import torch
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import MachineTool, Tripod, mechanism_from_description
+from ccnn_torch.numerics.least_squares import jacobian_of
 
 
 def _poses(mechanism, count=40, seed=0):

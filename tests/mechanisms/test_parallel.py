@@ -8,9 +8,9 @@ import torch
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
-from ccnn_torch.least_squares import jacobian_of
 from ccnn_torch.mechanisms import Stewart, load_mechanism
-from ccnn_torch.rotations import rotation_vector_rate, rotation_vector_to_matrix
+from ccnn_torch.numerics.least_squares import jacobian_of
+from ccnn_torch.numerics.rotations import rotation_vector_rate, rotation_vector_to_matrix
 
 PARALLEL = ("five_bar", "overconstrained_2dof", "stewart", "delta", "delta_linear")
 

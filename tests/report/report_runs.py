@@ -7,10 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
-from ccnn_torch.report.json_files import write_json
-from ccnn_torch.report.results import (
+from ccnn_torch.calibration.statistics import (
     before_block,
     constant_errors,
     floor_block,
@@ -19,6 +16,9 @@ from ccnn_torch.report.results import (
     ratio_to_floor,
     spread,
 )
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
+from ccnn_torch.report.json_files import write_json
 
 
 def tripod_run(repeats: int = 5) -> tuple[dict[str, Any], RunArrays, dict[str, np.ndarray]]:

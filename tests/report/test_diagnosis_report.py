@@ -19,15 +19,11 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_run_report import Page
 
-from ccnn_torch._display import unit_text
-from ccnn_torch.diagnosis.words import (
-    aside_text,
-    network_text,
-    verdict_text,
-)
-from ccnn_torch.errors import InputError
-from ccnn_torch.report.diagnosis_data import About, about_of, load_diagnosis_arrays, signatures_of
-from ccnn_torch.report.diagnosis_places import (
+from ccnn_torch.diagnosis.page.data import About, about_of, load_diagnosis_arrays, signatures_of
+from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
+from ccnn_torch.diagnosis.page.figure_signature import signature_plot
+from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
+from ccnn_torch.diagnosis.page.localisation import (
     aside_table,
     next_table,
     quantity_text,
@@ -35,18 +31,22 @@ from ccnn_torch.report.diagnosis_places import (
     shares,
     where_table,
 )
-from ccnn_torch.report.diagnosis_report import diagnosis_markdown, print_diagnosis, write_diagnosis_report
-from ccnn_torch.report.diagnosis_tables import (
+from ccnn_torch.diagnosis.page.report import diagnosis_markdown, print_diagnosis, write_diagnosis_report
+from ccnn_torch.diagnosis.page.tables import (
     confusable_table,
     effect_table,
     gap_table,
     order_table,
     parameter_table,
 )
+from ccnn_torch.diagnosis.words import (
+    aside_text,
+    network_text,
+    verdict_text,
+)
+from ccnn_torch.display import unit_text
+from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import write_json
-from ccnn_torch.report.plots._diagnosis import gap_plot, probability_plot
-from ccnn_torch.report.plots._diagnosis_places import remainder_map, where_plot
-from ccnn_torch.report.plots._diagnosis_signature import signature_plot
 
 
 def _numpy(arrays: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:

@@ -15,22 +15,14 @@ from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.colors import LogNorm
 from report_runs import arm_run
 
+from ccnn_torch.calibration.page.figure_learning import convergence_plot, population_plot
+from ccnn_torch.calibration.page.figure_network import alive_nodes, network_plot
 from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.display import display_unit, interval_text, number_text
 from ccnn_torch.report.arrays import RunArrays
-from ccnn_torch.report.display import display_unit, interval_text, number_text
-from ccnn_torch.report.plots import (
-    Plot,
-    alive_nodes,
-    convergence_plot,
-    inline_svg,
-    joint_error_plot,
-    network_plot,
-    overview_plot,
-    population_plot,
-    pose_error_plot,
-    save_figure,
-    workspace_plot,
-)
+from ccnn_torch.report.figures.errors import joint_error_plot, pose_error_plot
+from ccnn_torch.report.figures.style import Plot, inline_svg, save_figure
+from ccnn_torch.report.figures.workspace import overview_plot, workspace_plot
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -11,11 +11,8 @@ import torch
 from jsonschema import Draft202012Validator
 from sklearn.metrics import mean_absolute_error, mean_squared_error
 
-from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.errors import InputError
-from ccnn_torch.report.json_files import load_schema, plain, read_json, write_json
-from ccnn_torch.report.paper_tables import PAPER
-from ccnn_torch.report.results import (
+from ccnn_torch.calibration.page.paper_tables import PAPER
+from ccnn_torch.calibration.statistics import (
     before_block,
     constant_errors,
     floor_block,
@@ -24,6 +21,9 @@ from ccnn_torch.report.results import (
     ratio_to_floor,
     spread,
 )
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError
+from ccnn_torch.report.json_files import load_schema, plain, read_json, write_json
 
 JOINTS = (Coordinate("q1", "m"), Coordinate("q2", "m"), Coordinate("q3", "m"))
 

@@ -19,14 +19,14 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from typer.testing import CliRunner
 
+from ccnn_torch.calibration.page.report import html_text, make_picture, write_report
+from ccnn_torch.calibration.page.tables import markdown_text, print_tables, result_tables, verdict, worse_text
+from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback, tags_of
 from ccnn_torch.cli.picture import picture
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.csv_file import tidy_rows
-from ccnn_torch.report.html import html_text
+from ccnn_torch.report.event_file import EventFile
 from ccnn_torch.report.json_files import write_json
-from ccnn_torch.report.run_report import make_picture, write_report
-from ccnn_torch.report.tables import markdown_text, print_tables, result_tables, verdict, worse_text
-from ccnn_torch.report.tensorboard import TensorBoardCallback, tags_of
 
 
 def test_the_report_folder(report_folder: Path) -> None:
@@ -215,6 +215,14 @@ def test_a_resumed_run_shows_no_step_twice(tmp_path: Path) -> None:
     with Image.open(io.BytesIO(images[0].encoded_image_string)) as picture_of_mask:
         pixels = np.asarray(picture_of_mask.convert("L"))
     assert np.array_equal(pixels[8::16, 8::16] > 0, np.eye(3, 2, dtype=bool))
+
+
+def test_event_files_of_one_second_sort_in_the_order_they_were_opened(tmp_path: Path) -> None:
+    opened = []
+    for _ in range(12):
+        EventFile(tmp_path).close()
+        opened += [path.name for path in tmp_path.iterdir() if path.name not in opened]
+    assert sorted(opened) == opened
 
 
 def test_errors_stand_against_evaluations_and_time_too_and_outlive_a_resume(tmp_path: Path) -> None:

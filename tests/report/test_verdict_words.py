@@ -5,17 +5,17 @@ from __future__ import annotations
 import pytest
 from diagnosis_cases import CASES, indistinguishable, none, one_effect, outlier, outside, two_effects, with_rotation
 
+from ccnn_torch.diagnosis.page.data import About
+from ccnn_torch.diagnosis.page.figures import gap_plot
+from ccnn_torch.diagnosis.page.tables import (
+    gap_table,
+)
 from ccnn_torch.diagnosis.words import (
     driver_words,
     effect_words,
     probability_words,
     verdict_text,
 )
-from ccnn_torch.report.diagnosis_data import About
-from ccnn_torch.report.diagnosis_tables import (
-    gap_table,
-)
-from ccnn_torch.report.plots._diagnosis import gap_plot
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -1,0 +1,90 @@
+"""The main jobs, each as one Python call."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ccnn_torch.calibration.calibrate import Calibration
+from ccnn_torch.calibration.calibrate import calibrate as _calibrate
+from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.prepare import prepare
+from ccnn_torch.compensation import load_compensation
+from ccnn_torch.config.held_out import given_records, name_given
+from ccnn_torch.identification.config import make_identify_config
+from ccnn_torch.identification.identify import Identification
+from ccnn_torch.identification.identify import identify as _identify
+from ccnn_torch.verification.job import verify_model
+
+__all__ = ["calibrate", "identify", "verify"]
+
+
+def calibrate(**keys: Any) -> Calibration:
+    """Train on measured records or on a case study, judge on held-out rows; nothing is written.
+
+    Args:
+        keys: those of a config (`ccnn keys` lists them); `records` may also be a pandas DataFrame with headers
+            ``name[unit]``, or what `load_records` gave. For example `records="robot.csv", mechanism="robot.yaml"`,
+            `case="tripod"`, `seed=3`, `split={"kind": "group"}`, `ccnn={"generations": 200}`.
+
+    Returns:
+        A `Calibration`: `results` (as in results.json), `compensator()`, `mechanism()`, `save(folder)`.
+
+    Raises:
+        InputError: a key, the records or the mechanism cannot be used; the sentence says what to change.
+    """
+    given = given_records(keys.get("records"))
+    if given is None:
+        return _calibrate(make_config(**keys))
+    config = make_config(**{**keys, "records": name_given(given)})
+    config = config.model_copy(update={"records": name_given(given)})
+    return _calibrate(config, prepared=prepare(config, given))
+
+
+def identify(**keys: Any) -> Identification:
+    """Identify geometric parameters from measured records or simulated machines; nothing is written.
+
+    Args:
+        keys: those of a config (`ccnn identify --keys` lists them); `records` may also be a pandas DataFrame with
+            headers ``name[unit]``, or what `load_records` gave. For example `mechanism="five_bar",
+            simulate={"machines": 10, "poses": 36}`, or `mechanism="arm.yaml", records="measured.csv", methods=["lm"]`.
+
+    Returns:
+        An `Identification`: `results` (as in identified.json), `mechanism()`, `save(folder)`.
+
+    Raises:
+        InputError: a key, the records or the mechanism cannot be used; the sentence says what to change.
+    """
+    given = given_records(keys.get("records"))
+    if given is None:
+        return _identify(make_identify_config(**keys))
+    config = make_identify_config(**{**keys, "records": name_given(given)})
+    return _identify(config.model_copy(update={"records": name_given(given)}), given=given)
+
+
+def verify(
+    model: str | Path,
+    records: Any,
+    mechanism: str | None = None,
+    compensated: bool = False,
+    refit_frames: bool = False,
+    allow_code: bool = False,
+) -> dict[str, Any]:
+    """Judge a model on rows that it has never seen, against what its held-out rows promised; nothing is written.
+
+    Args:
+        model: a .safetensors or .onnx file, or identified.yaml.
+        records: new rows, as `load_records` takes them.
+        mechanism: name or file, where the machine's file is not where the model says.
+        compensated: the machine was commanded by the model while it was measured; the joints are then those wanted.
+        refit_frames: the measuring device was moved since the model was made.
+        allow_code: run the Python file that the model names for a user's own mechanism.
+
+    Returns:
+        The content of verify.json; its `kept` says whether the promise is kept.
+
+    Raises:
+        InputError: the model or the rows cannot be used; the sentence says what to change.
+    """
+    loaded = load_compensation(model, allow_code=allow_code)
+    return verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code).results

@@ -1,0 +1,258 @@
+"""The main job in memory: rows, learners, figures, and a compensator from the best repeat of the best method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.calibration.config import METHODS, RunConfig, method_names
+from ccnn_torch.calibration.evaluate import Outcome, evaluate, pose_before
+from ccnn_torch.calibration.fitting import fit_method, refit
+from ccnn_torch.calibration.method_choice import Comparison, compare
+from ccnn_torch.calibration.prepare import Prepared, damping_of, prepare
+from ccnn_torch.calibration.result import assemble, best_method, plan_of
+from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model
+from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.learners import LEARNERS, Learner, make_learner
+from ccnn_torch.mechanisms import Mechanism, PoseError
+from ccnn_torch.run_folder.folder import RunFolder
+from ccnn_torch.training import Callback, Scaling
+from ccnn_torch.verification.promise import configurations, promise_block
+
+__all__ = ["Calibration", "Watch", "calibrate", "makers"]
+
+Watch = Callable[[Prepared, str, str, Scaling], list[Callback]]
+"""Callbacks of one training, given the rows, the method, the phase (`choose` or `fit`) and the phase's scaling."""
+
+
+@dataclass
+class Calibration:
+    """What a run found.
+
+    Attributes:
+        before: pose error without compensation, `r x s`.
+        outcomes: trained methods by name; `failed` has the sentence of each that could not be trained.
+        results: the content of `results.json`.
+    """
+
+    config: RunConfig
+    prepared: Prepared
+    before: PoseError
+    outcomes: dict[str, Outcome]
+    failed: dict[str, str]
+    results: dict[str, Any]
+
+    @property
+    def method(self) -> str:
+        """The best method."""
+        return best_method(self.outcomes)
+
+    def repeat(self, method: str | None = None) -> int:
+        """The repeat that is exported: that of the best validation."""
+        return int(self.outcomes[method or self.method].fitted.score.argmin())
+
+    def mechanism(self, method: str | None = None) -> Mechanism:
+        """The nominal machine, with the frames fitted in the exported repeat."""
+        parameters = self.prepared.repeat_parameters(self.repeat(method))
+        mechanism = self.prepared.mechanism
+        return mechanism if parameters is None else mechanism.with_nominal(parameters)
+
+    def compensator(self, method: str | None = None) -> Compensator:
+        """The compensator of a method's exported repeat."""
+        method = method or self.method
+        repeat, prepared = self.repeat(method), self.prepared
+        rows = prepared.dataset.usable_rows("fit")
+        there = rows.index[repeat][rows.weights[repeat] > 0]
+        fitted = self.outcomes[method].fitted
+        network = fitted.learner.network(repeat).cpu()
+        sd_scale = fitted.sd_scale[repeat]
+        if not isinstance(network, UncertainNetwork):
+            # A learner without a variance of its own has one standard deviation everywhere, here as in the results.
+            sd_scale = fitted.sd(prepared.dataset.inputs[:, :1])[repeat, 0] / fitted.scaling.deviation[repeat]
+        inputs, margin = prepared.dataset.inputs[repeat, there], self.config.compensation.margin
+        limit, geometry, effects = _limit(self.config, len(prepared.mechanism.joints)), None, None
+        if prepared.geometry is not None or prepared.effects is not None:
+            # What these leave at singular poses can be larger than what was there.
+            limit = default_limit(prepared.total[repeat, there]) if limit is None else limit
+        if prepared.effects is not None:
+            effects = prepared.effects.module(repeat, there, margin)
+        if prepared.geometry is not None:
+            geometry = prepared.geometry.module(repeat, inputs[:, : len(prepared.mechanism.joints)], margin)
+        return fit_compensator(
+            network,
+            fitted.scaling.repeat(repeat),
+            inputs,
+            prepared.dataset.deviation[repeat, there],
+            prepared.mechanism.joints,
+            prepared.covariate_coordinates,
+            limit=limit,
+            margin=margin,
+            sd_scale=sd_scale,
+            geometry=geometry,
+            effects=effects,
+        )
+
+    def save(
+        self,
+        folder: str | Path,
+        method: str | None = None,
+        name: str = "model",
+        forms: Collection[str] = FORMS,
+    ) -> float:
+        """Write model files and card of a method's compensator.
+
+        Args:
+            method: the best one when None.
+            name: of the files.
+            forms: which files; each takes a few seconds to export and check.
+
+        Returns:
+            The share of what was learned that the compensator applies, 1 unless all of it was too steep.
+
+        Raises:
+            MethodFailedError: the model cannot be exported; the sentence says why.
+        """
+        method = method or self.method
+        repeat = self.repeat(method)
+        metrics = _of_repeat(self.results["methods"][method], repeat)
+        # Seconds differ from run to run, and the model file of one config and seed may not.
+        del metrics["seconds"]
+        compensator = self.compensator(method)
+        metrics["promise"] = self._promise(method, compensator)
+        about = {
+            "mechanism": self.mechanism(method).describe(),
+            "method": method,
+            "data_sha256": self.prepared.data_hash,
+            "seed": self.config.seed + repeat,
+            "metrics": metrics,
+            "rotation_weight": self.config.rotation_weight,
+            "damping": damping_of(self.config, self.prepared.mechanism),
+            "columns": self.config.columns,
+        }
+        save_model(Path(folder), compensator, about, method=name, forms=forms)
+        return compensator.share
+
+    def _promise(self, method: str, compensator: Compensator) -> dict[str, Any] | None:
+        """What the held-out rows promise for new ones, with the compensator as it stands in the file.
+
+        With frames per group of rows the card has no frames to judge new rows by, and of a simulated machine the
+        commanded one is judged: both by the figures of the results.
+        """
+        prepared, repeat = self.prepared, self.repeat(method)
+        test = prepared.dataset.splits[repeat].test
+        found = (self.before, self.outcomes[method].after)
+        before, after = (_rows_of(error, len(prepared.joints), repeat, test) for error in found)
+        joints, covariates = prepared.joints[repeat, test], prepared.covariates[repeat, test]
+        if not prepared.simulated and (prepared.parameters is None or prepared.parameters.shape[1] == 1):
+            mechanism = self.mechanism(method)
+            with torch.no_grad():
+                ideal = compensator.back(joints, covariates)
+            after = mechanism.pose_error(prepared.pose[repeat, test], mechanism.forward_kinematics(ideal))
+        return promise_block(before, after, configurations(joints, prepared.mechanism.joints))
+
+
+def calibrate(
+    config: RunConfig, folder: RunFolder | None = None, watch: Watch = lambda *_: [], prepared: Prepared | None = None
+) -> Calibration:
+    """Train the methods of a config and judge them on held-out rows.
+
+    Args:
+        folder: where checkpoints go; None = nowhere.
+        watch: makes the callbacks of every training.
+        prepared: the rows, where the caller has them already.
+
+    Raises:
+        InputError: the config or its data cannot be used.
+        MethodFailedError: no method could be trained.
+    """
+    prepared = prepared or prepare(config)
+    # Looked at before anything is computed, though it is used last.
+    _limit(config, len(prepared.mechanism.joints))
+    plan, dataset = plan_of(config), prepared.dataset
+    before = pose_before(prepared)
+    outcomes: dict[str, Outcome] = {}
+    failed: dict[str, str] = {}
+    found = makers(config, prepared.default_method)
+    comparison: Comparison | None = None
+    if config.methods == ["auto"]:
+        comparison = compare(
+            found, dataset, plan, config.auto.budget, folder, lambda name: partial(watch, prepared, name)
+        )
+        found = {name: found[name] for name in comparison.order}
+    for name, make in found.items():
+        if make is None:
+            failed[name] = f"this version has no learner {name!r}"
+            continue
+        watched = partial(watch, prepared, name)
+        try:
+            if comparison is None:
+                fitted = fit_method(name, make, dataset, plan, folder, watched)
+            else:
+                fitted = refit(name, make, dataset, plan, comparison.compared[name], folder, watched)
+            outcomes[name] = evaluate(prepared, fitted)
+        except MethodFailedError as problem:
+            failed[name] = str(problem)
+            continue
+        if comparison is not None:
+            break
+    if not outcomes:
+        raise MethodFailedError("; ".join(f"{name}: {sentence}" for name, sentence in failed.items()))
+    results = assemble(config, prepared, before, outcomes, failed, comparison)
+    return Calibration(config, prepared, before, outcomes, failed, results)
+
+
+def makers(config: RunConfig, default: str = "ccnn") -> dict[str, Callable[[], Learner] | None]:
+    """What makes the learner of each method, by the name that results and files have for it.
+
+    A user's `path/to/file.py:Name` is called `Name` there. None stands for a learner that `methods=all` or `auto`
+    asks for and this version does not have.
+
+    Args:
+        default: the method where the config names none.
+
+    Raises:
+        InputError: a method that was named is not to be had.
+    """
+    found: dict[str, Callable[[], Learner] | None] = {}
+    for method in method_names(config, default):
+        if config.methods in (["all"], ["auto"]) and method in METHODS and method not in LEARNERS:
+            found[method] = None
+            continue
+        settings = config.settings(method)
+        make_learner(method, settings)
+        found[method.rpartition(":")[2]] = partial(make_learner, method, settings)
+    return found
+
+
+def _limit(config: RunConfig, joints: int) -> Tensor | None:
+    """The config's limit for every joint, `n` [SI]; None = by the training deviations."""
+    given = config.compensation.limit
+    if given is None:
+        return None
+    if len(given) not in (1, joints):
+        raise InputError(
+            f"compensation.limit has {len(given)} numbers; write one, or one for each of the {joints} joints"
+        )
+    return torch.tensor(given, dtype=torch.float64).expand(joints).clone()
+
+
+def _rows_of(error: PoseError, repeats: int, repeat: int, rows: Tensor) -> PoseError:
+    """Of one repeat and some rows; all repeats may share their figures."""
+    position, rotation = (None if e is None else e.expand(repeats, -1)[repeat, rows] for e in error)
+    assert position is not None
+    return PoseError(position, rotation)
+
+
+def _of_repeat(block: Any, repeat: int) -> Any:
+    """The same figures for one repeat: every spread becomes its value there."""
+    if isinstance(block, dict):
+        if set(block) == {"median", "low", "high", "values"}:
+            return block["values"][repeat]
+        return {key: _of_repeat(value, repeat) for key, value in block.items()}
+    return block

@@ -1,0 +1,346 @@
+"""The config of a run: its keys, defaults and checks.
+
+Relative paths in a config file start from the file's folder, those on the command line from the current one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
+
+from ccnn_torch.config.keys import list_keys
+from ccnn_torch.config.split import SplitConfig
+from ccnn_torch.config.tree import Columns, Files, Names, Section, config_from_file, config_from_keys, written
+from ccnn_torch.learners.bp_lm import BPLMSettings
+from ccnn_torch.learners.ccnn import CCNNSettings
+from ccnn_torch.learners.enn import ENNSettings
+from ccnn_torch.learners.gp import GPSettings
+from ccnn_torch.learners.grnn import GRNNSettings
+from ccnn_torch.records.table import nearest
+
+__all__ = [
+    "METHODS",
+    "AutoConfig",
+    "CompensationConfig",
+    "RealisticConfig",
+    "RunConfig",
+    "SplitConfig",
+    "TrainingConfig",
+    "describe_keys",
+    "dump_config",
+    "key_table",
+    "load_config",
+    "make_config",
+    "method_names",
+]
+
+METHODS = ("ccnn", "bp_lm", "grnn", "enn", "constant", "gp")
+"""The learner names of the framework; `ccnn_torch.learners.LEARNERS` has those that this version can make."""
+
+
+def _one(value: Any) -> Any:
+    return [value] if isinstance(value, int | float) else value
+
+
+Numbers = Annotated[
+    list[Annotated[float, Field(gt=0)]], BeforeValidator(_one, json_schema_input_type=float | list[float])
+]
+
+
+class _Part(Section):
+    model_config = ConfigDict(coerce_numbers_to_str=True)
+
+
+class TrainingConfig(_Part):
+    """How the trainer uses the validation rows and how often it saves."""
+
+    early_stop: bool = Field(
+        default=True,
+        description="find the best step on the validation rows, then refit on all training rows for so long",
+    )
+    folds: int = Field(
+        default=1,
+        ge=1,
+        description="1 = hold the rows of split.validation out; K > 1 = cross-validate in K folds of the training rows",
+    )
+    patience: int | None = Field(
+        default=None, ge=1, description="steps without improvement after which that search ends; null = go to the end"
+    )
+    checkpoint_every: int = Field(default=20, ge=1, description="steps between two checkpoints")
+    log_every: int = Field(default=1, ge=1, description="steps between two points of the held-out curves")
+
+
+class CompensationConfig(_Part):
+    """Guard and limit of the compensator."""
+
+    margin: float = Field(
+        default=0.1,
+        ge=0,
+        description="how far beyond the training inputs the correction is trusted, as a share of their half range",
+    )
+    limit: Numbers | None = Field(
+        default=None,
+        min_length=1,
+        description="hard limit of the correction in SI, one number or one per joint; null = 1.5 times the largest "
+        "training deviation of each joint",
+    )
+
+
+class RealisticConfig(_Part):
+    """A simulated real machine (case=realistic); every repeat has a machine, poses and noise of its own."""
+
+    machine: Literal["tripod", "machine_tool", "arm"] = Field(
+        default="tripod", description="tripod, machine_tool or arm (six joints)"
+    )
+    cause: Literal["geometry", "compliance", "transmission", "thermal", "backlash", "mixed"] = Field(
+        default="mixed",
+        description="what makes it miss: geometry, compliance, transmission, thermal, backlash, or mixed = all of them",
+    )
+    strength: float = Field(default=1.0, ge=0, description="size of the cause; 1 = 0.05 to 0.3 mm of pose error")
+    rows: int = Field(default=200, ge=20, description="poses measured")
+    noise: float = Field(
+        default=5e-6,
+        gt=0,
+        description="standard deviation of each measured coordinate of the position in m; an angle has it over 0.3 m",
+    )
+
+
+class AutoConfig(_Part):
+    """How `methods=auto` chooses a method."""
+
+    methods: Names = Field(
+        default=["constant", "grnn", "gp", "bp_lm", "enn", "ccnn"],
+        min_length=1,
+        description="the methods that methods=auto compares, in the order in which they are tried: cheap ones first",
+    )
+    budget: float = Field(
+        default=300.0,
+        gt=0,
+        description="seconds inside the learners that the comparison may take; the refit comes on top",
+    )
+    folds: int = Field(default=5, ge=2, description="folds of the training rows that the methods are compared by")
+
+    @field_validator("methods")
+    @classmethod
+    def _known(cls, methods: list[str]) -> list[str]:
+        return _checked(methods, METHODS)
+
+
+def _checked(methods: list[str], choices: tuple[str, ...]) -> list[str]:
+    for method in methods:
+        if method not in choices and ".py:" not in method:
+            near = nearest(method, choices)
+            hint = f"did you mean '{near}'?" if near else f"known are {', '.join(choices)} and file.py:Name"
+            raise ValueError(f"there is no method '{method}'; {hint}")
+        if methods.count(method) > 1:
+            raise ValueError(f"'{method}' stands twice")
+    return methods
+
+
+class RunConfig(_Part):
+    """A run: data, split, methods and their settings."""
+
+    name: str = Field(default="run", min_length=1, description="name of the run; default: the config file's name")
+    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the first repeat; repeat k has seed + k")
+    repeats: int = Field(
+        default=1, ge=1, description="independent repeats, side by side: new noise, split and start each"
+    )
+    out: str | None = Field(default=None, description="folder to write; default runs/NAME-STAMP")
+    methods: Names | None = Field(
+        default=None,
+        min_length=1,
+        description=f"learners: a list of {', '.join(METHODS)}; all = these; auto = the best of auto.methods "
+        "by cross-validation; null = ccnn, and where geometry=auto compared a learner, what that comparison prefers",
+    )
+    device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?|mps)$", description="cpu, cuda, cuda:N or mps")
+    covariates: Names | None = Field(
+        default=None,
+        description="inputs beside the joints, names or patterns; null = time, temperature, load_*, direction*, "
+        "speed* where they are there; [] = none",
+    )
+    split: SplitConfig = Field(default_factory=SplitConfig)
+    case: Literal["tripod", "machine_tool", "realistic"] | None = Field(
+        default=None,
+        description="simulated data: a case study of paper 000, tripod or machine_tool; a realistic machine; or null "
+        "and records instead",
+    )
+    realistic: RealisticConfig = Field(default_factory=RealisticConfig)
+    variant: Literal["printed", "tabulated"] | None = Field(
+        default=None,
+        description="noise of the machine_tool case: printed (eq. 19) or tabulated (Table III); default printed",
+    )
+    order: Literal["raster", "shuffled"] | None = Field(
+        default=None, description="order in which a case visits its poses: raster or shuffled; default raster"
+    )
+    records: Files | None = Field(
+        default=None,
+        description="measured records, a CSV file (or .xlsx) with headers name[unit], or a list of such files",
+    )
+    columns: Columns
+    mechanism: str | None = Field(
+        default=None,
+        description="mechanism of the records: tripod, machine_tool, a DH file (.yaml), a URDF, or file.py:Name",
+    )
+    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    geometry: Literal["auto", "identify", "none"] = Field(
+        default="auto",
+        description="identify = find all geometric parameters on the training rows of records, and let the network "
+        "learn only what they leave; the model files hold both. none = the network learns everything. auto = what "
+        "cross-validation prefers of identified geometry alone, or either with a learner; none for cases and effects",
+    )
+    effects: str = Field(
+        default="none",
+        description="from:DIR/diagnosis.json = take the effects that a diagnosis named, fit their coefficients to the "
+        "training rows of records, and let the network learn only what they leave; the model files hold both. none = "
+        "the network learns everything",
+    )
+    rotation_weight: float = Field(
+        default=0.04, gt=0, description="weight of orientation against position in m per rad (η of eq. 5)"
+    )
+    damping: float | None = Field(
+        default=None,
+        ge=0,
+        description="weight of the joint deviation itself beside the pose error it explains, in m per rad; keeps it "
+        "small near singular poses; null = 0.01 for a serial arm, 0 for other mechanisms",
+    )
+    max_condition: float | None = Field(
+        default=None,
+        gt=1,
+        description="rows whose Jacobian is worse conditioned are not trained on, but still judged; null = 50, and no "
+        "bound where damping is above 0",
+    )
+    max_deviation: float | None = Field(
+        default=None, gt=0, description="rows with a larger joint deviation (SI) are not trained on; null = no bound"
+    )
+    training: TrainingConfig = Field(default_factory=TrainingConfig)
+    auto: AutoConfig = Field(default_factory=AutoConfig)
+    compensation: CompensationConfig = Field(default_factory=CompensationConfig)
+    save_models: bool = Field(default=True, description="write model files and their card")
+    save_report: bool = Field(
+        default=True, description="draw plots/ and write report.html; results.json, .csv and .md are always written"
+    )
+    ccnn: CCNNSettings = Field(default_factory=CCNNSettings)
+    bp_lm: BPLMSettings = Field(default_factory=BPLMSettings)
+    grnn: GRNNSettings = Field(default_factory=GRNNSettings)
+    enn: ENNSettings = Field(default_factory=ENNSettings)
+    gp: GPSettings = Field(default_factory=GPSettings)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill(cls, tree: Any) -> Any:
+        """An empty section is one of defaults; a case has its order and the machine tool its variant."""
+        if not isinstance(tree, dict):
+            return tree
+        sections = [key for key, field in cls.model_fields.items() if field.default_factory is not None]
+        tree = {key: value for key, value in tree.items() if value is not None or key not in sections}
+        if tree.get("case") in ("tripod", "machine_tool") and tree.get("order") is None:
+            tree["order"] = "raster"
+        if tree.get("case") == "machine_tool" and tree.get("variant") is None:
+            tree["variant"] = "printed"
+        return tree
+
+    @field_validator("methods")
+    @classmethod
+    def _known(cls, methods: list[str] | None) -> list[str] | None:
+        for method in _checked(methods or [], (*METHODS, "all", "auto")):
+            if method in ("all", "auto") and len(methods or []) > 1:
+                raise ValueError(f"'{method}' stands alone; remove the other names or '{method}'")
+        return methods
+
+    @field_validator("effects")
+    @classmethod
+    def _none_or_a_file(cls, effects: str) -> str:
+        if effects != "none" and not effects.startswith("from:"):
+            raise ValueError(f"is '{effects}'; write effects=from:{effects} for such a file, or effects=none")
+        return effects
+
+    @model_validator(mode="after")
+    def _one_source(self) -> RunConfig:
+        if (self.case is None) == (self.records is None):
+            both = "both case and records are given; remove one" if self.case else "no data is named"
+            raise ValueError(
+                f"{both}: case=tripod, case=machine_tool, case=realistic, or records=FILE.csv with mechanism=…"
+            )
+        if self.records is not None and self.mechanism is None:
+            raise ValueError(
+                "mechanism: records need it; write mechanism=tripod, machine_tool, a DH file, a URDF or file.py:Name"
+            )
+        if self.case is not None and self.mechanism not in (None, self.case):
+            raise ValueError(f"mechanism: the case {self.case} brings its own; remove the key")
+        if self.variant is not None and self.case != "machine_tool":
+            raise ValueError("variant: only the case machine_tool has variants; remove the key")
+        if self.realistic != RealisticConfig() and self.case != "realistic":
+            raise ValueError("realistic: these keys need case=realistic; write that, or remove them")
+        if self.order is not None and self.case == "realistic":
+            raise ValueError("order: a realistic machine visits random poses; remove the key")
+        if self.order is not None and self.case is None:
+            raise ValueError("order: records have the order in which they were measured; remove the key")
+        if self.case is not None and self.split.test_file is not None:
+            raise ValueError("split.test: a case makes its own rows and takes no file; write a share, e.g. 0.3")
+        if self.case is not None and self.columns:
+            raise ValueError("columns: a case reads no file; remove the key")
+        if self.case is not None and self.geometry == "identify":
+            raise ValueError("geometry: a case is there to compare learners; write geometry=none, or take records")
+        if self.case is not None and self.effects != "none":
+            raise ValueError("effects: a case is there to compare learners; write effects=none, or take records")
+        folds = self.training.folds > 1 or self.methods == ["auto"]
+        if self.training.early_stop and self.split.validation == 0 and not folds:
+            raise ValueError(
+                "training.early_stop: it needs validation rows; write split.validation=0.2, training.folds=5 or "
+                "training.early_stop=false"
+            )
+        return self
+
+    def settings(self, method: str) -> dict[str, Any]:
+        """The settings of one method, from the section of its name; {} where it has none."""
+        section = getattr(self, method, None) if method in METHODS else None
+        return dataclasses.asdict(section) if section is not None else {}
+
+
+def load_config(path: str | Path, overrides: Iterable[str] = ()) -> RunConfig:
+    """Read a config file and put overrides ``key.sub=value`` over it.
+
+    Raises:
+        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
+    """
+    return config_from_file(RunConfig, path, overrides)
+
+
+def make_config(**keys: Any) -> RunConfig:
+    """A config from keys, e.g. ``make_config(case="tripod", ccnn={"generations": 60})``; paths from the current folder.
+
+    Raises:
+        InputError: keys are wrong: one line that names them all.
+    """
+    return config_from_keys(RunConfig, keys)
+
+
+def dump_config(config: RunConfig, folder: Path | None = None) -> str:
+    """The resolved config as YAML, its paths relative to `folder` if given; `load_config` of it gives an equal one."""
+    return written(config, folder)
+
+
+def method_names(config: RunConfig, default: str = "ccnn") -> list[str]:
+    """The methods to train: ``all`` and ``auto`` spelt out; `default` where the config names none and sets no ccnn."""
+    if config.methods is None:
+        return [default if config.ccnn == CCNNSettings() else "ccnn"]
+    if config.methods == ["all"]:
+        return list(METHODS)
+    if config.methods == ["auto"]:
+        return list(config.auto.methods)
+    return list(config.methods)
+
+
+def describe_keys() -> list[tuple[str, str, str]]:
+    """Every key, dotted, with its default and what it means."""
+    return list(list_keys(RunConfig))
+
+
+def key_table() -> str:
+    """`describe_keys` as a Markdown table."""
+    rows = [f"| `{key}` | `{default}` | {description} |" for key, default, description in describe_keys()]
+    return "\n".join(["| key | default | meaning |", "| --- | --- | --- |", *rows]) + "\n"

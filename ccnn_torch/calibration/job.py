@@ -1,0 +1,102 @@
+"""`ccnn run`: a config to a finished run folder, and an unfinished folder to a finished one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from ccnn_torch.calibration.calibrate import Calibration, calibrate, makers
+from ccnn_torch.calibration.config import RunConfig, dump_config, load_config
+from ccnn_torch.calibration.outputs import write_outputs
+from ccnn_torch.calibration.page.tables import print_tables
+from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback
+from ccnn_torch.calibration.prepare import Prepared, prepare
+from ccnn_torch.calibration.progress import HeldOut, ProgressBar
+from ccnn_torch.calibration.result import plan_of
+from ccnn_torch.calibration.statistics import share_unit
+from ccnn_torch.errors import WriteError
+from ccnn_torch.report.screen import note, say_place, stdout
+from ccnn_torch.run_folder.folder import RunFolder, kept_for
+from ccnn_torch.run_folder.resume import facts_of, refuse_changes
+from ccnn_torch.training import Callback, Scaling, past_of
+
+__all__ = ["resume_run", "start_run"]
+
+
+def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> RunFolder:
+    """Run a config into a fresh folder.
+
+    Args:
+        quiet: no progress and no tables.
+        tables: show the results when it is done.
+
+    Raises:
+        InputError: the config or its data cannot be used, or the folder is taken or in use.
+        WriteError: a file cannot be written; what was computed until then is kept.
+    """
+    makers(config)
+    prepared = prepare(config)
+    with RunFolder.fresh(config.out, config.name) as folder:
+        folder.write("config.yaml", dump_config(config, folder.path))
+        _run(config, prepared, folder, quiet, tables)
+    return folder
+
+
+def resume_run(path: Path, quiet: bool = False, tables: bool = True) -> RunFolder:
+    """Finish the run in a folder; the result is that of a run that was never stopped. A finished one stays as it is.
+
+    Args:
+        quiet, tables: as in `start_run`.
+
+    Raises:
+        InputError: there is no run in the folder, it is in use, or its config, records or checkpoints were changed.
+        WriteError: as `start_run`.
+    """
+    folder = RunFolder(path)
+    if folder.finished:
+        note(f"{path} is finished; nothing to do", quiet)
+        return folder
+    with RunFolder.existing(path) as folder:
+        config = load_config(folder.config, [])
+        refuse_changes(folder.checkpoints, facts_of(config), folder.config)
+        _run(config, prepare(config), folder, quiet, tables)
+    return folder
+
+
+def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, tables: bool) -> None:
+    for sentence in prepared.notes:
+        note(sentence, quiet)
+    folder = replace(folder, facts=facts_of(config, prepared.data_hash))
+    refuse_changes(folder.checkpoints, folder.facts, folder.config)
+
+    tell = partial(note, quiet=quiet)
+
+    def watch(prepared: Prepared, method: str, phase: str, scaling: Scaling) -> list[Callback]:
+        joints = prepared.mechanism.joints
+        choosing = "cross-validating" if plan_of(config).folds > 1 else "choosing how long"
+        label = f"{method}: {choosing if phase == 'choose' else 'training'}"
+        board = folder.tensorboard / (method if phase == "fit" else f"{method}-{phase}")
+        every = config.training.log_every
+        past = partial(past_of, folder.checkpoint(method, phase))
+        shown: list[Callback] = [
+            TensorBoardCallback(board, every=every, past=past, tell=tell),
+            ProgressBar(label, quiet),
+        ]
+        if phase == "choose":
+            # It has held-out errors of its own, of rows that are there to choose by.
+            return shown
+        names = tuple(joint.name for joint in joints)
+        return [HeldOut(prepared.dataset, scaling, names, share_unit(joints), every), *shown]
+
+    with kept_for(f"ccnn run --resume {folder.path}"):
+        calibration: Calibration = calibrate(config, folder, watch, prepared)
+        note("writing model files, plots and tables …", quiet)
+        try:
+            write_outputs(calibration, folder)
+        except WriteError:
+            print_tables(calibration.results, stdout)
+            raise
+    if tables and not quiet:
+        print_tables(calibration.results, stdout)
+        say_place(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")

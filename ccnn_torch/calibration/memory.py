@@ -1,0 +1,64 @@
+"""How much memory a run will take, told before it begins: a process that the system kills says nothing."""
+
+from __future__ import annotations
+
+import os
+
+from ccnn_torch.calibration.config import RunConfig, method_names
+from ccnn_torch.errors import InputError
+
+__all__ = ["check_memory", "free_memory", "memory_of_run"]
+
+# Bytes for a row of a repeat, measured on runs of the tripod: rows, deviations and Jacobians of all kinds; and, of the
+# one method that keeps a population, for each individual.
+_ROW, _INDIVIDUAL = 10_000, 2_500
+
+
+def memory_of_run(config: RunConfig, rows: int, joints: int) -> int:
+    """About what a run takes at its peak, in bytes; the methods come one after the other.
+
+    Args:
+        config: says repeats, methods and their sizes.
+        rows: of the data.
+        joints: of the mechanism.
+    """
+    methods = method_names(config)
+    of_row = _ROW + (_INDIVIDUAL * config.ccnn.population if "ccnn" in methods else 0)
+    # A Gaussian process has a matrix of all rows by all rows for each joint, its factor and its gradient.
+    squared = 3 * 8 * joints * rows if "gp" in methods else 0
+    return config.repeats * rows * (of_row + squared)
+
+
+def check_memory(config: RunConfig, rows: int, joints: int) -> list[str]:
+    """Sentences for who starts a run that takes more than half of the free memory.
+
+    Raises:
+        InputError: it takes more than there is; names the keys to lower.
+    """
+    needed, free = memory_of_run(config, rows, joints), free_memory()
+    if free is None or needed <= free / 2:
+        return []
+    keys = [f"repeats ({config.repeats})"] if config.repeats > 1 else []
+    keys += [f"ccnn.population ({config.ccnn.population})"] if "ccnn" in method_names(config) else []
+    told = (
+        f"{config.repeats} x {rows} rows (repeats x rows) take about {needed / 1e9:,.1f} GB of memory, and "
+        f"{free / 1e9:,.1f} GB are free; lower {' or '.join([*keys, 'the number of rows'])}"
+    )
+    if needed > free:
+        raise InputError(told)
+    return [f"{told} if the run is stopped by the system."]
+
+
+def free_memory() -> int | None:
+    """Bytes that a new process could have; None where the system does not tell."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as about:
+            lines = dict(line.split(":", 1) for line in about)
+        return int(lines["MemAvailable"].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        pass
+    try:
+        # All of it: what is free is not told everywhere.
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return None

@@ -1,0 +1,131 @@
+"""From the numbers in a run folder to everything a person reads: tables, pictures, one HTML page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ccnn_torch.calibration.page.figure_learning import convergence_plot, population_plot
+from ccnn_torch.calibration.page.figure_network import network_plot
+from ccnn_torch.calibration.page.figure_progress import progress_plot
+from ccnn_torch.calibration.page.tables import cautions, result_tables, verdict, write_tables
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.report.arrays import ARRAYS_FILE, load_arrays, load_history
+from ccnn_torch.report.figures.errors import joint_error_plot, pose_error_plot
+from ccnn_torch.report.figures.style import Plot, inline_svg, save_figure
+from ccnn_torch.report.figures.workspace import overview_plot, workspace_plot
+from ccnn_torch.report.html import InlineFigure, page_text
+from ccnn_torch.report.json_files import read_json
+
+__all__ = ["html_text", "make_picture", "run_plots", "write_report"]
+
+_LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "model.onnx", "model.pt2", "config.yaml")
+
+
+def html_text(
+    results: Mapping[str, Any], figures: Sequence[InlineFigure] = (), config: str = "", files: Sequence[str] = ()
+) -> str:
+    """The report of a run.
+
+    Args:
+        results: as in `results.json`.
+        figures: in reading order.
+        config: the resolved configuration, as text.
+        files: names of files in the run folder to link to.
+    """
+    optional: dict[str, Any] = {"case": None, "best_method": None, "notes": [], "versions": {}}
+    return page_text(
+        "report",
+        optional | dict(results),
+        verdict(results),
+        result_tables(results),
+        cautions(results),
+        figures,
+        config,
+        files,
+        results.get("best_method"),
+    )
+
+
+def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -> Path:
+    """Write `results.csv`, `results.md`, `plots/` and `report.html` of a run folder.
+
+    Reads, as far as they are there, `arrays.safetensors`, `history-METHOD.safetensors` and `config.yaml`; the same
+    files give the same report, so it can be written again at any time.
+
+    Args:
+        folder: the run folder.
+        results: the content of its `results.json`, which is read when None.
+
+    Returns:
+        The path of `report.html`.
+
+    Raises:
+        InputError: `results.json` is not there or damaged, or another file is damaged.
+    """
+    folder = Path(folder)
+    results = read_json(folder / "results.json") if results is None else results
+    write_tables(folder, results)
+    plots = run_plots(folder, results)
+    figures = []
+    for plot in plots:
+        _, svg = save_figure(plot.figure, folder / "plots" / plot.name)
+        figures.append(InlineFigure(plot.name, plot.caption, inline_svg(svg.read_text(encoding="utf-8"), plot.name)))
+    config = folder / "config.yaml"
+    page = html_text(
+        results,
+        figures,
+        config.read_text(encoding="utf-8") if config.is_file() else "",
+        [name for name in _LINKED if (folder / name).is_file()],
+    )
+    path = folder / "report.html"
+    write_whole(path, page)
+    return path
+
+
+def run_plots(folder: str | Path, results: Mapping[str, Any]) -> list[Plot]:
+    """All pictures of a run folder, in reading order; a picture whose data is not there is left out."""
+    folder = Path(folder)
+    plots: list[Plot | None] = []
+    if (folder / ARRAYS_FILE).is_file():
+        arrays = load_arrays(folder)
+        plots += [pose_error_plot(arrays), workspace_plot(arrays), joint_error_plot(arrays)]
+        if arrays.masks:
+            names = [joint.name for joint in arrays.joints]
+            method = arrays.labels.get("method", "model")
+            plots.append(network_plot(arrays.masks, arrays.weights, method, names))
+    levels = {"floor": (results["floor"] or {}).get("realised"), "constant": results["constant"]["test"]}
+    lines = {name: block["all"]["mse"]["median"] for name, block in levels.items() if block and "all" in block}
+    paths = {method: folder / f"history-{method}.safetensors" for method in results["methods"]}
+    histories = {method: load_history(path) for method, path in paths.items() if path.is_file()}
+    unit = results["joints"][0]["unit"]
+    plots.append(progress_plot(histories, unit=unit, **lines))
+    for method, history in histories.items():
+        plots.append(convergence_plot(history, method, unit=unit, **lines))
+        plots.append(population_plot(history, method))
+    return [plot for plot in plots if plot is not None]
+
+
+def make_picture(folder: str | Path, path: str | Path, joint: str | None = None) -> str:
+    """Draw the one wide picture of a run: joint error and workspace, before and after.
+
+    Args:
+        folder: a run folder with `arrays.safetensors`.
+        path: where to write; `.png` and `.svg` are both written.
+        joint: name of the joint shown; by default the one with the largest error.
+
+    Returns:
+        The caption.
+
+    Raises:
+        InputError: the arrays are not there or damaged, or there is no such joint.
+    """
+    arrays = load_arrays(folder)
+    names = [j.name for j in arrays.joints]
+    if joint is not None and joint not in names:
+        raise InputError(f"There is no joint {joint!r}; this run has {', '.join(names)}.")
+    plot = overview_plot(arrays, None if joint is None else names.index(joint))
+    save_figure(plot.figure, path)
+    return plot.caption

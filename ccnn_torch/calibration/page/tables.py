@@ -1,0 +1,283 @@
+"""The tables of a run, from `results.json` alone: for the screen, for `results.md`, and for the HTML report.
+
+They follow the paper: before calibration as Tables I and III, after it as Tables II and IV, and where the run is one of
+the paper's cases its printed figures stand beside ours. All numbers are medians over the repeats with [5 %, 95 %].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from ccnn_torch.calibration.page.comparison_tables import (
+    comparison_table,
+    method_label,
+    pose_by_method_table,
+    reach_table,
+)
+from ccnn_torch.calibration.page.paper_tables import PAPER, PaperCase
+from ccnn_torch.display import count_text, display_unit, interval_text, number_text, removed_percent
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.report.csv_file import write_csv
+from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
+
+__all__ = [
+    "cautions",
+    "failures",
+    "markdown_text",
+    "print_tables",
+    "result_tables",
+    "verdict",
+    "worse_text",
+    "write_tables",
+]
+
+Results = Mapping[str, Any]
+# By less a learned part may be worse on other rows by chance.
+_WORSE = 1.01
+
+
+def verdict(results: Results) -> str:
+    """One sentence: what the best method does to the error on held-out rows."""
+    position = results["pose"]["position"]
+    best = results.get("best_method") or next(iter(results["methods"]), "the model")
+    # What is left is left of both: the identified geometry, and what the method learned of the rest.
+    parts = [part for part in ("geometry", "effects") if part in position]
+    whose = " + ".join([*parts, best])
+    rows = count_text(results["rows"]["test"], "held-out row")
+    before, after = position["before"]["rms"], position["after"]["rms"]
+    removed = removed_percent(before, after)
+    if removed is None:
+        return f"On {rows} the pose error of {whose} could not be measured."
+    scale, unit = display_unit("m", before["median"])
+    left, right = (number_text(s["median"] / scale, 3) for s in (before, after))
+    did = f"removes {removed:.1f} %" if removed >= 0 else f"adds {-removed:.1f} %"
+    text = f"On {rows} {whose} {did} of the RMS position error ({left} → {right} {unit})"
+    ratio = (results["methods"].get(best) or {}).get("ratio_to_floor")
+    if ratio and ratio["median"] is not None:
+        text += f"; its mean squared joint error is {number_text(ratio['median'], 3)} times the noise floor"
+        constant = results["constant"].get("ratio_to_floor")
+        if constant and constant["median"] is not None:
+            text += f" (a constant correction: {number_text(constant['median'], 3)})"
+    return text + "."
+
+
+def result_tables(results: Results) -> list[Table]:
+    """All tables of a run, in reading order."""
+    paper = PAPER.get(results.get("case") or "")
+    tables = [
+        _before_table(results, paper),
+        comparison_table(results),
+        *(_after_table(results, paper, measure) for measure in ("mse", "mae", "sse")),
+        reach_table(results),
+        _pose_table(results),
+        pose_by_method_table(results),
+    ]
+    return [table for table in tables if table is not None]
+
+
+def print_tables(results: Results, console: Console) -> None:
+    """Show the verdict and the tables on a terminal."""
+    for table in result_tables(results):
+        print_table(table, console)
+    for sentence in cautions(results):
+        print_text(sentence, console, "yellow")
+    for note in results.get("notes", []):
+        print_text(note, console, "dim")
+    print_text(verdict(results), console, "bold")
+
+
+def markdown_text(results: Results) -> str:
+    """The verdict and the tables as Markdown (`results.md`)."""
+    parts = [f"# {results['name']}", verdict(results), *cautions(results)]
+    parts += map(markdown_table, result_tables(results))
+    return "\n\n".join(parts) + "\n"
+
+
+def write_tables(folder: Path, results: Results) -> None:
+    """Write `results.csv` and `results.md`."""
+    write_csv(folder / "results.csv", results)
+    write_whole(folder / "results.md", markdown_text(results))
+
+
+def cautions(results: Results) -> list[str]:
+    """What a person must know before they use the model: `worse_text` and `failures`."""
+    worse = worse_text(results)
+    return [*([worse] if worse else []), *failures(results)]
+
+
+def worse_text(results: Results) -> str:
+    """One sentence where the best method's RMS position error on held-out rows is larger than without it; else empty.
+
+    Without it: what identified geometry and known effects leave by themselves where these are a part, else no
+    correction at all.
+    """
+    position, best = results["pose"]["position"], results.get("best_method")
+    without = next((part for part in ("effects", "geometry") if part in position), "before")
+    alone, after = position[without]["rms"]["median"], position["after"]["rms"]["median"]
+    if best is None or not alone or after is None or after <= _WORSE * alone:
+        return ""
+    parts = [part for part in ("geometry", "effects") if part in position]
+    scale, unit = display_unit("m", alone)
+    left, right = (number_text(value / scale, 3) for value in (alone, after))
+    instead = " + ".join(parts) + " alone" if parts else "no correction at all"
+    text = f"On held-out rows {best} makes it worse than {instead} ({left} → {right} {unit} RMS position error)"
+    if best == "constant":
+        return f"{text}: what it learned of the training rows does not hold on others."
+    return f"{text}: methods=constant leaves the network out, methods=auto chooses by cross-validation."
+
+
+def failures(results: Results) -> list[str]:
+    """One sentence for each method that failed, and for each that has no model file; first whose `model.*` are."""
+    said = []
+    model = results.get("model") or {"method": None, "without": {}}
+    without, best = dict(model["without"]), results.get("best_method")
+    if best in without and model["method"] is not None:
+        why = without.pop(best)
+        said.append(f"The model files model.* and card.json are of {model['method']}, not of {best}: {why}.")
+    said += [f"No model file of {name}: {why}." for name, why in without.items()]
+    said += [
+        f"The model files of {name} apply {share:.0%} of what it learned: all of it changes too fast for a command to "
+        "be solved for; the promise in their card is of what they apply, the figures here of all that was learned."
+        for name, share in model.get("damped", {}).items()
+    ]
+    return said + [f"{name} failed: {m['failed']}" for name, m in results["methods"].items() if m["test"] is None]
+
+
+def _units(results: Results) -> dict[str, str]:
+    return {joint["name"]: joint["unit"] for joint in results["joints"]}
+
+
+def _repeats(results: Results) -> str:
+    count = results["repeats"]
+    return f"Medians [5 %, 95 %] over {count} repeats." if count > 1 else ""
+
+
+def _before_table(results: Results, paper: PaperCase | None) -> Table:
+    units, train = _units(results), results.get("before_train")
+    columns = ["joint"] + ["mean, training rows", "maximum, training rows"] * (train is not None)
+    columns += ["mean, held-out rows", "maximum, held-out rows", "largest by absolute value"]
+    if paper:
+        columns += ["mean, paper", "maximum, paper"]
+    rows = []
+    for i, (name, unit) in enumerate(units.items()):
+        scale, shown = display_unit(unit, results["before"][name]["max_abs"] or 0.0)
+        row = [f"{name} [{shown}]"]
+        if train is not None:
+            row += [interval_text(train[name]["spread"][key], scale) for key in ("mean", "max")]
+        row += [interval_text(results["before"][name]["spread"][key], scale) for key in ("mean", "max", "max_abs")]
+        if paper:
+            row += [number_text(value / scale) for value in paper.before_test[i]]
+        rows.append(tuple(row))
+    note = "Mean and maximum are of the signed error. " + _repeats(results)
+    if paper:
+        note += f" Paper: Table {paper.before}, verification set. {paper.remark}"
+    return Table("Joint error before calibration", tuple(columns), tuple(rows), note.strip())
+
+
+def _after_table(results: Results, paper: PaperCase | None, measure: str) -> Table:
+    titles = {"mse": "Mean squared error", "mae": "Mean absolute error", "sse": "Sum of squared errors"}
+    floor = results["floor"]
+    keys = list(_units(results)) + ["all"] * ("all" in results["constant"]["test"])
+    # Joints of one unit share a scale, so that columns can be compared at a glance.
+    shared = "all" if "all" in keys else None
+    scales = {key: _scale(results, shared or key, measure) for key in keys}
+    beside = measure == "mse"
+    columns = ["method", *(f"{'all joints' if key == 'all' else key} [{scales[key][1]}]" for key in keys)]
+    blocks = [*results["methods"].values(), results["constant"]]
+    extras = [
+        (key, column, digits)
+        for key, column, digits in (
+            ("ratio_to_floor", "ratio to floor [1]", 4),
+            ("coverage", "coverage of 95 % [1]", 3),
+            ("seconds", "time [s]", 3),
+        )
+        if beside and (key == "seconds" or any(block.get(key) for block in blocks))
+    ]
+    columns += [column for _, column, _ in extras]
+    printed = dict(paper.methods) if paper and len(keys) == len(paper.symbols) + 1 else {}
+    rows: list[tuple[str, ...]] = []
+
+    def add(label: str, errors: Mapping[str, Any] | None, method: Mapping[str, Any]) -> None:
+        cells = [interval_text(errors[key][measure] if errors else None, scales[key][0]) for key in keys]
+        rows.append((label, *cells, *(interval_text(method.get(key), digits=digits) for key, _, digits in extras)))
+
+    def add_printed(name: str) -> None:
+        assert paper is not None
+        values = printed.pop(name)[("mse", "mae", "sse").index(measure)]
+        cells = [number_text(value / scales[key][0]) for key, value in zip(keys, values, strict=True)]
+        rows.append((f"{name}, paper's Table {paper.after}", *cells, *["–"] * len(extras)))
+
+    for name, method in results["methods"].items():
+        add(method_label(results, name), method["test"], method)
+        if name in printed:
+            add_printed(name)
+    if not (results["methods"].get("constant") or {}).get("test"):
+        add("constant", results["constant"]["test"], results["constant"])
+    if floor and beside:
+        add("noise floor, realised", floor["realised"], {})
+        add("noise floor, expected", floor["expected"], {})
+        if floor.get("with_unlearnable"):
+            add("noise floor with what cannot be learned", floor["with_unlearnable"], {})
+    for name in list(printed):
+        add_printed(name)
+    note = _repeats(results)
+    if any(key == "coverage" for key, _, _ in extras):
+        note += (
+            " Coverage: share of the held-out figures inside the domain that lie within 1.96 predictive standard "
+            "deviations of the prediction."
+        )
+    return Table(f"{titles[measure]} on held-out rows, after calibration", tuple(columns), tuple(rows), note.strip())
+
+
+def _scale(results: Results, key: str, measure: str) -> tuple[float, str]:
+    """One unit for a column: a prefixed one for absolute errors, a power of ten of the SI unit for squares."""
+    units = _units(results)
+    unit = units[key] if key != "all" else next(iter(units.values()))
+    block = [m["test"] for m in results["methods"].values() if m["test"]] or [results["constant"]["test"]]
+    medians = [errors[key][measure]["median"] for errors in block]
+    typical = min((m for m in medians if m), default=1.0)
+    if measure == "mae":
+        return display_unit(unit, typical)
+    square = "1" if unit == "1" else f"{unit}²"
+    power = math.floor(math.log10(typical))
+    return (1.0, square) if power == 0 else (10.0**power, f"1e{power} {square}")
+
+
+def _pose_table(results: Results) -> Table:
+    names = {"position": "position", "rotation": "rotation", "energy": "energy E (eq. 5)"}
+    blocks = {name: results["pose"][key] for key, name in names.items() if results["pose"].get(key)}
+    # Beside before and after, where the run has them: block key, column, and the sentence that explains it.
+    extras = [
+        extra
+        for extra in (
+            ("geometry", "RMS geometry alone", "Geometry alone: link parameters and frames fitted to the same rows."),
+            ("effects", "RMS effects alone", "Effects alone: those of the diagnosis, fitted to the training rows."),
+            (
+                "not_compensable",
+                "RMS not compensable",
+                "Not compensable: the part of the measured error that no joint deviation, damped as it was, explains.",
+            ),
+        )
+        if any(extra[0] in block for block in blocks.values())
+    ]
+    rows = []
+    for name, block in blocks.items():
+        scale, unit = display_unit(block["unit"], block["before"]["rms"]["median"] or 0.0)
+        cells = [f"{name} [{unit}]"]
+        for measure in ("rms", "max"):
+            removed = removed_percent(block["before"][measure], block["after"][measure])
+            cells += [interval_text(block[when][measure], scale) for when in ("before", "after")]
+            cells.append("–" if removed is None else f"{removed:.1f}")
+        cells += [interval_text(block.get(key, {}).get("rms"), scale) for key, _, _ in extras]
+        rows.append(tuple(cells))
+    columns = ["pose error"]
+    for measure in ("RMS", "max"):
+        columns += [f"{measure} before", f"{measure} after", f"{measure} removed [%]"]
+    columns += [column for _, column, _ in extras]
+    note = " ".join([*(sentence for _, _, sentence in extras), _repeats(results)]).strip()
+    return Table("Pose error on held-out rows", tuple(columns), tuple(rows), note)

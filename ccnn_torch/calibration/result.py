@@ -1,0 +1,247 @@
+"""Put the figures of a run together in the form of `results.json`; everything on held-out rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.calibration.config import RunConfig
+from ccnn_torch.calibration.dataset import Dataset, Rows, pad_rows
+from ccnn_torch.calibration.early_stop import Plan
+from ccnn_torch.calibration.evaluate import Outcome, pose_with_effects, pose_with_geometry
+from ccnn_torch.calibration.method_choice import Comparison
+from ccnn_torch.calibration.prepare import Prepared
+from ccnn_torch.calibration.statistics import (
+    before_block,
+    constant_errors,
+    floor_block,
+    joint_errors,
+    pose_block,
+    ratio_to_floor,
+    spread,
+)
+from ccnn_torch.calibration.uncertainty import coverage, inside_domain
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.simulation.case_study import Simulation
+
+__all__ = ["assemble", "best_method", "by_score", "plan_of", "versions"]
+
+_NO_GEOMETRY = {"chosen": "none", "why": "A simulated case compares learners."}
+_PACKAGES = ("ccnn-torch", "torch", "numpy", "scipy", "onnx", "onnxruntime", "safetensors")
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package and of those that decide its numbers."""
+    return {name: version(name) for name in _PACKAGES}
+
+
+def plan_of(config: RunConfig) -> Plan:
+    """How the methods of a config are trained."""
+    training = config.training
+    return Plan(
+        early_stop=training.early_stop,
+        patience=training.patience,
+        checkpoint_every=training.checkpoint_every,
+        device=config.device,
+        folds=config.auto.folds if config.methods == ["auto"] else training.folds,
+        kind=config.split.kind,
+    )
+
+
+def best_method(outcomes: Mapping[str, Outcome]) -> str:
+    """The method whose median score over the repeats is lowest (validation, or training where none was held out)."""
+    return by_score(outcomes)[0]
+
+
+def by_score(outcomes: Mapping[str, Outcome]) -> list[str]:
+    """The methods, the best first."""
+    return sorted(outcomes, key=lambda name: float(outcomes[name].fitted.score.median()))
+
+
+def assemble(
+    config: RunConfig,
+    prepared: Prepared,
+    before: PoseError,
+    outcomes: dict[str, Outcome],
+    failed: dict[str, str],
+    comparison: Comparison | None = None,
+) -> dict[str, Any]:
+    """The content of `results.json`.
+
+    Args:
+        before: pose error without compensation, `r x s`.
+        outcomes: trained methods by name, at least one.
+        failed: sentence of each method that could not be trained.
+        comparison: how the method was chosen, where it was.
+    """
+    dataset, joints = prepared.dataset, prepared.mechanism.joints
+    test, fit = dataset.usable_rows("test"), dataset.usable_rows("fit")
+    measured, learned = test.take(dataset.deviation), fit.take(dataset.deviation)
+    floor = None if prepared.simulation is None else _floor(prepared.simulation, test, joints)
+    methods: dict[str, Any] = {name: {"test": None, "failed": sentence} for name, sentence in failed.items()}
+    inside = inside_domain(dataset, config.compensation.margin)
+    for name, outcome in outcomes.items():
+        errors = joint_errors(test.take(outcome.deviation), measured, test.weights, joints)
+        each = outcome.fitted.seconds / len(dataset.seeds)
+        methods[name] = {
+            "test": errors,
+            "ratio_to_floor": ratio_to_floor(errors, floor),
+            "seconds": spread([each] * len(dataset.seeds)),
+            **_certainty(outcome, dataset, test, inside, joints),
+            "converged": _spread_or_none(outcome.fitted.converged),
+            "evaluations": _spread_or_none(outcome.fitted.evaluations),
+            "pose": _pose_of(prepared, outcome),
+        }
+    constant = constant_errors(learned, measured, fit.weights, test.weights, joints)
+    best = best_method(outcomes)
+    return {
+        "name": config.name,
+        "seed": config.seed,
+        "repeats": config.repeats,
+        "case": None if config.case is None else case_label(config),
+        "joints": [{"name": joint.name, "unit": joint.unit} for joint in joints],
+        "best_method": best,
+        "rows": row_counts(config, dataset),
+        "before": before_block(test.take(prepared.total), test.weights, joints),
+        "before_train": before_block(fit.take(prepared.total), fit.weights, joints),
+        "methods": {name: methods[name] for name in [*outcomes, *failed]},
+        "constant": {"test": constant, "ratio_to_floor": ratio_to_floor(constant, floor)},
+        "floor": floor,
+        "auto": None if comparison is None else comparison.block(best),
+        "pose": _pose(config, prepared, before, outcomes[best].after),
+        "records": None if prepared.simulated else _records(prepared),
+        **_effects(prepared, test),
+        "data_sha256": prepared.data_hash,
+        "geometry": _NO_GEOMETRY if prepared.choice is None else prepared.choice.block,
+        "notes": [*prepared.notes, *_notes(plan_of(config))],
+        "versions": versions(),
+    }
+
+
+def _notes(plan: Plan) -> list[str]:
+    if not plan.holds_out:
+        return [
+            "No row was held out to choose by: the predictive sd is the learners' own, by no other rows corrected "
+            "(training.folds=5 does that without changing the model)."
+        ]
+    if plan.folds > 1:
+        blocks = "neighbouring blocks" if plan.kind == "block" else "whole groups" * (plan.kind == "group") or "rows"
+        return [f"What was chosen was chosen by cross-validation in {plan.folds} folds of {blocks}."]
+    return []
+
+
+def _certainty(
+    outcome: Outcome, dataset: Dataset, test: Rows, inside: Tensor, joints: tuple[Coordinate, ...]
+) -> dict[str, Any]:
+    """How wide the predictive sd is, and how often what was measured lies within its 95 % interval."""
+    sd = outcome.fitted.sd(test.take(dataset.inputs))
+    residuals = test.take(dataset.deviation) - test.take(outcome.deviation)
+    there = (test.weights > 0).unsqueeze(-1)
+    typical = sd.masked_fill(~there, torch.nan).nanmedian(1).values
+    return {
+        "coverage": spread(coverage(residuals, sd, test.weights * test.take(inside))),
+        "sd": {joint.name: spread(typical[:, j]) for j, joint in enumerate(joints)},
+    }
+
+
+def _spread_or_none(values: Tensor | None) -> dict[str, Any] | None:
+    return None if values is None else spread(values)
+
+
+def _pose_of(prepared: Prepared, outcome: Outcome) -> dict[str, Any]:
+    """The pose error that a method leaves, over all test rows."""
+    rows = pad_rows([split.test for split in prepared.dataset.splits])
+    position, rotation = (
+        None if error is None else rows.take(error.expand(len(rows.index), -1))
+        for error in (outcome.after.position, outcome.after.rotation)
+    )
+    assert position is not None
+    block = pose_block(position, position, rows.weights, rotation, rotation)
+    return {name: part and {"unit": part["unit"], **part["after"]} for name, part in block.items()}
+
+
+def case_label(config: RunConfig) -> str:
+    """`tripod`, `machine_tool:VARIANT`, or `realistic:MACHINE:CAUSE`."""
+    if config.case == "realistic":
+        return f"realistic:{config.realistic.machine}:{config.realistic.cause}"
+    return f"{config.case}:{config.variant}" if config.case == "machine_tool" else str(config.case)
+
+
+def _floor(simulation: Simulation, test: Rows, joints: tuple[Coordinate, ...]) -> dict[str, Any]:
+    variance = test.take(simulation.noise_variance) * test.weights.unsqueeze(-1)
+    unlearnable = simulation.unlearnable
+    return floor_block(
+        test.take(simulation.noise),
+        test.weights,
+        joints,
+        variance.sum(1, keepdim=True) / test.weights.sum(1)[:, None, None],
+        None if unlearnable is None else test.take(unlearnable),
+    )
+
+
+def row_counts(config: RunConfig, dataset: Dataset) -> dict[str, int]:
+    """Rows of the first repeat's split; without early stopping, and with folds, the validation rows are trained on."""
+    split = dataset.splits[0]
+    plan = plan_of(config)
+    held = len(split.validation) if plan.holds_out and plan.folds == 1 else 0
+    return {
+        "train": len(split.train) + len(split.validation) - held,
+        "validation": held,
+        "test": len(split.test),
+        "not_trained_on": int((~dataset.usable[0]).sum()),
+    }
+
+
+def _pose(config: RunConfig, prepared: Prepared, before: PoseError, after: PoseError) -> dict[str, Any]:
+    """Over all test rows, those that were not fit to be trained on as well."""
+    rows = pad_rows([split.test for split in prepared.dataset.splits])
+    remainder = prepared.pseudoerror
+    geometry, effects = pose_with_geometry(prepared), pose_with_effects(prepared)
+
+    def held_out(values: Tensor | None) -> Tensor | None:
+        return None if values is None else rows.take(values.expand(len(rows.index), -1))
+
+    position_before, position_after = held_out(before.position), held_out(after.position)
+    assert position_before is not None and position_after is not None
+    return pose_block(
+        position_before,
+        position_after,
+        rows.weights,
+        held_out(before.rotation),
+        held_out(after.rotation),
+        config.rotation_weight,
+        held_out(_finite(remainder.remainder_position)),
+        held_out(_finite(remainder.remainder_rotation)),
+        held_out(None if geometry is None else geometry.position),
+        held_out(None if geometry is None else geometry.rotation),
+        held_out(None if effects is None else effects.position),
+        held_out(None if effects is None else effects.rotation),
+    )
+
+
+def _finite(values: Tensor | None) -> Tensor | None:
+    return None if values is None else torch.nan_to_num(values, nan=0.0)
+
+
+def _effects(prepared: Prepared, test: Rows) -> dict[str, Any]:
+    """What known effects do by themselves, where they are a part of the compensator."""
+    if prepared.effects is None:
+        return {}
+    left = test.take(prepared.dataset.deviation)
+    errors = joint_errors(torch.zeros_like(left), left, test.weights, prepared.mechanism.joints)
+    return {"effects": {"from": prepared.effects.path, "test": errors, "coefficients": prepared.effects.block()}}
+
+
+def _records(prepared: Prepared) -> dict[str, Any]:
+    """What measured records have beside: rows set aside and the frames that were fitted."""
+    usable = prepared.dataset.usable[0]
+    return {
+        "rows": len(usable),
+        "rows_set_aside": torch.nonzero(~usable).squeeze(-1).tolist(),
+        "why_set_aside": prepared.set_aside(),
+    }

@@ -1,0 +1,141 @@
+"""Several runs side by side, from their `results.json` alone: `ccnn compare`."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ccnn_torch.display import display_unit, interval_text, number_text
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.report.json_files import read_json
+from ccnn_torch.report.table import Table, markdown_table
+
+__all__ = ["read_runs", "runs_csv", "runs_table", "write_runs"]
+
+Results = Mapping[str, Any]
+_CSV = ("run", "name", "case", "seed", "repeats", "train", "validation", "test", "data_sha256", "method", "best",
+        "quantity", "unit", "before", "after", "ratio_to_floor", "seconds")  # fmt: skip
+
+
+def read_runs(folders: Sequence[Path]) -> dict[str, dict[str, Any]]:
+    """Content of `results.json` of finished run folders, by folder.
+
+    Raises:
+        InputError: a folder holds no finished run.
+    """
+    found = {}
+    for folder in folders:
+        results = read_json(folder / "results.json")
+        if not all(isinstance(results.get(key), dict) for key in ("methods", "pose", "rows", "before")):
+            raise InputError(f"{folder / 'results.json'}: is not the result of a run; give folders of ccnn run")
+        found[str(folder)] = results
+    return found
+
+
+def runs_table(runs: Mapping[str, Results]) -> Table:
+    """One row a run: its best method, pose error before and after, ratio to the floor, seconds.
+
+    Runs are marked by a letter for the rows that they were judged on: only those of one letter are comparable.
+    """
+    marks = _marks(runs)
+    largest = max(results["pose"]["position"]["before"]["rms"]["median"] or 0.0 for results in runs.values())
+    scale, unit = display_unit("m", largest)
+    rows = []
+    for folder, results in runs.items():
+        best, position, counts = results.get("best_method"), results["pose"]["position"], results["rows"]
+        block = results["methods"].get(best) or {}
+        rows.append(
+            (
+                f"{results['name']} ({Path(folder).name})" if Path(folder).name != results["name"] else results["name"],
+                marks[folder],
+                f"{counts['train'] + counts['validation']} + {counts['test']}",
+                _method_text(results),
+                *(interval_text(position[when]["rms"], scale, 3) for when in ("before", "after")),
+                interval_text(block.get("ratio_to_floor"), digits=3),
+                interval_text(block.get("seconds"), digits=3),
+            )
+        )
+    columns = ("run", "test rows", "rows", "method", f"before [{unit}]", f"after [{unit}]", "to floor", "time [s]")
+    note = "Before and after: RMS position error on the test rows. Rows: trained on + tested on."
+    if len(set(marks.values())) > 1:
+        note += " Runs with different letters were judged on different test rows: their figures are not comparable."
+    return Table("Runs", columns, tuple(rows), note, words=("test rows", "method"))
+
+
+def runs_csv(runs: Mapping[str, Results]) -> str:
+    """Every method of every run as one row, in SI, with 17 significant digits."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_CSV)
+    for folder, results in runs.items():
+        about = [folder, results["name"], results.get("case") or "", results["seed"], results["repeats"]]
+        about += [results["rows"][part] for part in ("train", "validation", "test")]
+        about.append(results.get("data_sha256") or "")
+        for method, block in results["methods"].items():
+            for kind, pose in results["pose"].items():
+                left = (block.get("pose") or {}).get(kind)
+                if pose is None or left is None:
+                    continue
+                figures = [pose["before"]["rms"], left["rms"], block.get("ratio_to_floor"), block.get("seconds")]
+                best = int(method == results.get("best_method"))
+                row = [*about, method, best, f"{kind}_rms", pose["unit"], *map(_median, figures)]
+                writer.writerow(f"{v:.17g}" if isinstance(v, float) else v for v in row)
+    return text.getvalue()
+
+
+def write_runs(path: Path, runs: Mapping[str, Results]) -> None:
+    """Write the table as .csv or .md, by what the name ends in.
+
+    Raises:
+        InputError: it ends in something else.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".md"):
+        raise InputError(f"--out {path}: write a name that ends in .csv or .md")
+    text = runs_csv(runs) if suffix == ".csv" else markdown_table(runs_table(runs)) + "\n"
+    write_whole(path, text.encode())
+
+
+def _marks(runs: Mapping[str, Results]) -> dict[str, str]:
+    """A letter for each set of test rows: data, seed and repeats, split, and how many rows are in each part.
+
+    The figures before compensation stand for the split, which `results.json` does not name: they are those of the test
+    rows alone.
+    """
+    keys: dict[tuple[Any, ...], str] = {}
+    found = {}
+    for folder, results in runs.items():
+        before = {name: block["spread"] for name, block in results["before"].items()}
+        key = (results.get("data_sha256"), results["rows"]["test"], _number_key(before))
+        found[folder] = keys.setdefault(key, _letter(len(keys)))
+    return found
+
+
+def _number_key(before: Mapping[str, Any]) -> str:
+    """Figures as a text that is equal where they are to 9 digits: what was summed in another order is the same."""
+    return " ".join(
+        f"{joint} {quantity} {number_text(spread['median'], 9)}"
+        for joint, block in before.items()
+        for quantity, spread in block.items()
+    )
+
+
+def _letter(number: int) -> str:
+    return chr(ord("A") + number) if number < 26 else str(number + 1)
+
+
+def _method_text(results: Results) -> str:
+    """The best method, of how many, and with what beside it."""
+    trained = sum(block.get("test") is not None for block in results["methods"].values())
+    of = f" (best of {trained})" if trained > 1 else ""
+    chosen = (results.get("geometry") or {}).get("chosen")
+    geometry = "geometry + " if chosen == "identify" else ""
+    return f"{geometry}{results.get('best_method')}{of}"
+
+
+def _median(spread: Mapping[str, Any] | None) -> float | str:
+    return "" if spread is None or spread["median"] is None else float(spread["median"])

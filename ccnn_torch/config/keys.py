@@ -1,0 +1,166 @@
+"""What keys a config may have, and one sentence for all that is wrong in one."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import re
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from ccnn_torch.files.yaml_file import read_yaml
+from ccnn_torch.records.table import nearest
+
+__all__ = ["config_model", "explain", "list_keys"]
+
+# Wrong keys that one sentence names.
+_FEW = 8
+
+# The model of each command's config, by name: they are loaded when asked for, as each of them imports this module.
+_COMMANDS = {
+    "run": "ccnn_torch.calibration.config:RunConfig",
+    "identify": "ccnn_torch.identification.config:IdentifyConfig",
+    "suite": "ccnn_torch.suite.job:SuiteFile",
+    "plan": "ccnn_torch.planning.config:PlanConfig",
+    "diagnose": "ccnn_torch.diagnosis.config:DiagnoseConfig",
+}
+# Commands that take their config by an option.
+_OPTION = {"plan": " --config", "diagnose": " --config"}
+
+
+def config_model(command: str) -> type[BaseModel]:
+    """The model that a command's config is checked by."""
+    module, _, name = _COMMANDS[command].partition(":")
+    model: type[BaseModel] = getattr(import_module(module), name)
+    return model
+
+
+def list_keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, str]]:
+    """Every key of a config, dotted, with its default as YAML has it and its description."""
+    for name, info in model.model_fields.items():
+        kind = _section(info.annotation)
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield from list_keys(kind, f"{prefix}{name}.")
+        elif isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            yield from _list_dataclass(kind, f"{prefix}{name}.")
+        else:
+            default = info.get_default(call_default_factory=True)
+            yield f"{prefix}{name}", _yaml(default), info.description or ""
+
+
+def _section(kind: Any) -> Any:
+    """The model of a section that may be left out (`Model | None`); any other annotation as it is."""
+    models = [k for k in get_args(kind) if isinstance(k, type) and issubclass(k, BaseModel)]
+    return models[0] if models and type(None) in get_args(kind) else kind
+
+
+def _list_dataclass(kind: type[Any], prefix: str) -> Iterator[tuple[str, str, str]]:
+    """Keys of a section that is a plain dataclass; descriptions from its docstring's ``Attributes:``."""
+    default = kind()
+    documented = _attributes(inspect.getdoc(kind) or "")
+    for field in dataclasses.fields(kind):
+        yield f"{prefix}{field.name}", _yaml(getattr(default, field.name)), documented.get(field.name, "")
+
+
+def _attributes(text: str) -> dict[str, str]:
+    """Name -> description from the ``Attributes:`` part of a docstring; `a, b: text` describes both."""
+    _, _, part = text.partition("Attributes:\n")
+    part = re.split(r"\n(?=\S)", "\n" + part)[0] if part else ""
+    found: dict[str, str] = {}
+    for entry in re.split(r"\n {4}(?=\S)", part):
+        names, colon, description = entry.partition(":")
+        if colon:
+            found |= dict.fromkeys((name.strip() for name in names.split(",")), " ".join(description.split()))
+    return found
+
+
+def _yaml(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def explain(error: ValidationError, model: type[BaseModel], file: str, given: Mapping[str, str]) -> str:
+    """One line for all errors, each with its key, what is wrong and what would be right.
+
+    Args:
+        error: what pydantic found.
+        model: the model that was validated.
+        file: the config's name.
+        given: key -> override, for keys that were set on the command line.
+    """
+    keys = {key: description for key, _, description in list_keys(model)}
+    parts: dict[str, None] = {}
+    for item in error.errors():
+        key = ".".join(str(step) for step in item["loc"])
+        override = next((text for name, text in given.items() if f"{key}.".startswith(f"{name}.")), None)
+        override = override or next((text for name, text in given.items() if key and name.startswith(f"{key}.")), None)
+        source = f"'{override}': " if override else ""
+        parts[source + _sentence(key, item["type"], item["msg"], item["input"], keys)] = None
+    other = _other_command(file, model)
+    if other:
+        return f"{file}: this looks like {other}"
+    said: list[str] = []
+    for part in parts:
+        head, _, keys_there = part.partition("; the keys ")
+        said.append(head if keys_there and any(part.endswith(keys_there) for part in said) else part)
+    return f"{file}: " + "; ".join(said[:_FEW]) + (f"; and {len(said) - _FEW} more" if len(said) > _FEW else "")
+
+
+def _other_command(file: str, model: type[BaseModel]) -> str:
+    """What a file of other keys is: a mechanism, or a config of another command that knows them all; else empty."""
+    if not Path(file).is_file():
+        return ""
+    there = set(read_yaml(Path(file)))
+    if there >= {"convention", "alpha"}:
+        return f"the file of an arm, no config; write mechanism={file}"
+    # A single strange key is a slip of the pen rather than another command's file.
+    if len(there) < 2 or there <= set(model.model_fields):
+        return ""
+    names = (name for name in _COMMANDS if there <= set(config_model(name).model_fields))
+    return next((f"a config for `ccnn {name}{_OPTION.get(name, '')}`" for name in names), "")
+
+
+def _sentence(key: str, kind: str, message: str, value: Any, keys: Mapping[str, str]) -> str:
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        return f"there is no key '{key}'; {_hint(key, keys)}"
+    if kind in ("model_type", "dataclass_type", "dict_type"):
+        return f"{key}: must hold the keys {', '.join(_below(key, keys))}, not {_short(value)}"
+    if kind == "value_error":
+        return (f"{key}: " if key else "") + message.removeprefix("Value error, ")
+    if kind == "string_pattern_mismatch":
+        return f"{key}: must be {keys[key]}, not {_short(value)}"
+    if kind in ("too_short", "too_long"):
+        return f"{key}: must have{message.partition('should have')[2].replace(' after validation', '')}"
+    text = message.replace("Input should be", "must be")
+    for technical in ("a valid tuple", "a valid list"):
+        text = text.replace(technical, "a list")
+    return f"{key}: {text}, not {_short(value)}"
+
+
+def _hint(key: str, keys: Mapping[str, str]) -> str:
+    section, _, last = key.rpartition(".")
+    beside = _below(section, keys)
+    near = nearest(last, beside, 0.65)
+    if near is not None:
+        return f"did you mean '{section + '.' if section else ''}{near}'?"
+    # The right word in the wrong section, such as generations for ccnn.generations.
+    ends = {other.rpartition(".")[2]: other for other in reversed(list(keys))}
+    elsewhere = nearest(last, list(ends), 0.8)
+    if elsewhere is not None:
+        return f"did you mean '{ends[elsewhere]}'?"
+    return f"the keys {'of ' + section if section else ''} are {', '.join(beside)}".replace("  ", " ")
+
+
+def _below(section: str, keys: Mapping[str, str]) -> list[str]:
+    prefix = f"{section}." if section else ""
+    names = [key.removeprefix(prefix).partition(".")[0] for key in keys if key.startswith(prefix)]
+    return list(dict.fromkeys(names))
+
+
+def _short(value: Any) -> str:
+    text = _yaml(value) if isinstance(value, str | int | float | list | dict | None) else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}…"

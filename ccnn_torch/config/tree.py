@@ -1,0 +1,137 @@
+"""What the configs of runs, identifications, plans and suites share: from a tree of keys to one that is checked."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from ccnn_torch.config.keys import explain
+from ccnn_torch.config.overrides import apply_overrides, relate_paths, resolve_paths
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import dump_yaml, read_yaml
+
+__all__ = [
+    "Columns",
+    "Files",
+    "Names",
+    "Section",
+    "config_from_file",
+    "config_from_keys",
+    "config_from_options",
+    "validated",
+    "written",
+]
+
+Config = TypeVar("Config", bound=BaseModel)
+
+
+def _listed(value: Any) -> Any:
+    """A single name, or several with commas as a shell would have them, as a list."""
+    return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+
+
+Names = Annotated[list[str], BeforeValidator(_listed, json_schema_input_type=str | list[str])]
+
+
+def _files(value: Any) -> Any:
+    if not (isinstance(value, str) or (isinstance(value, list) and value and all(isinstance(v, str) for v in value))):
+        raise ValueError(
+            f"must be a file of records or a list of them, e.g. day1.csv or [day1.csv, day2.csv], not {value}"
+        )
+    return value
+
+
+Files = Annotated[str | list[str], BeforeValidator(_files, json_schema_input_type=str | list[str])]
+"""Records: a file, or several with the same columns."""
+
+Columns = Annotated[
+    dict[str, str],
+    Field(
+        default={},
+        description='columns under other names than ours: header in the file: "name[unit]", or ignore, e.g. '
+        '{A1: "q1[deg]", X: "x[mm]", Note: ignore}',
+    ),
+]
+"""What the headers of records mean."""
+
+
+class Section(BaseModel):
+    """Keys that are all known, with values that do not change and are finite."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def config_from_file(model: type[Config], path: str | Path, overrides: Iterable[str]) -> Config:
+    """Read a config file and put overrides ``key.sub=value`` over it; its name is the file's unless it has one.
+
+    Raises:
+        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
+    """
+    path = Path(path)
+    tree = read_yaml(path)
+    tree.setdefault("name", path.stem)
+    # As the system goes up from a folder that is a link, and as `written` counts.
+    resolve_paths(tree, Path(os.path.realpath(path.parent)))
+    given = apply_overrides(tree, overrides, Path.cwd())
+    return validated(model, tree, str(path), given)
+
+
+def config_from_options(model: type[Config], path: Path | None, overrides: Iterable[str]) -> Config:
+    """As `config_from_file` for commands that need no file: defaults where there is none, and for empty keys.
+
+    Raises:
+        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
+    """
+    tree = {} if path is None else read_yaml(path)
+    if path is not None:
+        resolve_paths(tree, path.absolute().parent)
+    given = apply_overrides(tree, overrides, Path.cwd())
+    filled = {key: value for key, value in tree.items() if value is not None}
+    return validated(model, filled, str(path or "command line"), given)
+
+
+def config_from_keys(model: type[Config], keys: Mapping[str, Any]) -> Config:
+    """A config from keys; relative paths start from the current folder.
+
+    Raises:
+        InputError: keys are wrong: one line that names them all.
+    """
+    tree = dict(keys)
+    resolve_paths(tree, Path.cwd())
+    return validated(model, tree, "config", {})
+
+
+def validated(model: type[Config], tree: Mapping[str, Any], source: str, given: Mapping[str, str]) -> Config:
+    """A config from a tree of keys whose paths are absolute.
+
+    Args:
+        model: what it is to be.
+        tree: keys and sections.
+        source: the config's name, which opens the sentence of an error.
+        given: key -> override, for keys that were set on the command line.
+
+    Raises:
+        InputError: keys are wrong: one line that names them all.
+    """
+    try:
+        return model.model_validate(tree)
+    except ValidationError as error:
+        raise InputError(explain(error, model, source, given)) from None
+
+
+def written(config: BaseModel, folder: Path | None) -> str:
+    """A resolved config as YAML, every key written out.
+
+    Args:
+        config: what to write.
+        folder: where the file will stand; paths are written relative to it, so that both can be moved. Absolute when
+            None.
+    """
+    tree = config.model_dump(mode="json")
+    if folder is not None:
+        relate_paths(tree, folder)
+    return dump_yaml(tree)

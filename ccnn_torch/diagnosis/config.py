@@ -1,0 +1,82 @@
+"""The config of a diagnosis: its keys, defaults and checks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
+
+from ccnn_torch.config.keys import list_keys
+from ccnn_torch.config.noise import Noise
+from ccnn_torch.config.sizes import size
+from ccnn_torch.config.tree import Columns, Files, Names, Section, config_from_options
+from ccnn_torch.errors import InputError
+
+__all__ = ["DiagnoseConfig", "describe_diagnose_keys", "load_diagnose_config"]
+
+_WRONG_NOISE = (
+    "must be a standard deviation of the pose, a size above 0 (10um, or 1e-5 in SI) or one for each coordinate; leave "
+    "it out to have it estimated"
+)
+
+
+def _deviation(value: Any) -> Any:
+    """Noise as it stands in a config: None, a size above 0, or sizes above 0 by name."""
+    sizes = list(value.values()) if isinstance(value, dict) else [value]
+    try:
+        fine = value is None or (sizes and all(0 < size(one, None, "noise") < math.inf for one in sizes))
+    except (TypeError, InputError):
+        fine = False
+    if not fine or (isinstance(value, dict) and not all(isinstance(name, str) for name in value)):
+        raise ValueError(f"{_WRONG_NOISE} (it is {value})")
+    return value
+
+
+class DiagnoseConfig(Section):
+    """What `ccnn diagnose` and `ccnn check` may be told."""
+
+    records: Files | None = Field(
+        default=None,
+        description="CSV (or .xlsx) of the records, or a list of such files; the same as --records",
+    )
+    columns: Columns
+    mechanism: str | None = Field(default=None, description="the nominal machine; the same as --mechanism")
+    out: str | None = Field(default=None, description="folder to write; the same as --out")
+    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    covariates: Names | None = Field(
+        default=None,
+        description="covariate columns by name or pattern; null = time, temperature, load_*, direction*, …",
+    )
+    noise: Annotated[Noise | None, BeforeValidator(_deviation)] = Field(
+        default=None,
+        description="standard deviation of the measured pose, in SI or with a unit (10um), one size for every "
+        "coordinate or by coordinate or unit; null = estimated from the records; one number is metres for lengths and "
+        "radians for angles alike",
+    )
+    effects: Names | None = Field(
+        default=None, description="candidates, by name or path/to/file.py:Name, all for the library; null = all"
+    )
+    gravity: tuple[float, float, float] | None = Field(
+        default=None, description="gravity in the base frame in m/s²; null = down along -z (planar machines: -y)"
+    )
+    network: bool = Field(
+        default=True, description="whether to say what a network on the remainder would still gain; takes seconds"
+    )
+    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of folds and resampling")
+
+
+def load_diagnose_config(path: Path | None, overrides: Iterable[str] = ()) -> DiagnoseConfig:
+    """Read a config file (defaults where there is none) and put overrides ``key.sub=value`` over it.
+
+    Raises:
+        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
+    """
+    return config_from_options(DiagnoseConfig, path, overrides)
+
+
+def describe_diagnose_keys() -> list[tuple[str, str, str]]:
+    """Every key with its default and what it means."""
+    return list(list_keys(DiagnoseConfig))

@@ -1,0 +1,226 @@
+"""From `diagnosis.json` and its arrays to everything a person reads: terminal, Markdown, pictures, one HTML page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from torch import Tensor
+
+from ccnn_torch.diagnosis.page.data import (
+    ARRAYS,
+    LABELS,
+    About,
+    about_of,
+    load_diagnosis_arrays,
+    load_labels,
+    save_diagnosis_arrays,
+    signatures_of,
+    used_rows,
+)
+from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
+from ccnn_torch.diagnosis.page.figure_signature import signature_plot
+from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
+from ccnn_torch.diagnosis.page.localisation import aside_table, next_table, region_table, where_table, write_next_csv
+from ccnn_torch.diagnosis.page.tables import (
+    confusable_table,
+    effect_table,
+    gap_table,
+    order_table,
+    parameter_table,
+    record_table,
+    unseen_table,
+)
+from ccnn_torch.diagnosis.page.tensorboard import write_diagnosis_events
+from ccnn_torch.diagnosis.words import aside_text, network_text, unseen_text, verdict_text
+from ccnn_torch.display import count_text
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.report.figures.style import Plot, inline_svg, save_figure
+from ccnn_torch.report.html import InlineFigure, render, trusted
+from ccnn_torch.report.json_files import read_json
+from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
+
+__all__ = ["NEXT", "Section", "diagnosis_markdown", "print_diagnosis", "write_diagnosis_report"]
+
+Block = Mapping[str, Any]
+Arrays = Mapping[str, NDArray[np.float64]]
+NEXT = "next_measurements.csv"
+_RESULT = "diagnosis.json"
+_MARKDOWN = "diagnosis.md"
+# On a terminal only what may matter; the page and the Markdown list every candidate.
+_LEAST = 0.01
+
+
+class Section(NamedTuple):
+    """A heading of the page with the pictures and the tables that answer it."""
+
+    title: str
+    figures: list[InlineFigure]
+    tables: list[Table]
+
+
+def write_diagnosis_report(
+    folder: str | Path,
+    results: Block | None = None,
+    arrays: Mapping[str, Tensor] | None = None,
+    labels: Block | None = None,
+    *,
+    tensorboard: bool = True,
+) -> Path:
+    """Write `report.html`, `diagnosis.md`, `next_measurements.csv`, `plots/` and the events for TensorBoard.
+
+    The same files give the same report, so it can be written again at any time. A picture or a table whose numbers are
+    not there is left out.
+
+    Args:
+        folder: where to write; with `diagnosis.json`, `diagnosis.safetensors` and `diagnosis_pictures.json`.
+        results: the content of `diagnosis.json`, which is read when None.
+        arrays: what stands behind the pictures (`s` rows in the order of the file, `c` pose channels, float64, SI):
+            `place` `s x 3`, `joints` `s x n`, `residual` and `remainder` `s x c`, `held_out` and `set_aside` `s`, and
+            `signature.EFFECT.x`, `.y` and `.fit` `s`; written to the folder first, or read from it when None.
+        labels: names and units of the signatures' axes, `{EFFECT: {"x": {"name", "unit"}, "y": …}}`, and under `about`
+            what `About` holds; written or read like the arrays.
+        tensorboard: whether to write event files, which cost a second.
+
+    Returns:
+        The path of `report.html`.
+
+    Raises:
+        InputError: a file is not there or damaged.
+    """
+    folder = Path(folder)
+    results = read_json(folder / _RESULT) if results is None else results
+    if arrays is not None:
+        save_diagnosis_arrays(folder, arrays, labels or {})
+    numbers, labels = load_diagnosis_arrays(folder), load_labels(folder)
+    about = about_of(labels)
+    write_whole(folder / _MARKDOWN, diagnosis_markdown(results, about))
+    write_next_csv(folder / NEXT, results, about)
+    plots = _plots(results, numbers, labels, about)
+    figures, pictures = {}, {}
+    for plot in plots:
+        png, svg = save_figure(plot.figure, folder / "plots" / plot.name)
+        text = inline_svg(svg.read_text(encoding="utf-8"), plot.name)
+        figures[plot.name], pictures[plot.name] = InlineFigure(plot.name, plot.caption, text), png
+    page = render(
+        "diagnosis",
+        results={"name": about.name, "notes": _notes(results, about), "versions": {}},
+        facts=_facts(results, numbers, about),
+        verdict=verdict_text(results),
+        failures=[],
+        sections=_sections(results, numbers, about, figures),
+        files=[f for f in (_RESULT, _MARKDOWN, NEXT, ARRAYS, LABELS) if f == _RESULT or (folder / f).is_file()],
+        config="",
+        best=None,
+    )
+    path = folder / "report.html"
+    write_whole(path, page)
+    if tensorboard:
+        write_diagnosis_events(folder / "tensorboard", results, verdict_text(results), pictures)
+    return path
+
+
+def diagnosis_markdown(results: Block, about: About | None = None) -> str:
+    """Verdict and tables as Markdown (`diagnosis.md`)."""
+    about = about or About()
+    tables = [table for section in _sections(results, {}, about, {}) for table in section.tables]
+    return (
+        "\n\n".join([f"# {about.name}", verdict_text(results), *map(markdown_table, tables), *_notes(results, about)])
+        + "\n"
+    )
+
+
+def print_diagnosis(results: Block, console: Console, about: About | None = None, *, verdict: bool = True) -> None:
+    """Show what matters of the tables, and the verdict where it was not shown before, on a terminal."""
+    about = about or About()
+    effects = effect_table(results, least=_LEAST)
+    if effects is not None:
+        # Its sentence is in the verdict; on a terminal the column would break the table in two.
+        kept = [i for i, column in enumerate(effects.columns) if column != "what it is"]
+        columns, *rows = (tuple(line[i] for i in kept) for line in (effects.columns, *effects.rows))
+        effects = Table(effects.title, columns, tuple(rows), effects.note, effects.words)
+    shown = (
+        gap_table(results, about),
+        effects,
+        order_table(results),
+        parameter_table(results, 12),
+        where_table(results, about, telling=True),
+        next_table(results, about),
+        unseen_table(results),
+        record_table(results),
+    )
+    for table in shown:
+        if table is not None:
+            print_table(table, console)
+    aside = results["rows_set_aside"]
+    why = results.get("why_set_aside") or ["for a reason that is not told"] * len(aside)
+    told = aside_text(aside, why, about.lines)
+    for sentence in ([told] if told else []) + _notes(results, about):
+        print_text(sentence, console, "yellow")
+    if order_table(results) is None and (text := network_text(results)):
+        print_text(text, console)
+    if verdict:
+        print_text(verdict_text(results), console, "bold")
+
+
+def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
+    effects = list(results["verdict"]["effects"])
+    plots = (
+        gap_plot(results),
+        probability_plot(results),
+        signature_plot(signatures_of(arrays, labels, effects), arrays, effects),
+        remainder_map(arrays, about),
+        where_plot(results, about),
+    )
+    return [plot for plot in plots if plot is not None]
+
+
+def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str, InlineFigure]) -> list[Section]:
+    """The page in reading order; a section with nothing to show is left out."""
+    planned: list[tuple[str, tuple[str, ...], tuple[Table | None, ...]]] = [
+        ("How large is the gap?", ("gap",), (gap_table(results, about), order_table(results))),
+        ("Which effect?", ("probabilities",), (effect_table(results), parameter_table(results))),
+        ("What gives it away?", ("signatures",), ()),
+        (
+            "Where does the gap lie?",
+            ("map", "where"),
+            (where_table(results, about), region_table(results, about)),
+        ),
+        ("What can these rows not tell apart?", (), (confusable_table(results),)),
+        ("What can these records not show?", (), (unseen_table(results), record_table(results))),
+        ("What should be measured next?", (), (next_table(results, about),)),
+        ("Which rows were set aside?", (), (aside_table(results, arrays, about),)),
+    ]
+    sections = []
+    for title, names, tables in planned:
+        shown = [figures[name] for name in names if name in figures]
+        there = [table for table in tables if table is not None]
+        if shown or there:
+            sections.append(Section(title, trusted(shown), there))
+    return sections
+
+
+def _notes(results: Block, about: About) -> list[str]:
+    """Notes of the diagnosis and of the report, as sentences."""
+    # What has a table of its own needs no sentence.
+    told = {unseen_text(name, why) for name, why in results.get("not_seen", {}).items()}
+    notes = (note for note in (*results["notes"], *about.notes) if note not in told)
+    return [note if note.endswith(".") else f"{note}." for note in notes]
+
+
+def _facts(results: Block, arrays: Arrays, about: About) -> str:
+    facts = [text for text in (about.mechanism, about.records) if text]
+    if "residual" in arrays:
+        held, aside = used_rows(arrays, len(arrays["residual"]))
+        facts.append(count_text(len(held), "row"))
+        if (held | aside).all():
+            facts.append("each judged by a fit to other rows")
+        elif held.any():
+            facts.append(f"{int((held & ~aside).sum())} of them not used for fitting")
+    if results["rows_set_aside"]:
+        facts.append(f"{len(results['rows_set_aside'])} set aside")
+    return " · ".join(facts)

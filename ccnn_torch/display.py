@@ -1,0 +1,112 @@
+"""SI numbers as people read them: the unit that gives 1 to 999, four digits; and text that may be shown at all."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Mapping
+from pathlib import PurePath
+from typing import Any
+
+__all__ = [
+    "count_text",
+    "display_unit",
+    "interval_text",
+    "is_shown",
+    "number_text",
+    "removed_percent",
+    "short_path",
+    "unit_text",
+    "visible",
+]
+
+_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+
+
+def display_unit(unit: str, magnitude: float | None) -> tuple[float, str]:
+    """The prefixed unit for numbers of about this magnitude.
+
+    Args:
+        unit: `m` or `rad`; any other SI unit stays, written as in print.
+        magnitude: a typical number [unit]; 1e-3 and more is shown in mm or mrad, less in µm or µrad, less than 1e-7 in
+            nm or nrad; None where it is not known.
+
+    Returns:
+        Divide a number by the first to have it in the second.
+    """
+    if unit not in ("m", "rad") or magnitude is None:
+        return 1.0, unit_text(unit)
+    wanted = (10.0, 1e-3, 1e-7, 0.0)
+    scale, prefix = next(
+        entry for entry, least in zip(_PREFIXES, wanted, strict=True) if abs(magnitude) >= least or entry[1] == "n"
+    )
+    return scale, prefix + unit
+
+
+def unit_text(unit: str) -> str:
+    """A unit as in print: `rad/N/m` and `rad/(N*m)` are both `rad/(N·m)`."""
+    over, *under = unit.replace("(", "").replace(")", "").replace("*", "·").split("/")
+    return f"{over}/{f'({below})' if '·' in (below := '·'.join(under)) else below}" if under else over
+
+
+def number_text(value: float | None, digits: int = 4) -> str:
+    """A number to so many significant digits; `–` for None. Exponents are written as 1.234e-10."""
+    if value is None:
+        return "–"
+    if value == 0:
+        return "0"
+    if 1e-3 <= abs(value) < 1e5:
+        text = f"{value:#.{digits}g}"
+        return text.rstrip(".")
+    return f"{value:.{digits - 1}e}"
+
+
+def count_text(count: int, word: str) -> str:
+    """`1 repeat`, `30 repeats`."""
+    return f"{count} {word}" if count == 1 else f"{count} {word}s"
+
+
+def visible(text: str, longest: int = 200) -> str:
+    """Text from outside as it may stand on a screen or a page: what a terminal would obey is shown as its code.
+
+    Control characters, marks that turn the direction of writing, and halves of pairs become \\x1b or \\u202e; of a text
+    that is too long the middle is left out, since a sentence has the place at its begin and the remedy at its end.
+    """
+    if len(text) > longest:
+        text = f"{text[: longest * 2 // 3]} … {text[len(text) - longest // 3 :]}"
+    return "".join(c if is_shown(c) else c.encode("unicode_escape").decode() for c in text)
+
+
+def is_shown(character: str) -> bool:
+    """Whether a character is one that a person sees, or a space."""
+    return character.isprintable() or unicodedata.category(character) == "Zs"
+
+
+def short_path(path: str) -> str:
+    """A file's folder and name: enough to know it by, and nothing of the machine on which a page was made."""
+    return "/".join(PurePath(path).parts[-2:])
+
+
+def interval_text(spread: Mapping[str, Any] | None, scale: float = 1.0, digits: int = 4) -> str:
+    """A spread as `median [low, high]`, or as one number when all repeats agree; says how many repeats have none.
+
+    Args:
+        spread: a block of `results.json`, or None.
+        scale: the unit shown [SI].
+        digits: significant digits of the median; the interval has one less.
+    """
+    if spread is None or spread["median"] is None:
+        return "–"
+    text = number_text(spread["median"] / scale, digits)
+    values = spread["values"]
+    if spread["low"] != spread["high"]:
+        low, high = (number_text(spread[k] / scale, digits - 1) for k in ("low", "high"))
+        text += f" [{low}, {high}]"
+    there = sum(v is not None for v in values)
+    return text if there == len(values) else f"{text} ({there} of {len(values)})"
+
+
+def removed_percent(before: Mapping[str, Any], after: Mapping[str, Any]) -> float | None:
+    """Share of an error that was removed, from the medians [percent]; None where the error before is unknown or 0."""
+    if not before["median"] or after["median"] is None:
+        return None
+    return 100.0 * (1.0 - float(after["median"]) / float(before["median"]))

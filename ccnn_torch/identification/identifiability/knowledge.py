@@ -1,0 +1,158 @@
+"""What the measured rows tell of each parameter: standard errors, correlation, and what cannot be known from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from scipy.special import ndtri, stdtrit
+from torch import Tensor
+
+from ccnn_torch.coordinates import Parameter
+from ccnn_torch.errors import InputError
+from ccnn_torch.identification.identifiability.combinations import TAKES_PART, combinations_in_words
+from ccnn_torch.identification.problems.linear import OPEN, WeightedRows
+from ccnn_torch.identification.problems.problem import Problem
+
+__all__ = ["Knowledge", "require_identifiable", "what_is_known"]
+
+# Singular values below this share of the largest are rounding.
+_RANK = 1e-9
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """Of `r` machines and `k` parameters.
+
+    Attributes:
+        parameters: the free ones.
+        sd: standard errors, `r x k` [SI], priors included; inf where the rows (and priors) leave a parameter open.
+        correlation: of the estimates, `r x k x k` [1]; NaN in the rows and columns of parameters left open.
+        identifiable: `r x k`, bool: whether the rows alone determine the parameter, whatever the priors.
+        singular_values: of the Jacobian with residuals in their unit and parameters in plausible errors, falling,
+            without priors, `r x k` [1].
+        directions: its right singular vectors, one a row, `r x k x k`, in plausible errors; those from `rank` on
+            cannot be known.
+        rank: `r`.
+        combinations: sentences that say what of the parameters left open is known, of the machine of least rank; empty
+            where every parameter is identifiable.
+        noise: standard deviation of the residuals that the fit leaves, `r`, in their unit: about 1 where the noise was
+            given rightly; inf where no equation is to spare.
+        freedom: equations less parameters that they determine, `r` [1].
+        noise_known: whether the standard errors use the noise given (1) or that of the fit.
+    """
+
+    parameters: tuple[Parameter, ...]
+    sd: Tensor
+    correlation: Tensor
+    identifiable: Tensor
+    singular_values: Tensor
+    directions: Tensor
+    rank: Tensor
+    combinations: tuple[str, ...]
+    noise: Tensor
+    freedom: Tensor
+    noise_known: bool
+
+    def half_width(self, level: float = 0.95) -> Tensor:
+        """Half the interval that holds the truth with this probability, `r x k` [SI]; by Student's t where the noise
+        is that of the fit."""
+        tail = (1 + level) / 2
+        if self.noise_known:
+            return self.sd * float(ndtri(tail))
+        factor = stdtrit(self.freedom.clamp_min(1e-9).cpu().numpy(), tail)
+        return self.sd * torch.as_tensor(factor, dtype=self.sd.dtype, device=self.sd.device)[:, None]
+
+
+def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
+    """Standard errors and identifiability at some values, from the linearised problem (Gauss-Markov, Cramér-Rao).
+
+    At the true values with the true noise the standard errors are the Cramér-Rao bound. No pseudoinverse: along a
+    direction that the rows do not see the uncertainty is infinite, and so is that of every parameter that takes part
+    in it. A direction whose standard error would be above 100 plausible errors counts as not seen.
+    A parameter takes part in a direction if one plausible error along it moves the parameter by more than a hundredth
+    of its own; one that is moved by less keeps a finite error, with that movement in it.
+
+    Args:
+        problem: for a robust fit, that of `robust.reweighted`; its errors are then approximate, `bootstrap` tells.
+        values: `r x k` or `k` [SI].
+
+    Raises:
+        InputError: the residual is not finite at these values.
+    """
+    rows = WeightedRows(problem)
+    values = values.expand_as(problem.start)
+    everyone = torch.arange(len(values), device=values.device)
+    residual, slope = (part[:, 0] for part in rows.jacobian(values[:, None], everyone))
+    lost = torch.nonzero(~(torch.isfinite(residual).all(-1) & torch.isfinite(slope).all(-1).all(-1)))
+    if len(lost):
+        raise InputError(f"machine {int(lost[0]) + 1}: the residual is not finite at the values given")
+    k = values.shape[-1]
+    pull = torch.diag(rows.pull.sqrt()).expand(len(values), k, k)
+    _, strength, basis = torch.linalg.svd(_tall(torch.cat([slope, pull], dim=-2)), full_matrices=False)
+    freedom, noise = _noise(residual, slope, rows.equations, strength, basis)
+    unit = torch.ones_like(noise) if problem.noise_known else noise
+    # Without an equation to spare nobody knows the noise: then only rounding says what is not seen.
+    least = torch.where(torch.isfinite(unit), unit / OPEN, 0.0)[:, None]
+
+    _, singular, directions = torch.linalg.svd(_tall(slope), full_matrices=False)
+    seen = singular > torch.maximum(_RANK * singular[:, :1], least)
+    hidden = torch.where(seen[..., None], 0.0, directions)
+    identifiable = hidden.square().sum(-2) <= TAKES_PART**2
+    open_ = strength <= torch.maximum(_RANK * strength[:, :1], least)
+    dragged = torch.where(open_[..., None], basis, 0.0).square().sum(-2)
+    left_open = dragged > TAKES_PART**2
+    spread = torch.where(open_, 0.0, 1 / strength.clamp_min(1e-300))[..., None] * basis
+    covariance = spread.mT @ spread
+    root = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    correlation = covariance / (root[..., None] * root[..., None, :]).clamp_min(1e-300)
+    either = left_open[..., None] | left_open[..., None, :]
+    worst = int(seen.sum(-1).argmin())
+    return Knowledge(
+        parameters=problem.parameters,
+        sd=torch.where(left_open, torch.inf, ((unit[:, None] * root).square() + dragged).sqrt() * problem.scale),
+        correlation=torch.where(either, torch.nan, correlation.clamp(-1, 1)),
+        identifiable=identifiable,
+        singular_values=singular,
+        directions=directions,
+        rank=seen.sum(-1),
+        combinations=combinations_in_words(problem.parameters, hidden[worst], problem.scale),
+        noise=noise,
+        freedom=freedom,
+        noise_known=problem.noise_known,
+    )
+
+
+def _noise(
+    residual: Tensor, slope: Tensor, equations: Tensor, strength: Tensor, basis: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Equations to spare and the standard deviation of the residual, `r` each; strength and basis with the priors."""
+    inverse = torch.where(strength > _RANK * strength[:, :1], 1 / strength.clamp_min(1e-300), 0.0)
+    determined = (slope @ (inverse[..., None] * basis).mT).square().sum((-2, -1))
+    # Whole numbers without priors; a remainder of rounding is no equation to spare.
+    freedom = equations - determined
+    freedom = torch.where(freedom > 1e-6, freedom, 0.0)
+    noise = torch.where(freedom > 0, (residual.square().sum(-1) / freedom.clamp_min(1e-6)).sqrt(), torch.inf)
+    return freedom, noise
+
+
+def require_identifiable(knowledge: Knowledge) -> None:
+    """For what needs every parameter.
+
+    Raises:
+        InputError: the identification matrix is singular; the sentence says what of the parameters is known.
+    """
+    if knowledge.combinations:
+        k = len(knowledge.parameters)
+        raise InputError(
+            f"the identification matrix is singular (rank {int(knowledge.rank.min())} of {k}): "
+            f"{'; '.join(knowledge.combinations)}; fix or tie parameters, give a prior, or measure other poses"
+        )
+
+
+def _tall(matrix: Tensor) -> Tensor:
+    """With rows of zeros until there are as many as columns, so that every direction gets a singular value."""
+    missing = matrix.shape[-1] - matrix.shape[-2]
+    if missing <= 0:
+        return matrix
+    return torch.cat([matrix, matrix.new_zeros(*matrix.shape[:-2], missing, matrix.shape[-1])], dim=-2)

@@ -1,0 +1,182 @@
+"""The job in memory: rows, methods, figures; then what is written."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.config.held_out import Given
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.identification import Fit, Progress
+from ccnn_torch.identification.config import IdentifyConfig, base_method, dump_identify_config
+from ccnn_torch.identification.constrained.identify import identify_by_constraint
+from ccnn_torch.identification.identifiability.bootstrap import bootstrap
+from ccnn_torch.identification.measured.measured import Measured
+from ccnn_torch.identification.measured.nominal import nominal_machine
+from ccnn_torch.identification.measured.records import from_records
+from ccnn_torch.identification.result import assemble
+from ccnn_torch.identification.simulated.counts import count_study
+from ccnn_torch.identification.simulated.machines import simulate
+from ccnn_torch.identification.solve import (
+    QUICK,
+    Outcome,
+    frames_first,
+    free_values,
+    is_apart,
+    pieces_of,
+    run_method,
+    select,
+    solver_of,
+)
+from ccnn_torch.identification.store import load_outcome, save_outcome
+from ccnn_torch.identification.transfer import read_elsewhere, transferred
+from ccnn_torch.mechanisms import Framed, Mechanism
+from ccnn_torch.records import Records, write_table
+from ccnn_torch.records.sources import read_source
+from ccnn_torch.run_folder.resume import facts_of, refuse_changes
+
+__all__ = ["Identification", "Watch", "identify"]
+
+Watch = Callable[[str], Progress]
+"""Given a label, somewhere to report the share that is done."""
+
+
+@dataclass
+class Identification:
+    """What an identification found.
+
+    Attributes:
+        measured: mechanism and rows.
+        outcomes: by method; the first is the result.
+        results: the content of `identified.json`.
+        arrays: tensors behind the pictures, by name.
+    """
+
+    config: IdentifyConfig
+    measured: Measured
+    outcomes: Mapping[str, Outcome]
+    results: dict[str, Any]
+    arrays: dict[str, Tensor]
+    given: Given | None = None
+
+    def mechanism(self, machine: int = 0, method: str | None = None) -> Mechanism:
+        """The mechanism with the identified parameters of one machine; by default the first method's."""
+        outcome = self.outcomes[method or next(iter(self.outcomes))]
+        return self.measured.mechanism.with_nominal(outcome.values[machine])
+
+    def save(self, folder: str | Path) -> None:
+        """Write what `ccnn identify` writes into a folder, which is made; a DataFrame's rows as `records.csv`.
+
+        Raises:
+            InputError: a class of a mechanism stands in no file, so that nobody could build it again.
+        """
+        from ccnn_torch.identification.outputs import write_outputs
+
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        config = self.config
+        if self.given is not None and not isinstance(self.given, Records):
+            # What Python gave has no file that the config could name.
+            table = read_source(self.given)
+            write_table(folder / "records.csv", {table.header(name): table.raw(name) for name in table.names})
+            config = config.model_copy(update={"records": str(folder / "records.csv")})
+        write_whole(folder / "config.yaml", dump_identify_config(config, folder))
+        write_outputs(self, folder)
+
+    def nominal(self) -> dict[str, float]:
+        """What the parameters were before, by name [SI]: nominal, or with the frames fitted."""
+        names = [p.name for p in self.measured.mechanism.geometry]
+        return dict(zip(names, self.measured.start[0].tolist(), strict=True))
+
+
+def prepare(config: IdentifyConfig, given: Given | None = None) -> tuple[Mechanism, Measured]:
+    """Mechanism and rows of a config; the rows of `given` where Python has them.
+
+    Raises:
+        InputError: the mechanism or the data cannot be used.
+    """
+    mechanism = nominal_machine(config)
+    if config.frame.base or config.frame.tool:
+        mechanism = Framed(mechanism, base=config.frame.base, tool=config.frame.tool)
+    measured = from_records(config, mechanism, given) if config.records is not None else simulate(config, mechanism)
+    return mechanism, frames_first(measured, config)
+
+
+def identify(
+    config: IdentifyConfig, store: Path | None = None, watch: Watch | None = None, given: Given | None = None
+) -> Identification:
+    """Identify the parameters of a config by every method.
+
+    Args:
+        store: folder beside config.yaml in which each method's outcome is kept, and from which finished ones are
+            taken.
+        watch: where progress goes.
+        given: records that Python has, in place of the config's file.
+
+    Raises:
+        InputError: the config, the mechanism or the data cannot be used; one sentence.
+    """
+    if config.constraint is not None:
+        progress = None if watch is None else watch("lm")
+        return Identification(config, *identify_by_constraint(config, progress, given), given=given)
+    mechanism, measured = prepare(config, given)
+    elsewhere = read_elsewhere(config, mechanism)
+    for method in config.methods:  # what cannot be solved is said before anything takes minutes
+        solver_of(method, config)
+        pieces_of(measured, config, is_apart(method, config), torch.arange(1))
+    facts = facts_of(config, _fingerprint(measured))
+    if store is not None:
+        refuse_changes(sorted(store.glob("*.safetensors")), facts, store.parent / "config.yaml")
+    outcomes: dict[str, Outcome] = {}
+    for method in config.methods:
+        path = None if store is None else store / f"{method}.safetensors"
+        if path is not None and path.is_file():
+            outcomes[method] = load_outcome(path)
+            continue
+        outcomes[method] = run_method(method, measured, config, None if watch is None else watch(method))
+        if path is not None:
+            save_outcome(path, outcomes[method], facts)
+    counts = count_study(config, mechanism)
+    done = assemble(config, measured, outcomes, counts, _bootstrap(config, measured, outcomes))
+    if elsewhere is not None:
+        done.results["transfer"] = transferred(config, elsewhere, next(iter(outcomes.values())).values[0])
+    return Identification(config, measured, outcomes, done.results, done.arrays, given)
+
+
+def _bootstrap(config: IdentifyConfig, measured: Measured, outcomes: dict[str, Outcome]) -> Tensor | None:
+    """Standard deviations of the first machine's parameters over resampled fits, `k` [SI]; None where not asked for.
+
+    Raises:
+        InputError: of a slow method: hundreds of its fits would take hours.
+    """
+    if config.bootstrap == 0:
+        return None
+    method = config.methods[0]
+    if base_method(method) not in QUICK:
+        raise InputError(f"bootstrap: {method} takes too long to be run again and again; put lm first in methods")
+    selection, outcome = select(measured, config), outcomes[method]
+    one, solver = torch.arange(1), solver_of(method, config)
+    names = [p.name for p in selection.parameters]
+    sd = torch.full((len(names),), torch.nan, dtype=torch.float64)
+    found = free_values(selection, outcome.values[:1])
+    for number, piece in enumerate(pieces_of(measured, config, is_apart(method, config), one)):
+        at = torch.tensor([names.index(p.name) for p in piece.problem.parameters])
+        fit = Fit(found[:, at], torch.zeros(1), outcome.converged[:1], 0, "")
+        sd[at] = bootstrap(piece.problem, fit, solver, config.bootstrap, config.seed + number).sd()[0]
+    return sd
+
+
+def _fingerprint(measured: Measured) -> str:
+    """SHA-256 of the rows and of where the search begins."""
+    digest = hashlib.sha256()
+    rows = [measured.rows, measured.test, *measured.leg_rows.values()]
+    for table in (measured.start, *(t for r in rows for t in (r.joints, r.observed))):
+        digest.update(table.contiguous().numpy().tobytes())
+    return digest.hexdigest()

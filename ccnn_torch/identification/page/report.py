@@ -1,0 +1,78 @@
+"""From an identification's folder to its pictures and its HTML page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+from safetensors.torch import save
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.identification.page.tables import identified_tables, identified_verdict, unknown_sentences
+from ccnn_torch.report.html import InlineFigure, page_text
+from ccnn_torch.report.json_files import read_json
+
+__all__ = ["ARRAYS", "save_identified_arrays", "write_identified_report"]
+
+ARRAYS = "arrays.safetensors"
+_LINKED = (
+    "identified.json",
+    "identified.csv",
+    "identified.md",
+    "identified.yaml",
+    "identified_dh.yaml",
+    "identified.urdf",
+    "config.yaml",
+)
+
+
+def save_identified_arrays(folder: Path, arrays: Mapping[str, Tensor]) -> None:
+    """Write the tensors behind the pictures."""
+    write_whole(folder / ARRAYS, save({name: value.contiguous() for name, value in arrays.items()}))
+
+
+def write_identified_report(folder: str | Path, results: Mapping[str, Any] | None = None) -> Path:
+    """Write `plots/` and `report.html`; the same files give the same report, so it can be written again at any time.
+
+    Args:
+        folder: with arrays, and `identified.json`, which is read when `results` is None.
+
+    Raises:
+        InputError: a file is not there or damaged.
+    """
+    # Loads matplotlib, which only a report waits for.
+    from ccnn_torch.identification.page.figures import identified_plots
+    from ccnn_torch.report.figures.style import inline_svg, save_figure
+
+    folder = Path(folder)
+    results = read_json(folder / "identified.json") if results is None else results
+    try:
+        arrays: dict[str, NDArray[np.float64]] = load_file(folder / ARRAYS)
+    except (OSError, SafetensorError):
+        raise InputError(f"{folder / ARRAYS}: is not there or damaged; identify again into another folder") from None
+    figures = []
+    for plot in identified_plots(results, arrays):
+        _, svg = save_figure(plot.figure, folder / "plots" / plot.name)
+        figures.append(InlineFigure(plot.name, plot.caption, inline_svg(svg.read_text(encoding="utf-8"), plot.name)))
+    config = folder / "config.yaml"
+    page = page_text(
+        "identified",
+        results,
+        identified_verdict(results),
+        identified_tables(results),
+        unknown_sentences(results),
+        figures,
+        config.read_text(encoding="utf-8") if config.is_file() else "",
+        # The result itself is written last, behind this page.
+        [name for name in _LINKED if name == "identified.json" or (folder / name).is_file()],
+    )
+    path = folder / "report.html"
+    write_whole(path, page)
+    return path

@@ -1,0 +1,134 @@
+"""Where simulated machines are measured: poses inside the workspace, or joints of a serial arm, evenly or at random."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.config.sizes import Size, size
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
+
+__all__ = ["Places"]
+
+# Rounds of drawing before a box counts as out of reach.
+_ROUNDS = 50
+
+
+class Places:
+    """A box of places, and what machines with given parameters do there.
+
+    A place is a pose, `p` [SI]; of a serial arm, whose poses are hard to reach with all joints inside their limits, it
+    is a joint vector, `n` [SI]; of a mechanism seen from a measuring frame it is a pose of the mechanism itself.
+    """
+
+    def __init__(self, mechanism: Mechanism, truth: Tensor, box: Mapping[str, tuple[Size, Size]], circle: bool) -> None:
+        """Set the box.
+
+        Args:
+            mechanism: with its nominal parameters.
+            truth: parameters of the machines, `r x K` [SI]; a place is one that all of them reach.
+            box: ranges in place of the mechanism's own, by coordinate.
+            circle: only poses inside the maximal inscribed circle.
+
+        Raises:
+            InputError: a range names no coordinate or is empty, or the mechanism has no inscribed circle.
+        """
+        self.mechanism, self.truth = mechanism, truth
+        own = mechanism.mechanism if isinstance(mechanism, Framed) else mechanism
+        self._own = own
+        coordinates = own.joints if isinstance(own, SerialArm) else own.pose
+        edges = own.limits.T if isinstance(own, SerialArm) else torch.stack(own.bounds)
+        self.low, self.high = (edge.clone() for edge in edges)
+        names = [c.name for c in coordinates]
+        self.circle: tuple[Tensor, Tensor] | None = None
+        if circle:
+            self.circle = self._inscribed(own)
+            centre, radius = self.circle
+            self.low, self.high = centre - radius, centre + radius
+        for name, pair in box.items():
+            if name not in names:
+                raise InputError(f"simulate.box.{name}: there is no such coordinate; there are {', '.join(names)}")
+            i = names.index(name)
+            low, high = (size(v, coordinates[i].unit, f"simulate.box.{name}") for v in pair)
+            if not low < high:
+                raise InputError(f"simulate.box.{name}: must be [low, high] with low below high, got {list(pair)}")
+            self.low[i], self.high[i] = low, high
+
+    @staticmethod
+    def _inscribed(mechanism: Mechanism) -> tuple[Tensor, Tensor]:
+        find: Any = getattr(mechanism, "maximal_inscribed_circle", None)
+        if find is None:
+            raise InputError(
+                f"simulate.circle: {mechanism.name} has no maximal inscribed circle; give the range as simulate.box"
+            )
+        centre, radius = find()
+        return torch.as_tensor(centre, dtype=torch.float64), torch.as_tensor(radius, dtype=torch.float64)
+
+    def taken(self, place: Tensor) -> tuple[Tensor, Tensor]:
+        """Joints `r x s x n` and pose `r x s x p` of every machine at places `s x .` or `r x s x .`."""
+        parameters = self.truth[:, None]
+        if self._own is not self.mechanism or isinstance(self._own, SerialArm):
+            joints, near = self.nominal(place)
+            joints = joints.expand(len(self.truth), *joints.shape[-2:])
+            return joints, self.mechanism.forward_kinematics(joints, parameters, near)
+        pose = place.expand(len(self.truth), *place.shape[-2:])
+        near = self.mechanism.solve_inverse(place)
+        return self.mechanism.solve_inverse(pose, parameters, near.expand(len(self.truth), *near.shape[-2:])), pose
+
+    def nominal(self, place: Tensor) -> tuple[Tensor, Tensor]:
+        """Joints and pose of the nominal machine at places `... x .`."""
+        if isinstance(self._own, SerialArm):
+            return place, self.mechanism.forward_kinematics(place)
+        joints = self._own.solve_inverse(place)
+        return joints, place if self._own is self.mechanism else self.mechanism.forward_kinematics(joints)
+
+    def usable(self, place: Tensor) -> Tensor:
+        """Which places `s x .` every machine reaches, inside the circle where there is one; `s`, bool."""
+        inside = torch.ones(len(place), dtype=torch.bool)
+        if self.circle is not None:
+            centre, radius = self.circle
+            inside = torch.linalg.vector_norm(place - centre, dim=-1) <= radius
+        if not isinstance(self._own, SerialArm):
+            inside = inside & self._own.reachable(place)
+        joints, pose = self.taken(place)
+        usable: Tensor = inside & torch.isfinite(joints).all(-1).all(0) & torch.isfinite(pose).all(-1).all(0)
+        return usable
+
+    def even(self, count: int) -> Tensor:
+        """Places of low discrepancy, `count x .`: a Halton sequence in the box, without what is out of reach."""
+        # Only here: scipy.stats takes half a second to load.
+        from scipy.stats import qmc
+
+        sequence = qmc.Halton(len(self.low), scramble=False)
+        sequence.fast_forward(1)  # its first point is a corner
+        return self._filled(count, lambda number: torch.from_numpy(sequence.random(number)))
+
+    def random(self, count: int, generator: torch.Generator) -> Tensor:
+        """Uniform places, `count x .`."""
+        width = len(self.low)
+        return self._filled(count, lambda number: torch.rand(number, width, generator=generator, dtype=torch.float64))
+
+    def map(self, across: int) -> Tensor:
+        """A square grid over the first two coordinates, the others in the middle; `m x .`, in reach only."""
+        middle = (self.low + self.high) / 2
+        lines = [torch.linspace(float(self.low[i]), float(self.high[i]), across, dtype=torch.float64) for i in (0, 1)]
+        grid: Tensor = torch.cartesian_prod(*lines)
+        place: Tensor = middle.expand(len(grid), -1).clone()
+        place[:, :2] = grid
+        return place[self.usable(place)]
+
+    def _filled(self, count: int, draw: Any) -> Tensor:
+        found: list[Tensor] = []
+        for _ in range(_ROUNDS):
+            place = self.low + (self.high - self.low) * draw(2 * count)
+            found.append(place[self.usable(place)])
+            if sum(map(len, found)) >= count:
+                return torch.cat(found)[:count]
+        raise InputError(
+            f"simulate: hardly any pose of the box of {self.mechanism.name} can be reached by all machines; give a "
+            "smaller range in simulate.box, or smaller simulate.errors"
+        )

@@ -1,0 +1,271 @@
+"""One method on the rows of an identification: joint or leg by leg, on all machines side by side."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.config.sizes import prior_sizes
+from ccnn_torch.errors import InputError
+from ccnn_torch.identification import (
+    Fit,
+    Knowledge,
+    ParameterChoice,
+    Problem,
+    Progress,
+    Solver,
+    forward_problem,
+    inverse_problem,
+    split_by_leg,
+    what_is_known,
+)
+from ccnn_torch.identification.config import PER_LEG, IdentifyConfig, base_method
+from ccnn_torch.identification.measured.measured import Measured, Rows
+from ccnn_torch.identification.problems.parameters import Selection, select_parameters
+from ccnn_torch.identification.solvers.registry import get_solver
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
+
+__all__ = [
+    "QUICK",
+    "Outcome",
+    "Piece",
+    "choice_of",
+    "frames_first",
+    "free_values",
+    "is_apart",
+    "knowledge_of",
+    "machines_of",
+    "pieces_of",
+    "run_method",
+    "select",
+    "solver_of",
+]
+
+QUICK = ("lm", "tikhonov")
+"""The others are global searches, which take minutes where these take a blink."""
+# The noise of a row is carried over at the start, then at what was found; a third time changes nothing that counts.
+_ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A problem that is solved by itself: the whole, or one leg's; `leg` is None for the whole."""
+
+    problem: Problem
+    leg: int | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one method found.
+
+    Attributes:
+        machines: which machines it was run on, `r`, int64.
+        values: the whole geometry of each, `r x K` [SI].
+        converged: `r`, bool.
+        evaluations: residuals of all rows of one machine computed.
+        seconds: wall time.
+        message: a sentence where not all converged; else empty.
+    """
+
+    machines: Tensor
+    values: Tensor
+    converged: Tensor
+    evaluations: int
+    seconds: float
+    message: str
+
+
+def choice_of(config: IdentifyConfig, mechanism: Mechanism) -> ParameterChoice:
+    """The parameters of a config; its priors in SI.
+
+    Raises:
+        InputError: a prior is no size of its parameter, or fits none.
+    """
+    about = config.parameters
+    prior = prior_sizes(about.prior, mechanism.geometry, "parameters.prior")
+    return ParameterChoice(free=about.free, fixed=about.fixed, tied=about.tied, prior=prior)
+
+
+def select(measured: Measured, config: IdentifyConfig) -> Selection:
+    """The free parameters of all machines."""
+    return select_parameters(measured.mechanism.geometry, choice_of(config, measured.mechanism), measured.start)
+
+
+def pieces_of(
+    measured: Measured, config: IdentifyConfig, apart: bool, machines: Tensor, near: Tensor | None = None
+) -> list[Piece]:
+    """The problems that a method solves.
+
+    Args:
+        apart: one for each leg, from that leg's rows where it has its own; else one for all.
+        machines: which machines.
+        near: geometry at which the noise of the pose is carried over to the residual, `r x K` [SI]; where the search
+            begins when None. Near singular poses the difference matters.
+
+    Raises:
+        InputError: the rows do not fit the mechanism or are too few, or legs are not apart.
+    """
+    if not apart:
+        return [Piece(_problem(measured, config, measured.rows.of(machines), machines, False, near))]
+    whole = split_by_leg(_problem(measured, config, measured.rows.of(machines), machines, True, near))
+    legs = [next(p.leg for p in part.parameters if p.leg is not None) for part in whole]
+    if not measured.leg_rows:
+        return [Piece(part, leg) for part, leg in zip(whole, legs, strict=True)]
+    own = []
+    for i, leg in enumerate(legs):
+        rows = measured.leg_rows[leg].of(machines)
+        own.append(Piece(split_by_leg(_problem(measured, config, rows, machines, True, near))[i], leg))
+    return own
+
+
+def _problem(
+    measured: Measured, config: IdentifyConfig, rows: Rows, machines: Tensor, per_leg: bool, near: Tensor | None
+) -> Problem:
+    start = measured.start[machines]
+    problem = _problem_at(measured, config, rows, start if near is None else near, per_leg)
+    return replace(problem, start=select(measured, config).start[machines])
+
+
+def _problem_at(measured: Measured, config: IdentifyConfig, rows: Rows, start: Tensor, per_leg: bool) -> Problem:
+    forward = config.residual == "forward" or (
+        config.residual == "auto"
+        and (isinstance(measured.mechanism, SerialArm) or config.frame.base or config.frame.tool)
+    )
+    if not forward:
+        return inverse_problem(
+            measured.view,
+            rows.joints,
+            rows.observed,
+            choice=choice_of(config, measured.mechanism),
+            pose_noise=measured.pose_noise,
+            joint_noise=measured.joint_noise,
+            start=start,
+            per_leg=per_leg,
+        )
+    if per_leg:
+        raise InputError(
+            "methods: a pose depends on all legs, so legs are identified apart only by their joints; write "
+            "residual=inverse, or remove _per_leg"
+        )
+    return forward_problem(
+        measured.view,
+        rows.joints,
+        rows.observed,
+        choice=choice_of(config, measured.mechanism),
+        pose_noise=measured.pose_noise,
+        joint_noise=measured.joint_noise,
+        rotation_weight=config.rotation_weight,
+        start=start,
+    )
+
+
+def frames_first(measured: Measured, config: IdentifyConfig) -> Measured:
+    """The rows with those frames fitted that no maker can know: the search and "before" begin from there."""
+    if not (config.frame.base or config.frame.tool):
+        return measured
+    assert isinstance(measured.mechanism, Framed)
+    closed = measured.mechanism.fitted_frames(measured.rows.joints, measured.view.frame(measured.rows.observed))
+    prefixes = tuple(f"{part}_" for part, free in (("base", config.frame.base), ("tool", config.frame.tool)) if free)
+    names = tuple(p.name for p in measured.mechanism.geometry if p.name.startswith(prefixes))
+    choice = ParameterChoice(free=names)
+    problem = forward_problem(
+        measured.view,
+        measured.rows.joints,
+        measured.rows.observed,
+        choice=choice,
+        pose_noise=measured.pose_noise,
+        joint_noise=measured.joint_noise,
+        rotation_weight=config.rotation_weight,
+        start=closed,
+    )
+    found = get_solver("lm")(problem, config.seed)
+    start = select_parameters(measured.mechanism.geometry, choice, closed).full(found.values)
+    return replace(measured, start=start, unknown_frame=names)
+
+
+def is_apart(method: str, config: IdentifyConfig) -> bool:
+    """Whether a method identifies leg by leg."""
+    return config.per_leg or method.endswith(PER_LEG)
+
+
+def machines_of(method: str, measured: Measured, config: IdentifyConfig) -> Tensor:
+    """Which machines a method is run on: slow ones on the first few only."""
+    count = measured.machines
+    return torch.arange(min(count, config.hga_machines) if base_method(method) not in QUICK else count)
+
+
+def solver_of(method: str, config: IdentifyConfig) -> Solver:
+    """The solver of a method with its settings.
+
+    Raises:
+        InputError: a setting that it does not have.
+    """
+    settings = dict(config.settings.get(base_method(method), {}))
+    if base_method(method) == "lm":
+        settings = {"starts": config.starts, "loss": config.robust or "squared"} | settings
+    return get_solver(base_method(method), **settings)
+
+
+def run_method(method: str, measured: Measured, config: IdentifyConfig, progress: Progress | None = None) -> Outcome:
+    """Run a method.
+
+    Raises:
+        InputError: see `pieces_of`, `solver_of`.
+    """
+    machines = machines_of(method, measured, config)
+    solver, selection = solver_of(method, config), select(measured, config)
+    begun = time.perf_counter()
+    fits: list[Fit] = []
+    values: Tensor | None = None
+    rounds = _ROUNDS if base_method(method) in QUICK and measured.pose_noise is not None else 1
+    for _ in range(rounds):
+        pieces = pieces_of(measured, config, is_apart(method, config), machines, values)
+        fits = []
+        for i, piece in enumerate(pieces):
+            part = None if progress is None else _part(progress, i, len(pieces))
+            fits.append(solver(piece.problem, config.seed + i, part))
+        values = whole_values(selection, pieces, [fit.values for fit in fits], machines)
+    assert values is not None
+    seconds = time.perf_counter() - begun
+    said = [fit.message for fit in fits if fit.message]
+    return Outcome(
+        machines,
+        values,
+        torch.stack([fit.converged for fit in fits]).all(0),
+        sum(fit.evaluations for fit in fits),
+        seconds,
+        said[0] if said else "",
+    )
+
+
+def whole_values(selection: Selection, pieces: list[Piece], values: list[Tensor], machines: Tensor) -> Tensor:
+    """The whole geometry `r x K` from the values `r x k` of each piece's free parameters."""
+    names = [p.name for p in selection.parameters]
+    free = selection.start[machines].clone()
+    for piece, found in zip(pieces, values, strict=True):
+        free[:, [names.index(p.name) for p in piece.problem.parameters]] = found
+    return free @ selection.spread + selection.fixed[machines]
+
+
+def free_values(selection: Selection, whole: Tensor) -> Tensor:
+    """Values of the free parameters, `r x k`, out of the whole geometry `r x K`."""
+    first = selection.spread.argmax(-1)
+    return whole[:, first]
+
+
+def knowledge_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> list[Knowledge]:
+    """What is known of each piece's parameters at a geometry `r x K`."""
+    names = [p.name for p in selection.parameters]
+    free = free_values(selection, whole)
+    return [
+        what_is_known(piece.problem, free[:, [names.index(p.name) for p in piece.problem.parameters]])
+        for piece in pieces
+    ]
+
+
+def _part(progress: Progress, index: int, count: int) -> Progress:
+    return lambda done: progress((index + done) / count)

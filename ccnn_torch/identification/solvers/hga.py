@@ -1,0 +1,198 @@
+"""Hybrid genetic algorithm: a genetic algorithm finds the hill, sequential quadratic programming climbs it.
+
+Paper 001, section IV. The genetic algorithm is real-coded and runs on the individuals of all machines at once; what the
+paper leaves open is ours: tournament selection, extended line recombination (Mühlenbein and Schlierkamp-Voosen 1993),
+and the mutation of the breeder genetic algorithm (there), whose steps have all sizes from a tenth of the box downwards,
+so that it needs no schedule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from ccnn_torch.evolution.operators import tournament
+from ccnn_torch.evolution.random import uniform_parts
+from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
+from ccnn_torch.identification.solvers.lockstep import Array, run_side_by_side
+from ccnn_torch.identification.solvers.objective import Objective, make_objective
+
+__all__ = ["HybridGenetic", "polish"]
+
+# Streams of random numbers: the first population and the generations.
+_FIRST, _BREED = 0, 1
+# Line recombination reaches so far beyond either parent, as a share of their distance.
+_BEYOND = 0.25
+# The smallest mutation step is the largest times 2^-20.
+_OCTAVES = 20.0
+# Share of the work that the genetic algorithm is, for the progress.
+_GENETIC_SHARE = 0.9
+# Rounds of quadratic programming, and the share of the cost below which the gain of one ends them.
+_ROUNDS, _GAIN = 20, 1e-9
+# Steps by the gradient after them.
+_LAST = 2
+
+
+@dataclass(frozen=True)
+class HybridGenetic:
+    """Genetic algorithm, then SQP from its best individual (SciPy's SLSQP with the gradient by differentiation).
+
+    Attributes:
+        population: individuals of each machine.
+        generations: bound on the generations.
+        elites: best individuals that go on unchanged.
+        crossover: share of the other individuals that have two parents.
+        mutation: probability that a parameter of a new individual is changed.
+        tournament: contestants of one selection.
+        settled: the search of a machine ends when its cost fell by less than 1 % in so many generations.
+        sqp: whether SQP follows; without it this is the plain genetic algorithm.
+    """
+
+    population: int = 100
+    generations: int = 3000
+    elites: int = 8
+    crossover: float = 0.7
+    mutation: float = 0.1
+    tournament: int = 2
+    settled: int = 200
+    sqp: bool = True
+
+    def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
+        """Minimise; machine i draws its numbers from seed + i alone."""
+        objective = make_objective(problem)
+        tell = progress or _silent
+        share = _GENETIC_SHARE if self.sqp else 1.0
+        best, cost, generations, settled = self._evolve(objective, seed, lambda done: tell(share * done))
+        evaluations = self.population * (generations + 1)
+        if self.sqp:
+            best, cost, settled, calls = polish(objective, best, lambda done: tell(share + (1 - share) * done))
+            evaluations += calls
+        tell(1.0)
+        return Fit(objective.values(best), cost, settled, evaluations, _message(settled, self.sqp))
+
+    def _evolve(self, objective: Objective, seed: int, tell: Progress) -> tuple[Tensor, Tensor, int, Tensor]:
+        """Best points `r x k`, their costs `r`, generations of the slowest machine, and which settled, `r`."""
+        r, k = objective.machines, len(objective.problem.scale)
+        seeds = seed + torch.arange(r)
+        (draws,) = uniform_parts(seeds, _FIRST, 0, [(self.population, k)])
+        people = (2 * draws - 1) * objective.width
+        people[:, 0] = 0.0  # the start is a guess worth having
+        costs = objective.cost(people)
+        mark, since = costs.amin(-1), torch.zeros(r, dtype=torch.int64)
+        active = torch.arange(r)
+        generation = 0
+        while len(active) and generation < self.generations:
+            generation += 1
+            children = self._breed(people[active], costs[active], seeds[active], generation, objective.width)
+            kept = costs[active].argsort(dim=-1, stable=True)[:, : self.elites]
+            old = people[active].gather(1, kept[..., None].expand(-1, -1, k))
+            people[active] = torch.cat([old, children], dim=1)
+            costs[active] = torch.cat([costs[active].gather(1, kept), objective.cost(children, active)], dim=1)
+            least = costs.amin(-1)
+            better = least < 0.99 * mark
+            mark = torch.where(better, least, mark)
+            since[active] = torch.where(better[active], 0, since[active] + 1)
+            active = active[since[active] < self.settled]
+            tell(generation / self.generations)
+        place = costs.argmin(-1)
+        return people[torch.arange(r), place], costs.amin(-1), generation, since >= self.settled
+
+    def _breed(self, people: Tensor, costs: Tensor, seeds: Tensor, generation: int, width: float) -> Tensor:
+        """Children `m x (p - elites) x k` of people `m x p x k` with costs `m x p`."""
+        k, count = people.shape[-1], self.population - self.elites
+        shapes = [(2 * count, self.tournament), (count,), (count,), (count, k), (count, k), (count, k)]
+        picks, mates, along, chosen, size, side = uniform_parts(seeds, _BREED, generation, shapes)
+        parents = people.gather(1, tournament(-costs, picks)[..., None].expand(-1, -1, k))
+        first, second = parents[:, :count], parents[:, count:]
+        share = torch.where(mates < self.crossover, (1 + 2 * _BEYOND) * along - _BEYOND, 0.0)
+        children = first + share[..., None] * (second - first)
+        step = torch.where(side < 0.5, -0.2, 0.2) * width * 2 ** (-_OCTAVES * size)
+        return (children + torch.where(chosen < self.mutation, step, 0.0)).clamp(-width, width)
+
+
+def polish(objective: Objective, points: Tensor, tell: Progress) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Sequential quadratic programming from each machine's point, without bounds.
+
+    SciPy's SLSQP begins with the identity for the Hessian and learns the rest by updates, of which parameters that are
+    hardly told apart need thousands. So each round is in coordinates in which the Gauss-Newton Hessian at its start is
+    the identity, and rounds follow until one gains nothing that counts.
+
+    Args:
+        objective: what is minimised.
+        points: `r x k` [1].
+        tell: told the share of the rounds that is done.
+
+    Returns:
+        points `r x k`, costs `r`, converged `r` (the last round gained nothing that counts), and the evaluations of the
+        slowest machine (one gradient = one).
+    """
+    here, calls = points, 0
+    cost = objective.cost_and_gradient(here)[0]
+    ended = torch.zeros(len(here), dtype=torch.bool)
+    for number in range(_ROUNDS):
+        found, count = _one_round(objective, here, cost)
+        reached = objective.cost_and_gradient(found)[0]
+        ended = ~(reached < cost * (1 - _GAIN))
+        here = torch.where((reached < cost)[:, None], found, here)
+        cost, calls = torch.minimum(cost, reached), calls + count
+        tell((number + 1) / _ROUNDS)
+        if bool(ended.all()):
+            break
+    for _ in range(_LAST):
+        here, cost = _one_step(objective, here, cost)
+    return here, cost, ended, calls + 2 * _LAST
+
+
+def _one_step(objective: Objective, points: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
+    """A Gauss-Newton step of each machine, where it makes the gradient less.
+
+    At its end the cost is flat, and differs by rounding alone between points that the gradient still tells apart.
+    """
+    turn = objective.even_coordinates(points)
+    gradient = (turn.mT @ objective.cost_and_gradient(points)[1][..., None])[..., 0]
+    stepped = points - (turn @ gradient[..., None])[..., 0]
+    reached, slope = objective.cost_and_gradient(stepped)
+    left = (turn.mT @ slope[..., None])[..., 0]
+    better = (left.norm(dim=-1) < gradient.norm(dim=-1)) & (reached <= cost * (1 + _GAIN))
+    return torch.where(better[:, None], stepped, points), torch.where(better, reached, cost)
+
+
+def _one_round(objective: Objective, points: Tensor, cost: Tensor) -> tuple[Tensor, int]:
+    """SLSQP of every machine from its point; returns where it ended, `r x k`, and the number of evaluations."""
+    unit = cost.clamp_min(1e-300)
+    # u = points + turn z, so that cost / unit is about 1 + gradient z + |z|² / 2.
+    turn = objective.even_coordinates(points) * unit.sqrt()[:, None, None]
+    calls = 0
+
+    def evaluate(where: Array) -> list[tuple[float, Array]]:
+        nonlocal calls
+        calls += 1
+        at = points + (turn @ torch.from_numpy(where)[..., None])[..., 0]
+        there, gradient = objective.cost_and_gradient(at)
+        slope = (turn.mT @ gradient[..., None])[..., 0] / unit[:, None]
+        return list(zip((there / unit).tolist(), slope.numpy(), strict=True))
+
+    def search(machine: int, ask: Callable[[Array], tuple[float, Array]]) -> Array:
+        begin = np.zeros(points.shape[-1])
+        found = minimize(ask, begin, jac=True, method="SLSQP", options={"maxiter": 500, "ftol": 1e-15})
+        return np.asarray(found.x)
+
+    found = torch.from_numpy(run_side_by_side(search, evaluate, np.zeros(points.shape)))
+    return points + (turn @ found[..., None])[..., 0], calls
+
+
+def _message(settled: Tensor, sqp: bool) -> str:
+    failed = (~settled).nonzero()
+    if len(failed) == 0:
+        return ""
+    what = "quadratic programming still gained" if sqp else "the genetic algorithm still gained when it had to stop"
+    return f"{len(failed)} of {len(settled)} machines did not settle; for the first (index {int(failed[0])}) {what}"
+
+
+def _silent(_: float) -> None:
+    """Progress that nobody asked for."""

@@ -1,0 +1,135 @@
+"""Levenberg-Marquardt over machines and starts at once (Levenberg 1944, Marquardt 1963); robust loss, priors."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.identification.problems.linear import WeightedRows
+from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
+from ccnn_torch.identification.solvers.descent import descend
+from ccnn_torch.identification.solvers.robust import LOSSES, loss_weights
+
+__all__ = ["solve_lm"]
+
+_BLOCK = 400_000  # Numbers in the Jacobian of the machines that are worked on at once: about what caches hold.
+_REACH = 3.0  # Starts lie within so many plausible errors.
+_ROUNDS = 30  # Of reweighting.
+_SETTLED = 1e-4  # Change of the weights below which reweighting ends.
+
+
+def solve_lm(
+    problem: Problem,
+    seed: int = 0,
+    progress: Progress | None = None,
+    *,
+    starts: int = 1,
+    loss: str = "squared",
+    max_iterations: int = 60,
+    tolerance: float = 1e-4,
+) -> Fit:
+    """Minimise the problem of every machine from several starts, all in one batch; the best start counts.
+
+    The step solves (JᵀJ + prior + λ max diag(JᵀJ) I) du = -gradient, u being the values in plausible errors. A
+    direction that the rows do not see stays where it was, and so does one that they see so faintly that the noise
+    would move it by 100 plausible errors. A trial that is worse, or not finite (out of reach), is
+    refused and λ grows.
+
+    Args:
+        problem: what to minimise.
+        seed: of the starts after the first, which is `problem.start`; they are uniform within three plausible errors.
+        progress: told the share of the machines that is done.
+        starts: searches of each machine.
+        loss: `squared`, `huber` or `cauchy`, by reweighting whole rows (`robust.loss_weights`).
+        max_iterations: bound on the trials.
+        tolerance: a search ends when what is left to go, as the fall of its steps tells, is below so many standard
+            deviations of the estimate.
+
+    Returns:
+        Fit; its cost is the squared loss with the problem's weights, and its `evaluations` count a residual and its
+        Jacobian as one.
+
+    Raises:
+        InputError: an unknown loss, or not one start.
+    """
+    if loss not in LOSSES or starts < 1:
+        raise InputError(f"loss is one of {', '.join(LOSSES)} and starts at least 1; got '{loss}', {starts}")
+    rows = WeightedRows(problem)
+    machines, k = problem.start.shape
+    size = max(1, starts * rows.weights.shape[1] * rows.channels * k)
+    everyone = torch.arange(machines, device=problem.start.device)
+    blocks = torch.split(everyone, max(1, _BLOCK // size))
+    begin = _starts(rows, starts, seed)
+    values, cost, converged, count = torch.empty_like(problem.start), [], [], 0
+    for block in blocks:
+        found = _solve_block(rows, begin[block], block, loss, max_iterations, tolerance)
+        values[block] = found[0]
+        cost.append(found[1])
+        converged.append(found[2])
+        count += found[3]
+        if progress is not None:
+            progress(float(block[-1] + 1) / machines)
+    settled = torch.cat(converged)
+    total = torch.cat(cost)
+    return Fit(values, total, settled, count, _message(settled, total, max_iterations))
+
+
+def _starts(rows: WeightedRows, starts: int, seed: int) -> Tensor:
+    """`r x m x k`: the problem's start and draws around it, drawn in halfway until every row is within reach."""
+    if starts == 1:
+        return rows.start[:, None]
+    generator = torch.Generator().manual_seed(seed)
+    r, k = rows.start.shape
+    draw = torch.rand(r, starts - 1, k, generator=generator, dtype=torch.float64).to(rows.start.device)
+    away = torch.cat([torch.zeros_like(rows.start)[:, None], (2 * draw - 1) * (_REACH * rows.scale)], dim=1)
+    everyone = torch.arange(r, device=rows.start.device)
+    for _ in range(10):
+        lost = torch.isinf(rows.cost(rows.start[:, None] + away, everyone))
+        if not bool(lost[:, 1:].any()):
+            break
+        away = torch.where(lost[..., None], away / 2, away)
+    return rows.start[:, None] + away
+
+
+def _solve_block(
+    rows: WeightedRows, begin: Tensor, block: Tensor, loss: str, max_iterations: int, tolerance: float
+) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Values `r x k`, cost `r`, converged `r` and evaluations of some machines."""
+    free = rows.equations[block] - begin.shape[-1]
+
+    def search(point: Tensor, extra: Tensor | None) -> tuple[Tensor, Tensor, Tensor, int]:
+        def normal(values: Tensor, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            return rows.normal(values, block[index], None if extra is None else extra[index])
+
+        return descend(normal, point, rows.scale, free.clamp_min(1)[:, None], max_iterations, tolerance)
+
+    x, cost, converged, count = search(begin, None)
+    best = cost.argmin(-1)
+    pick = torch.arange(len(x), device=x.device), best
+    x, cost, converged = x[pick], cost[pick], converged[pick]
+    if loss == "squared":
+        return x, cost, converged, count
+    weights = x.new_ones(len(x), 1, rows.weights.shape[1])
+    # Cauchy's loss has several minima: it begins where Huber's has settled.
+    for kind in ("huber", "cauchy") if loss == "cauchy" else (loss,):
+        for _ in range(_ROUNDS):
+            fresh = loss_weights(rows.residuals(x[:, None], block), rows.weights[block][:, None], kind, x.shape[-1])
+            change = float((fresh - weights).abs().max())
+            weights = fresh
+            found, _, settled, more = search(x[:, None], weights)
+            x, converged, count = found[:, 0], settled[:, 0], count + more
+            if change < _SETTLED:
+                break
+    return x, rows.cost(x[:, None], block)[:, 0], converged, count
+
+
+def _message(converged: Tensor, cost: Tensor, max_iterations: int) -> str:
+    failed = torch.nonzero(~converged).squeeze(-1)
+    if not len(failed):
+        return ""
+    first = int(failed[0])
+    why = f"did not settle in {max_iterations} steps"
+    if not bool(torch.isfinite(cost[first])):
+        why = "has a residual that is not finite at its start"
+    return f"{len(failed)} of {len(converged)} machines failed; the first, number {first + 1}, {why}"

@@ -1,0 +1,157 @@
+"""Global searches of well-kept libraries, for comparison: genetic algorithm, particle swarm, simulated annealing.
+
+The first two are pymoo's (Blank and Deb 2020), asked for their populations, which are evaluated together for all
+machines; the third is SciPy's generalised simulated annealing. All stay in the box of `Objective.width` and spend the
+same number of evaluations by default.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from pymoo.algorithms.soo.nonconvex.ga import GA
+from pymoo.algorithms.soo.nonconvex.pso import PSO
+from pymoo.core.algorithm import Algorithm
+from pymoo.core.evaluator import Evaluator
+from pymoo.core.problem import Problem as Box
+from pymoo.problems.static import StaticProblem
+from scipy.optimize import dual_annealing
+
+from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
+from ccnn_torch.identification.solvers.lockstep import Array, run_side_by_side
+from ccnn_torch.identification.solvers.objective import FORBIDDEN, Objective, make_objective
+
+__all__ = ["Annealing", "Genetic", "Swarm"]
+
+
+@dataclass(frozen=True)
+class Genetic:
+    """Genetic algorithm of pymoo with its defaults: binary tournament, SBX crossover, polynomial mutation.
+
+    Attributes:
+        evaluations: bound for each machine.
+        population: individuals.
+    """
+
+    evaluations: int = 30_000
+    population: int = 100
+
+    def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
+        """Minimise; machine i draws its numbers from seed + i alone."""
+
+        def make(sampling: Array) -> Algorithm:
+            # Looking for equal individuals takes more time than all the rest and finds none: the coding is real.
+            return GA(pop_size=self.population, sampling=sampling, eliminate_duplicates=False)
+
+        return _ask_and_tell(make, problem, self.population, self.evaluations, seed, progress)
+
+
+@dataclass(frozen=True)
+class Swarm:
+    """Particle swarm of pymoo with its defaults (Zhan et al. 2009: inertia and pulls adapt to the swarm's state).
+
+    Attributes:
+        evaluations: bound for each machine.
+        particles: particles.
+    """
+
+    evaluations: int = 30_000
+    particles: int = 50
+
+    def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
+        """Minimise; machine i draws its numbers from seed + i alone."""
+
+        def make(sampling: Array) -> Algorithm:
+            return PSO(pop_size=self.particles, sampling=sampling)
+
+        return _ask_and_tell(make, problem, self.particles, self.evaluations, seed, progress)
+
+
+@dataclass(frozen=True)
+class Annealing:
+    """Generalised simulated annealing of SciPy (Xiang et al. 1997) without its local search.
+
+    Attributes:
+        evaluations: bound for each machine.
+    """
+
+    evaluations: int = 30_000
+
+    def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
+        """Minimise; machine i draws its numbers from seed + i alone."""
+        objective = make_objective(problem)
+        r, k = objective.machines, len(problem.scale)
+        bounds = [(-objective.width, objective.width)] * k
+        done = 0
+
+        def evaluate(points: Array) -> list[float]:
+            nonlocal done
+            done += 1
+            if progress is not None and done % 100 == 0:
+                progress(min(done / self.evaluations, 1.0))
+            found: list[float] = objective.cost(torch.from_numpy(points)[:, None])[:, 0].tolist()
+            return found
+
+        def search(machine: int, ask: Callable[[Array], float]) -> Array:
+            found = dual_annealing(
+                ask,
+                bounds,
+                maxiter=self.evaluations,  # never reached: an iteration takes 2 k evaluations
+                maxfun=self.evaluations,
+                rng=np.random.default_rng(seed + machine),
+                no_local_search=True,
+                x0=np.zeros(k),
+            )
+            return np.asarray(found.x)
+
+        best = torch.from_numpy(run_side_by_side(search, evaluate, np.zeros((r, k))))
+        return _fit(objective, best, done)
+
+
+def _ask_and_tell(
+    make: Callable[[Array], Algorithm],
+    problem: Problem,
+    population: int,
+    evaluations: int,
+    seed: int,
+    progress: Progress | None,
+) -> Fit:
+    """Run one pymoo algorithm each machine, all populations evaluated in one call a generation."""
+    objective = make_objective(problem)
+    r, k = objective.machines, len(problem.scale)
+    generations = max(1, evaluations // population)
+    searches = []
+    for machine in range(r):
+        draw = np.random.default_rng(seed + machine).uniform(-objective.width, objective.width, (population, k))
+        draw[0] = 0.0  # the start is a guess worth having
+        search = make(draw)
+        search.setup(_box(objective), termination=("n_gen", generations), seed=seed + machine, verbose=False)
+        searches.append(search)
+    for generation in range(generations):
+        asked = [search.ask() for search in searches]
+        points = torch.from_numpy(np.stack([people.get("X") for people in asked]).astype(np.float64))
+        costs = objective.cost(points).numpy()
+        for search, people, cost in zip(searches, asked, costs, strict=True):
+            Evaluator().eval(StaticProblem(search.problem, F=cost[:, None]), people)
+            search.tell(infills=people)
+        if progress is not None:
+            progress((generation + 1) / generations)
+    best = torch.from_numpy(np.stack([search.result().X for search in searches]).astype(np.float64))
+    return _fit(objective, best, generations * population)
+
+
+def _box(objective: Objective) -> Any:
+    k = len(objective.problem.scale)
+    return Box(n_var=k, n_obj=1, xl=np.full(k, -objective.width), xu=np.full(k, objective.width))
+
+
+def _fit(objective: Objective, points: torch.Tensor, evaluations: int) -> Fit:
+    """These searches end with their budget; the best point they saw is their answer."""
+    cost = objective.cost(points[:, None])[:, 0]
+    there = cost < FORBIDDEN
+    message = "" if bool(there.all()) else "a machine has no parameters in the box with which all rows can be reached"
+    return Fit(objective.values(points), cost, there, evaluations, message)

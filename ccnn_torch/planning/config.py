@@ -1,0 +1,88 @@
+"""The config of a pose plan: its keys, defaults and checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from ccnn_torch.config.keys import list_keys
+from ccnn_torch.config.tree import Names, Section, config_from_options
+
+__all__ = ["PlanConfig", "describe_plan_keys", "load_plan_config"]
+
+
+Size = float | str
+"""A number in SI, or a text of number and unit, such as `0.1 mm` or `0.03 deg`."""
+
+
+class PlannedParameters(Section):
+    """Which parameters are to be identified, by name or pattern (`A*`, `leg1.*`)."""
+
+    free: Names | None = Field(default=None, description="parameters to identify, names or patterns; null = all")
+    fixed: Names = Field(default=[], description="parameters that keep their nominal value, names or patterns")
+    tied: list[list[str]] = Field(default=[], description="groups of parameters with one common value")
+    prior: dict[str, Size] = Field(
+        default={},
+        description="standard deviation of what is known already, by name or pattern, in SI or as '0.5 mm'",
+    )
+
+
+class PlanConfig(Section):
+    """What `ccnn plan` may be told."""
+
+    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    parameters: PlannedParameters = Field(default_factory=PlannedParameters)
+    residual: Literal["auto", "inverse", "forward"] = Field(
+        default="auto",
+        description="how the parameters will be identified: from joints (inverse) or poses (forward); auto = poses "
+        "for serial arms and framed mechanisms, else joints",
+    )
+    noise: Size | dict[str, Size] = Field(
+        default=1e-5,
+        description="standard deviation of each measured coordinate, in SI or as '0.1 mm': of a position (an angle has "
+        "it over 0.3 m), or by coordinate",
+    )
+    joint_noise: Size | dict[str, Size] = Field(
+        default=0.0, description="standard deviation of the recorded joints, in SI or as '0.01 deg', one or by joint"
+    )
+    index: Literal["O1", "O2", "O3", "O4", "O5"] = Field(
+        default="O1", description="observability index to make large: O1 (determinant, as in the paper) to O5"
+    )
+    candidates: int = Field(default=100_000, ge=10, description="configurations that the poses are chosen from")
+    limits: dict[str, tuple[Size, Size]] = Field(
+        default={}, description="range of a joint or pose coordinate in SI or with units, {x: [-200 mm, 0.3]}"
+    )
+    max_condition: float = Field(
+        default=50.0, gt=1, description="largest condition number of the Jacobian: farther is too near to a singularity"
+    )
+    rotation_weight: float = Field(
+        default=0.04, gt=0, description="weight of orientation against position in that number, in m per rad"
+    )
+    per_leg: bool = Field(default=False, description="a plan for each leg's parameters (divide and conquer)")
+    repeat: bool = Field(default=False, description="whether a pose may be planned more than once")
+    least_gain: float = Field(
+        default=0.02, gt=0, lt=1, description="what a further pose must give to be worth measuring, a share"
+    )
+    margin: float = Field(
+        default=2.0,
+        ge=0,
+        description="poses stay in reach of machines whose parameters are off by so many plausible errors",
+    )
+    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the candidates")
+
+
+def load_plan_config(path: Path | None, overrides: Iterable[str] = ()) -> PlanConfig:
+    """Read a config file (defaults where there is none) and put overrides ``key.sub=value`` over it.
+
+    Raises:
+        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
+    """
+    return config_from_options(PlanConfig, path, overrides)
+
+
+def describe_plan_keys() -> list[tuple[str, str, str]]:
+    """Every key, dotted, with its default and what it means."""
+    return list(list_keys(PlanConfig))

@@ -1,0 +1,99 @@
+"""How much each further pose still gives, and where to stop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.planning.observability import Observability, observability
+
+__all__ = ["Gains", "gains_of", "recommended_count"]
+
+# So many poses in a row must give little before the search for more ends: single gains jump.
+_WINDOW = 3
+
+
+@dataclass(frozen=True)
+class Gains:
+    """What the first so many poses of a plan show; `t` counts.
+
+    Attributes:
+        count: number of poses, `t`, int64.
+        observability: of these poses, `t` each; parameters in plausible errors, measurements in noise.
+        information: det^(1/2k) of the information, `t`: the mean accuracy of the parameters, growing like √poses where
+            a pose only averages the noise.
+        sd: standard deviation of each parameter, `t x k` [SI].
+        largest: the largest of them in plausible errors, `t` [1].
+        information_gain: share by which the last pose made `information` larger, `t` [1]; NaN for the first.
+        sd_gain: share by which it made `largest` smaller, `t` [1]; NaN for the first.
+    """
+
+    count: Tensor
+    observability: Observability
+    information: Tensor
+    sd: Tensor
+    largest: Tensor
+    information_gain: Tensor
+    sd_gain: Tensor
+
+
+def gains_of(rows: Tensor, first: int, scale: Tensor, prior_sd: Tensor) -> Gains:
+    """The figures of the first n poses for all n from `first` on.
+
+    Args:
+        rows: of the poses in order, `N x c x k` [1], in plausible errors.
+        first: the least number of poses that see every direction.
+        scale: plausible errors, `k` [SI].
+        prior_sd: standard deviations of the prior, `k` [SI], inf where there is none.
+    """
+    count = torch.arange(first, len(rows) + 1)
+    there = torch.arange(len(rows)) < count[:, None]
+    matrices = torch.where(there[:, :, None, None], rows, 0.0).flatten(1, 2)
+    return gains_of_sets(matrices, count, scale, prior_sd)
+
+
+def gains_of_sets(matrices: Tensor, count: Tensor, scale: Tensor, prior_sd: Tensor) -> Gains:
+    """The figures of several sets of poses, one after the other.
+
+    Args:
+        matrices: identification matrices, `t x m x k` [1], in plausible errors.
+        count: poses in each, `t` or one for all.
+        scale, prior_sd: as `gains_of`.
+    """
+    k = matrices.shape[-1]
+    seen = observability(matrices, count)
+    held = torch.diag(torch.where(torch.isfinite(prior_sd), scale / prior_sd, 0.0)).expand(len(matrices), k, k)
+    whole = torch.cat([matrices, held], dim=1)
+    # The triangular factor of the rows, and not their square, so that no digits are lost.
+    factor = torch.linalg.qr(whole).R
+    information = factor.diagonal(dim1=-2, dim2=-1).abs().log().mean(-1).exp()
+    unit = torch.eye(k, dtype=matrices.dtype).expand_as(factor)
+    inverse = torch.linalg.solve_triangular(factor, unit, upper=True)
+    relative = torch.linalg.vector_norm(inverse, dim=-1)
+    largest = relative.amax(-1)
+    nan = torch.full((1,), math.nan, dtype=matrices.dtype)
+    return Gains(
+        count.expand(len(matrices)),
+        seen,
+        information,
+        relative * scale,
+        largest,
+        torch.cat([nan, information[1:] / information[:-1] - 1]),
+        torch.cat([nan, 1 - largest[1:] / largest[:-1]]),
+    )
+
+
+def recommended_count(gains: Gains, least_gain: float) -> int | None:
+    """The smallest number of poses after which a further one gives less than `least_gain` (a share).
+
+    Gives: makes the information det^(1/2k) larger and the largest standard deviation smaller, each on average over the
+    next three poses. None where even the last poses give more.
+    """
+    for gain in range(len(gains.count) - _WINDOW):
+        ahead = slice(gain + 1, gain + 1 + _WINDOW)
+        if max(float(gains.information_gain[ahead].mean()), float(gains.sd_gain[ahead].mean())) < least_gain:
+            return int(gains.count[gain])
+    return None

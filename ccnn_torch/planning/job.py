@@ -1,0 +1,123 @@
+"""From a mechanism and a config to the poses to measure, in a file for the machine and a page for the person."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.config.sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import make_folder, write_whole
+from ccnn_torch.identification import ParameterChoice
+from ccnn_torch.identification.problems.problem import Progress
+from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.planning import Plan, plan_poses
+from ccnn_torch.planning.config import PlanConfig
+from ccnn_torch.planning.figure import plan_plot
+from ccnn_torch.planning.page import plan_markdown
+from ccnn_torch.records import write_table
+from ccnn_torch.report.figures.style import save_figure
+
+__all__ = ["make_plan", "write_plan"]
+
+
+def make_plan(
+    mechanism: str | Mechanism, poses: int, config: PlanConfig | None = None, progress: Progress | None = None
+) -> tuple[Mechanism, list[Plan]]:
+    """Plan poses as a config says.
+
+    Args:
+        mechanism: a name, a file, or a mechanism.
+        poses: how many; with `per_leg` for each leg.
+        config: defaults when None.
+        progress: told the share that is done.
+
+    Raises:
+        InputError: as `load_mechanism` and `plan_poses`; a size that is none, or of something unknown.
+    """
+    config = config or PlanConfig()
+    if poses < 1:
+        raise InputError(f"--poses: plan at least 1 pose, not {poses}")
+    machine = load_mechanism(mechanism, **config.mechanism_keys) if isinstance(mechanism, str) else mechanism
+    wanted = config.parameters
+    prior = prior_sizes(wanted.prior, machine.geometry, "parameters.prior")
+    plans = plan_poses(
+        machine,
+        poses,
+        choice=ParameterChoice(wanted.free, wanted.fixed, wanted.tied, prior),
+        pose_noise=_pose_noise(config, machine),
+        joint_noise=_joint_noise(config, machine),
+        residual=config.residual,
+        index=config.index,
+        candidates=config.candidates,
+        limits=_limits(config, machine),
+        max_condition=config.max_condition,
+        rotation_weight=config.rotation_weight,
+        per_leg=config.per_leg,
+        repeat=config.repeat,
+        least_gain=config.least_gain,
+        margin=config.margin,
+        seed=config.seed,
+        progress=progress,
+    )
+    return machine, plans
+
+
+def write_plan(path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: float) -> list[Path]:
+    """Write the poses as CSV, and beside it a page (.md) with its picture (.png, .svg).
+
+    The CSV has a row for each pose: `leg[1]` where each leg has its own, the joints to command, and the pose at which
+    they bring the nominal machine; rows stand in the order of their worth.
+
+    Returns:
+        The files.
+
+    Raises:
+        InputError: the name does not end in .csv, or the folder cannot be written.
+    """
+    if path.suffix.lower() != ".csv":
+        raise InputError(f"--out: '{path}' must end in .csv; the page and the picture are written beside it")
+    columns = {}
+    if plans[0].leg is not None:
+        columns["leg[1]"] = torch.cat([torch.full((len(p.pose),), float(p.leg or 0)) for p in plans]).numpy()
+    for coordinates, part in ((mechanism.joints, "joints"), (mechanism.pose, "pose")):
+        values = torch.cat([getattr(plan, part) for plan in plans])
+        columns |= {c.header: values[:, i].numpy() for i, c in enumerate(coordinates)}
+    make_folder(path.parent)
+    write_table(path, columns)
+    plot = plan_plot(mechanism.pose, plans, least_gain)
+    pictures = save_figure(plot.figure, path)
+    page = path.with_suffix(".md")
+    write_whole(page, plan_markdown(mechanism.name, plans, least_gain, pictures[0].name, plot.caption))
+    return [path, page, *pictures]
+
+
+def _limits(config: PlanConfig, machine: Mechanism) -> dict[str, tuple[float, float]]:
+    """Limits [SI]; a name that the machine does not have is refused where they are used."""
+    units = {c.name: c.unit for c in (*machine.joints, *machine.pose)}
+    found = {}
+    for name, bounds in config.limits.items():
+        low, high = (size(value, units.get(name), f"limits.{name}") for value in bounds)
+        found[name] = (low, high)
+    return found
+
+
+def _pose_noise(config: PlanConfig, machine: Mechanism) -> Tensor:
+    found = sizes_of_pose(config.noise, machine.pose, "noise")
+    if not bool((found > 0).all()):
+        raise InputError("noise: a standard deviation is above 0; write e.g. noise='0.1 mm'")
+    return found
+
+
+def _joint_noise(config: PlanConfig, machine: Mechanism) -> Tensor | None:
+    """None where there is none."""
+    given, none = config.joint_noise, [0.0] * len(machine.joints)
+    if isinstance(given, dict):
+        found = sizes_by_name(given, machine.joints, "joint_noise", none)
+    else:
+        found = torch.tensor([size(given, j.unit, "joint_noise") for j in machine.joints], dtype=torch.float64)
+    if bool((found < 0).any()):
+        raise InputError("joint_noise: a standard deviation is not negative; write e.g. joint_noise='0.01 deg', or 0")
+    return found if bool((found > 0).any()) else None

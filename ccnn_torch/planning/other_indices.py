@@ -1,0 +1,81 @@
+"""Exchange by an index that is no determinant: O2 to O5."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.identification.problems.problem import Progress
+from ccnn_torch.planning.observability import index_of
+
+__all__ = ["exchange_by_index"]
+
+# Candidates whose index is computed in full in place of a chosen pose; the derivative of the index picks them.
+_SHORTLIST = 256
+_SWEEPS = 50
+# Relative gain that counts.
+_GAIN = 1e-7
+
+
+def exchange_by_index(
+    rows: Tensor, chosen: list[int], prior: Tensor, index: str, repeat: bool = False, tell: Progress | None = None
+) -> tuple[list[int], bool]:
+    """Better a design by exchanging its poses one after the other until the index gains no more.
+
+    These indices know no cheap update: the derivative of the index by the information says which candidates are worth
+    the eigenvalues of the information with them.
+
+    Args:
+        rows: of the candidates, `M x c x k` [1], in the units that the index is meant in.
+        chosen: a design that sees every direction, for example the one of largest O1.
+        prior: information without any pose, `k x k`.
+        index: `O2` … `O5`.
+        repeat: whether a candidate may be chosen more than once.
+        tell: told the share that is done.
+
+    Returns:
+        The design, and whether no exchange betters it.
+    """
+    chosen = list(chosen)
+    information = prior + _information(rows[chosen]).sum(0)
+    free = torch.ones(len(rows), dtype=torch.bool)
+    free[chosen] = repeat
+    for sweep in range(_SWEEPS):
+        changed = False
+        for place, old in enumerate(chosen):
+            here = float(_index(information, index))
+            without = information - _information(rows[old])
+            short = _promising(rows, information, index, free)
+            tried = without + _information(rows[short])
+            values = _index(tried, index)
+            best = int(values.argmax())
+            if float(values[best]) <= here * (1 + _GAIN):
+                continue
+            free[old], chosen[place] = True, int(short[best])
+            free[chosen[place]] = repeat
+            information = prior + _information(rows[chosen]).sum(0)
+            changed = True
+        if tell is not None:
+            tell((sweep + 1) / (sweep + 2))
+        if not changed:
+            return chosen, True
+    return chosen, False
+
+
+def _promising(rows: Tensor, information: Tensor, index: str, free: Tensor) -> Tensor:
+    """Numbers of the free candidates along which the index grows most steeply."""
+    values, vectors = torch.linalg.eigh(information)
+    slope = torch.func.grad(lambda square: index_of(index, square.flip(-1).sqrt()))(values.clamp_min(1e-300))
+    steepness = ((rows @ vectors).square() @ slope).sum(-1)
+    steepness = torch.where(free, steepness, -torch.inf)
+    return steepness.topk(min(_SHORTLIST, int(free.sum()))).indices
+
+
+def _information(rows: Tensor) -> Tensor:
+    return rows.mT @ rows
+
+
+def _index(information: Tensor, index: str) -> Tensor:
+    """The index of informations `... x k x k`; `...`."""
+    values = torch.linalg.eigvalsh(information).clamp_min(0.0)
+    return index_of(index, values.flip(-1).sqrt())

@@ -1,0 +1,135 @@
+"""Which columns of a table become inputs beside the joints, and in which unit each of them must be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError
+from ccnn_torch.records.table import FILE, Table, nearest
+from ccnn_torch.units import parse_header, si_unit_of, to_si
+
+__all__ = ["DEFAULT_COVARIATES", "choose_covariates"]
+
+# A cell so many times farther from the column's median than every other one leaves nothing of the others to learn.
+_GIANT = 1e3
+# A column that varies by less than this share is constant but for how its numbers were written.
+_SAME = 1e-14
+
+DEFAULT_COVARIATES = ("time", "temperature", "load_*", "direction*", "speed*")
+
+
+def choose_covariates(
+    table: Table, joints: Sequence[Coordinate], pose: Mapping[str, str], wanted: Sequence[str] | None
+) -> tuple[tuple[Coordinate, ...], list[str]]:
+    """Choose the covariates of a table.
+
+    Args:
+        table: the records.
+        joints: the columns that are joints; none of them may be a covariate.
+        pose: SI unit of the columns that are pose, likewise.
+        wanted: names or patterns (``load_*``) instead of the default ones; None = the default ones that are there.
+
+    Returns:
+        Covariates in the file's order, constant ones left out, and notes on what was left out and why.
+
+    Raises:
+        InputError: a wanted column is missing, is a joint or a pose column, or a column has the wrong dimension; one
+            cell dwarfs all others of its column.
+    """
+    taken = {coordinate.name for coordinate in joints} | set(pose)
+    free = [name for name in table.names if name not in taken]
+    if wanted is None:
+        chosen = [name for name in free if _matches(name, DEFAULT_COVARIATES)]
+    else:
+        for pattern in wanted:
+            _check_wanted(pattern, free, table, joints, pose)
+        chosen = [name for name in free if _matches(name, wanted)]
+    covariates, notes = [], []
+    for name in chosen:
+        coordinate = Coordinate(name, _si_unit(name, table, pose))
+        values = table.column(name, coordinate.unit)
+        _refuse_lone_giant(values, name, table)
+        if np.ptp(values) <= _SAME * max(np.abs(values).max(), 1.0):
+            notes.append(f"covariate '{name}' is constant ({table.raw(name)[0]:g} {table.units[name]}) and was dropped")
+        else:
+            covariates.append(coordinate)
+    # The column that numbers several files is ours, and nobody asked for it.
+    ignored = [name for name in free if name not in chosen and not (table.parts and name == FILE)]
+    if ignored:
+        notes.append(f"ignored columns: {', '.join(ignored)}; name them in covariates to use them as inputs")
+    for name in ignored:
+        meant = nearest(name, [default for default in DEFAULT_COVARIATES if "*" not in default], 0.8)
+        if wanted is None and meant is not None and meant not in table:
+            notes.append(f"the ignored column '{name}' looks like '{meant}'; rename it if that is meant")
+    return tuple(covariates), notes
+
+
+def _refuse_lone_giant(values: NDArray[np.float64], name: str, table: Table) -> None:
+    """Refuse a column of which one cell decides alone: scaled to it, all others are the same."""
+    if len(values) < 3:
+        return
+    away = np.abs(values - np.median(values))
+    order = np.argsort(away)
+    first, second = away[order[-1]], away[order[-2]]
+    if first > _GIANT * second > 0:
+        row = int(order[-1])
+        raise InputError(
+            f"{table.path}: column '{name}' has {table.cell(name, row)} at "
+            f"{table.name_rows([row])}, {first / second:.0e} times as far from the rest as any other cell; "
+            "correct the cell or remove the row"
+        )
+
+
+def _matches(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _check_wanted(
+    pattern: str, free: list[str], table: Table, joints: Sequence[Coordinate], pose: Mapping[str, str]
+) -> None:
+    if _matches_any(pattern, free):
+        return
+    if pattern in {coordinate.name for coordinate in joints}:
+        raise InputError(f"covariates: '{pattern}' is a joint and an input already; remove it from the list")
+    if pattern in pose:
+        raise InputError(f"covariates: '{pattern}' is the measured pose, which no command can know; remove it")
+    near = nearest(pattern, free)
+    hint = f"did you mean '{near}'?" if near else f"the columns that could be are: {', '.join(free) or 'none'}"
+    raise InputError(f"covariates: {table.path} has no column '{pattern}'; {hint}")
+
+
+def _matches_any(pattern: str, names: list[str]) -> bool:
+    return any(fnmatchcase(name, pattern) for name in names)
+
+
+def _si_unit(name: str, table: Table, pose: Mapping[str, str]) -> str:
+    """SI unit of a covariate, whose dimension must fit a name that has a meaning."""
+    where = f"{table.path}: column '{name}'"
+    if not table.units[name]:
+        parse_header(name, table.path)
+    found = si_unit_of(table.units[name], where)
+    allowed = _allowed(name, pose)
+    if allowed and found not in allowed:
+        to_si([], table.units[name], allowed[0], where, name)
+    return found
+
+
+def _allowed(name: str, pose: Mapping[str, str]) -> tuple[str, ...]:
+    if name == "time":
+        return ("s",)
+    if name == "temperature":
+        return ("K",)
+    if name.startswith("load_"):
+        # A force along a length, a moment about an angle; for another name either.
+        unit = pose.get(name.removeprefix("load_"))
+        return {"m": ("N",), "rad": ("N*m",)}.get(unit or "", ("N", "N*m"))
+    if name.startswith("direction"):
+        return ("1",)
+    if name.startswith("speed"):
+        return ("rad/s", "m/s", "1")
+    return ()

@@ -1,0 +1,254 @@
+"""Measured records: one row per configuration, joints commanded and pose reached, in SI."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError
+from ccnn_torch.records.covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES
+from ccnn_torch.records.covariates import choose_covariates
+from ccnn_torch.records.pose_columns import HasCoordinates, check_joints, refuse_lost_orientation, unused_joints
+from ccnn_torch.records.pose_columns import read_pose as read_pose
+from ccnn_torch.records.pose_columns import stack_columns as stack_columns
+from ccnn_torch.records.read_table import read_table as read_table
+from ccnn_torch.records.sources import Source, read_source
+from ccnn_torch.records.table import Table as Table
+from ccnn_torch.records.table import name_lines as name_lines
+from ccnn_torch.records.table import write_table as write_table
+from ccnn_torch.units import to_si
+
+__all__ = [
+    "DEFAULT_COVARIATES",
+    "JOINT_LIMIT",
+    "Records",
+    "Table",
+    "check_rows",
+    "load_records",
+    "name_lines",
+    "read_pose",
+    "read_table",
+    "stack_columns",
+    "write_table",
+]
+
+# Two turns of a joint, rounded up as the limit of a pose angle is.
+JOINT_LIMIT = 12.6
+# The tool of an arm whose frames are unknown may lengthen its reach by this share.
+_TOOL_ALLOWANCE = 0.25
+
+
+@dataclass(frozen=True)
+class Records:
+    """Measured records in SI, rows in the order measured.
+
+    Attributes:
+        path: the file; several with commas between them.
+        joints: commanded joints, `rows x n`.
+        pose: measured pose, `rows x p`, the columns as in `pose_coordinates`.
+        covariates: further inputs, `rows x m`, the columns as in `covariate_coordinates`.
+        joint_coordinates, pose_coordinates, covariate_coordinates: names and SI units. The pose is the mechanism's,
+            less the orientation where it was not measured.
+        orientation: how a serial arm's orientation was measured: ``rotation_vector``; ``quaternion``, ``kuka``,
+            ``fanuc`` or ``staubli`` (converted); or ``none``. None for a mechanism whose pose has fixed columns.
+        columns: every column that is neither joint nor pose, `rows` each, in SI, NaN where a cell is empty.
+        units: unit of each column as written in the file; empty where it has none.
+        notes: what was dropped, ignored or guessed, one sentence each.
+        lines: line of each row in the file, `rows`, int64.
+        data_hash: SHA-256 of headers and values.
+        parts: where rows are from, in order: file and number of its rows; empty for a single file.
+    """
+
+    path: str
+    joints: Tensor
+    pose: Tensor
+    covariates: Tensor
+    joint_coordinates: tuple[Coordinate, ...]
+    pose_coordinates: tuple[Coordinate, ...]
+    covariate_coordinates: tuple[Coordinate, ...]
+    orientation: str | None
+    columns: dict[str, NDArray[np.float64]]
+    units: dict[str, str]
+    notes: list[str]
+    lines: NDArray[np.int64]
+    data_hash: str
+    parts: tuple[tuple[str, int], ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    @property
+    def joint_units(self) -> dict[str, str]:
+        """Unit of each joint as written in the file."""
+        return {joint.name: self.units[joint.name] for joint in self.joint_coordinates}
+
+    @property
+    def pose_units(self) -> dict[str, str]:
+        """Unit of each pose coordinate as written in the file (rad for a quaternion's rotation vector)."""
+        return {
+            coordinate.name: self.units.get(coordinate.name, coordinate.unit) for coordinate in self.pose_coordinates
+        }
+
+    @property
+    def positions(self) -> Tensor:
+        """The pose coordinates that are lengths, `rows x d` [m]."""
+        return self.pose[:, [k for k, coordinate in enumerate(self.pose_coordinates) if coordinate.unit == "m"]]
+
+    def name_rows(self, rows: Sequence[int] | NDArray[np.int64]) -> str:
+        """Rows (0-based) as a person finds them in the file, e.g. "line 17 (row 16)"."""
+        return name_lines(self.lines, rows, parts=self.parts)
+
+
+def load_records(
+    source: Source | Records,
+    mechanism: HasCoordinates,
+    covariates: Sequence[str] | None = None,
+    learns: bool = True,
+    columns: Mapping[str, str] | None = None,
+) -> Records:
+    """Load records for a mechanism.
+
+    Joint and pose columns are named as the mechanism names them. A serial arm (one that lists `orientations`) may have
+    its orientation as a rotation vector `rx, ry, rz`, as a quaternion `qw, qx, qy, qz`, as Euler angles
+    (`kuka_a, kuka_b, kuka_c`, `fanuc_w, fanuc_p, fanuc_r`, `staubli_rx, staubli_ry, staubli_rz`) or not at all; where a
+    file has several, the first of these counts. The covariates are by default the columns `time`, `temperature`,
+    `load_*`, `direction*` and `speed*` that are there; `covariates` replaces this choice by names or patterns
+    ([] = none). A constant covariate is dropped with a note. A column that is not used needs no unit.
+
+    Args:
+        source: a CSV file or an .xlsx workbook; several of them, whose rows stand one file after the other and whose
+            column `file` numbers them; a pandas DataFrame with headers as in a file; or records that are loaded
+            already, which stay as they are.
+        learns: whether a learner is trained on the rows: fewer than a linear fit of the inputs needs, twice, are then
+            refused. How many an identification needs, its number of parameters tells.
+        columns: header in the file -> ``name[unit]``, or ``ignore``.
+
+    Raises:
+        InputError: a column is missing, stands twice, or has no unit or one of a wrong dimension; a cell is not a
+            finite number; values in rad look like degrees; columns look like an orientation that is not read; files
+            differ in their columns; too few rows; no input varies.
+    """
+    if isinstance(source, Records):
+        return _loaded(source, mechanism, covariates, columns)
+    table = read_source(source, columns)
+    check_joints(table, mechanism.joints)
+    joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
+    pose, coordinates, orientation, read = read_pose(table, mechanism)
+    used = {joint.name for joint in mechanism.joints} | set(read)
+    # Of an arm, no other form of the pose may be an input either: no command can know it.
+    measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
+    chosen, notes = choose_covariates(table, mechanism.joints, measured, covariates)
+    unused = [name for name in table.names if name not in used | {c.name for c in chosen}]
+    if orientation == "none":
+        refuse_lost_orientation(table, mechanism, unused)
+    if learns:
+        _check_enough(table, len(mechanism.joints) + len(chosen))
+    still = [joint.name for k, joint in enumerate(mechanism.joints) if np.ptp(joints[:, k]) == 0]
+    if len(still) == len(mechanism.joints) and not chosen:
+        raise InputError(
+            f"{table.path}: no input varies: {', '.join(still)} are constant and there is no covariate that changes; "
+            "record configurations that differ"
+        )
+    notes = [*(f"joint '{name}' is constant and tells the learner nothing" for name in still), *notes, *table.notes]
+    alike = unused_joints(table, mechanism.joints, unused)
+    if alike:
+        notes.append(
+            f"columns {', '.join(alike)} look like joints and are not used; {mechanism.name} has no such joint"
+        )
+    return Records(
+        path=table.path,
+        joints=torch.from_numpy(joints),
+        pose=torch.from_numpy(pose),
+        covariates=torch.from_numpy(stack_columns(table, chosen)),
+        joint_coordinates=tuple(mechanism.joints),
+        pose_coordinates=coordinates,
+        covariate_coordinates=chosen,
+        orientation=orientation,
+        columns={name: _leniently(table, name, notes) for name in table.names if name not in used},
+        units=dict(table.units),
+        notes=notes,
+        lines=table.lines,
+        data_hash=table.data_hash,
+        parts=table.parts,
+    )
+
+
+def check_rows(records: Records, mechanism: HasCoordinates) -> None:
+    """Refuse rows that the mechanism cannot have reached.
+
+    With known frames a row must be `mechanism.reachable(pose)`, where the mechanism has that method. An arm with
+    `unknown_frames` can only be judged by its size: no position may be farther from the median position than twice
+    `mechanism.reach` [m], to which a quarter is added for the tool where that is unknown too.
+
+    Raises:
+        InputError: names the rows.
+    """
+    unknown: Sequence[str] = getattr(mechanism, "unknown_frames", ())
+    if not unknown:
+        reachable = getattr(mechanism, "reachable", None)
+        if reachable is None or len(records.pose_coordinates) != len(mechanism.pose):
+            return
+        outside = np.flatnonzero(~reachable(records.pose).numpy())
+        if len(outside):
+            raise InputError(
+                f"{records.path}: the pose at {records.name_rows(outside)} is outside the workspace of "
+                f"{mechanism.name}; correct or remove {'it' if len(outside) == 1 else 'them'}, or check the units"
+            )
+        return
+    reach = getattr(mechanism, "reach", None)
+    positions = records.positions.numpy()
+    if reach is None or positions.shape[1] == 0:
+        return
+    limit = 2 * float(reach) * (1 + _TOOL_ALLOWANCE * ("tool" in unknown))
+    distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    outside = np.flatnonzero(distance > limit)
+    if len(outside):
+        far = f"{distance[outside[0]]:.3g} m from the median position"
+        raise InputError(
+            f"{records.path}: the position at {records.name_rows(outside)} is {far}, farther than {mechanism.name} can "
+            f"move ({limit:.3g} m, twice its reach and tool); "
+            f"correct or remove {'it' if len(outside) == 1 else 'them'}, or check the units"
+        )
+
+
+def _loaded(
+    records: Records,
+    mechanism: HasCoordinates,
+    covariates: Sequence[str] | None,
+    columns: Mapping[str, str] | None,
+) -> Records:
+    """Records as they are, where they are of this mechanism."""
+    names, wanted = ([c.name for c in joints] for joints in (records.joint_coordinates, mechanism.joints))
+    if names != wanted:
+        raise InputError(
+            f"{records.path}: these records have the joints {', '.join(names)}, and {mechanism.name} has "
+            f"{', '.join(wanted)}; load them with this mechanism"
+        )
+    if covariates or columns:
+        key = "covariates" if covariates else "columns"
+        raise InputError(f"{key}: the records are loaded already; give it to load_records instead")
+    return records
+
+
+def _check_enough(table: Table, inputs: int) -> None:
+    least = 2 * (inputs + 1)
+    if len(table) < least:
+        raise InputError(
+            f"{table.path}: {len(table)} rows are too few, at least {least} are needed: a linear fit in {inputs} "
+            f"inputs has {inputs + 1} unknowns per joint, and as many rows again must judge it"
+        )
+
+
+def _leniently(table: Table, name: str, notes: list[str]) -> NDArray[np.float64]:
+    """A column that is perhaps never used: not judged, and left as written if its unit is not known."""
+    try:
+        return to_si(table.raw(name), table.units[name] or "1", where=f"column '{name}'")
+    except InputError as reason:
+        notes.append(f"{reason}; its values are kept as written")
+        return table.raw(name).copy()

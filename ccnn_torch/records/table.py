@@ -1,0 +1,186 @@
+"""Tables with units, and the way to write them as CSV."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ccnn_torch.display import visible
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.units import LARGEST, parse_header, split_header, to_si, write_hint
+
+__all__ = ["FILE", "Table", "name_lines", "nearest", "write_table"]
+
+FILE = "file"
+"""The column that numbers the files where there are several: 0, 1, …"""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table as it stands in the file: nothing is converted or judged until a column is asked for.
+
+    Attributes:
+        path: the file, as given; several with commas between them.
+        units: unit of each column as written, by name, in the file's order; empty where the header has none.
+        values: `rows x columns`, in those units; NaN where a cell is empty or no number.
+        lines: line of each row in the file, `rows`, int64 (the header is line 1).
+        bad_cells: (row, column) -> text of the cells that are empty or no number.
+        parts: where rows are from, in order: file and number of its rows; empty for a single file.
+        notes: what a person should know of how the file was read, one sentence each.
+    """
+
+    path: str
+    units: dict[str, str]
+    values: NDArray[np.float64]
+    lines: NDArray[np.int64]
+    bad_cells: dict[tuple[int, int], str] = field(default_factory=dict)
+    parts: tuple[tuple[str, int], ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Column names in the file's order."""
+        return tuple(self.units)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.units
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    @property
+    def data_hash(self) -> str:
+        """SHA-256 (hex) of headers and values as read: the same for every separator, line end and way to write 1e-3."""
+        digest = hashlib.sha256(json.dumps(self.units).encode())
+        digest.update(self.values.astype("<f8").tobytes())
+        return digest.hexdigest()
+
+    def header(self, name: str) -> str:
+        """The column's header, ``name[unit]``; the bare name where it has no unit."""
+        return f"{name}[{self.units[name]}]" if self.units[name] else name
+
+    def name_rows(self, rows: Sequence[int] | NDArray[np.int64]) -> str:
+        """Rows (0-based) as a person finds them: "line 17 (row 16)", with the file where there are several."""
+        return name_lines(self.lines, rows, parts=self.parts)
+
+    def raw(self, name: str) -> NDArray[np.float64]:
+        """The column in its own unit, `rows`, NaN where a cell is empty or no number."""
+        return self.values[:, self.names.index(name)]
+
+    def cell(self, name: str, row: int) -> str:
+        """A number of the column as written, with its unit."""
+        unit = self.units[name]
+        return f"{self.raw(name)[row]:g}{'' if unit == '1' else ' ' + unit}"
+
+    def column(self, name: str, si_unit: str | None = None) -> NDArray[np.float64]:
+        """A column in SI, `rows`, every value finite.
+
+        Args:
+            name: the column.
+            si_unit: the SI unit it must be in, or None for whatever it is; without a unit it is then as written.
+
+        Raises:
+            InputError: the column is missing (with the nearest name), has no, a wrong or an unknown unit, or a cell
+                that is empty, no number, NaN, infinite, or larger than anything that is measured (named by line).
+        """
+        if name not in self.units:
+            raise InputError(f"{self.path}: there is no column '{name}'; {self._remedy(name, si_unit)}")
+        unit = self.units[name]
+        if not unit and si_unit is not None:
+            parse_header(name, self.path, si_unit)
+        values = self.raw(name)
+        wrong = np.flatnonzero(~np.isfinite(values))
+        if len(wrong):
+            row = int(wrong[0])
+            text = visible(self.bad_cells.get((row, self.names.index(name)), f"{values[row]:g}"), 40)
+            what = f"has '{text}'" if text else "is empty"
+            more = f", and {len(wrong) - 1} more of its cells are not finite either" if len(wrong) > 1 else ""
+            raise InputError(
+                f"{self.path}: column '{name}' {what} at {self.name_rows([row])}{more}; "
+                "write a finite number or remove the row"
+            )
+        converted = to_si(values, unit or "1", si_unit, f"{self.path}: column '{name}'", name)
+        far = np.flatnonzero(np.abs(converted) > LARGEST)
+        if len(far):
+            raise InputError(
+                f"{self.path}: column '{name}' has {self.cell(name, int(far[0]))} at "
+                f"{self.name_rows(far)}, larger than anything that is measured; correct or remove "
+                f"{'it' if len(far) == 1 else 'them'}, or check the unit"
+            )
+        return converted
+
+    def _remedy(self, name: str, si_unit: str | None) -> str:
+        near = nearest(name, self.names)
+        if near is not None:
+            mapped = f'columns: {{"{near}": "{name}[{self.units[near] or si_unit or "unit"}]"}}'
+            return f"'{near}' is the nearest there: rename it to '{name}' if it is meant, or write {mapped}"
+        return write_hint(name, si_unit)
+
+
+def nearest(name: str, candidates: Sequence[str], cutoff: float = 0.6) -> str | None:
+    """The candidate that is most likely meant by a misspelt name, without regard to case; None if none is near.
+
+    `cutoff` is the least similarity, of difflib's 0 to 1.
+    """
+    folded = {candidate.lower(): candidate for candidate in reversed(candidates)}
+    near = difflib.get_close_matches(name.lower(), folded, 1, cutoff)
+    return folded[near[0]] if near else None
+
+
+def name_lines(
+    lines: NDArray[np.int64],
+    rows: Sequence[int] | NDArray[np.int64],
+    most: int = 5,
+    parts: Sequence[tuple[str, int]] = (),
+) -> str:
+    """Name rows (given 0-based) for a person, at most `most` of them: "line 17 (row 16)".
+
+    The line is that of the file, whose first line is the header; the row counts the rows below it from 1. With `parts`
+    (files and the numbers of their rows) the file is named and the row counts in it: "line 17 (row 16) of day2.csv".
+    """
+    more = f" and {len(rows) - most} more" if len(rows) > most else ""
+    ends = np.cumsum([count for _, count in parts])
+    owners = np.searchsorted(ends, np.asarray(rows[:most], dtype=np.int64), side="right")
+    named = []
+    for owner in dict.fromkeys(owners.tolist()):
+        there = [int(row) for row, own in zip(rows[:most], owners, strict=True) if own == owner]
+        first = 0 if owner == 0 else int(ends[owner - 1])
+        plural = "s" if len(there) > 1 else ""
+        shown_lines = ", ".join(str(int(lines[row])) for row in there)
+        shown_rows = ", ".join(str(row - first + 1) for row in there)
+        file = f" of {parts[owner][0]}" if parts else ""
+        named.append(f"line{plural} {shown_lines} (row{plural} {shown_rows}){file}")
+    return " and ".join(named) + more
+
+
+def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
+    """Write a CSV file with 17 significant digits, so that `read_table` gives back the same floats bit by bit.
+
+    Args:
+        path: the file; an existing one is replaced.
+        columns: header ``name[unit]``, or a bare name -> values `rows`; NaN is written as an empty cell.
+
+    Raises:
+        InputError: columns have one name or differ in length, or the file cannot be written.
+    """
+    names = [split_header(header)[0] for header in columns]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise InputError(f"{path}: column '{twice[0]}' would stand twice in the header")
+    arrays = [np.asarray(values, dtype=np.float64) for values in columns.values()]
+    if len({array.shape for array in arrays}) != 1 or arrays[0].ndim != 1:
+        raise InputError(f"{path}: the columns to write must be one-dimensional and of one length")
+    buffer = io.StringIO()
+    np.savetxt(buffer, np.stack(arrays, axis=1), fmt="%.17g", delimiter=",")
+    if not Path(path).absolute().parent.is_dir():
+        raise InputError(f"{path}: cannot be written (its folder is not there); make it, or correct the name")
+    write_whole(path, ",".join(columns) + "\n" + buffer.getvalue().replace("nan", ""))

@@ -1,0 +1,117 @@
+"""The run folder: where each file of a run stands, and who may write there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from ccnn_torch.errors import InputError, WriteError
+from ccnn_torch.files.write import sweep, write_whole
+from ccnn_torch.run_folder.lock import LOCK, locked
+
+__all__ = ["RunFolder", "kept_for"]
+
+
+@contextmanager
+def kept_for(command: str) -> Iterator[None]:
+    """Where a file cannot be written, say by which command the work goes on once it can."""
+    try:
+        yield
+    except WriteError as problem:
+        raise WriteError(f"{problem}; what was computed is kept, and {command} goes on from there") from None
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths inside one run folder. `results.json` is written last: a folder that has it is finished.
+
+    Attributes:
+        facts: what the checkpoints are made with, as `facts_of` gives it.
+    """
+
+    path: Path
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    @contextmanager
+    def fresh(cls, out: str | None, name: str, resume: str = "ccnn run --resume") -> Iterator[RunFolder]:
+        """Make the folder `out`, or `runs/NAME-STAMP`, and hold it; `resume` is the command that goes on in a folder.
+
+        A folder in which a run was killed before its first file stood is as good as an empty one, and one that stays
+        empty is removed.
+
+        Raises:
+            InputError: the folder holds files already, is in use, or cannot be made.
+        """
+        path = Path(out) if out else Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+        taken = InputError(
+            f"{path} holds files already; give another folder with out=…, or go on with that run: {resume} {path}"
+        )
+        if path.exists() and not path.is_dir():
+            raise taken
+        try:
+            with locked(path):
+                sweep(path)
+                if any(file.name != LOCK for file in path.iterdir()):
+                    raise taken
+                yield cls(path)
+        except BaseException:
+            with suppress(OSError):
+                path.rmdir()
+            raise
+
+    @classmethod
+    @contextmanager
+    def existing(cls, path: Path, command: str = "ccnn run") -> Iterator[RunFolder]:
+        """Hold a folder to resume; `command` is the one that made it.
+
+        Raises:
+            InputError: there is no run in it, or it is in use.
+        """
+        if not (path / "config.yaml").is_file():
+            raise InputError(
+                f"{path} has no config.yaml, so there is nothing to resume; name a folder made by {command}, or, where "
+                "it was stopped before its first file stood, give the command that began it again"
+            )
+        with locked(path):
+            sweep(path)
+            yield cls(path)
+
+    @property
+    def config(self) -> Path:
+        return self.path / "config.yaml"
+
+    @property
+    def results(self) -> Path:
+        return self.path / "results.json"
+
+    @property
+    def auto(self) -> Path:
+        """What `methods=auto` has decided so far."""
+        return self.path / "auto.json"
+
+    @property
+    def finished(self) -> bool:
+        return self.results.is_file()
+
+    @property
+    def tensorboard(self) -> Path:
+        return self.path / "tensorboard"
+
+    @property
+    def models(self) -> Path:
+        return self.path / "models"
+
+    @property
+    def checkpoints(self) -> list[Path]:
+        return sorted((self.path / "checkpoints").glob("*.safetensors"))
+
+    def checkpoint(self, method: str, phase: str) -> Path:
+        return self.path / "checkpoints" / f"{method}-{phase}.safetensors"
+
+    def write(self, name: str, content: str) -> None:
+        write_whole(self.path / name, content)

@@ -1,1 +1,0 @@
-"""Machines whose cause is sealed from the diagnoser, and the check of the diagnosis on them."""

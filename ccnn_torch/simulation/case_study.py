@@ -1,0 +1,106 @@
+"""What preparing and judging a run need of a simulated machine, whichever it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.simulation.cases import CaseStudy
+from ccnn_torch.simulation.machines.realistic import RealisticMachine
+
+__all__ = ["CaseSimulation", "RealisticSimulation", "Simulation", "simulate_realistic"]
+
+
+class Simulation(Protocol):
+    """A machine whose true behaviour is known.
+
+    Attributes:
+        pose: poses wanted, `r x s x p` [SI].
+        noise: what noise adds to the joint deviations as they are learned, `r x s x n` [SI].
+        noise_variance: its variance, `r x s x n` [SI²].
+        unlearnable: part of the signal that no function of the inputs can follow, `r x s x n` [SI], or None.
+    """
+
+    @property
+    def pose(self) -> Tensor: ...
+    @property
+    def noise(self) -> Tensor: ...
+    @property
+    def noise_variance(self) -> Tensor: ...
+    @property
+    def unlearnable(self) -> Tensor | None: ...
+
+    def pose_errors(self, command: Tensor) -> tuple[PoseError, PoseError]:
+        """Distance from the poses wanted to those that the machine reaches under a command.
+
+        Args:
+            command: `r x s x n` [SI].
+
+        Returns:
+            `r x s` each: as it is, and without the scatter of the machine itself. A machine whose noise is all in the
+            measurement has none, and both are one.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class CaseSimulation:
+    """A case study of paper 000: its noise is the machine's own."""
+
+    case: CaseStudy
+    noise: Tensor
+
+    @property
+    def pose(self) -> Tensor:
+        return self.case.pose.expand(len(self.noise), -1, -1)
+
+    @property
+    def noise_variance(self) -> Tensor:
+        return self.case.sigma.square().expand(self.noise.shape)
+
+    @property
+    def unlearnable(self) -> Tensor | None:
+        chirp = self.case.unlearnable
+        return chirp.expand(self.noise.shape) if bool(chirp.any()) else None
+
+    def pose_errors(self, command: Tensor) -> tuple[PoseError, PoseError]:
+        return self.case.pose_error(command, self.noise), self.case.pose_error(command)
+
+
+@dataclass(frozen=True)
+class RealisticSimulation:
+    """A machine as built: it repeats itself, and the noise is the measurement's."""
+
+    machine: RealisticMachine
+    noise: Tensor
+    noise_variance: Tensor
+    unlearnable: Tensor | None = None
+
+    @property
+    def pose(self) -> Tensor:
+        return self.machine.pose
+
+    def pose_errors(self, command: Tensor) -> tuple[PoseError, PoseError]:
+        error = self.machine.pose_error(command)
+        return error, error
+
+
+def simulate_realistic(
+    machine: RealisticMachine, deviations: Callable[[Tensor], Tensor], measured: Tensor
+) -> RealisticSimulation:
+    """Push the noise of the measurement into the joints by the pseudoerror itself.
+
+    Args:
+        machine: the rows.
+        deviations: joint deviations of poses, `r x s x p` -> `r x s x n` [SI].
+        measured: those of the measured poses, `r x s x n` [SI].
+    """
+    true = deviations(machine.reached)
+    # One freedom of the pose after the other: the noise is far below the curvature of the kinematics.
+    parts = [(deviations(machine.shifted(i)) - true).square() for i in range(len(machine.sd))]
+    return RealisticSimulation(machine, measured - true, torch.stack(parts).sum(0))

@@ -1,0 +1,61 @@
+"""The config of simulated records: its keys, defaults and checks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from ccnn_torch.config.keys import list_keys
+from ccnn_torch.config.tree import Section, config_from_options
+from ccnn_torch.effects.covariates import SHIFT
+
+__all__ = ["SimulateConfig", "describe_simulate_keys", "load_simulate_config"]
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class SimulateConfig(Section):
+    """What `ccnn simulate` may be told."""
+
+    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    covariates: list[str] | None = Field(
+        default=None, description="columns to write, names or patterns; null = all that the rows have"
+    )
+    rows: Literal["auto", "poses", "trajectory"] = Field(
+        default="auto",
+        description="poses at rest over the workspace, or moves recorded on the way; auto = moves where latency acts",
+    )
+    duration: Positive = Field(default=SHIFT, description="time from the first to the last pose at rest, in s")
+    step: Positive = Field(default=0.02, description="time between the rows of a move, in s")
+    move: Positive = Field(default=1.0, description="how long a move takes, in s")
+    way: float = Field(
+        default=0.25, gt=0, le=1, description="how far a move goes from one configuration to another one, a share"
+    )
+    load: Annotated[float, Field(ge=0)] = Field(default=60.0, description="standard deviation of forces, in N")
+    moment: Annotated[float, Field(ge=0)] = Field(default=6.0, description="standard deviation of moments, in N*m")
+    gravity: tuple[float, float, float] | None = Field(
+        default=None, description="in the base frame, in m/s^2; null = along -y for a machine in the x-y plane, else -z"
+    )
+    max_condition: float = Field(
+        default=50.0, gt=1, description="largest condition number of the Jacobian: farther is too near to a singularity"
+    )
+    rotation_weight: float = Field(
+        default=0.04, gt=0, description="weight of orientation against position in that number, in m per rad"
+    )
+
+
+def load_simulate_config(path: Path | None, overrides: Iterable[str] = ()) -> SimulateConfig:
+    """Read a config file (defaults where there is none) and put overrides ``key=value`` over it.
+
+    Raises:
+        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
+    """
+    return config_from_options(SimulateConfig, path, overrides)
+
+
+def describe_simulate_keys() -> list[tuple[str, str, str]]:
+    """Every key with its default and what it means."""
+    return list(list_keys(SimulateConfig))

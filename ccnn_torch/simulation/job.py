@@ -1,0 +1,196 @@
+"""Simulated records: a machine with effects, measured with noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ccnn_torch.config.noise import Noise, noise_of_pose
+from ccnn_torch.effects import OUTLIER, Acting, Situation, default_gravity, measured_pose, reached
+from ccnn_torch.effects.covariates import covariate_units
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import make_folder
+from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.records import name_lines, write_table
+from ccnn_torch.report.table import Table
+from ccnn_torch.simulation.acting import Injected, act, read_wanted, units_of
+from ccnn_torch.simulation.config import SimulateConfig
+from ccnn_torch.simulation.limits import refuse_beyond_bounds
+from ccnn_torch.simulation.outliers import bad_rows
+from ccnn_torch.simulation.rows import draw_moves, draw_poses
+
+__all__ = ["Simulated", "injected_table", "simulate_records", "write_simulated"]
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """Rows of a simulated machine.
+
+    Attributes:
+        mechanism: the nominal one.
+        joints: commanded, `s x n` [SI].
+        pose: measured, `s x p` [SI].
+        covariates: by name, `s` each [SI].
+        injected: what is wrong with the machine.
+        outliers: numbers of the bad rows, from 0.
+        gap: root of the mean square of the position's error by all effects, without noise and bad rows [m].
+    """
+
+    mechanism: Mechanism
+    joints: Tensor
+    pose: Tensor
+    covariates: dict[str, Tensor]
+    injected: tuple[Injected, ...]
+    outliers: tuple[int, ...]
+    gap: float
+
+
+def simulate_records(
+    mechanism: str | Mechanism,
+    effects: Sequence[str],
+    rows: int,
+    noise: Noise = 0.0,
+    config: SimulateConfig | None = None,
+    seed: int = 0,
+) -> Simulated:
+    """Simulate a machine with effects.
+
+    Args:
+        mechanism: a name, a file, or a mechanism.
+        effects: each `NAME` or `NAME:parameter=value,…`; none = a machine that is as its model says.
+        rows: how many.
+        noise: standard deviation of each measured coordinate, in SI or with a unit (`10um`), one for all, or by name or
+            unit (others 0).
+        config: defaults when None.
+        seed: of everything that is drawn.
+
+    Raises:
+        InputError: an unknown effect, parameter or coordinate, an effect that these rows cannot show, values that no
+            machine has, or effects so large that the machine does not reach its poses.
+    """
+    config = config or SimulateConfig()
+    if rows < 1:
+        raise InputError(f"--rows: simulate at least 1 row, not {rows}")
+    machine = load_mechanism(mechanism, **config.mechanism_keys) if isinstance(mechanism, str) else mechanism
+    sigma = _noise(noise, machine)
+    wanted = [read_wanted(text) for text in effects]
+    generator = torch.Generator().manual_seed(seed)
+    moving = config.rows == "trajectory" or (config.rows == "auto" and any(w.name == "latency" for w in wanted))
+    joints, columns = (draw_moves if moving else draw_poses)(machine, rows, config, generator)
+    kept = _kept(columns, config.covariates)
+    gravity = default_gravity(machine)
+    if config.gravity is not None:
+        gravity = torch.tensor(config.gravity, dtype=torch.float64)
+    situation = Situation(machine, joints, kept, gravity)
+    acting = [act(w, situation, generator) for w in wanted if not w.outlier]
+    refuse_beyond_bounds(situation, acting)
+    frame = reached(situation, acting)
+    lost = torch.nonzero(~torch.isfinite(frame).all(-1)).flatten().tolist()
+    if lost:
+        raise InputError(
+            f"--effect: with these effects the machine has no pose in {len(lost)} of {rows} rows; make them smaller"
+        )
+    nominal = reached(situation, [])
+    gap = _rms(frame - nominal)
+    alone = iter([_injected(situation, one, nominal) for one in acting])
+    injected, outliers = [], set[int]()
+    for one in wanted:
+        if one.outlier:
+            chosen, added, parameters = bad_rows(one, rows, frame.shape[-1], generator)
+            frame = _moved(frame, (situation.visible @ added.unsqueeze(-1)).squeeze(-1))
+            outliers |= set(chosen.tolist())
+            injected.append(Injected(one.name, parameters, _rms(added)))
+        else:
+            injected.append(next(alone))
+    pose = measured_pose(situation, frame)
+    errors = sigma * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
+    pose = _moved(pose, errors) if machine.orientations and pose.shape[-1] == 6 else pose + errors
+    return Simulated(machine, joints, pose, kept, tuple(injected), tuple(sorted(outliers)), gap)
+
+
+def write_simulated(path: Path, simulated: Simulated) -> None:
+    """Write the records: joints, pose, covariates, in SI.
+
+    Raises:
+        InputError: the name does not end in .csv, or the file cannot be written.
+    """
+    if path.suffix.lower() != ".csv":
+        raise InputError(f"--out: '{path}' must end in .csv")
+    machine, units = simulated.mechanism, covariate_units(simulated.mechanism)
+    columns = {c.header: simulated.joints[:, i].numpy() for i, c in enumerate(machine.joints)}
+    columns |= {c.header: simulated.pose[:, i].numpy() for i, c in enumerate(machine.pose)}
+    columns |= {f"{name}[{units[name]}]": values.numpy() for name, values in simulated.covariates.items()}
+    make_folder(path.parent)
+    write_table(path, columns)
+
+
+def injected_table(simulated: Simulated) -> Table:
+    """What was injected, a row for each parameter."""
+    rows = [
+        (one.name, name, f"{value:.4g}", unit)
+        for one in simulated.injected
+        for name, (value, unit) in one.parameters.items()
+    ]
+    parts = []
+    effects = [one for one in simulated.injected if one.name != OUTLIER]
+    if effects:
+        alone = "; ".join(f"{one.name} alone {one.gap * 1e6:.3g} µm" for one in effects)
+        without = "noise and bad rows" if simulated.outliers else "noise"
+        parts.append(
+            f"RMS error of the position {simulated.gap * 1e6:.3g} µm over all rows without {without} ({alone})"
+        )
+    if simulated.outliers:
+        # As the file will have them, below a header.
+        lines = np.arange(len(simulated.joints), dtype=np.int64) + 2
+        added = sum(one.gap**2 for one in simulated.injected if one.name == OUTLIER) ** 0.5
+        named = name_lines(lines, simulated.outliers, len(simulated.outliers))
+        parts.append(f"RMS error by bad rows {added * 1e6:.3g} µm over all rows; bad rows: {named}")
+    return Table("Injected", ("effect", "parameter", "value", "unit"), tuple(rows), "; ".join(parts))
+
+
+def _injected(situation: Situation, acting: Acting, nominal: Tensor) -> Injected:
+    effect = acting.effect
+    values = dict(zip((c.name for c in effect.coefficients(situation)), acting.coefficients.tolist(), strict=True))
+    units = units_of(effect, situation)
+    shown = {name: value for name, value in values.items() if value}
+    there = list(values.values())
+    for shape, value in zip(effect.shapes(situation), acting.shape.tolist(), strict=True):
+        # Of a coefficient that is 0 it changes nothing.
+        if any(there[k] for k in (range(len(there)) if shape.columns is None else shape.columns)):
+            shown[shape.name] = value
+    gap = _rms(reached(situation, [acting]) - nominal)
+    return Injected(effect.name, {name: (value, units[name]) for name, value in shown.items()}, gap)
+
+
+def _rms(change: Tensor) -> float:
+    return float(change[..., :3].square().sum(-1).mean().sqrt())
+
+
+def _moved(frame: Tensor, change: Tensor) -> Tensor:
+    """Positions shifted and, where there are any, rotations turned in the base frame; `... x c` both."""
+    position = frame[..., :3] + change[..., :3]
+    if frame.shape[-1] == 3:
+        return position
+    turned = rotation_vector_to_matrix(change[..., 3:]) @ rotation_vector_to_matrix(frame[..., 3:])
+    return torch.cat([position, matrix_to_rotation_vector(turned)], -1)
+
+
+def _kept(columns: dict[str, Tensor], wanted: list[str] | None) -> dict[str, Tensor]:
+    if wanted is None:
+        return columns
+    for pattern in wanted:
+        if not any(fnmatchcase(name, pattern) for name in columns):
+            raise InputError(f"covariates: there is no column '{pattern}'; these rows have {', '.join(columns)}")
+    return {name: v for name, v in columns.items() if any(fnmatchcase(name, pattern) for pattern in wanted)}
+
+
+def _noise(given: Noise, machine: Mechanism) -> Tensor:
+    by_name = noise_of_pose(given, machine.pose)
+    return torch.tensor([by_name.get(c.name, 0.0) for c in machine.pose], dtype=torch.float64)

@@ -1,0 +1,151 @@
+"""What the headers of a stranger's table most likely mean: joints, pose, and in which units."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.mechanisms._registry import REGISTRY
+from ccnn_torch.records import DEFAULT_COVARIATES
+from ccnn_torch.records.pose_columns import EULER_ANGLES
+from ccnn_torch.records.table import Table
+from ccnn_torch.units import si_unit_of
+
+__all__ = ["Recognised", "recognise", "suitable_mechanisms", "unit_pair"]
+
+_JOINT = re.compile(r"(q|j|a|joint|axis|achse|theta)0*(\d+)")
+_POSITION = {"x", "y", "z"}
+# Names as people have them -> ours; together, because a single letter may be anything.
+_TURNS = (
+    (("rx", "ry", "rz"), ("rx", "ry", "rz")),
+    (("qw", "qx", "qy", "qz"), ("qw", "qx", "qy", "qz")),
+    *((columns, columns) for columns, _ in EULER_ANGLES.values()),
+    (("a", "b", "c"), EULER_ANGLES["kuka"][0]),
+    (("w", "p", "r"), EULER_ANGLES["fanuc"][0]),
+)
+# The two whose number of joints and frames no header tells.
+_OPEN = ("serial", "framed")
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """Columns that have a meaning, and the rest.
+
+    Attributes:
+        meaning: name in the file -> our name, joints first.
+        joints: how many joints.
+        unknown: names in the file that mean nothing here.
+    """
+
+    meaning: dict[str, str]
+    joints: int
+    unknown: list[str] = field(default_factory=list)
+
+    @property
+    def pose(self) -> set[str]:
+        """Our names of the pose columns that are there."""
+        return {name for name in self.meaning.values() if not re.fullmatch(r"q\d+", name)}
+
+    def unit_kind(self, name: str, machine: Mechanism | None) -> str:
+        """SI unit that a column of ours is in: `m`, `rad` or `1`."""
+        known = {} if machine is None else {c.name: c.unit for c in (*machine.joints, *machine.pose)}
+        if name in known:
+            return known[name]
+        return "m" if name in _POSITION else "1" if name in ("qw", "qx", "qy", "qz") else "rad"
+
+
+def recognise(table: Table) -> Recognised:
+    """Find joints (q1, J1, A1, joint_1, axis1, …) and pose columns by their names, whatever their case."""
+    folded = {name: re.sub(r"[\s_.\-]", "", name).lower() for name in table.names}
+    families: dict[str, dict[int, str]] = {}
+    for name, plain in folded.items():
+        match = _JOINT.fullmatch(plain)
+        if match is not None:
+            families.setdefault(match[1], {}).setdefault(int(match[2]), name)
+    numbered = [f for f in families.values() if set(f) == set(range(1, len(f) + 1))]
+    family = families["q"] if families.get("q") in numbered else max(numbered, key=len, default={})
+    meaning = {family[k]: f"q{k}" for k in sorted(family)}
+    wanted = _POSITION | {c.name for name in REGISTRY if name not in _OPEN for c in load_mechanism(name).pose}
+    wanted -= {"rx", "ry", "rz"}
+    by_plain = {plain: name for name, plain in reversed(folded.items()) if name not in meaning}
+    meaning |= {by_plain[plain]: ours for ours in sorted(wanted) if (plain := ours.replace("_", "")) in by_plain}
+    for theirs, ours in _TURNS:
+        plains = [name.replace("_", "") for name in theirs]
+        if all(plain in by_plain for plain in plains):
+            meaning |= dict(zip((by_plain[plain] for plain in plains), ours, strict=True))
+            break
+    return Recognised(meaning, len(family), [name for name in table.names if name not in meaning])
+
+
+def suitable_mechanisms(found: Recognised, table: Table) -> list[str]:
+    """Built-in mechanisms whose joints and pose are exactly those of the table, units included where it has them."""
+    theirs = {ours: table.units[name] for name, ours in found.meaning.items()}
+    fitting = []
+    for name in REGISTRY:
+        if name in _OPEN:
+            continue
+        machine = load_mechanism(name)
+        wanted = {c.name: c.unit for c in (*machine.joints, *machine.pose)}
+        if set(wanted) == set(theirs) and all(_fits(theirs[ours], unit) for ours, unit in wanted.items()):
+            fitting.append(name)
+    return fitting
+
+
+def unit_pair(text: str) -> dict[str, str]:
+    """Of `mm,deg`: SI unit -> unit of the lengths and of the angles.
+
+    Raises:
+        InputError: it is not a length and an angle.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) != 2 or [_kind(part) for part in parts] != ["m", "rad"]:
+        raise InputError(f"--units {text}: write the unit of lengths and that of angles, e.g. mm,deg or m,rad")
+    return {"m": parts[0], "rad": parts[1], "1": "1"}
+
+
+def is_covariate(name: str, patterns: Sequence[str] = DEFAULT_COVARIATES) -> bool:
+    """Whether a run takes a column of this name as an input by itself."""
+    from fnmatch import fnmatchcase
+
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def choose_split(positions: np.ndarray[tuple[int, int], np.dtype[np.float64]] | None, names: Sequence[str],
+                 goals: np.ndarray[tuple[int, int], np.dtype[np.float64]] | None) -> tuple[str, str]:  # fmt: skip
+    """Split of a config, as YAML, and why: whole targets are held out where targets repeat.
+
+    Args:
+        positions: `s x d` [m], or None where the pose has none.
+        names: of the columns `goals`, which hold the commanded targets, `s x g`; None without.
+    """
+    if goals is not None and _repeats(np.round(goals, 9)):
+        return f"{{kind: group, by: [{', '.join(names)}], test: 0.3, validation: 0.2}}", (
+            "targets repeat: all rows of one target (goal columns) are on one side"
+        )
+    if positions is not None and _repeats(np.round(positions / 5e-3)):
+        return "{kind: group, by: position:5mm, test: 0.3, validation: 0.2}", (
+            "positions repeat: all rows of one 5 mm cell are on one side"
+        )
+    return "{kind: random, test: 0.3, validation: 0.2}", "targets do not repeat: single rows are held out"
+
+
+def _repeats(rows: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> bool:
+    """Whether a fifth of the rows or more stands where another one does, at 10 places or more."""
+    distinct = len(np.unique(rows, axis=0))
+    return 10 <= distinct <= 0.8 * len(rows)
+
+
+def _fits(unit: str, si_unit: str) -> bool:
+    return not unit or _kind(unit) == si_unit
+
+
+def _kind(unit: str) -> str | None:
+    try:
+        return si_unit_of(unit)
+    except InputError:
+        return None
