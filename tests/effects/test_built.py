@@ -1,6 +1,6 @@
 """Effects against machines as built that know nothing of them: own closures, statics, heat and play.
 
-In `ccnn_torch.runs.machines` drives stiffen, play has a soft edge between friction and load, waves have two harmonics,
+In `ccnn_torch.simulation.machines` drives stiffen, play has a soft edge between friction and load, waves have two harmonics,
 heat moves through bodies of three time constants, one of them warmed by the drives' own work. What share of such a gap
 an effect leaves at its best bounds what a diagnosis can make of it.
 """

@@ -84,7 +84,8 @@ def link_weight_torque(joints: Tensor) -> Tensor:
     at = torch.stack([p + (r @ c[:, None])[..., 0] for (r, p), c in zip(frames, centres, strict=True)], -2)
     arms = torch.linalg.cross(axes[..., :, None, :], at[..., None, :, :] - points[..., :, None, :])
     carried = torch.triu(torch.ones(6, 6, dtype=torch.float64))
-    return -(arms[..., 2] * carried * masses).sum(-1) * _GRAVITY
+    torque: Tensor = -(arms[..., 2] * carried * masses).sum(-1) * _GRAVITY
+    return torque
 
 
 def _free_frames() -> SerialArm:
