@@ -1,8 +1,8 @@
 """Effects against machines as built that know nothing of them: own closures, statics, heat and play.
 
-In `ccnn_torch.simulation.machines` drives stiffen, play has a soft edge between friction and load, waves have two harmonics,
-heat moves through bodies of three time constants, one of them warmed by the drives' own work. What share of such a gap
-an effect leaves at its best bounds what a diagnosis can make of it.
+In `ccnn_torch.simulation.machines` drives stiffen, backlash has a soft edge between friction and load, waves have two
+harmonics, and heat moves through bodies of three time constants, one of them warmed by the drives' own work. The
+share of the residual that an effect leaves at its best bounds what a diagnosis can conclude from it.
 """
 
 from __future__ import annotations
