@@ -20,7 +20,7 @@ import torch
 from sklearn.linear_model import BayesianRidge
 
 from ccnn_torch.diagnosis import diagnose_rows, engine
-from ccnn_torch.diagnosis._alone import fit_alone, own_products
+from ccnn_torch.diagnosis.evidence.single_groups import fit_single_groups, own_products
 from ccnn_torch.effects import Situation, default_gravity
 from ccnn_torch.simulation.job import simulate_records
 
@@ -81,7 +81,9 @@ def against_ridge(machine: str, rows: int) -> None:
     x, y = analysis.dictionary.columns, analysis.y
     own = [(i, x[..., g].contiguous()) for i, g in analysis.dictionary.groups.items()]
     start = time.perf_counter()
-    evidence = fit_alone([own_products(c, y) for _, c in own], y.square().sum(), float(y.numel()), 0.0).log_evidence
+    evidence = fit_single_groups(
+        [own_products(c, y) for _, c in own], y.square().sum(), float(y.numel()), 0.0
+    ).log_evidence
     ours = time.perf_counter() - start
     start = time.perf_counter()
     plain = []

@@ -1,6 +1,6 @@
 """Which effect causes the gap between model and machine, where it lies, and how far it shrinks."""
 
-from ccnn_torch.diagnosis._network import with_network as with_network
+from ccnn_torch.diagnosis.discrepancy.network import with_network as with_network
 from ccnn_torch.diagnosis.engine import OUTLIER as OUTLIER
 from ccnn_torch.diagnosis.engine import candidates as candidates
 from ccnn_torch.diagnosis.engine import diagnose_rows as diagnose_rows

@@ -8,20 +8,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._analysis import Analysis, analyse
-from ccnn_torch.diagnosis._belonging import Belonging, belonging
-from ccnn_torch.diagnosis._by_block import by_block
-from ccnn_torch.diagnosis._catch_all import SPEED
-from ccnn_torch.diagnosis._cautions import cautions
-from ccnn_torch.diagnosis._missing import missing_covariates
-from ccnn_torch.diagnosis._next import next_measurements
-from ccnn_torch.diagnosis._report import Blocks, blocks, in_order
-from ccnn_torch.diagnosis._rows import picked
-from ccnn_torch.diagnosis._verdict import Judgement, judge, withdrawn
-from ccnn_torch.diagnosis._where import where
+from ccnn_torch.diagnosis.checks.cautions import cautions
+from ccnn_torch.diagnosis.checks.missing_covariates import missing_covariates
+from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows, plausible_rows
+from ccnn_torch.diagnosis.design.next_measurements import next_measurements
+from ccnn_torch.diagnosis.discrepancy.smooth import SPEED
 from ccnn_torch.diagnosis.from_file import not_held_notes
+from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.diagnosis.result import Diagnosis
-from ccnn_torch.diagnosis.words import lacking_text, unseen_text, verdict_text
+from ccnn_torch.diagnosis.search.analysis import Analysis, analyse
+from ccnn_torch.diagnosis.shrink.by_block import by_block
+from ccnn_torch.diagnosis.verdict.blocks import Blocks, blocks, in_order
+from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge, without_names
+from ccnn_torch.diagnosis.verdict.localisation import localise
+from ccnn_torch.diagnosis.verdict.text import lacking_text, unseen_text, verdict_text
 from ccnn_torch.effects import (
     Effect,
     Situation,
@@ -34,7 +34,16 @@ from ccnn_torch.effects import (
 )
 from ccnn_torch.errors import InputError, RowsError
 
-__all__ = ["OUTLIER", "UNSHOWN", "candidates", "diagnose_rows", "gross_rows", "thinned", "usable_rows", "why_set_aside"]
+__all__ = [
+    "OUTLIER",
+    "UNSHOWN",
+    "candidates",
+    "diagnose_rows",
+    "drawn_rows",
+    "gross_outliers",
+    "usable_rows",
+    "why_set_aside",
+]
 
 OUTLIER = "outlier"
 # More rows, and more measured values, than this name a cause no better: so many are drawn.
@@ -94,7 +103,7 @@ def diagnose_rows(
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
     rows = usable_rows(situation, measured)
-    situation, measured, chosen = thinned(situation, measured, rows.fine, seed)
+    situation, measured, chosen = drawn_rows(situation, measured, rows.fine, seed)
     residual = pose_residual(situation, measured)
     every = _made(situation, effects)
     usable, lacking = candidates(situation, every)
@@ -106,12 +115,12 @@ def diagnose_rows(
     together = made.main(made.together)
     unlikely = bool(judgement.names) and not judgement.outside and judgement.probability < _LIKELY
     if unlikely and (together.interval is None or together.interval[0] <= 0):
-        judgement = withdrawn(analysis, judgement)
+        judgement = without_names(analysis, judgement)
         made = Blocks(analysis, judgement, residual, seed)
         together = made.main(made.together)
     gap, gap_rotation, listed = blocks(made)
     nothing = not judgement.names and not judgement.outside
-    outlier = nothing and bool(rows.astray.any() or gross_rows(analysis).any())
+    outlier = nothing and bool(rows.astray.any() or gross_outliers(analysis).any())
     missing = missing_covariates(analysis, every, lacking, judgement.driver, seed)
     doubts = cautions(analysis, judgement, rows, missing, together)
     texts = [caution.text for caution in doubts]
@@ -128,7 +137,7 @@ def diagnose_rows(
     why = why_set_aside(analysis, rows, chosen)
     told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": texts}
     verdict["text"] = verdict_text(told | {"rows_set_aside": sorted(why)})
-    places, intervals = where(analysis, residual, seed)
+    places, intervals = localise(analysis, residual, seed)
     proposed = next_measurements(analysis, judgement, seed)
     return Diagnosis(
         gap=gap,
@@ -156,7 +165,7 @@ def diagnose_rows(
 def _notes(
     analysis: Analysis,
     judgement: Judgement,
-    rows: Belonging,
+    rows: PlausibleRows,
     lacking: Mapping[str, str],
     missing: Sequence[Mapping[str, Any]],
     proposed: Sequence[Mapping[str, Any]],
@@ -167,18 +176,18 @@ def _notes(
     notes += [lacking_text(mechanism.name, condition) for condition in mechanism.lacking(covariates)]
     notes += not_held_notes(judgement.names)
     for atom in (analysis.dictionary.atoms[i] for i in judgement.found.members):
-        if atom.catch_all and len(atom.shape):
+        if atom.is_discrepancy and len(atom.shape):
             notes.append(f"what follows the time is a sway with a period of {float(atom.shape):.3g} s")
     if len(analysis.measured) < int(rows.fine.sum()):
         notes.append(f"{len(analysis.measured)} of {len(rows.fine)} rows, drawn at random, were looked at")
     atoms = analysis.dictionary.atoms
     beside = [atoms[i] for i in judgement.fullest.members if i not in judgement.found.members]
-    mends = [a.name for a in beside if not a.catch_all]
-    if judgement.names and mends:
+    corrections = [a.name for a in beside if not a.is_discrepancy]
+    if judgement.names and corrections:
         share = (judgement.found.rss - judgement.fullest.rss) / analysis.gap
         notes.append(
-            f"the numbers of {' and '.join(judgement.names)} are told beside {' and '.join(mends)}, which would take "
-            f"{100 * share:.2g} % of the gap more, too little to be told from another form of what is named"
+            f"the values of {' and '.join(judgement.names)} are from a fit that also holds "
+            f"{' and '.join(corrections)}, which would explain {100 * share:.2g} % more of the residual: too little to be named"
         )
     if judgement.outside and not proposed:
         notes.append(
@@ -193,7 +202,7 @@ def _notes(
     return notes
 
 
-def why_set_aside(analysis: Analysis, rows: Belonging, chosen: Tensor) -> dict[int, str]:
+def why_set_aside(analysis: Analysis, rows: PlausibleRows, chosen: Tensor) -> dict[int, str]:
     """Reason by row, counted from 0 in the file; rows: all of them; chosen: those looked at."""
     why = dict.fromkeys(torch.nonzero(~rows.fine).squeeze(-1).tolist(), "the machine does not reach it")
     why |= dict.fromkeys(torch.nonzero(rows.astray).squeeze(-1).tolist(), "far from where its joints put it")
@@ -202,7 +211,7 @@ def why_set_aside(analysis: Analysis, rows: Belonging, chosen: Tensor) -> dict[i
     return why | dict.fromkeys(chosen[aside & near].tolist(), "next to a singularity")
 
 
-def gross_rows(analysis: Analysis) -> Tensor:
+def gross_outliers(analysis: Analysis) -> Tensor:
     """Rows set aside that are so far off that no heavy tail of ordinary noise makes them, `s` bool."""
     white = analysis.whitening
     size = (analysis.residual[:, white.channels] / white.sigma).abs().amax(-1)
@@ -212,7 +221,7 @@ def gross_rows(analysis: Analysis) -> Tensor:
     return far if together else aside & (size > _GROSS)
 
 
-def usable_rows(situation: Situation, measured: Tensor) -> Belonging:
+def usable_rows(situation: Situation, measured: Tensor) -> PlausibleRows:
     """Rows that the mechanism can have reached.
 
     Raises:
@@ -221,10 +230,10 @@ def usable_rows(situation: Situation, measured: Tensor) -> Belonging:
     rows = len(situation.joints)
     if rows < _FEWEST_ROWS:
         raise RowsError(f"{rows} rows are too few for a diagnosis; measure at least {_FEWEST_ROWS}, better 100")
-    return belonging(situation, measured)
+    return plausible_rows(situation, measured)
 
 
-def thinned(situation: Situation, measured: Tensor, fine: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:
+def drawn_rows(situation: Situation, measured: Tensor, fine: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:
     """As many of the fine rows as are looked at, in order, and which they are."""
     chosen = torch.nonzero(fine).squeeze(-1)
     most = min(_MOST_ROWS, _MOST_VALUES // len(situation.mechanism.pose))

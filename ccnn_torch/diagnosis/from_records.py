@@ -11,10 +11,10 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._distance import size_of
-from ccnn_torch.diagnosis._network import with_network
-from ccnn_torch.diagnosis._told import refuse_lost_rows, told
+from ccnn_torch.diagnosis.discrepancy.network import with_network
 from ccnn_torch.diagnosis.engine import diagnose_rows
+from ccnn_torch.diagnosis.residual.distance import size_of
+from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, simulator_inputs
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Effect, Situation, default_gravity
 from ccnn_torch.errors import InputError, RowsError
@@ -120,7 +120,7 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
         raise InputError(f"gravity: needs three numbers (x, y, z in m/s²), not {len(down)}")
     covariates = {c.name: records.covariates[:, i] for i, c in enumerate(records.covariate_coordinates)}
     _refuse_no_sign(records, covariates)
-    mechanism, more = told(records, mechanism, covariates)
+    mechanism, more = simulator_inputs(records, mechanism, covariates)
     covariates |= more
     guess = records.pose if records.pose.shape[-1] == len(mechanism.pose) else None
     situation = Situation(mechanism, records.joints, covariates, down, parameters, guess)

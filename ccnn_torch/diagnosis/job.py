@@ -8,12 +8,12 @@ from pathlib import Path
 
 from ccnn_torch.config.noise import noise_of_pose
 from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of
-from ccnn_torch.diagnosis.check import Check, check_rows
+from ccnn_torch.diagnosis.checks.identifiable import Check, check_rows
 from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.diagnosis.from_records import naming
+from ccnn_torch.diagnosis.page.arrays import picture_arrays
 from ccnn_torch.diagnosis.page.report import write_diagnosis_report
-from ccnn_torch.diagnosis.pictures import picture_arrays
-from ccnn_torch.diagnosis.words import aside_text
+from ccnn_torch.diagnosis.verdict.text import aside_text
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError

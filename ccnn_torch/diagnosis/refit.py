@@ -8,12 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis._atoms import scales
-from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
-from ccnn_torch.diagnosis._linear import remainder, signature_at, tangent
-from ccnn_torch.diagnosis._richest import fitted_whitening
-from ccnn_torch.diagnosis._whitening import Whitening, moving_channels, reweighted
+from ccnn_torch.diagnosis.candidates.atom import scales
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
 from ccnn_torch.diagnosis.from_file import Known
+from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at, tangent
+from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
+from ccnn_torch.diagnosis.residual.whitening import Whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Situation
 
 __all__ = ["refit"]

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from ccnn_torch.diagnosis._analysis import Analysis
-from ccnn_torch.diagnosis._verdict import Judgement
+from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Acting
 
 __all__ = ["Diagnosis"]

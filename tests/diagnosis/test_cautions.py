@@ -13,9 +13,9 @@ from diagnosis._machines import NOISE, acting, measured, reached_with, rows_of
 from torch import Tensor
 
 from ccnn_torch.diagnosis import diagnose_rows, engine
-from ccnn_torch.diagnosis._analysis import Analysis
-from ccnn_torch.diagnosis._verdict import Judgement, judge
-from ccnn_torch.diagnosis.check import check_rows
+from ccnn_torch.diagnosis.checks.identifiable import check_rows
+from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge
 from ccnn_torch.effects import Situation, default_gravity
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism

@@ -11,7 +11,7 @@ import torch
 from diagnosis._machines import NOISE, acting, measured, reached_with, rows_of
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, diagnose_rows
-from ccnn_torch.diagnosis.check import check_rows
+from ccnn_torch.diagnosis.checks.identifiable import check_rows
 from ccnn_torch.diagnosis.engine import candidates
 from ccnn_torch.effects import EFFECTS, Situation, default_gravity, make_effect
 from ccnn_torch.errors import InputError

@@ -10,13 +10,13 @@ import torch
 from diagnosis._machines import rows_of
 from scipy.stats import multivariate_normal
 
-from ccnn_torch.diagnosis._alone import NOTHING, fit_alone, own_products
-from ccnn_torch.diagnosis._atoms import Atom
-from ccnn_torch.diagnosis._dictionary import Dictionary, dictionary_of, singles_of
-from ccnn_torch.diagnosis._evidence import fit_sets, grams_of
-from ccnn_torch.diagnosis._joined import side_by_side
-from ccnn_torch.diagnosis._remainder import Lead, Remainder, Tried
-from ccnn_torch.diagnosis._sets import promising, scored
+from ccnn_torch.diagnosis.candidates.atom import Atom
+from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns
+from ccnn_torch.diagnosis.evidence.batched_sets import column_indices
+from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, dictionary_of, singles_of
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.diagnosis.evidence.single_groups import NO_COLUMNS, fit_single_groups, own_products
+from ccnn_torch.diagnosis.search.sets import promising, scored
 from ccnn_torch.effects import make_effect
 
 
@@ -73,10 +73,13 @@ def test_columns_without_their_zeros_are_the_columns(name: str) -> None:
 
 def test_what_is_put_beside_in_parts_takes_what_it_takes_at_once() -> None:
     y, x = _columns(6, 60, 1).reshape(30, 2), 5 * _columns(7, 60, 9).reshape(30, 2, 9)
-    at_once, in_parts = Remainder(y, x), Remainder(y, x[..., :4]).beside(x[..., 4:])
-    factors, lead = _columns(8, 30, 12).reshape(30, 4, 3).transpose(0, 1), Lead(_columns(9, 60, 2).reshape(30, 2, 2))
-    led, each = Tried(factors[..., None, :], lead), Tried(factors[..., :2, None], lead)
-    plain, apart = (Tried(torch.stack([t.one(k) for k in range(4)])) for t in (led, each))
+    at_once, in_parts = NuisanceFit(y, x), NuisanceFit(y, x[..., :4]).beside(x[..., 4:])
+    factors, lead = (
+        _columns(8, 30, 12).reshape(30, 4, 3).transpose(0, 1),
+        SharedColumns(_columns(9, 60, 2).reshape(30, 2, 2)),
+    )
+    led, each = TrialColumns(factors[..., None, :], lead), TrialColumns(factors[..., :2, None], lead)
+    plain, apart = (TrialColumns(torch.stack([t.one(k) for k in range(4)])) for t in (led, each))
     wanted = at_once.gain(plain)
     assert at_once.gain(each) == pytest.approx(at_once.gain(apart).numpy(), rel=1e-9)
     # By the textbook: what M(I + MᵀM)^-1 Mᵀ leaves of y and of the columns.
@@ -97,24 +100,24 @@ def test_several_remainders_at_once_are_as_one_by_one(own: bool, width: int) -> 
     y, x = _columns(20, 60, 1).reshape(30, 2), _columns(21, 60, 3).reshape(30, 2, 3)
     more, lead = _columns(22, 180, 2).reshape(3, 30, 2, 2), _columns(23, 180, 3).reshape(3, 30, 2, 3)
     factors = _columns(24, 3 * 5 * 30 * 3, width).reshape(3, 5, 30, 3, width)[..., : 3 if own else 1, :]
-    left = Remainder(y, x)
-    together = left.beside(more).gain(Tried(factors, Lead(lead)))
+    left = NuisanceFit(y, x)
+    together = left.beside(more).gain(TrialColumns(factors, SharedColumns(lead)))
     for mine, m, f, k in zip(together, more, factors, lead, strict=True):
-        assert mine == pytest.approx(left.beside(m).gain(Tried(f, Lead(k))).numpy(), rel=1e-9)
+        assert mine == pytest.approx(left.beside(m).gain(TrialColumns(f, SharedColumns(k))).numpy(), rel=1e-9)
 
 
 def test_nearly_the_same_columns_far_above_the_noise_can_be_taken_out_twice() -> None:
     y, x = _columns(12, 60, 1).reshape(30, 2), 1e7 * _columns(13, 60, 5).reshape(30, 2, 5)
-    twice = Remainder(y, x).beside(x * (1 + 1e-12 * torch.arange(5))).beside(x)
-    assert twice.y == pytest.approx(Remainder(y, x).y.numpy(), abs=0.05)
-    assert bool(torch.isfinite(twice.gain(Tried(_columns(14, 240, 3).reshape(4, 30, 2, 3)))).all())
+    twice = NuisanceFit(y, x).beside(x * (1 + 1e-12 * torch.arange(5))).beside(x)
+    assert twice.y == pytest.approx(NuisanceFit(y, x).y.numpy(), abs=0.05)
+    assert bool(torch.isfinite(twice.gain(TrialColumns(_columns(14, 240, 3).reshape(4, 30, 2, 3)))).all())
 
 
 def test_groups_in_their_axes_are_as_sets_of_one() -> None:
     x, y = _columns(10, 40, 9), _columns(11, 40, 1)[..., 0]
     x[..., 8] = x[..., 7]
     groups = [torch.arange(0, 3), torch.arange(3, 7), torch.arange(7, 9)]
-    found = fit_alone([NOTHING, *(own_products(x[..., g], y) for g in groups)], y.square().sum(), 40.0, 5.0)
+    found = fit_single_groups([NO_COLUMNS, *(own_products(x[..., g], y) for g in groups)], y.square().sum(), 40.0, 5.0)
     for k, group in enumerate([[], *([g] for g in groups)]):
         one = fit_sets(grams_of(x, y), [group], 5.0)
         assert float(found.log_evidence[k]) == pytest.approx(float(one.log_evidence[0]), rel=1e-9)
@@ -156,7 +159,7 @@ def test_a_dictionary_for_some_sets_says_of_these_what_the_whole_says() -> None:
 
 def test_columns_of_runs_stand_side_by_side() -> None:
     begin, width = torch.tensor([[4, 0], [2, 9]]), torch.tensor([[2, 3], [1, 1]])
-    columns, slot = side_by_side(begin, width)
+    columns, slot = column_indices(begin, width)
     assert columns.tolist() == [[4, 5, 0, 1, 2], [2, 9, -1, -1, -1]]
     assert slot.tolist() == [[0, 0, 1, 1, 1], [0, 1, -1, -1, -1]]
 

@@ -6,7 +6,7 @@ import torch
 from _machines import NOISE, measured, rows_of
 
 from ccnn_torch.diagnosis import diagnose_rows
-from ccnn_torch.diagnosis.pictures import picture_arrays
+from ccnn_torch.diagnosis.page.arrays import picture_arrays
 from ccnn_torch.effects import pose_residual
 
 

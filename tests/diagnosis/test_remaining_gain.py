@@ -74,6 +74,6 @@ def test_many_rows_are_drawn_and_constant_conditions_left_out(monkeypatch: pytes
     )
     poses = measured(still, {"compliance": 12.0, "joint_gain": 8.0}, 10)
     said = diagnose_rows(still, poses, None, ["compliance"])
-    monkeypatch.setattr("ccnn_torch.diagnosis._network._ROWS", 150)
+    monkeypatch.setattr("ccnn_torch.diagnosis.discrepancy.network._ROWS", 150)
     network = with_network(said).network
     assert network is not None and network["rows"] == 150 and network["gain_ci95"][0] > 0

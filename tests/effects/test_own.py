@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.cli._main import app
 from ccnn_torch.diagnosis import diagnose_rows, noise_of, situation_of
-from ccnn_torch.diagnosis.check import check_rows
+from ccnn_torch.diagnosis.checks.identifiable import check_rows
 from ccnn_torch.effects import Effect, make_effect, owned
 from ccnn_torch.errors import InputError
 from ccnn_torch.simulation.job import simulate_records

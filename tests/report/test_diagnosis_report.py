@@ -39,7 +39,7 @@ from ccnn_torch.diagnosis.page.tables import (
     order_table,
     parameter_table,
 )
-from ccnn_torch.diagnosis.words import (
+from ccnn_torch.diagnosis.verdict.text import (
     aside_text,
     network_text,
     verdict_text,

@@ -10,7 +10,7 @@ from ccnn_torch.diagnosis.page.figures import gap_plot
 from ccnn_torch.diagnosis.page.tables import (
     gap_table,
 )
-from ccnn_torch.diagnosis.words import (
+from ccnn_torch.diagnosis.verdict.text import (
     driver_words,
     effect_words,
     probability_words,

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ccnn_torch.diagnosis.page.data import gaps_of
-from ccnn_torch.diagnosis.words import driver_words, probability_words
+from ccnn_torch.diagnosis.verdict.text import driver_words, probability_words
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, GREY, SERIES, Plot, styled
 

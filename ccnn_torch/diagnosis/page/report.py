@@ -36,7 +36,7 @@ from ccnn_torch.diagnosis.page.tables import (
     unseen_table,
 )
 from ccnn_torch.diagnosis.page.tensorboard import write_diagnosis_events
-from ccnn_torch.diagnosis.words import aside_text, network_text, unseen_text, verdict_text
+from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, unseen_text, verdict_text
 from ccnn_torch.display import count_text
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.figures.style import Plot, inline_svg, save_figure

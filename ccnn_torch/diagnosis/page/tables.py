@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccnn_torch.diagnosis.page.data import About, gaps_of
-from ccnn_torch.diagnosis.words import block_text, effect_words, listed, network_text, probability_words
+from ccnn_torch.diagnosis.verdict.text import block_text, effect_words, listed, network_text, probability_words
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.table import Table
 

@@ -1,0 +1,73 @@
+"""Candidates of a diagnosis as groups of whitened columns: library effects at given shapes, and catch-alls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.effects import Coefficient, Effect, Situation, signature
+
+__all__ = ["Atom", "default_shape", "scaled_signature", "scales"]
+
+
+@dataclass(frozen=True)
+class Atom:
+    """One candidate cause with its columns.
+
+    Attributes:
+        name: of the effect, or the driver of a catch-all (`workspace`, `joint q1`, `load z`, …).
+        effect: None for a catch-all.
+        shape: values of the effect's shapes, `h` [SI]; of a catch-all that sways its period [s], of others none.
+        columns: first-order change of the pose per plausible size of each coefficient, `s x c x m` [m, rad].
+        log_prior: log prior odds, the search over shapes charged.
+        used: the coefficients that the columns belong to; None = all, in order.
+        plain: whether a catch-all has straight lines, planes or gentle curves only.
+    """
+
+    name: str
+    effect: Effect | None
+    shape: Tensor
+    columns: Tensor
+    log_prior: float
+    used: tuple[int, ...] | None = None
+    plain: bool = False
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """Those that the columns belong to; () for a catch-all."""
+        if self.effect is None:
+            return ()
+        every = self.effect.coefficients(situation)
+        return every if self.used is None else tuple(every[i] for i in self.used)
+
+    def spread(self, situation: Situation, mean: Tensor) -> Tensor:
+        """All of the effect's coefficients [SI] from those of the columns in plausible sizes, `m`."""
+        assert self.effect is not None
+        every = scales(self.effect.coefficients(situation), mean)
+        if self.used is None:
+            return every * mean
+        index = torch.tensor(self.used)
+        return torch.zeros_like(every).index_copy(0, index, every[index] * mean)
+
+    @property
+    def is_discrepancy(self) -> bool:
+        """Whether it stands for something that no effect of the library describes."""
+        return self.effect is None
+
+
+def scales(coefficients: Sequence[Coefficient], like: Tensor) -> Tensor:
+    """Plausible sizes, `m`."""
+    return torch.tensor([c.scale for c in coefficients], dtype=like.dtype, device=like.device)
+
+
+def scaled_signature(situation: Situation, effect: Effect, shape: Tensor) -> Tensor:
+    """Signature per plausible size, `... x s x c x m`."""
+    return signature(situation, effect, shape) * scales(effect.coefficients(situation), situation.joints)
+
+
+def default_shape(situation: Situation, effect: Effect) -> Tensor:
+    """The middle of every grid, `h`."""
+    grids = [s.grid for s in effect.shapes(situation)]
+    return torch.tensor([g[len(g) // 2] for g in grids], dtype=situation.joints.dtype, device=situation.joints.device)

@@ -1,0 +1,183 @@
+"""Candidates of a search: every effect at the shapes that suit the rows, at first and about a set that acts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.candidates.atom import Atom, default_shape
+from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows, Shaped
+from ccnn_torch.diagnosis.candidates.single_joint import single_joint_atoms
+from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
+from ccnn_torch.diagnosis.residual.whitening import Whitening
+from ccnn_torch.effects import Acting, Effect, Situation
+
+__all__ = [
+    "Known",
+    "candidates_about_nominal",
+    "candidates_about_set",
+    "default_atom",
+    "has_usual_shape",
+    "without_unused_rows",
+]
+
+LOG_PRIOR = math.log(0.1)
+
+
+class Known(NamedTuple):
+    """Shapes found before.
+
+    Attributes:
+        starts: they stay candidates, since what acts now may have hidden the better ones.
+        kept: by names of effects whose shapes are not looked for again those that they have.
+        alone: whether shapes of what acts are looked for with nothing beside it, too.
+    """
+
+    starts: Sequence[Atom]
+    kept: Mapping[str, Sequence[Atom]]
+    alone: bool
+
+
+def default_atom(situation: Situation, there: Situation, effect: Effect) -> Atom:
+    """The effect with all coefficients, at the middle of its grids; `there`: the machine about which it is linear."""
+    return _atom(situation, there, effect, Shaped(default_shape(situation, effect), None, 0.0))
+
+
+def without_unused_rows(atom: Atom, usable: Tensor) -> Atom:
+    """With rows that are left out set to zero."""
+    return atom if bool(usable.all()) else replace(atom, columns=atom.columns.where(usable[:, None, None], 0.0))
+
+
+def candidates_about_nominal(
+    situation: Situation, atoms: Sequence[Atom], white: Whitening, residual: Tensor, usable: Tensor, fitted: Tensor
+) -> tuple[list[Atom], list[Atom]]:
+    """Effects without shapes, whole and in part; and those with shapes, at what suits the residual.
+
+    Shapes are looked for by themselves and with the rest of the library beside them: two ways to start, both stay
+    candidates, and so do the shapes that are usual where an effect has such.
+
+    Args:
+        situation: `s` rows.
+        atoms: of all effects at the middle of their grids.
+        white: noise and weights.
+        residual: `s x c0` [m, rad].
+        usable: `s`, bool.
+        fitted: columns of what was fitted before, `s x c0 x r`.
+    """
+    whole = [a for a in atoms if a.shape.numel() == 0]
+    parts = [p for p in single_joint_atoms(situation, whole, white, [residual] * len(whole)) if p is not None]
+    bare = white(fitted)
+    beside = torch.cat([bare, *(white(a.columns) for a in whole)], -1)
+    grounds = [SearchRows(white(residual), nuisance, quick=True) for nuisance in (bare, beside)]
+    starts: list[Atom] = []
+    for atom in (a for a in atoms if a.shape.numel()):
+        assert atom.effect is not None
+        scan = Scan(situation, situation, atom.effect, _only(white, usable))
+        looked_for = (scan.best(ground) for ground in grounds)
+        for shaped in (*_usual(situation, atom.effect), *looked_for):
+            if not any(a.effect is atom.effect and _same_shape(a, shaped) for a in starts):
+                starts.append(without_unused_rows(_atom(situation, situation, atom.effect, shaped), usable))
+    return [*whole, *parts], starts
+
+
+def candidates_about_set(
+    situation: Situation,
+    there: Situation,
+    measured: Tensor,
+    target: Tensor,
+    effects: Sequence[Effect],
+    acting: Sequence[Acting],
+    known: Known,
+    white: Whitening,
+    usable: Tensor,
+    fitted: Tensor,
+) -> list[Atom]:
+    """All effects about the machine `there`, to which those that act bring it; shapes looked for beside these.
+
+    Args:
+        situation, there: rows on the nominal machine, and on the other.
+        measured: poses, `s x p`.
+        target: what a linear model about `there` has to explain, `s x c0` [m, rad].
+        effects: candidates.
+        acting: those of the best set.
+        known: of shapes.
+        white, usable, fitted: as in `candidates_about_nominal`.
+    """
+
+    def beside(others: Sequence[Acting]) -> Tensor:
+        return torch.where(usable[:, None], torch.nan_to_num(remainder(situation, measured, others)), 0.0)
+
+    def ground(others: Sequence[Acting]) -> SearchRows:
+        names = tuple(a.effect.name for a in others)
+        if names not in grounds:
+            grounds[names] = made(others)
+        return grounds[names]
+
+    def made(others: Sequence[Acting]) -> SearchRows:
+        columns = [_atom(situation, there, a.effect, Shaped(a.shape, None, 0.0)) for a in others]
+        present = torch.cat([white(fitted), *(white(without_unused_rows(c, usable).columns) for c in columns)], -1)
+        return SearchRows(white(target), present)
+
+    grounds: dict[tuple[str, ...], SearchRows] = {}
+    rigid = [e for e in effects if not e.shapes(situation)]
+    whole = [without_unused_rows(default_atom(situation, there, e), usable) for e in rigid]
+    all_act = beside(acting)
+    left = []
+    for effect in rigid:
+        others = [a for a in acting if a.effect is not effect]
+        left.append(all_act if len(others) == len(acting) else beside(others))
+    atoms = [*whole, *(p for p in single_joint_atoms(situation, whole, white, left) if p is not None)]
+    for effect in (e for e in effects if e.shapes(situation)):
+        others = [a for a in acting if a.effect is not effect]
+        start = next((a.shape for a in acting if a.effect is effect), None)
+        shapes: list[Shaped] = []
+        if effect.name in known.kept:
+            found = known.kept[effect.name]
+        else:
+            # What acts beside an effect may be there to mend a wrong shape: the right one needs nothing beside it.
+            beside_what = [others, []] if known.alone and start is not None and others else [others]
+            scan = Scan(situation, there, effect, _only(white, usable))
+            shapes = [scan.best(ground(them), start) for them in beside_what]
+            found = [a for a in known.starts if a.effect is effect]
+        shapes += [Shaped(a.shape, a.used, LOG_PRIOR - a.log_prior) for a in found]
+        own: list[Atom] = []
+        for shaped in shapes:
+            if not any(_same_shape(a, shaped) for a in own):
+                own.append(without_unused_rows(_atom(situation, there, effect, shaped), usable))
+        atoms += own
+    return atoms
+
+
+def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped) -> Atom:
+    columns = signature_at(situation, there, effect, shaped.value)
+    if shaped.used is not None:
+        columns = columns[..., list(shaped.used)]
+    return Atom(effect.name, effect, shaped.value, columns, LOG_PRIOR - shaped.charge, shaped.used)
+
+
+def _usual(situation: Situation, effect: Effect) -> list[Shaped]:
+    """The shapes of the textbook, which nobody has to look for; none where an effect has no usual ones."""
+    usual = [s.usual for s in effect.shapes(situation)]
+    if any(value is None for value in usual):
+        return []
+    return [Shaped(torch.tensor(usual, dtype=situation.joints.dtype), None, 0.0)]
+
+
+def has_usual_shape(situation: Situation, atom: Atom) -> bool:
+    """Whether an atom has the shapes that are usual for its effect."""
+    usual = [] if atom.effect is None else _usual(situation, atom.effect)
+    return any(_same_shape(atom, shaped) for shaped in usual)
+
+
+def _same_shape(atom: Atom, shaped: Shaped) -> bool:
+    return atom.used == shaped.used and torch.allclose(atom.shape, shaped.value, rtol=1e-3)
+
+
+def _only(white: Whitening, usable: Tensor) -> Whitening:
+    """The same with rows that are left out set to zero."""
+    return replace(white, weight=torch.where(usable, white.weight, 0.0))

@@ -1,0 +1,309 @@
+"""Shapes (periods, lags, rates): looked for over their grids with what else may be there projected out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.candidates.atom import default_shape, scales
+from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns, search_charge
+from ccnn_torch.diagnosis.residual.whitening import Whitening
+from ccnn_torch.effects import Effect, Shape, Situation
+
+__all__ = ["Scan", "SearchRows", "Shaped"]
+
+# The grid, then twice this many values between the neighbours of the best.
+_FINE, _ROUNDS = 9, 3
+# Log odds, less than these being chance, for which values between those of the grid are looked at.
+_CHANCE = 5.0
+# Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
+_LOOSE = 10.0
+# Values of the residual that the grids are looked at on, for a start and then: so many or one in so many, whichever is
+# more, but no more than the last.
+_START, _THEN, _MOST = (900, 4), (1500, 2), 4800
+# Values of a grid that explain so little less than the best may be meant, a few of them, where it is more than chance.
+_AS_WELL, _FEW, _THERE = 20.0, 16, 100.0
+# Shapes that share coefficients are looked for together where that are no more values.
+_TOGETHER = 150
+
+
+class Shaped(NamedTuple):
+    """Shapes found: `value` `h`; `used`, the coefficients whose shape is worth its charge (None = all); and `charge`,
+    what looking for them costs in log odds: the logarithm of the share of the values looked at that do as well."""
+
+    value: Tensor
+    used: tuple[int, ...] | None
+    charge: float
+
+
+@runtime_checkable
+class _OneByOne(Protocol):
+    """An effect on the joints that tells what `basis` tells without its zeros, for long grids."""
+
+    def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor: ...
+
+
+@runtime_checkable
+class _Factored(Protocol):
+    """An effect on the pose whose `basis` is fixed columns, each times a number that depends on the shapes."""
+
+    def fixed_columns(self, situation: Situation) -> Tensor: ...
+
+    def column_factors(self, situation: Situation, shape: Tensor) -> Tensor: ...
+
+
+class _Part(NamedTuple):
+    """Shapes that share coefficients, and which those are."""
+
+    shapes: list[int]
+    columns: list[int]
+
+
+class _Turn(NamedTuple):
+    """Candidates `g x h`, the columns of each part there, and those that a part looks at: None = none this time."""
+
+    candidates: Tensor
+    columns: list[TrialColumns]
+    tried: list[TrialColumns | None]
+
+
+class SearchRows:
+    """What is to be explained, and what else is there, on the rows that grids are looked at on.
+
+    Attributes:
+        rows: looked at, `t`; None = all.
+        left: what the others leave there.
+        times: how many values there are for each that is looked at.
+        rounds: how often values between the neighbours of the best are looked at.
+    """
+
+    def __init__(self, y: Tensor, others: Tensor, quick: bool = False) -> None:
+        """y: whitened residual, `s x c`; others: whitened columns, in units of their prior, `s x c x P`; quick:
+        whether a start is enough."""
+        drawn = torch.randperm(len(y), generator=torch.Generator().manual_seed(0))
+        fewest, share = _START if quick else _THEN
+        most = min(max(fewest, y.numel() // share), _MOST)
+        count = max(1, most // max(y.shape[1], 1))
+        self.rows = drawn[:count].sort().values if count < len(y) else None
+        self.left = NuisanceFit(_of(y, self.rows, 0), _LOOSE * _of(others, self.rows, 0))
+        self.times = y.numel() / self.left.y.numel()
+        self.rounds = 1 if quick else _ROUNDS
+
+
+class Scan:
+    """The columns of one effect over the grids of its shapes; they serve every search of the same rows."""
+
+    def __init__(self, situation: Situation, there: Situation, effect: Effect, white: Whitening) -> None:
+        """situation: the rows; there: the machine about which they are linear; white: noise and weights."""
+        self.situation, self.effect, self.white = situation, effect, white
+        self.shapes = effect.shapes(situation)
+        coefficients = effect.coefficients(situation)
+        self.size = scales(coefficients, situation.joints)
+        self.parts = _parts(self.shapes, len(coefficients))
+        self.start = default_shape(situation, effect)
+        kind = {"joints": lambda: there.jacobian, "parameters": lambda: there.parameter_jacobian}.get(effect.kind)
+        self.lead = white(torch.nan_to_num(kind())) if kind is not None else None
+        self.fixed: Tensor | None = None
+        if isinstance(effect, _Factored):
+            self.fixed = white(torch.nan_to_num(situation.once(effect.fixed_columns))) * self.size
+        # Which joint a column moves is a matter of the effect's form: the middle and the ends of its grids show it.
+        ends = torch.tensor([[s.grid[0], s.grid[-1]] for s in self.shapes], dtype=self.start.dtype).mT
+        first = effect.basis(situation, torch.stack([self.start, *ends]))
+        self.movers = _movers(first) if self.lead is not None else None
+        free = [c for c in range(len(coefficients)) if not any(c in p.columns for p in self.parts)]
+        self.unshaped = self._whitened(first[:1], free, None)[0]
+        self.coarse: list[_Turn] | None = None
+        self.leads: dict[tuple[int, ...], SharedColumns] = {}
+
+    def columns(self, candidates: Tensor, rows: Tensor | None) -> list[TrialColumns]:
+        """Of each part, whitened, in plausible sizes; candidates: `g x h`; rows: which, None = all."""
+        if self.movers is not None and isinstance(self.effect, _OneByOne):
+            moved = self.effect.one_by_one(self.situation, candidates, rows)
+            return [self._by_movers(_of_run(moved, p.columns), p.columns, rows) for p in self.parts]
+        if self.fixed is not None and isinstance(self.effect, _Factored):
+            factors = _of(self.effect.column_factors(self.situation, candidates), rows, 1)[..., None]
+            return [TrialColumns(factors[:, :, p.columns], self._lead(self.fixed, p.columns, rows)) for p in self.parts]
+        basis = _of(self.effect.basis(self.situation, candidates), rows, 1)
+        if self.movers is None:
+            return [TrialColumns(self._whitened(basis, part.columns, rows)) for part in self.parts]
+        return [self._by_movers(basis[..., self.movers[p.columns], p.columns], p.columns, rows) for p in self.parts]
+
+    def _by_movers(self, moved: Tensor, columns: list[int], rows: Tensor | None) -> TrialColumns:
+        """moved: change of the joint or parameter that each of the columns moves, in the rows, `g x s x m`."""
+        assert self.lead is not None and self.movers is not None
+        one = (moved * self.size[columns]).nan_to_num_()
+        movers = self.movers[columns]
+        which, each = torch.unique_consecutive(movers, return_counts=True)
+        if len(columns) and bool((each == each[0]).all()):
+            return TrialColumns(
+                one.reshape(*one.shape[:-1], len(which), -1), self._lead(self.lead, which.tolist(), rows)
+            )
+        return TrialColumns(_of(self.lead, rows, 0)[..., movers] * one[..., None, :])
+
+    def _lead(self, columns: Tensor, which: Sequence[int], rows: Tensor | None) -> SharedColumns:
+        """Some of the columns in the rows looked at, which are the same all along: one object, however often it is
+        asked for."""
+        key = tuple(which)
+        if key not in self.leads:
+            self.leads[key] = SharedColumns(_of(columns, rows, 0)[..., list(which)])
+        return self.leads[key]
+
+    def _whitened(self, basis: Tensor, columns: list[int], rows: Tensor | None) -> Tensor:
+        """basis: in the rows, `g x s x ... x m`; `g x s x c x m`."""
+        mine = _of_run(basis, columns)
+        if self.lead is not None:
+            return (_of(self.lead, rows, 0) @ (mine * self.size[columns])).nan_to_num_()
+        mine = mine[:, :, self.white.channels] * self.size[columns]
+        return mine.mul_(_of(self.white.scale, rows, 0)[..., None]).nan_to_num_()
+
+    def best(self, ground: SearchRows, start: Tensor | None = None) -> Shaped:
+        """The shapes that explain most.
+
+        Args:
+            ground: what is to be explained, and beside what.
+            start: shapes found before, when the effect is known to be there: its parts are then looked for beside each
+                other.
+        """
+        value = self.start if start is None else start
+        gains = [0.0] * len(self.parts)
+        charges = [0.0] * len(self.parts)
+        plain, times = ground.left.beside(_LOOSE * _of(self.unshaped, ground.rows, 0)), ground.times
+        for level in range(ground.rounds + 1):
+            if level == 1 and not self._promising(gains, charges):
+                break
+            for candidates, pieces, looked_at in self._level(value, level, ground.rows):
+                chosen = [self._nearest(candidates, value, part) for part in self.parts]
+                spent = [0.0] * len(self.parts)
+                # Beside each other: over the grid once each by itself before, and then about what that has found.
+                both = start is not None and len(self.parts) > 1
+                for sweep in ((0, 1) if level == 0 else (1,)) if both else (0,):
+                    for i, tried in enumerate(looked_at):
+                        if tried is None:
+                            continue
+                        own = [_LOOSE * p.one(chosen[j]) for j, p in enumerate(pieces) if sweep and j != i]
+                        left = plain.beside(torch.cat(own, -1)) if own else plain
+                        # What chance explains does not grow with the rows.
+                        score = times * (left.gain(tried) - tried.width) + tried.width
+                        chosen[i] = _likeliest(left, tried, score) if level == 0 else int(score.argmax())
+                        gains[i] = float(score[chosen[i]])
+                        spent[i] = search_charge(score) if level == 0 else 0.0
+                charges = [c + s for c, s in zip(charges, spent, strict=True)]
+                value = value.clone()
+                for i, part in enumerate(self.parts):
+                    value[part.shapes] = candidates[chosen[i]][part.shapes]
+        return self._worth(value, gains, charges, times)
+
+    def _promising(self, gains: Sequence[float], charges: Sequence[float]) -> bool:
+        """Whether any part explains more than chance at the best value of its grid."""
+        parts = zip(self.parts, gains, charges, strict=True)
+        return any((gain - len(part.columns)) / 2 - charge > _CHANCE for part, gain, charge in parts)
+
+    def _level(self, value: Tensor, level: int, rows: Tensor | None) -> list[_Turn]:
+        """Candidates with their columns: of every part all its shapes at once where that are few, else one by one."""
+        if level == 0 and self.coarse is not None:
+            return self.coarse
+        tables = [self._tables(value, part, level) for part in self.parts]
+        found = []
+        for turn in range(max(map(len, tables), default=0)):
+            mine = [
+                table[turn] if turn < len(table) else value[part.shapes][None, :0]
+                for part, table in zip(self.parts, tables, strict=True)
+            ]
+            candidates = value.expand(max(map(len, mine)), -1).clone()
+            for part, table in zip(self.parts, mine, strict=True):
+                if table.shape[-1]:
+                    candidates[: len(table), part.shapes] = table
+                    candidates[len(table) :, part.shapes] = table[-1]
+            columns = self.columns(candidates, rows)
+            tried = [c.first(len(t)) if t.shape[-1] else None for c, t in zip(columns, mine, strict=True)]
+            found.append(_Turn(candidates, columns, tried))
+        if level == 0:
+            self.coarse = found
+        return found
+
+    def _tables(self, value: Tensor, part: _Part, level: int) -> list[Tensor]:
+        """Values to look at, one table a turn, `g x (shapes of the part)`."""
+        grids = [self._grid(h, float(value[h]), level) for h in part.shapes]
+        if len(grids) > 1 and level == 0 and math.prod(map(len, grids)) <= _TOGETHER:
+            return [torch.cartesian_prod(*grids)]
+        found = []
+        for k, grid in enumerate(grids):
+            if level and not self.shapes[part.shapes[k]].refined:
+                continue
+            table = value[part.shapes].expand(len(grid), -1).clone()
+            table[:, k] = grid
+            found.append(table)
+        return found
+
+    def _grid(self, h: int, value: float, level: int) -> Tensor:
+        grid = torch.tensor(self.shapes[h].grid, dtype=self.size.dtype)
+        if level == 0:
+            return grid
+        k = int((grid - value).abs().argmin())
+        low, high = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
+        half = (high - low) / 2 * (2 / (_FINE - 1)) ** (level - 1)
+        fine = torch.linspace(-1, 1, _FINE, dtype=grid.dtype) * half + value
+        return fine.clamp(float(grid[0]), float(grid[-1]))
+
+    def _nearest(self, candidates: Tensor, value: Tensor, part: _Part) -> int:
+        return int((candidates[:, part.shapes] - value[part.shapes]).abs().sum(-1).argmin())
+
+    def _worth(self, value: Tensor, gains: Sequence[float], charges: Sequence[float], times: float) -> Shaped:
+        """Only the parts that pay for their search and half a unit of log evidence a coefficient; at least the best.
+
+        times: how much more than it is worth chance counts in the gains.
+        """
+        net = [g / 2 - c for g, c in zip(gains, charges, strict=True)]
+        best = max(range(len(net)), key=lambda i: net[i])
+        kept = [i for i, p in enumerate(self.parts) if i == best or net[i] > 1.5 * times * len(p.columns)]
+        charge = sum(charges[i] for i in kept)
+        if len(kept) == len(self.parts):
+            return Shaped(value, None, charge)
+        unshaped = set(range(len(self.size))) - {c for p in self.parts for c in p.columns}
+        return Shaped(value, tuple(sorted(unshaped | {c for i in kept for c in self.parts[i].columns})), charge)
+
+
+def _likeliest(left: NuisanceFit, tried: TrialColumns, score: Tensor) -> int:
+    """Of values that explain about as much the one that does so with coefficients of the likeliest sizes.
+
+    Eight waves of the wrong, low frequency can be bent to any other over a short travel.
+    """
+    best = int(score.argmax())
+    near = torch.nonzero(score > score[best] - _AS_WELL).squeeze(-1)
+    if len(near) < 2 or float(score[best]) < _THERE:
+        return best
+    near = near[score[near].argsort(descending=True)[:_FEW]]
+    return int(near[left.log_evidence(tried, near).argmax()])
+
+
+def _movers(basis: Tensor) -> Tensor | None:
+    """The one joint or parameter that each column moves, `m`, or None where one moves several; basis:
+    `g x s x k x m`."""
+    there = torch.nan_to_num(basis).flatten(0, -3).abs().amax(0) > 0
+    return there.to(torch.int8).argmax(0) if bool((there.sum(0) <= 1).all()) else None
+
+
+def _of(values: Tensor, rows: Tensor | None, dim: int) -> Tensor:
+    return values if rows is None else values.index_select(dim, rows)
+
+
+def _of_run(values: Tensor, columns: list[int]) -> Tensor:
+    """Some of the columns, without a copy where they stand side by side."""
+    run = range(columns[0], columns[0] + len(columns)) if columns else range(0)
+    return values[..., run.start : run.stop] if list(run) == columns else values[..., columns]
+
+
+def _parts(shapes: tuple[Shape, ...], coefficients: int) -> list[_Part]:
+    """Shapes in groups that share a coefficient; one with no columns of its own belongs to all."""
+    parts: list[_Part] = []
+    for h, shape in enumerate(shapes):
+        mine = set(range(coefficients) if shape.columns is None else shape.columns)
+        joined = [p for p in parts if mine & set(p.columns)]
+        parts = [p for p in parts if not mine & set(p.columns)]
+        members = sorted({h, *(k for p in joined for k in p.shapes)})
+        parts.append(_Part(members, sorted(mine.union(*(p.columns for p in joined)))))
+    return parts

@@ -1,0 +1,237 @@
+"""Signs that records and model do not fit each other, or that a verdict rests on what was not recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows
+from ccnn_torch.diagnosis.evidence.dictionary import covariance
+from ccnn_torch.diagnosis.residual.distance import distance, size_of
+from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.diagnosis.shrink.held_out import Gap
+from ccnn_torch.diagnosis.verdict.judgement import Judgement
+from ccnn_torch.display import number_text
+from ccnn_torch.effects import EXACT, Situation
+
+__all__ = ["Caution", "cautions", "row_cautions"]
+
+# What a verdict is worth beside a caution; and beside one that says that it rests on nothing.
+_DOUBTED, _HOLLOW = 0.9, 0.5
+# Plausible sizes: sealed machines whose gap was 30 times the noise had up to 185 of them; a wrong prefix makes 1000.
+_IMPLAUSIBLE = 250.0
+# Size of the machine, of which no calibration is so far off.
+_LARGE = 0.1
+# Standard deviation left, of that which was given; heavy tails left 0.7 of it in sealed machines.
+_QUIET, _LOUD = 0.5, 2.0
+_MANY = 0.1
+# So many rows set aside are looked at together, against as many drawn anew so often; the share of these as close.
+_SEVERAL, _DRAWS, _BY_CHANCE = 5, 1000, 0.003
+# A joint that moves less than this share of its workspace stands still. Rows that may be copies of others.
+_STILL, _COPIES = 1e-3, 0.2
+# Effects that only the place of a row tells from one another.
+_OF_PLACE = EXACT | {"coupling", "gravity", "transmission"}
+# Standard deviations from which a coefficient has a sign.
+_SIGNED = 3.0
+# A workshop, with something to spare [K].
+_COLDEST, _HOTTEST = 213.15, 423.15
+
+
+class Caution(NamedTuple):
+    """A sentence without a full stop, and the largest probability that a verdict beside it may claim."""
+
+    text: str
+    most: float = _DOUBTED
+
+
+def cautions(
+    analysis: Analysis, judgement: Judgement, rows: PlausibleRows, missing: Sequence[Mapping[str, Any]], together: Gap
+) -> list[Caution]:
+    """What speaks against taking a verdict at its word; none where all is as it should be.
+
+    Args:
+        analysis: of the rows.
+        judgement: what is stood by.
+        rows: which of them are of the machine at all.
+        missing: as in diagnosis.json.
+        together: what the verdict's effects take away on held-out rows.
+    """
+    return [
+        *row_cautions(analysis, rows, judgement.names),
+        *_of_place(analysis, judgement),
+        *_of_noise(analysis, judgement),
+        *_of_nothing_gained(analysis, judgement, together),
+        *_of_sizes(analysis, judgement),
+        *_of_signs(analysis, judgement),
+        *_of_inputs(analysis, missing),
+    ]
+
+
+def row_cautions(analysis: Analysis, rows: PlausibleRows, names: Sequence[str] = ()) -> list[Caution]:
+    """Those of them that need no verdict; names: of one, where there is one."""
+    return [*_of_model(analysis, rows), *_of_plan(analysis, names), *_of_temperature(analysis.situation)]
+
+
+def _of_place(analysis: Analysis, judgement: Judgement) -> list[Caution]:
+    """Rows set aside that lie together: bad ones lie anywhere."""
+    aside = (analysis.whitening.weight <= 0) & ~analysis.near_singular
+    count = int(aside.sum())
+    if count < _SEVERAL or judgement.driver is not None:
+        return []
+    place = analysis.situation.pose
+    place = (place - place.mean(0)) / place.std(0).clamp_min(1e-300)
+    drawn = torch.rand(_DRAWS, len(place), generator=torch.Generator().manual_seed(0)).topk(count).indices
+
+    def spread(rows: Tensor) -> Tensor:
+        return (rows - rows.mean(-2, keepdim=True)).square().sum((-2, -1))
+
+    if float((spread(place[drawn]) <= spread(place[aside])).double().mean()) > _BY_CHANCE:
+        return []
+    middle = analysis.situation.pose[aside].mean(0).tolist()
+    named = ", ".join(
+        f"{c.name} = {number_text(v, 3)} {c.unit}"
+        for c, v in zip(analysis.situation.mechanism.pose, middle, strict=True)
+    )
+    words = f"the {count} rows set aside as far off lie together, about {named}: something may act there alone"
+    return [Caution(words, _HOLLOW)]
+
+
+def _of_plan(analysis: Analysis, names: Sequence[str]) -> list[Caution]:
+    """Joints that stand still, and rows that are there more than once."""
+    situation, said = analysis.situation, []
+    low, high = situation.workspace
+    moved = (situation.joints.amax(0) - situation.joints.amin(0)) > _STILL * (high - low)
+    still = [j.name for j, moves in zip(situation.mechanism.joints, moved.tolist(), strict=True) if not moves]
+    if still and len(still) == len(moved):
+        one = "all rows are at one place, where what depends on the place cannot be told apart"
+        said.append(Caution(one, _HOLLOW if _OF_PLACE & {*names} else _DOUBTED))
+    elif still:
+        named = " and ".join(still)
+        said.append(Caution(f"{named} did not move: errors of {named} cannot be told from those of a frame"))
+    columns = [situation.joints, analysis.measured, *(v[:, None] for v in situation.covariates.values())]
+    whole = torch.cat(columns, -1)
+    copies = 1 - len(torch.unique(whole, dim=0)) / len(whole)
+    if copies > _COPIES:
+        said.append(
+            Caution(f"{100 * copies:.0f} % of the rows are exact copies of others, and count here as if measured anew")
+        )
+    return said
+
+
+def _of_model(analysis: Analysis, rows: PlausibleRows) -> list[Caution]:
+    situation, said = analysis.situation, []
+    if rows.lost > _MANY:
+        advice = rows.mistake or "look at their units, and at what they have in common"
+        said.append(
+            Caution(
+                f"{100 * rows.lost:.0f} % of the rows are far from where their joints put them and were left out: "
+                f"{advice}"
+            )
+        )
+    usual = float(distance(situation, analysis.measured, size_of(situation)).nanmedian())
+    if usual > _LARGE:
+        said.append(
+            Caution(
+                f"the gap is {usual:.2g} times the spread of the machine's poses over its workspace, more than any "
+                "calibration takes away: check the units, the frames, and that this is the machine"
+            )
+        )
+    return said
+
+
+def _of_noise(analysis: Analysis, judgement: Judgement) -> list[Caution]:
+    """Whether what was given is far from what the verdict's effects, or even the richest explanation, leave."""
+    if analysis.whitening.known == 0:
+        return []
+    numbers = analysis.dictionary.grams.values
+    left, least = (
+        (f.rss / max(numbers - f.effective, 1.0)) ** 0.5
+        for f in (judgement.found, min(analysis.found, key=lambda f: f.rss))
+    )
+    if left < _QUIET:
+        quiet = f"the rows scatter by {number_text(left, 2)} times the noise that was given"
+        return [Caution(f"{quiet}: with less of it smaller causes would show")]
+    if least > _LOUD:
+        loud = f"whatever is tried leaves {number_text(least, 2)} times the noise that was given"
+        return [Caution(f"{loud}: it is too small, or something is there that follows nothing recorded")]
+    return []
+
+
+def _of_nothing_gained(analysis: Analysis, judgement: Judgement, together: Gap) -> list[Caution]:
+    """Whether rows that the fit has not seen show nothing of what the verdict names."""
+    if not judgement.names or (together.interval is not None and together.interval[0] > 0):
+        return []
+    text = "rows not used for fitting do not show that this takes anything away"
+    if analysis.whitening.known == 0:
+        text += (
+            "; the noise was not given and is taken for nearly all of the gap, so that a cause that follows nothing "
+            "recorded counts as noise"
+        )
+    return [Caution(text, _HOLLOW)]
+
+
+def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
+    """Causes of the verdict that would have to be hundreds of times as large as in any machine."""
+    said = []
+    for i, mean in zip(judgement.found.members, judgement.found.mean, strict=True):
+        atom = analysis.dictionary.atoms[i]
+        coefficients = atom.coefficients(analysis.situation)
+        if atom.name not in judgement.names or not coefficients:
+            continue
+        size = torch.where(torch.tensor([c.secondary for c in coefficients]), 0.0, mean.abs())
+        worst = int(size.argmax())
+        if float(size[worst]) > _IMPLAUSIBLE:
+            said.append(
+                Caution(
+                    f"{atom.name} would have to be {float(size[worst]):.0f} times as large as is plausible "
+                    f"({coefficients[worst].name}): check the units of the columns that it goes by"
+                )
+            )
+    return said
+
+
+def _of_signs(analysis: Analysis, judgement: Judgement) -> list[Caution]:
+    """Causes of the verdict whose coefficients are clearly negative where physics has none such, and none positive."""
+    said, first = [], 0
+    found = judgement.found
+    for i, mean in zip(found.members, found.mean, strict=True):
+        atom, part = analysis.dictionary.atoms[i], slice(first, first + len(mean))
+        first += len(mean)
+        coefficients = atom.coefficients(analysis.situation)
+        if atom.name not in judgement.names or not coefficients:
+            continue
+        sure = covariance(analysis.dictionary, found).diagonal()[part].clamp_min(1e-300).sqrt() * _SIGNED
+        signed = torch.tensor([c.positive for c in coefficients])
+        negative = torch.nonzero(signed & (mean < -sure))[:, 0].tolist()
+        if negative and not bool((signed & (mean > sure)).any()):
+            where = ", ".join(coefficients[k].name for k in negative)
+            wrong = f"{atom.name} would have to be negative ({where}), as in no machine"
+            said.append(Caution(f"{wrong}: check the signs of the columns that it goes by"))
+    return said
+
+
+def _of_temperature(situation: Situation) -> list[Caution]:
+    temperature = situation.covariates.get("temperature")
+    if temperature is None or _COLDEST < float(temperature.median()) < _HOTTEST:
+        return []
+    usual = f"{float(temperature.median()) - 273.15:.0f} °C"
+    return [Caution(f"the temperature is about {usual}: check the unit of its column, K or degC")]
+
+
+def _of_inputs(analysis: Analysis, missing: Sequence[Mapping[str, Any]]) -> list[Caution]:
+    """What the nominal machine itself takes and nobody recorded, where that may be more than the noise."""
+    situation = analysis.situation
+    lacking = situation.mechanism.lacking([*situation.covariates])
+    sizes = {c.partition("[")[0]: e["effects"] for e in missing for c in e["columns"]}
+    noise = float(analysis.whitening.sigma.min())
+    name = situation.mechanism.name
+    return [
+        Caution(
+            f"{name} takes {c.name}, which was not recorded: what it does counts as noise, or goes to another cause"
+        )
+        for c in lacking
+        if sizes.get(c.name, {}).get(name, noise) >= noise
+    ]

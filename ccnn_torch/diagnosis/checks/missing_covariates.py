@@ -1,0 +1,96 @@
+"""What was not recorded: columns that would bring further effects into sight, and how large those may be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.candidates.atom import default_shape, scaled_signature
+from ccnn_torch.diagnosis.residual.rows import picked
+from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.effects import Effect, Situation, pose_residual
+from ccnn_torch.effects.covariates import covariate_units, draw_covariates
+from ccnn_torch.errors import InputError
+
+__all__ = ["missing_covariates"]
+
+# Speeds are not among them: rows at rest, as most are, have none.
+_KINDS = ("time", "temperature", "load", "direction")
+# A usual row is found among so many.
+_ROWS = 60
+
+
+def missing_covariates(
+    analysis: Analysis, effects: Sequence[Effect], lacking: Mapping[str, str], driver: str | None, seed: int
+) -> list[dict[str, Any]]:
+    """The block `missing_covariates` of diagnosis.json: what to record beside the pose, most promising first.
+
+    The plausible size of an effect is what its coefficients, each of its plausible size, do to the median row under
+    conditions drawn for them (`draw_covariates`: a shift in a hall, loads of 60 N and 6 N·m). What a simulator takes
+    and was not told goes by the simulator's name. Where something that no effect describes follows the time, the
+    temperature comes first.
+
+    Args:
+        analysis: of the rows.
+        effects: all candidates.
+        lacking: what is missing for those of them that the rows cannot show, by name.
+        driver: of what no effect describes.
+        seed: of the conditions drawn.
+    """
+    rows = torch.unique(torch.linspace(0, len(analysis.situation.joints) - 1, _ROWS).round().long())
+    here = picked(analysis.situation, rows)
+    mechanism, units = here.mechanism, covariate_units(here.mechanism) | {"temperature": "degC"}
+    drawn = draw_covariates(mechanism, here.joints, torch.Generator().manual_seed(seed))
+    names = [*here.covariates]
+    kinds = {k: [n for n in drawn if n.startswith(k) and n not in names] for k in _KINDS}
+    # One machine for all of them: its derivatives may be dear.
+    there = replace(here, covariates=drawn | dict(here.covariates))
+    position = bool((analysis.whitening.channels < 3).any())
+    found: dict[tuple[str, ...], dict[str, float]] = {}
+    for effect in (e for e in effects if lacking.get(e.name)):
+        added = next((a for a in _additions(kinds) if not effect.missing(mechanism, [*names, *a])), None)
+        size = 0.0
+        # A user's own effect that fails on columns that were not recorded must not cost the verdict.
+        with suppress(InputError):
+            size = 0.0 if added is None else _plausible(there, effect, position)
+        if added is not None and size > 0:
+            found.setdefault(added, {})[effect.name] = size
+    for condition in mechanism.lacking(names):
+        if condition.name in drawn:
+            other = replace(here, covariates={**here.covariates, condition.name: drawn[condition.name]})
+            size = _usual(pose_residual(other, here.pose), position)
+            if size > 0:
+                found.setdefault((condition.name,), {})[mechanism.name] = size
+    told: list[dict[str, Any]] = [
+        {"columns": [f"{n}[{units[n]}]" for n in added], "effects": sizes, "unit": "m" if position else "rad"}
+        for added, sizes in found.items()
+    ]
+    first = "temperature" if driver == "time" else ""
+    return sorted(told, key=lambda e: (not first or not e["columns"][0].startswith(first), -max(e["effects"].values())))
+
+
+def _additions(kinds: Mapping[str, list[str]]) -> Iterator[tuple[str, ...]]:
+    """Columns that might be added: those of one kind, then of two."""
+    there = [k for k in kinds if kinds[k]]
+    for count in (1, 2):
+        for some in combinations(there, count):
+            yield tuple(n for k in some for n in kinds[k])
+
+
+def _plausible(situation: Situation, effect: Effect, position: bool) -> float:
+    """What an effect of plausible size does to the usual row [m] or [rad]."""
+    main = [i for i, c in enumerate(effect.coefficients(situation)) if not c.secondary]
+    columns = scaled_signature(situation, effect, default_shape(situation, effect))[..., main]
+    return _usual(columns, position)
+
+
+def _usual(change: Tensor, position: bool) -> float:
+    """Size of a change of the usual row, given as `s x c` or by parts, `s x c x m` [m] or [rad]."""
+    block = torch.nan_to_num(change[:, :3] if position else change[:, 3:])
+    return float(block.square().flatten(1).sum(1).median().sqrt())

@@ -1,0 +1,111 @@
+"""Mistakes often made in records: the one without which model and rows would agree is named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.residual.distance import USUAL, Size, distance
+from ccnn_torch.diagnosis.residual.rows import picked
+from ccnn_torch.effects import Situation
+from ccnn_torch.mechanisms import BlackBox, Framed
+
+__all__ = ["mistake"]
+
+# A mistake is named where without it so small a share of the distance is left.
+_MENDED = 0.1
+_FEW = 40
+# Mistakes that leave no more than this many times the least are as likely.
+_ALIKE = 1.2
+_TURN = 180 / torch.pi
+
+
+def mistake(situation: Situation, measured: Tensor, size: Size) -> str:
+    """The mistake, of those often made, without which model and rows would agree, in words; empty for none."""
+    rows = torch.linspace(0, len(measured) - 1, min(_FEW, len(measured))).round().long()
+    here, poses = picked(situation, rows), measured[rows]
+    # A row that the machine does not reach is off by its whole workspace, and more.
+    before = float(distance(here, poses, size).nan_to_num(nan=10.0).median())
+    found = []
+    for words, other, there in _mistakes(here, poses):
+        left = float(distance(replace(other, guess=_guess(other, there)), there, size).nan_to_num(nan=10.0).median())
+        if left < min(_MENDED * before, USUAL):
+            found.append((left, words))
+    # On a machine that is its own mirror image two mistakes may come to the same.
+    least = min((left for left, _ in found), default=0.0)
+    return ", or ".join(words for left, words in found if left <= _ALIKE * least)
+
+
+def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Situation, Tensor]]:
+    """What is wrong, in words, and the rows as they would be without it."""
+    mechanism = situation.mechanism
+    pose, joints = mechanism.pose, mechanism.joints
+    lengths = torch.tensor([c.unit == "m" for c in pose])
+    for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
+        mended = torch.where(lengths, factor * measured, measured)
+        yield f"the pose's lengths seem to be in {unit} under m", situation, mended
+    words = (
+        "the records' lengths are about 1000 times smaller than the model's: metres under mm, or a model in millimetres"
+    )
+    yield words, situation, torch.where(lengths, 1e3 * measured, measured)
+    for i, one in enumerate(pose):
+        if one.unit == "m":
+            factors = torch.ones(len(pose), dtype=measured.dtype)
+            factors[i] = 1e-3
+            yield f"{one.name} of the pose seems to be in millimetres under m", situation, measured * factors
+    shift = torch.where(lengths, torch.nan_to_num((measured - situation.pose).nanmedian(0).values), 0.0)
+    far = ", ".join(f"{c.name} by {float(v):.4g} m" for c, v in zip(pose, shift, strict=True) if c.unit == "m")
+    words = f"the frame that the pose is given in seems to be shifted ({far}): give the pose in the model's base frame"
+    yield words, situation, measured - shift
+    turned = torch.where(lengths, measured, measured / _TURN)
+    yield "the pose's angles seem to be in degrees under rad", situation, turned
+    for i, one in enumerate(pose):
+        yield f"{one.name} of the pose seems to be reversed", situation, _reversed(measured, i)
+    for i, k in combinations(range(len(pose)), 2):
+        if pose[i].unit == pose[k].unit:
+            words = f"{pose[i].name} and {pose[k].name} of the pose seem to be swapped"
+            yield words, situation, _swapped(measured, i, k)
+    inner = mechanism.mechanism if isinstance(mechanism, Framed) else mechanism
+    if isinstance(inner, BlackBox):
+        # Each of these would be simulated anew, which may take long.
+        return
+    turns = torch.tensor([g.unit == "rad" for g in inner.geometry])
+    if inner is mechanism and bool(turns.any()):
+        mended = torch.where(turns, inner.nominal / _TURN, inner.nominal)
+        words = "the angles of the model seem to be in degrees under rad: look at the units in its file"
+        yield words, replace(situation, parameters=mended), measured
+    at = situation.joints
+    for i, k in combinations(range(len(joints)), 2):
+        if joints[i].unit == joints[k].unit:
+            words = f"the joints {joints[i].name} and {joints[k].name} seem to be swapped"
+            yield words, replace(situation, joints=_swapped(at, i, k)), measured
+    for i, joint in enumerate(joints):
+        words = f"joint {joint.name} seems to count in the other direction"
+        yield words, replace(situation, joints=_reversed(at, i)), measured
+    angles = torch.tensor([j.unit == "rad" for j in joints])
+    for factor, words in ((1 / _TURN, "degrees under rad"), (_TURN, "radians under deg")):
+        scaled = torch.where(angles, factor * at, at)
+        yield f"the joints seem to be in {words}", replace(situation, joints=scaled), measured
+    for factor, words in ((1e-3, "millimetres under m"), (1e3, "metres under mm")):
+        scaled = torch.where(angles, at, factor * at)
+        yield f"the joints seem to be in {words}", replace(situation, joints=scaled), measured
+
+
+def _guess(situation: Situation, measured: Tensor) -> Tensor | None:
+    return None if situation.guess is None else measured
+
+
+def _reversed(values: Tensor, i: int) -> Tensor:
+    sign = torch.ones(values.shape[-1], dtype=values.dtype)
+    sign[i] = -1
+    return values * sign
+
+
+def _swapped(values: Tensor, i: int, k: int) -> Tensor:
+    order = [*range(values.shape[-1])]
+    order[i], order[k] = order[k], order[i]
+    return values[..., order]

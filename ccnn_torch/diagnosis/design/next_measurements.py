@@ -1,0 +1,218 @@
+"""What to measure next: rows that best tell the leading explanations apart, or make the only one sharper."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.candidates.atom import scaled_signature
+from ccnn_torch.diagnosis.evidence.dictionary import FittedSet, covariance
+from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.diagnosis.search.sets import scored
+from ccnn_torch.diagnosis.verdict.judgement import Judgement
+from ccnn_torch.effects import Situation
+
+__all__ = ["next_measurements"]
+
+_CANDIDATES = 400
+_WANTED = 8
+_RIVALS = 3
+# Candidates are left out where the joints move the platform so many times as far as usual: no first order holds there.
+_GAIN = 3.0
+# Columns that change together from row to row; all others are one kind more.
+_KINDS = ("load", "direction")
+# Rows farther apart in time are no motion [s].
+_APART = 1.1
+
+
+class _Question(NamedTuple):
+    """What a row may answer: coefficients `m` with covariance `m x m`, whose columns are `x` `s x c x m`, whitened.
+
+    Between two explanations the coefficients are those of both, the second's with a minus in the columns: `x @ mean` is
+    how far their predictions differ. `weight` is how much the answer is wanted, `names` whom it tells apart.
+    """
+
+    x: Tensor
+    mean: Tensor
+    covariance: Tensor
+    weight: float
+    names: list[str]
+    gain: Callable[[Tensor, Tensor], Tensor]
+
+
+def next_measurements(analysis: Analysis, judgement: Judgement, seed: int) -> list[dict[str, Any]]:
+    """The block `next_measurements` of diagnosis.json, the best first.
+
+    Between explanations the gain of a row is the divergence of what they predict for it, in nats: half the square of
+    their difference in units of what noise and both posteriors leave open. Where one explanation has no rival, it is
+    the information on its coefficients, half the log determinant (Bayesian D-optimality, Chaloner and Verdinelli 1995).
+    Rows are chosen one after the other, each for what it adds to those before it; `gain` is that of the row by itself.
+    """
+    rivals = _rivals(analysis, judgement)
+    if not any(found.members for _, found in rivals):
+        return []
+    situation = _candidates(analysis, seed)
+    first, x = rivals[0][1], _columns(analysis, rivals[0][1], situation)
+    questions, own = [], covariance(analysis.dictionary, first)
+    for weight, other in rivals[1:]:
+        both = torch.cat([x, -_columns(analysis, other, situation)], -1)
+        joint = torch.block_diag(own, covariance(analysis.dictionary, other))  # type: ignore[no-untyped-call]
+        names = sorted(_names(analysis, first) ^ _names(analysis, other))
+        mean = torch.cat([*first.mean, *other.mean])
+        questions.append(_Question(both, mean, joint, weight / rivals[1][0], names, _divergence))
+    if not questions:
+        questions = [_Question(x, torch.cat(first.mean), own, 1.0, [], _information)]
+    return _chosen(situation, questions)
+
+
+def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, FittedSet]]:
+    """The most probable sets with other library names, or none, no catch-all among them, and their probabilities.
+
+    What cannot be told from the verdict is among them, even where the search did not come across it.
+    """
+    atoms, own = analysis.dictionary.atoms, judgement.found
+    plain = [
+        (probability, one)
+        for _, driver, probability, one in judgement.leading
+        if driver is None and not any(atoms[i].is_discrepancy for i in one.members)
+    ]
+    if not plain:
+        return []
+    like = {
+        tuple(sorted(j if m == i else m for m in own.members))
+        for i in own.members
+        for name in judgement.classes.get(atoms[i].name, ())
+        for j, a in enumerate(atoms)
+        if a.name == name and name not in {atoms[m].name for m in own.members if m != i}
+    }
+    known = [_names(analysis, one) for _, one in plain]
+    for one in sorted(
+        scored(analysis.dictionary, sorted(like), {f.members: f for f in analysis.found}),
+        key=lambda f: -f.log_posterior,
+    ):
+        if _names(analysis, one) not in known:
+            known.append(_names(analysis, one))
+            plain.append((plain[0][0] * math.exp(min(one.log_posterior - own.log_posterior, 0.0)), one))
+    return sorted(plain, key=lambda pair: -pair[0])[:_RIVALS]
+
+
+def _names(analysis: Analysis, found: FittedSet) -> set[str]:
+    return {analysis.dictionary.atoms[i].name for i in found.members}
+
+
+def _candidates(analysis: Analysis, seed: int) -> Situation:
+    """Poses of the workspace under conditions as they were measured, the machine at rest.
+
+    Loads, directions, and time with temperature are drawn apart, each as some row had them: what always came together
+    so far comes apart.
+    """
+    here = analysis.situation
+    generator = torch.Generator().manual_seed(seed)
+    pose: Tensor | None = None
+    if _common(here):
+        pose = here.mechanism.sample_workspace(_CANDIDATES, generator)
+        joints = here.mechanism.solve_inverse(pose, here.parameters)
+    else:
+        joints = here.mechanism.sample_joints(_CANDIDATES, generator)
+    drawn = {k: torch.randint(len(here.joints), (len(joints),), generator=generator) for k in (*_KINDS, "")}
+    covariates = {n: v[drawn[next((k for k in _KINDS if n.startswith(k)), "")]] for n, v in here.covariates.items()}
+    if "time" in covariates:
+        # In the order of time, and so far apart that no two rows are a motion.
+        order = torch.argsort(covariates["time"])
+        covariates = {n: v[order] for n, v in covariates.items()}
+        covariates["time"] = covariates["time"] + _APART * torch.arange(len(joints))
+    parameters = here.parameters if _common(here) else None
+    return Situation(here.mechanism, joints, covariates, here.gravity, parameters, pose)
+
+
+def _common(situation: Situation) -> bool:
+    return situation.parameters is not None and situation.parameters.dim() == 1
+
+
+def _columns(analysis: Analysis, found: FittedSet, there: Situation) -> Tensor:
+    """Deviation at the candidates per plausible size of each coefficient of a set, in units of the noise."""
+    columns = [there.jacobian[..., :0]]
+    for i in found.members:
+        atom = analysis.dictionary.atoms[i]
+        assert atom.effect is not None
+        full = scaled_signature(there, atom.effect, atom.shape)
+        columns.append(full if atom.used is None else full[..., list(atom.used)])
+    white = analysis.whitening
+    noise = white.sigma * analysis.floor**0.5
+    whitened: Tensor = torch.cat(columns, -1)[:, white.channels] / noise[:, None]
+    return whitened
+
+
+def _divergence(difference: Tensor, open_: Tensor) -> Tensor:
+    """Half the square of a difference `s x c` in units of noise and what is open, `s x c x c`."""
+    gain: Tensor = 0.5 * (difference * torch.linalg.solve(open_, difference)).sum(-1)
+    return gain
+
+
+def _information(difference: Tensor, open_: Tensor) -> Tensor:
+    """Half the log determinant of noise and what is open in units of the noise, `s`."""
+    gain: Tensor = 0.5 * torch.linalg.slogdet(open_).logabsdet
+    return gain
+
+
+def _chosen(situation: Situation, questions: list[_Question]) -> list[dict[str, Any]]:
+    """The rows that say most together, by what each says alone."""
+    mechanism = situation.mechanism
+    possible = _possible(situation)
+    alone: Tensor | None = None
+    taken: list[tuple[int, int]] = []
+    for _ in range(_WANTED):
+        gains = torch.stack([_gains(q) for q in questions])
+        alone = gains if alone is None else alone
+        worth = torch.where(possible, torch.nan_to_num(gains * _weights(questions)), 0.0)
+        best = int(worth.max(0).values.argmax())
+        if not float(worth[:, best].max()) > 0:
+            break
+        taken.append((best, int(worth[:, best].argmax())))
+        possible = possible.clone()
+        possible[best] = False
+        questions = [_measured(q, best) for q in questions]
+    assert alone is not None
+    taken.sort(key=lambda pair: -float(alone[pair[1], pair[0]]))
+    return [
+        {
+            "joints": {j.name: float(situation.joints[k, i]) for i, j in enumerate(mechanism.joints)},
+            "covariates": {n: float(v[k]) for n, v in situation.covariates.items() if n != "time"},
+            "separates": questions[number].names,
+            "gain": float(alone[number, k]),
+        }
+        for k, number in taken
+    ]
+
+
+def _weights(questions: list[_Question]) -> Tensor:
+    """How much each answer is wanted, `q x 1`."""
+    return torch.tensor([[q.weight] for q in questions], dtype=torch.float64)
+
+
+def _possible(situation: Situation) -> Tensor:
+    """Candidates that the machine reaches and where first order holds, `s`."""
+    whole = torch.isfinite(situation.jacobian).flatten(1).all(-1) & torch.isfinite(situation.joints).all(-1)
+    reach = torch.linalg.matrix_norm(torch.nan_to_num(situation.jacobian), ord=2)
+    possible: Tensor = whole & (reach < _GAIN * reach[whole].median())
+    return possible
+
+
+def _gains(question: _Question) -> Tensor:
+    """What each candidate says, `s`."""
+    noise = torch.eye(question.x.shape[1], dtype=question.x.dtype)
+    return question.gain(question.x @ question.mean, noise + question.x @ question.covariance @ question.x.mT)
+
+
+def _measured(question: _Question, row: int) -> _Question:
+    """What is left to be told once a candidate is measured: a Kalman step towards no difference."""
+    x, covariance = question.x[row], question.covariance
+    open_ = torch.eye(len(x), dtype=x.dtype) + x @ covariance @ x.mT
+    step = torch.linalg.solve(open_, x @ covariance).mT
+    return question._replace(
+        mean=question.mean - step @ (x @ question.mean), covariance=covariance - step @ x @ covariance
+    )

@@ -1,0 +1,253 @@
+"""Catch-alls: what no effect of the library describes, one candidate for each driver it may follow.
+
+A catch-all lets the joints deviate by a smooth function of its driver, alone and times the pose: physical causes act
+through the joints, and the Jacobian then carries most of the dependence on the pose. What follows time, temperature or
+a load may also move the platform as a whole, alike wherever it stands, and faster than a smooth function.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.candidates.atom import Atom
+from ccnn_torch.effects import Situation
+
+__all__ = [
+    "ANY",
+    "LOG_PRIOR",
+    "SPEED",
+    "joint_moves",
+    "platform_moves",
+    "products",
+    "reduced",
+    "smooth_discrepancies",
+    "spread_out",
+    "unit_range",
+]
+
+# A catch-all is that much less probable than no deviation of its kind, before the data are seen.
+LOG_PRIOR = math.log(1e-3)
+# And one that holds most of what a library effect does has to be better than that effect by as much again.
+_NEAR_LIBRARY = math.log(1e-5)
+# A joint may be off by this much for reasons that nobody thought of [m], [rad].
+_SCALE = {"m": 3e-4, "rad": 5e-4}
+ANY = "*"
+"""Stands in a driver's name for all of its kind; a verdict names the one that explains most by itself."""
+SPEED = "speed"
+"""Begins the names of catch-alls that follow a joint's velocity: a verdict knows no such driver."""
+# What bends with a driver against what is proportional to it.
+_BEND = 0.5
+_MOST, _MOST_PLACES = 28, 60
+_PLATFORM = {3: (3e-4, 3e-4, 3e-4), 6: (3e-4, 3e-4, 3e-4, 5e-4, 5e-4, 5e-4)}
+_WAVES = 18
+
+
+def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[Atom]:
+    """One or two atoms for each driver that the records hold; beside: names of the library effects that are candidates.
+
+    Drives of one kind have errors of one kind, each along its own track. A transmission's are of a form that holds
+    elsewhere, too, so where that is a candidate no catch-all of all drives at once takes them from it.
+    """
+    mechanism, rows = situation.mechanism, situation.joints.shape[-2]
+    place = unit_range(situation.pose)
+    one = torch.ones_like(place[:, :1])
+    few = max(4, min(8, rows // 12))
+    around = torch.cat([one, place, _bumps(place, min(24, max(6, rows // 8)))], -1)
+    most = min(_MOST_PLACES, max(_MOST, rows // 4))
+    found = [_atom(situation, "workspace", around, most=most)]
+    found.append(
+        _atom(
+            situation, "workspace", torch.cat([one, *_configuration(situation)], -1), most=most, log_prior=_NEAR_LIBRARY
+        )
+    )
+    own: list[Tensor] = []
+    for i, joint in enumerate(mechanism.joints):
+        q = unit_range(situation.joints[..., i : i + 1])
+        found.append(_atom(situation, f"joint {joint.name}", torch.cat([one, q, _BEND * _bumps(q, few)], -1)))
+        fine = torch.cat([one, q, _bumps(q, min(_MOST, rows // 6))], -1)
+        own.append(fine)
+        found.append(_atom(situation, f"joint {joint.name}", fine, only=i))
+    if "transmission" not in beside:
+        found.append(_atom(situation, f"joint {ANY}", torch.stack(own, 1), most=most))
+    together: dict[str, list[Tensor]] = {}
+    for name, value in situation.covariates.items():
+        driver = _driver(name)
+        if driver is None or float(value.max() - value.min()) <= 0:
+            continue
+        d = unit_range(value.unsqueeze(-1))
+        features = [one, d, 0.7 * d * place]
+        if driver.startswith(SPEED):
+            pass
+        elif driver.startswith("direction"):
+            features.append(_BEND * d * _carried(situation, int(driver.split()[1]) - 1))
+        else:
+            features.append(_BEND * _bumps(d, few))
+            found.append(_whole(situation, driver, _waves(d, max(4, min(_WAVES, 2 * rows // 5)))))
+        if driver.startswith("load"):
+            # What a load asks of a joint goes with the slope of the kinematics, which is no plane over the workspace.
+            features.append(_BEND * d * products(place))
+            found.append(_atom(situation, driver, _asked(_under(situation, name)), most=most, log_prior=_NEAR_LIBRARY))
+        if driver == "temperature" and "time" in situation.covariates:
+            features += [_lagged(value, situation.covariates["time"], k) for k in (0.05, 0.2)]
+        found.append(_atom(situation, driver, torch.cat(features, -1)))
+        if " " in driver:
+            together.setdefault(driver.partition(" ")[0], []).extend(features[1:])
+    for kind, features in together.items():
+        # One cause may follow all loads, or all directions, at once.
+        if sum(a.name.startswith(kind) for a in found) > 1:
+            found.append(_atom(situation, f"{kind} {ANY}", torch.cat([one, *features], -1)))
+            if kind == "load":
+                found.append(_atom(situation, f"{kind} {ANY}", _asked(situation), most=most, log_prior=_NEAR_LIBRARY))
+    return found
+
+
+def _driver(name: str) -> str | None:
+    if name.startswith("load_"):
+        return f"load {name.removeprefix('load_')}"
+    if name.startswith("direction"):
+        return f"direction {name.removeprefix('direction')}"
+    if name.startswith(SPEED):
+        return f"{SPEED} {name.removeprefix(SPEED)}"
+    return name if name in ("temperature", "time") else None
+
+
+def unit_range(values: Tensor) -> Tensor:
+    """Each column brought to [-1, 1] over the rows."""
+    low, high = values.amin(-2, keepdim=True), values.amax(-2, keepdim=True)
+    return (2 * values - low - high) / (high - low).clamp_min(1e-300)
+
+
+def products(place: Tensor) -> Tensor:
+    """Squares and products of the coordinates, `s x (p + 1) p / 2`."""
+    first, second = torch.triu_indices(place.shape[-1], place.shape[-1])
+    return place[:, first] * place[:, second]
+
+
+def _bumps(points: Tensor, count: int) -> Tensor:
+    """A constant-free set of Gaussian bumps about rows far from each other, `s x count`."""
+    centres = spread_out(points, count)
+    distance = torch.cdist(points, centres)
+    apart = torch.cdist(centres, centres) + 1e9 * torch.eye(len(centres), dtype=points.dtype)
+    width = 1.5 * apart.amin(-1).median().clamp_min(1e-6)
+    features = torch.exp(-0.5 * (distance / width).square())
+    return features - features.mean(-2, keepdim=True)
+
+
+def spread_out(points: Tensor, count: int) -> Tensor:
+    """Rows, each as far as possible from those before (farthest-point sampling)."""
+    chosen = [int((points - points.mean(0)).square().sum(-1).argmin())]
+    nearest = (points - points[chosen[0]]).square().sum(-1)
+    for _ in range(min(count, len(points)) - 1):
+        chosen.append(int(nearest.argmax()))
+        nearest = torch.minimum(nearest, (points - points[chosen[-1]]).square().sum(-1))
+    return points[chosen]
+
+
+def _lagged(value: Tensor, time: Tensor, share: float) -> Tensor:
+    """First-order lag by a share of the time that the records span, `s x 1`, brought to [-1, 1]."""
+    span = (time.max() - time.min()).clamp_min(1e-300) * share
+    weight = torch.exp(-(time[:, None] - time[None, :]) / span) * (time[:, None] >= time[None, :])
+    return unit_range(((weight @ value) / weight.sum(-1)).unsqueeze(-1))
+
+
+def _configuration(situation: Situation) -> list[Tensor]:
+    """What repeats with the turns of the joints, and what the machine's weight asks of them, `s x …` each."""
+    turning = [i for i, j in enumerate(situation.mechanism.joints) if j.unit == "rad"]
+    angles = situation.joints[:, turning]
+    return [torch.sin(angles), torch.cos(angles), _over_largest(situation.own_weight_torque)]
+
+
+def _under(situation: Situation, load: str) -> Situation:
+    """The rows with one load alone."""
+    return situation.with_covariates({load: situation.covariates[load]})
+
+
+def _asked(situation: Situation) -> Tensor:
+    """What the load asks of the joints, and its square with the sign, `s x 2n`, the largest 1."""
+    torque = _over_largest(situation.load_torque)
+    return torch.cat([torque, _BEND * torque * torque.abs()], -1)
+
+
+def _over_largest(values: Tensor) -> Tensor:
+    return values / values.abs().amax().clamp_min(1e-300)
+
+
+def _carried(situation: Situation, joint: int) -> Tensor:
+    """What load and weight ask of a joint, by size, `s x 2 or less`: what holds it where it came from."""
+    asked = torch.stack([t[:, joint].abs() for t in (situation.load_torque, situation.own_weight_torque)], -1)
+    return unit_range(asked[:, (asked.amax(0) - asked.amin(0)) > 1e-9 * asked.amax().clamp_min(1e-300)])
+
+
+def _waves(values: Tensor, count: int) -> Tensor:
+    """Half waves over the range of values `s x 1` in [-1, 1], the faster the smaller, `s x count`."""
+    k = torch.arange(1, count + 1, dtype=values.dtype)
+    waves = torch.cos(0.5 * math.pi * k * (values + 1)) / k.sqrt()
+    return waves - waves.mean(-2, keepdim=True)
+
+
+def joint_moves(situation: Situation, jacobian: Tensor) -> Tensor:
+    """What the joints' derivatives, `s x c x n`, make of each joint being as far off as is to be expected."""
+    joints = situation.mechanism.joints
+    return jacobian * torch.tensor([_SCALE.get(j.unit, 5e-4) for j in joints], dtype=jacobian.dtype)
+
+
+def platform_moves(situation: Situation) -> Tensor:
+    """Shifts and turns of the platform as far as they are seen, each as large as is to be expected, `s x c x c`."""
+    visible = situation.visible
+    return visible * torch.tensor(_PLATFORM[visible.shape[-1]], dtype=visible.dtype)
+
+
+def _whole(situation: Situation, driver: str, features: Tensor) -> Atom:
+    """features: `s x f`; columns = shifts and turns of the platform, alike in all poses, times the features."""
+    columns = (platform_moves(situation).unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
+    shown = columns.abs().amax((0, 1)) > 0
+    return Atom(driver, None, features.new_zeros(0), columns[..., shown], LOG_PRIOR)
+
+
+def _atom(
+    situation: Situation,
+    driver: str,
+    features: Tensor,
+    most: int = _MOST,
+    log_prior: float = LOG_PRIOR,
+    only: int | None = None,
+) -> Atom:
+    """What the joints do by features that all of them go by, `s x f`, or each by its own, `s x n x f`.
+
+    Reduced to the directions that matter. only: of one joint, counted from 0.
+    """
+    moves = joint_moves(situation, situation.jacobian)
+    moves = moves if only is None else moves[..., only : only + 1]
+    if features.dim() == 2:
+        features = _principal(features, most)[:, None].expand(-1, moves.shape[-1], -1)
+    return Atom(driver, None, features.new_zeros(0), reduced(moves, features, most), log_prior)
+
+
+def _principal(features: Tensor, most: int) -> Tensor:
+    """The leading principal features, where there are more than of all that joints make of them will be kept."""
+    if features.shape[-1] <= most:
+        return features
+    _, vectors = torch.linalg.eigh(features.mT @ features)
+    principal: Tensor = features @ vectors[:, -most:]
+    return principal
+
+
+def reduced(moves: Tensor, features: Tensor, most: int) -> Tensor:
+    """The leading principal columns of each joint's moves, `s x c x n`, times each of its features, `s x n x f`.
+
+    With one prior scale for all, the rest is the least of what the prior allows. The columns themselves, n times f of
+    them, are never made.
+    """
+    n, f = features.shape[1:]
+    square = (moves.square() * features.square().sum(-1)[:, None]).mean((0, 2), keepdim=True) / f
+    scaled = moves / square.sqrt().clamp_min(1e-300)
+    inner = scaled.mT @ scaled
+    gram = [features[:, i].mT @ (inner[:, i, :, None] * features).flatten(1) for i in range(n)]
+    _, vectors = torch.linalg.eigh(torch.cat(gram))
+    kept = vectors[:, -most:].reshape(n, f, -1)
+    columns: Tensor = moves @ (features.transpose(0, 1) @ kept).transpose(0, 1)
+    return columns

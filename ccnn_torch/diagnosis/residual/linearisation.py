@@ -1,0 +1,62 @@
+"""Linearised anew where a set of effects has brought the machine: at a gap of many times the noise the first order
+about the nominal machine is not enough."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.candidates.atom import scales
+from ccnn_torch.effects import Acting, Effect, Situation, reached
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+
+__all__ = ["moved", "remainder", "signature_at", "tangent"]
+
+
+def moved(situation: Situation, acting: Sequence[Acting]) -> Situation:
+    """The same rows with joints and parameters as the effects make them."""
+    mechanism = situation.mechanism
+    joints = situation.joints
+    parameters = mechanism.resolve(situation.parameters).expand(*joints.shape[:-1], -1)
+    for one in acting:
+        if one.effect.kind == "joints":
+            joints = joints + one.change(situation)
+        elif one.effect.kind == "parameters":
+            parameters = parameters + one.change(situation)
+    return replace(situation, joints=joints, parameters=parameters, guess=situation.pose)
+
+
+def remainder(situation: Situation, measured: Tensor, acting: Sequence[Acting]) -> Tensor:
+    """Measured less reached with the effects, `s x c` [m, rad]; NaN where the machine with them cannot be."""
+    there = reached(situation, acting)
+    position, rotation = situation.mechanism.frame(measured)
+    left = position - there[..., :3]
+    if rotation is None or there.shape[-1] == 3:
+        return left
+    return torch.cat([left, matrix_to_rotation_vector(rotation @ rotation_vector_to_matrix(there[..., 3:]).mT)], -1)
+
+
+def signature_at(situation: Situation, there: Situation, effect: Effect, shape: Tensor) -> Tensor:
+    """Change of the pose per plausible size of each coefficient about the machine `there`, `s x c x m`."""
+    basis = effect.basis(situation, shape) * scales(effect.coefficients(situation), situation.joints)
+    if effect.kind == "joints":
+        return there.jacobian @ basis
+    if effect.kind == "parameters":
+        return there.parameter_jacobian @ basis
+    return basis
+
+
+def tangent(situation: Situation, left: Tensor, acting: Sequence[Acting]) -> tuple[Situation, Tensor]:
+    """Where the effects bring the machine, and the residual that a linear model about there has to explain, `s x c`.
+
+    left: the effects' `remainder`; rows that the machine with the effects cannot reach are NaN there and come back so.
+    """
+    there = moved(situation, acting)
+    for one in acting:
+        size = scales(one.effect.coefficients(situation), situation.joints)
+        columns = signature_at(situation, there, one.effect, one.shape)
+        left = left + (columns @ (one.coefficients / size)[..., None])[..., 0]
+    return there, left

@@ -1,0 +1,194 @@
+"""Noise and row weights before anything is named: what the richest fit leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.diagnosis.evidence.single_groups import (
+    NO_COLUMNS,
+    Axes,
+    GroupProducts,
+    axes_of,
+    fit_in_axes,
+    fit_single_groups,
+    own_products,
+)
+from ccnn_torch.diagnosis.residual.whitening import NO_NOISE, Whitening, reweighted
+
+__all__ = ["fitted_whitening"]
+
+# The richest fit: at most so many candidates, the log evidence from which one is taken in, the spread of its log size.
+_RICH, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
+# Candidates that are looked at with the rows' weights as they are, the most promising when all weigh alike.
+_NEXT = 4
+# The principal axes of all are taken anew where the channels' noise has changed by more among each other (logarithm).
+_SAME_AXES = 0.2
+# Updates of a fit that begins where the one before it ended.
+_UPDATES = 4
+
+
+def fitted_whitening(
+    residual: Tensor, columns: Sequence[Tensor], channels: Tensor, noise: Tensor | None, usable: Tensor
+) -> Whitening:
+    """Noise and row weights from the richest fit: of everything that may be there, one by one what explains most of
+    what is left, as long as the evidence for it is more than slight.
+
+    Args:
+        residual: `s x c0` [m, rad].
+        columns: of everything that may be there, `s x c0 x P` each.
+        channels: `c`.
+        noise: known standard deviation of each of the c0 channels, or None.
+        usable: `s`, False where a row is left out from the start.
+    """
+    rms = residual[usable][:, channels].abs().median(0).values * 1.4826
+    rms = rms.clamp_min(NO_NOISE)
+    sigma = rms if noise is None else noise[channels]
+    white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0)
+    shown = [c if len(channels) == c.shape[1] else c[:, channels] for c in columns if c.shape[-1]]
+    shown = [c.to(residual.dtype) for c in shown]
+    every = _Everything(shown, white)
+    y = residual[:, channels]
+    if noise is None:
+        white = replace(white, sigma=sigma * _noise_share(every, y, white).sqrt())
+    chosen: list[int] = []
+    log_scale = y.new_zeros(1, 0)
+    least = None if noise is not None else (1e-4 * rms).clamp_min(NO_NOISE)
+    left, free = y, 1.0
+    for _ in range(_RICH):
+        if chosen:
+            own = torch.cat([shown[k] / every.size[k] for k in chosen], -1)
+            ends = torch.tensor([shown[k].shape[-1] for k in chosen]).cumsum(0).tolist()
+            parts = [torch.arange(e - shown[k].shape[-1], e) for e, k in zip(ends, chosen, strict=True)]
+            grams = grams_of(white.scaled(own), white.scaled(y))
+            fit = fit_sets(grams, [parts], 0.0, _UPDATES, _ANY_SIZE, (log_scale, y.new_ones(1)))
+            left, log_scale = y - own @ fit.mean[0], fit.log_scale
+            free = max(1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), 0.1)
+            white = _settled(white, left, usable, free, least)
+        rest = [k for k in range(len(shown)) if k not in chosen]
+        if not rest:
+            break
+        squares = white.scaled(left).square().sum()
+        rough = every.roughly_added(white, left)[rest]
+        likely = [rest[k] for k in rough.argsort(descending=True)[:_NEXT].tolist()]
+        products = [own_products(white.scaled(shown[k]), white.scaled(left), every.size[k]) for k in likely]
+        added = _added(products, squares, y.numel())
+        best = int(added.gain.argmax())
+        if float(added.gain[best]) < _SLIGHT:
+            break
+        chosen.append(likely[best])
+        log_scale = torch.cat([log_scale, added.log_scale[None, best : best + 1]], -1)
+    white = _settled(white, left, usable, free, least)
+    return replace(white, known=0.0 if noise is None else 50.0)
+
+
+class _Added(NamedTuple):
+    """Log evidence gained by each of the candidates, `k`, and log α² with which it is, `k`."""
+
+    gain: Tensor
+    log_scale: Tensor
+
+
+def _added(products: Sequence[GroupProducts], squares: Tensor, values: int) -> _Added:
+    """products: of each candidate; squares: of what it is added to, and of how many values."""
+    fits = fit_single_groups([NO_COLUMNS, *products], squares, float(values), 0.0, _ANY_SIZE)
+    return _Added(fits.log_evidence[1:] - fits.log_evidence[0], fits.log_scale[1:])
+
+
+class _Everything:
+    """All that may be there, and its inner products channel by channel: these stay when the noise changes.
+
+    Columns count by what they tell, whatever their size: all have the same mean square.
+
+    Attributes:
+        columns: of each candidate, `s x c x m` [m, rad].
+        size: what they are divided by.
+    """
+
+    def __init__(self, columns: Sequence[Tensor], white: Whitening) -> None:
+        self.columns = columns
+        self._weight = white.weight
+        self._turned: tuple[Axes, Tensor] | None = None
+        self._among = [self._by_channel(c, c) for c in columns]
+        # Weights are 1 or 0 at first.
+        count = white.weight.sum() * len(white.channels)
+        per = white.sigma[:, None] ** -2
+        squares = [(g.diagonal(dim1=-2, dim2=-1) * per).sum() / g.shape[-1] for g in self._among]
+        self.size = [(s / count).sqrt().clamp_min(1e-300) for s in squares]
+
+    def _by_channel(self, one: Tensor, other: Tensor) -> Tensor:
+        """Inner products `c x m x k` of `s x c x m` and `s x c x k`."""
+        plain = bool((self._weight == 1).all())
+        weighted = one if plain else one * self._weight[:, None, None]
+        return weighted.permute(1, 2, 0) @ other.transpose(0, 1)
+
+    def by_channel(self, y: Tensor, white: Whitening) -> list[list[GroupProducts]]:
+        """Of every candidate those of each channel, in units of the noise; y: residual, `s x c`."""
+        per = white.sigma**-2
+        found = []
+        for columns, among, size in zip(self.columns, self._among, self.size, strict=True):
+            square = among * per[:, None, None] / size**2
+            along = self._by_channel(columns, y[..., None])[..., 0] * per[:, None] / size
+            found.append([GroupProducts(xx, xy) for xx, xy in zip(square, along, strict=True)])
+        return found
+
+    def roughly_added(self, white: Whitening, left: Tensor) -> Tensor:
+        """Log evidence that each candidate would gain beside a fit that leaves so much, `s x c`, as if all rows weighed
+        alike and up to a number that all have in common: near enough to tell which may be the best."""
+        per = white.sigma**-2
+        share = per * white.weight.sum() / self._weight.sum()
+        if self._turned is None or _spread(share / self._turned[1]) > _SAME_AXES:
+            square = share[:, None, None]
+            inner = [(a * square).sum(0) / size**2 for a, size in zip(self._among, self.size, strict=True)]
+            self._turned = axes_of(inner, left), share
+        axes, before = self._turned
+        target = (left * white.weight[:, None] * per).reshape(-1)
+        along = axes.turned(
+            [c.flatten(0, 1).mT @ target / size for c, size in zip(self.columns, self.size, strict=True)]
+        )
+        square = axes.square * (share / before).mean()
+        squares, there = white.scaled(left).square().sum(), torch.ones(len(square), dtype=torch.bool)
+        return fit_in_axes(square, along, there, squares, float(left.numel()), 0.0, _ANY_SIZE).log_evidence
+
+
+def _spread(factors: Tensor) -> float:
+    """Between the least and the largest, in logarithms."""
+    least, largest = factors.log().aminmax()
+    return float(largest - least)
+
+
+def _noise_share(every: _Everything, y: Tensor, white: Whitening) -> Tensor:
+    """Of the squares of each channel what the candidate that explains it best by itself leaves, `c`.
+
+    Channel by channel: one that is almost all gap would else be lost in the noise of the others.
+
+    Args:
+        every: candidates.
+        y: residual, `s x c` [m, rad].
+        white: noise and weights so far.
+    """
+    target = white.scaled(y).mT
+    groups = [NO_COLUMNS] * len(target) + [own for each in every.by_channel(y, white) for own in each]
+    squares = target.square().sum(-1).repeat(1 + len(every.columns))
+    fits = fit_single_groups(groups, squares, float(target.shape[-1]), 0.0, _ANY_SIZE)
+    evidence, noise = fits.log_evidence.reshape(-1, len(target)), fits.noise.reshape(-1, len(target))
+    best = evidence.max(0)
+    left = noise.gather(0, best.indices[None])[0] / noise[0]
+    return torch.where(best.values - evidence[0] > _SLIGHT, left, 1.0).clamp(1e-6, 1.0)
+
+
+def _settled(white: Whitening, left: Tensor, usable: Tensor, free: float, least: Tensor | None) -> Whitening:
+    """Noise (unless it is known: `least` None) and weights from what a fit leaves, `s x c`.
+
+    No channel's noise is below `least`: a perfect fit knows nothing of the noise.
+    """
+    if least is not None:
+        rows = white.weight > 0
+        spread = left[rows].abs().median(0).values * 1.4826 / free**0.5
+        white = replace(white, sigma=torch.maximum(spread, least))
+    return reweighted(white, left, usable, free)

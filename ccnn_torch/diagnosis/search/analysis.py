@@ -1,0 +1,320 @@
+"""From rows to the posterior over sets of candidates: whitening, shapes, search, and again where they point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.candidates.atom import Atom
+from ccnn_torch.diagnosis.candidates.library import (
+    Known,
+    candidates_about_nominal,
+    candidates_about_set,
+    default_atom,
+    has_usual_shape,
+    without_unused_rows,
+)
+from ccnn_torch.diagnosis.discrepancy.linear import linear_discrepancies
+from ccnn_torch.diagnosis.discrepancy.local import local_discrepancies
+from ccnn_torch.diagnosis.discrepancy.smooth import smooth_discrepancies
+from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.diagnosis.residual.linearisation import remainder, tangent
+from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
+from ccnn_torch.diagnosis.residual.whitening import NO_NOISE, Whitening, moving_channels, reweighted
+from ccnn_torch.diagnosis.search.beam import search
+from ccnn_torch.diagnosis.search.convergence import (
+    discrepancy_is_active,
+    has_new_effects,
+    is_converged,
+    known_shapes,
+    most_probable_shapes,
+)
+from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
+
+__all__ = ["Analysis", "analyse", "frame_columns"]
+
+# Rows are left out where the Jacobian is worse conditioned than this and than ten times the usual.
+_CONDITION = 50.0
+# Or where the joints move the platform so many times as far as usual.
+_GAIN = 3.0
+_NOISE_REDUCTION = 0.5
+# No third look where, with its shapes looked for beside its best, the library is so far behind (log odds).
+_MUCH_LESS_PROBABLE = 20.0
+# An effect shows where a coefficient of plausible size makes this share of the gap.
+_SHOWN = 1e-9
+# Values of the residual that the search for a set to start from takes, at most.
+_START = 900
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """What the rows say.
+
+    Attributes:
+        situation: the rows.
+        measured: poses, `s x p`.
+        residual: measured less nominal, `s x c0` [m, rad].
+        whitening: channels, noise and row weights in the end.
+        dictionary: atoms, their columns and Gram matrices in the end.
+        y: what the atoms explain, whitened, `s x c`; rows that count.
+        found: sets, most probable first.
+        near_singular: `s`, bool.
+        floor: mean square of the noise in the units of `y`: 1 where it was given, else that of the richest fit or,
+            where that is far less, of the most probable set.
+        idle: effects that change no pose in these rows, and were no candidates.
+    """
+
+    situation: Situation
+    measured: Tensor
+    residual: Tensor
+    whitening: Whitening
+    dictionary: Dictionary
+    y: Tensor
+    found: list[FittedSet]
+    near_singular: Tensor
+    floor: float
+    idle: tuple[str, ...] = ()
+
+    @property
+    def gap(self) -> float:
+        """Squares above the noise, in the units of `y`."""
+        return max(float(self.dictionary.grams.yy) - self.floor * self.dictionary.grams.values, 1e-300)
+
+    def acting(self, found: FittedSet) -> list[Acting]:
+        """The effects of a set with their most probable numbers; catch-alls are left out."""
+        out = []
+        for i, mean in zip(found.members, found.mean, strict=True):
+            atom = self.dictionary.atoms[i]
+            if atom.effect is not None:
+                out.append(Acting(atom.effect, atom.shape, atom.spread(self.situation, mean)))
+        return out
+
+
+class _Rows(NamedTuple):
+    """What every look goes by: the rows, `measured` poses `s x p`, the `noise` that was given, rows that are `usable`
+    and those `near` a singularity, `s`; and 0 in rows that are left out: the `residual`, `s x c0`, what was `fitted` to
+    them before, `s x c0 x r`, and the joints' `jacobian`, `s x c0 x n`."""
+
+    situation: Situation
+    measured: Tensor
+    noise: Tensor | None
+    usable: Tensor
+    near: Tensor
+    residual: Tensor
+    fitted: Tensor
+    jacobian: Tensor
+
+
+class _Fixed(NamedTuple):
+    """What stays whatever is found: effects that show, catch-alls, those of one place or sway found at first, and the
+    noise of the richest fit, `c`."""
+
+    effects: list[Effect]
+    rest: list[Atom]
+    local: list[Atom]
+    rich: Tensor
+
+
+def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], noise: Tensor | None) -> Analysis:
+    """The whole search.
+
+    Args:
+        situation: `s` rows.
+        measured: poses, `s x p` [SI].
+        effects: candidates, all of which the rows have the covariates for.
+        noise: standard deviation of each pose channel, `c0` [m, rad], or None.
+    """
+    rows = _rows_of(situation, measured, noise)
+    result, standing = _search_about_nominal(rows, effects)
+    # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
+    before: frozenset[str] | None = None
+    for _ in range(2):
+        atoms = result.dictionary.atoms
+        best = next(f for f in result.found if not any(atoms[i].is_discrepancy for i in f.members))
+        if before is not None and result.found[0].log_posterior - best.log_posterior > _MUCH_LESS_PROBABLE:
+            break
+        acting = result.acting(best)
+        act = frozenset(a.effect.name for a in acting)
+        white, left = _renewed(result, noise, rows.usable), remainder(situation, measured, acting)
+        shapes = Known([a for a in atoms if a.effect is not None and a.shape.numel()], {}, before is None)
+        if before is not None:
+            old, sought = result.whitening, act if act == before else None
+            if not has_new_effects(result.dictionary, result.found, best, before, result.gap) and is_converged(
+                result.dictionary, result.y, best, old, white, left
+            ):
+                if torch.equal(white.keep(), old.keep()):
+                    break
+                # Other rows are bad ones, and nothing else has changed.
+                sought = frozenset()
+            shapes = shapes._replace(kept=known_shapes(result.dictionary, result.found, best, sought))
+        else:
+            shapes = shapes._replace(starts=_kept_shapes(situation, shapes.starts, result, act))
+        # A bump is not looked for again where nothing outside the library does anything.
+        local = before is None or discrepancy_is_active(result.dictionary, result.found, best)
+        before = act
+        result = _search_about_set(rows, standing, result, acting, white, left, shapes, local)
+    shown = {e.name for e in standing.effects}
+    return replace(result, idle=tuple(e.name for e in effects if e.name not in shown))
+
+
+def _rows_of(situation: Situation, measured: Tensor, noise: Tensor | None) -> _Rows:
+    residual = pose_residual(situation, measured)
+    near = _near_singular(situation, moving_channels(situation))
+    usable = torch.isfinite(residual).all(-1) & torch.isfinite(situation.jacobian).flatten(1).all(-1) & ~near
+    residual = torch.where(usable[:, None], residual, 0.0)
+    jacobian = torch.where(usable[:, None, None], situation.jacobian, 0.0)
+    return _Rows(situation, measured, noise, usable, near, residual, frame_columns(situation, usable), jacobian)
+
+
+def _search_about_nominal(rows: _Rows, effects: Sequence[Effect]) -> tuple[Analysis, _Fixed]:
+    """About the nominal machine, on a part of the rows: only where to start from."""
+    situation, usable = rows.situation, rows.usable
+    channels = moving_channels(situation)
+    atoms = [without_unused_rows(default_atom(situation, situation, e), usable) for e in effects]
+    names = [e.name for e in effects]
+    rest = [*smooth_discrepancies(situation, names), *linear_discrepancies(situation, names)]
+    rest = [
+        without_unused_rows(a, usable) for a in rest if bool((torch.isfinite(a.columns.sum((1, 2))) | ~usable).all())
+    ]
+    # What does not show at all in these rows is no candidate (latency at rest).
+    largest = rows.residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)
+    atoms = [a for a in atoms if float((a.columns[:, channels] / largest[:, None]).abs().max()) > _SHOWN]
+    everything = [a.columns for a in (*atoms, *rest) if not (a.is_discrepancy and a.name.startswith("joint"))]
+    white = fitted_whitening(rows.residual, [rows.fitted, *everything], channels, rows.noise, usable)
+
+    fixed, starts = candidates_about_nominal(situation, atoms, white, rows.residual, usable, rows.fitted)
+    local = local_discrepancies(situation, rows.jacobian, rows.residual, white, rows.fitted)
+    shown = [a.effect for a in atoms if a.effect is not None]
+    standing = _Fixed(shown, rest, [without_unused_rows(a, usable) for a in local], white.sigma)
+    every = [*fixed, *starts, *rest, *standing.local]
+    few = _drawn(white.keep(), len(channels))
+    return _searched(rows, rows.residual, white, every, standing.rich, few), standing
+
+
+def _kept_shapes(situation: Situation, starts: Sequence[Atom], result: Analysis, acting: Set[str]) -> list[Atom]:
+    """Of the shapes found at first those that stay candidates: of effects that act all, since what else acts now may
+    have hidden the better ones, and of the others the likeliest and that of the textbook."""
+    likely = most_probable_shapes(result.dictionary, result.found)
+    return [a for a in starts if a.name in acting or a is likely.get(a.name) or has_usual_shape(situation, a)]
+
+
+def _search_about_set(
+    rows: _Rows,
+    standing: _Fixed,
+    result: Analysis,
+    acting: Sequence[Acting],
+    white: Whitening,
+    left: Tensor,
+    shapes: Known,
+    local: bool,
+) -> Analysis:
+    """About the machine with the best set's effects, on all rows.
+
+    Args:
+        rows, standing: what stays.
+        result: of the look before.
+        acting: effects of its best set.
+        white: noise and weights that its most probable set leaves.
+        left: what those effects leave by the machine itself, `s x c0` [m, rad].
+        shapes: found before.
+        local: whether bumps are looked for again.
+    """
+    situation, usable = rows.situation, rows.usable
+    there, target = tangent(situation, left, acting)
+    ok = usable & torch.isfinite(target).all(-1) & torch.isfinite(there.jacobian).flatten(1).all(-1)
+    if int(ok.sum()) < 0.9 * int(usable.sum()):
+        there, target, ok = situation, rows.residual, usable
+    target = torch.where(ok[:, None], target, 0.0)
+    white = white if bool((ok == usable).all()) else _renewed(result, rows.noise, ok)
+    atoms = candidates_about_set(
+        situation,
+        there,
+        rows.measured,
+        target,
+        standing.effects,
+        acting,
+        shapes,
+        white,
+        ok,
+        rows.fitted,
+    )
+    again: list[Atom] = []
+    if local:
+        # The first of a name has the shapes found now; its parts and earlier shapes add next to nothing.
+        newest = {a.name: a.columns for a in reversed(atoms)}
+        beside = torch.cat([rows.fitted, *(newest[name] for name in sorted({a.effect.name for a in acting}))], -1)
+        again = local_discrepancies(situation, rows.jacobian, target, white, beside)
+    every = [*atoms, *standing.rest, *standing.local, *(without_unused_rows(a, ok) for a in again)]
+    return _searched(rows, target, white, every, standing.rich)
+
+
+def _near_singular(situation: Situation, channels: Tensor) -> Tensor:
+    """Rows whose Jacobian is far worse conditioned than the others', `s`."""
+    jacobian = torch.nan_to_num(situation.jacobian[:, channels]).clone()
+    jacobian[:, channels >= 3] *= 0.3
+    values = torch.linalg.svdvals(jacobian)
+    condition = values[:, 0] / values[:, -1].clamp_min(1e-300)
+    far: Tensor = (condition > _CONDITION) & (condition > 10 * condition.median())
+    # First order does not hold where the joints move the platform much more, and a few such rows have the whole gap.
+    far = far | (values[:, 0] > _GAIN * values[:, 0].median())
+    return far
+
+
+def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
+    """What frames that were fitted to these rows can do, `s x c0 x r`, in sizes that no evidence holds back."""
+    unknown = getattr(situation.mechanism, "unknown_frames", ())
+    index = [k for k, g in enumerate(situation.mechanism.geometry) if g.name.partition("_")[0] in unknown]
+    columns = situation.parameter_jacobian[..., index] if index else situation.jacobian[..., :0]
+    return torch.where(usable[:, None, None], columns, 0.0)
+
+
+def _searched(
+    rows: _Rows, target: Tensor, white: Whitening, atoms: list[Atom], rich: Tensor, few: Tensor | None = None
+) -> Analysis:
+    """target: what a linear model has to explain, `s x c0`; rich: noise of the richest fit, `c`; few: rows for a quick
+    look, `t`; None = all that count, thoroughly."""
+    keep = white.keep() if few is None else few
+    counted = slice(None) if len(keep) == len(target) else keep
+    columns, y = [white(a.columns)[counted] for a in atoms], white(target)[counted]
+    if rows.fitted.shape[-1]:
+        # What was fitted before takes its part out of everything.
+        u, s, _ = torch.linalg.svd(white(rows.fitted)[counted].flatten(0, 1), full_matrices=False)
+        q = u[:, s > 1e-9 * s[0]]
+        y = (y.flatten() - q @ (q.mT @ y.flatten())).reshape(y.shape)
+        columns = [(c.flatten(0, 1) - q @ (q.mT @ c.flatten(0, 1))).reshape(c.shape) for c in columns]
+    # Noise that was given is right to some per cent, however many rows there are.
+    known = white.known * (1 + y.numel() / 100)
+    dictionary, found = search(atoms, columns, y, known, quick=few is not None)
+    # The richest fit knows no shapes: where these are most of the gap the best set leaves far less.
+    left = found[0].rss / max(y.numel() - found[0].effective, 1.0)
+    floor = min(float((rich / white.sigma).square().mean()), 1.0)
+    floor = left if white.known == 0 and left < _NOISE_REDUCTION * floor else floor
+    return Analysis(rows.situation, rows.measured, target, white, dictionary, y, found, rows.near, floor)
+
+
+def _drawn(rows: Tensor, channels: int) -> Tensor:
+    """As many of the rows as are enough to start from, in order."""
+    drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[: max(_START // channels, 1)]
+    return rows[drawn.sort().values]
+
+
+def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitening:
+    """Noise and weights from what the most probable set of all leaves."""
+    best, white = result.found[0], result.whitening
+    raw = result.residual
+    for i, mean in zip(best.members, best.mean, strict=True):
+        raw = raw - result.dictionary.atoms[i].columns @ mean
+    raw = raw[:, white.channels]
+    free = 1 - best.effective / max(result.dictionary.grams.values, 1.0)
+    if noise is None:
+        rows = (white.weight > 0) & usable
+        spread = raw[rows].abs().median(0).values * 1.4826 / max(free, 0.1) ** 0.5
+        rms = result.residual[rows][:, white.channels].abs().median(0).values * 1.4826
+        white = Whitening(
+            white.channels, torch.maximum(spread, 1e-4 * rms).clamp_min(NO_NOISE), white.weight, white.known
+        )
+    return reweighted(white, raw, usable, free)

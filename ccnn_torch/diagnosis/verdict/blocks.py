@@ -1,0 +1,153 @@
+"""The blocks of a diagnosis from an analysis and its judgement."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from ccnn_torch.diagnosis.evidence.dictionary import covariance
+from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.diagnosis.shrink.held_out import Gap, HeldOut, draws, held_out, shrink_of
+from ccnn_torch.diagnosis.verdict.judgement import Judgement
+from ccnn_torch.diagnosis.verdict.separability import signature_angles
+
+__all__ = ["Blocks", "blocks", "in_order", "noise_floor"]
+
+
+class Blocks:
+    """Gap, effects and shrink, all on the same held-out rows."""
+
+    def __init__(self, analysis: Analysis, judgement: Judgement, residual: Tensor, seed: int) -> None:
+        """residual: nominal, `s x c0` [m, rad]; seed: of folds and draws."""
+        white = analysis.whitening
+        self.analysis, self.judgement = analysis, judgement
+        self.before = residual[white.keep()][:, white.channels]
+        self.floor = noise_floor(analysis)
+        self.position = white.channels < 3
+        atoms = analysis.dictionary.atoms
+        self.candidates = _best_alone(analysis)
+        members = judgement.found.members
+        alone = [[i] for i in self.candidates.values()]
+        # The verdict's effects one after the other, the largest first; the last has them all.
+        place = {atoms[i].name: i for i in members if not atoms[i].is_discrepancy}
+        steps = [[place[n] for n in judgement.names[:k]] for k in range(len(judgement.names) + 1)]
+        self.draws = draws(len(self.before), seed)
+        held = held_out(analysis, [*steps, *alone], seed)
+        self.steps, self.together = held[1 : len(steps)], held[len(steps) - 1]
+        self.alone: dict[str, HeldOut] = dict(zip(self.candidates, held[len(steps) :], strict=True))
+        self.apart = signature_angles(analysis, judgement)
+
+    def gap(self, held: HeldOut, position: bool, before: Tensor | None = None) -> Gap:
+        """In position [m] or rotation [rad]; before: `s x c` [m, rad], None = the nominal residual."""
+        white = self.analysis.whitening
+        channels = self.position if position else ~self.position
+        exact = white.known > 0
+        dof = 0.0 if exact else max(self.analysis.dictionary.grams.values - self.judgement.found.effective, 1.0)
+        return shrink_of(self.before if before is None else before, held, self.floor, channels, dof, self.draws)
+
+    def main(self, held: HeldOut, before: Tensor | None = None) -> Gap:
+        """In position where the machine has one, else in rotation; before: as for `gap`."""
+        return self.gap(held, bool(self.position.any()), before)
+
+
+def blocks(made: Blocks) -> tuple[dict[str, Any], dict[str, Any] | None, list[dict[str, Any]]]:
+    """`gap`, `gap_rotation`, `effects` of diagnosis.json."""
+    position, rotation = bool(made.position.any()), bool((~made.position).any())
+    gap = _gap(made.main(made.together), "m" if position else "rad")
+    turned = _gap(made.gap(made.together, False), "rad") if rotation and position else None
+    return gap, turned, [_effect(made, name) for name in _ordered(made)]
+
+
+def in_order(made: Blocks) -> list[dict[str, Any]]:
+    """`in_order` of diagnosis.json: the verdict's effects added one after the other, each step refitted."""
+    found = []
+    for name, held in zip(made.judgement.names, made.steps, strict=True):
+        gap = made.main(held)
+        interval = None if gap.interval is None else list(gap.interval)
+        found.append({"name": name, "gap_after": gap.after, "shrink": gap.shrink, "shrink_ci95": interval})
+    return found
+
+
+def noise_floor(analysis: Analysis) -> Tensor:
+    """Variance of the noise, `c`: given, or the mean square that the most probable set of all leaves, tails and all."""
+    white, best = analysis.whitening, analysis.found[0]
+    if white.known > 0 or not analysis.dictionary.grams.values:
+        return white.sigma.square()
+    keep = white.keep()
+    left = analysis.y
+    for i, mean in zip(best.members, best.mean, strict=True):
+        left = left - analysis.dictionary.columns[..., analysis.dictionary.groups[i]] @ mean
+    free = max(1 - best.effective / analysis.dictionary.grams.values, 0.1)
+    # No more than the richest fit leaves.
+    share = min(analysis.floor / max(float(left.square().mean()) / free, 1e-300), 1.0)
+    return (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * share
+
+
+def _gap(gap: Gap, unit: str) -> dict[str, Any]:
+    share = max(0.0, 1 - (gap.floor / gap.before) ** 2) if gap.before > 0 else 0.0
+    return {
+        "unit": unit,
+        "before": gap.before,
+        "after": gap.after,
+        "noise_floor": gap.floor,
+        "reducible_share": share,
+    }
+
+
+def _effect(made: Blocks, name: str) -> dict[str, Any]:
+    alone = made.main(made.alone[name])
+    return {
+        "name": name,
+        "probability": made.judgement.marginal.get(name, 0.0),
+        "parameters": _parameters(made, name),
+        "gap_before": alone.before,
+        "gap_after": alone.after,
+        "shrink": alone.shrink,
+        "shrink_ci95": None if alone.interval is None else list(alone.interval),
+        "indistinguishable_from": list(made.judgement.classes.get(name, ())),
+        "signatures": made.apart.get(name, {}),
+    }
+
+
+def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
+    """Value and standard deviation in the verdict's set, beside what mends its form; else by itself."""
+    analysis = made.analysis
+    atoms = analysis.dictionary.atoms
+    own = made.judgement.fullest if name in made.judgement.names else made.judgement.found
+    if not any(atoms[i].name == name for i in own.members):
+        alone = made.candidates[name]
+        own = next(f for f in analysis.found if f.members == (alone,))
+    place = next(k for k, i in enumerate(own.members) if atoms[i].name == name)
+    atom = atoms[own.members[place]]
+    assert atom.effect is not None
+    start = sum(len(m) for m in own.mean[:place])
+    deviation = (
+        covariance(analysis.dictionary, own).diagonal()[start : start + len(own.mean[place])].clamp_min(0).sqrt()
+    )
+    coefficients = atom.coefficients(analysis.situation)
+    found: dict[str, dict[str, Any]] = {
+        c.name: {"value": float(v) * c.scale, "sd": float(d) * c.scale, "unit": c.unit}
+        for c, v, d in zip(coefficients, own.mean[place], deviation, strict=True)
+    }
+    used = None if atom.used is None else set(atom.used)
+    for shape, value in zip(atom.effect.shapes(analysis.situation), atom.shape.tolist(), strict=True):
+        if used is None or shape.columns is None or used & set(shape.columns):
+            found[shape.name] = {"value": value, "sd": None, "unit": shape.unit}
+    return found
+
+
+def _best_alone(analysis: Analysis) -> dict[str, int]:
+    """Of each library name the atom that the verdict's set uses, or that is most probable by itself."""
+    atoms = analysis.dictionary.atoms
+    best: dict[str, int] = {}
+    for found in analysis.found:
+        if len(found.members) == 1 and not atoms[found.members[0]].is_discrepancy:
+            best.setdefault(atoms[found.members[0]].name, found.members[0])
+    return best
+
+
+def _ordered(made: Blocks) -> list[str]:
+    marginal = made.judgement.marginal
+    tie = {n: made.alone[n].left.square().sum() for n in made.alone}
+    return sorted(made.alone, key=lambda n: (-marginal.get(n, 0.0), float(tie[n]), n))

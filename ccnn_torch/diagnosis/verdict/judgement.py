@@ -1,0 +1,373 @@
+"""From the posterior over sets to a name that can be stood by: outside or not, classes, probabilities."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from ccnn_torch.diagnosis.candidates.atom import Atom
+from ccnn_torch.diagnosis.discrepancy.smooth import ANY
+from ccnn_torch.diagnosis.evidence.dictionary import FittedSet
+from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.diagnosis.search.convergence import FORM
+from ccnn_torch.diagnosis.search.sets import scored, subsets_with_one_less
+from ccnn_torch.effects import EXACT
+
+__all__ = ["Judgement", "judge", "without_names"]
+
+# As `FORM`, of a catch-all beside library effects, and of library effects beside a catch-all, which stands for whatever
+# was not thought of. Exact effects leave no more than the second order.
+_FORM_DISCREPANCY, _FORM_EXACT, _BESIDE_CATCH_ALL = 0.002, 1e-4, 0.1
+# A library effect whose own part is more than this share of the gap is no form of other ones, however well these could
+# do without it.
+_CARRIES = 0.5
+# Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is stood by.
+_VETO, _MUCH = 0.005, 1.5
+# Or times the noise's energy, whatever the gap.
+_VETO_NOISE = 25.0
+# In any case by so many standard deviations of the noise's mean square.
+_CLEARLY = 5.0
+# What a claim is worth where a name carries less than this share of the gap, or where there are three names or more:
+# the textbook forms of effects are too rough to be surer.
+_SMALL, _UNSURE = 0.1, 0.85
+# A name is not claimed more surely than this where it could as well take over another candidate's typical part of the
+# gap, all but so many squares in units of the noise: then it could take over what the library does not know, too.
+_MIMIC, _MIMICKED = 0.9, 60.0
+# Share of an effect's own squares that must not be borrowed from what other effects do, and of what may be doubtful.
+_OWN, _DOUBTED = 0.1, 0.5
+# Or that must come from other coefficients than those that mend its form, where these are so many times as large, in
+# plausible sizes.
+_MAIN, _MENDED = 0.5, 15.0
+# Odds up to which one name for another is not told apart by the data.
+_ODDS = math.log(20.0)
+# Log odds against the most probable set beyond which nobody looks.
+_FAR = 12.0
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What is stood by.
+
+    Attributes:
+        found: the set that speaks for the verdict.
+        fullest: the most probable set with the same members and with what mends their form, whose coefficients are
+            told; `found` itself where nothing mends it.
+        names: library effects, the favourite of each class.
+        classes: for each of them the names that cannot be told from it.
+        probability: that the verdict, classes taken as one, is right.
+        outside: whether something is there that no library effect describes; `driver` says what it follows.
+        driver: of the catch-all, or None.
+        marginal: probability of each candidate's name.
+        leading: name sets by probability, most probable first (library names, driver or None, probability, set).
+    """
+
+    found: FittedSet
+    fullest: FittedSet
+    names: tuple[str, ...]
+    classes: dict[str, tuple[str, ...]]
+    probability: float
+    outside: bool
+    driver: str | None
+    marginal: dict[str, float]
+    leading: list[tuple[frozenset[str], str | None, float, FittedSet]]
+
+
+def judge(analysis: Analysis) -> Judgement:
+    """Weigh the sets that the search has found."""
+    groups: dict[tuple[frozenset[str], str | None], list[FittedSet]] = {}
+    top = analysis.found[0].log_posterior
+    tried = {f.members: f for f in analysis.found}
+    near = [f for f in analysis.found if f.log_posterior > top - _FAR]
+    for found, essential in zip(near, _essential(analysis, near, tried), strict=True):
+        groups.setdefault(_named(analysis, essential), []).extend([found, essential])
+    weights = {key: math.exp(max(f.log_posterior for f in fs) - top) for key, fs in groups.items()}
+    total = sum(weights.values())
+    leading = sorted(((k[0], k[1], w / total, _plainest(groups[k])) for k, w in weights.items()), key=lambda x: -x[2])
+    names, driver, probability, found = leading[0]
+    alike = [f for f in groups[names, driver] if set(found.members) <= set(f.members)]
+    fullest = max(alike, key=lambda f: f.log_posterior)
+    outside = driver is not None
+    if not outside and _unexplained(analysis, found):
+        outside = True
+        driver = _driver_of_remainder(analysis)
+    borrowed = _borrowed(analysis, found, tried)
+    if borrowed:
+        # Something is there that looks like a part of these effects, and nothing of what makes them what they are.
+        found = fullest = _best_without(analysis, borrowed, tried) or found
+        names, driver = _named(analysis, found)
+        names, outside = names - borrowed, True
+        driver = driver or _driver_alone(analysis)
+    marginal: dict[str, float] = {a.name: 0.0 for a in analysis.dictionary.atoms if not a.is_discrepancy}
+    for members, _, p, _ in leading:
+        for name in members:
+            marginal[name] += p
+    classes = {} if outside else _classes(analysis, found, names, tried)
+    if not outside:
+        same = [p for members, drive, p, _ in leading if drive is None and _equals(members, names, classes)]
+        probability = sum(same)
+    else:
+        probability = sum(p for _, drive, p, _ in leading if drive is not None) if leading[0][1] is not None else 0.5
+    if (names and (len(names) > 2 or _smallest(analysis, found, tried) < _SMALL)) or (
+        names and not outside and _above_noise(analysis, found)
+    ):
+        probability *= _UNSURE
+    if names and not outside and _could_be_another(analysis, found):
+        probability = min(probability, _MIMIC)
+    ordered = tuple(sorted(names, key=lambda n: -_energy(analysis, found, n)))
+    return Judgement(found, fullest, ordered, classes, min(probability, 1.0), outside, driver, marginal, leading)
+
+
+def without_names(analysis: Analysis, judgement: Judgement) -> Judgement:
+    """None in the place of names that are not likely and that no row outside the fit shows."""
+    empty = next(f for f in analysis.found if not f.members)
+    return replace(judgement, found=empty, fullest=empty, names=(), classes={}, probability=0.5)
+
+
+def _borrowed(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]) -> frozenset[str]:
+    """Names of a set that rest on what other effects do as well, or on what should only mend their form."""
+    grams, names = analysis.dictionary.grams, set()
+    for i, mean in zip(found.members, found.mean, strict=True):
+        atom, group = analysis.dictionary.atoms[i], analysis.dictionary.groups[i]
+        coefficients = atom.coefficients(analysis.situation)
+        if not any(c.borrowed or c.doubtful or c.mends for c in coefficients):
+            continue
+        borrowed, doubtful, corrections = (
+            torch.tensor(flags, dtype=torch.bool)
+            for flags in zip(*((c.borrowed, c.doubtful, c.mends) for c in coefficients), strict=True)
+        )
+        gram = grams.xx[group][:, group]
+        parts = (mean * ~borrowed, mean * doubtful, mean * ~corrections, mean)
+        alone, unsure, main, whole = (float(m @ gram @ m) for m in parts)
+        largest, mended = (float((mean * kind).abs().max()) for kind in (~corrections, corrections))
+        if (
+            alone < _OWN * whole
+            or (main < _MAIN * whole and mended > _MENDED * largest)
+            or (unsure > _DOUBTED * whole and not _follows_need(analysis, atom, tried))
+        ):
+            names.add(atom.name)
+    return frozenset(names)
+
+
+def _follows_need(analysis: Analysis, atom: Atom, tried: dict[tuple[int, ...], FittedSet]) -> bool:
+    """Whether, without an effect, something outside the library seems to follow a covariate that the effect needs."""
+    found = _best_without(analysis, frozenset({atom.name}), tried)
+    driver = None if found is None else _named(analysis, found)[1]
+    others = [c for c in analysis.situation.covariates if c != driver]
+    assert atom.effect is not None
+    return bool(atom.effect.missing(analysis.situation.mechanism, others))
+
+
+def _best_without(
+    analysis: Analysis, names: frozenset[str], tried: dict[tuple[int, ...], FittedSet]
+) -> FittedSet | None:
+    """The most probable set with a catch-all and none of these names."""
+    atoms = analysis.dictionary.atoms
+    for found in analysis.found:
+        if any(atoms[i].is_discrepancy for i in found.members) and not names & {atoms[i].name for i in found.members}:
+            return _essential(analysis, [found], tried)[0]
+    return None
+
+
+def _could_be_another(analysis: Analysis, found: FittedSet) -> bool:
+    """Whether what the effects of a set can do holds what some candidate beside it is likely to do, up to the noise.
+
+    All that they can do, in whatever joints or legs: the one leg that explains most was picked from all of them.
+    """
+    atoms, groups, grams = analysis.dictionary.atoms, analysis.dictionary.groups, analysis.dictionary.grams
+    names = {atoms[i].name for i in found.members}
+    own = torch.cat([groups[_whole(analysis, i)] for i in found.members])
+    inverse = torch.linalg.pinv(grams.xx[own][:, own], rtol=1e-9, hermitian=True)
+    gap = analysis.gap
+    for i, atom in enumerate(atoms):
+        if atom.is_discrepancy or atom.name in names:
+            continue
+        group = groups[i]
+        total = float(grams.xx[group, group].sum())
+        if total <= 0:
+            continue
+        cross = grams.xx[own][:, group]
+        if gap * (1 - float((cross * (inverse @ cross)).sum()) / total) < _MIMICKED:
+            return True
+    return False
+
+
+def _whole(analysis: Analysis, member: int) -> int:
+    """The atom with all coefficients of an effect of which one has some; itself where there is none of its shapes."""
+    atoms = analysis.dictionary.atoms
+    mine = atoms[member]
+    alike = (i for i, a in enumerate(atoms) if a.effect is mine.effect and a.used is None)
+    return next((i for i in alike if not mine.is_discrepancy and torch.equal(atoms[i].shape, mine.shape)), member)
+
+
+def _net(
+    analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]
+) -> dict[int, tuple[float, tuple[int, ...]]]:
+    """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
+    gap = analysis.gap
+    without = _fits(analysis, subsets_with_one_less(found.members), tried)
+    return {i: ((f.rss - found.rss) / gap, f.members) for i, f in zip(found.members, without, strict=True)}
+
+
+def _fits(
+    analysis: Analysis, sets: Sequence[tuple[int, ...]], tried: dict[tuple[int, ...], FittedSet]
+) -> list[FittedSet]:
+    """The sets, those fitted that are not among the tried, where they then are."""
+    fresh = [s for s in dict.fromkeys(sets) if s not in tried]
+    tried.update(zip(fresh, scored(analysis.dictionary, fresh, tried), strict=True))
+    return [tried[s] for s in sets]
+
+
+def _smallest(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]) -> float:
+    """Share of the gap that the least member of a set carries."""
+    return min(share for share, _ in _net(analysis, found, tried).values())
+
+
+def _essential(
+    analysis: Analysis, sets: Sequence[FittedSet], tried: dict[tuple[int, ...], FittedSet]
+) -> list[FittedSet]:
+    """Each of the sets without members that only mend the form of the others."""
+    found = [*sets]
+    going = list(range(len(found)))
+    while going:
+        # What is asked for one by one below is fitted side by side first.
+        _fits(
+            analysis,
+            [s for k in going if len(found[k].members) > 1 for s in subsets_with_one_less(found[k].members)],
+            tried,
+        )
+        less = {k: _with_less(analysis, found[k], tried) for k in going}
+        going = [k for k in going if less[k].members != found[k].members]
+        for k in going:
+            found[k] = less[k]
+    return found
+
+
+def _with_less(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]) -> FittedSet:
+    """The set without the first of its members that only mend the form of the others; itself where there is none."""
+    atoms = analysis.dictionary.atoms
+    if len(found.members) < 2:
+        return found
+    shares = _net(analysis, found, tried)
+    # Library effects are a form of the catch-all beside them only where that carries much more than they do.
+    wild = max((share for i, (share, _) in shares.items() if atoms[i].is_discrepancy), default=0.0)
+    beside = min(_BESIDE_CATCH_ALL, wild / 2)
+    limits = {}
+    for i in found.members:
+        wide = _FORM_DISCREPANCY if atoms[i].is_discrepancy else FORM
+        form = _FORM_EXACT if _exact(analysis, [m for m in found.members if m != i]) else wide
+        limits[i] = form if atoms[i].is_discrepancy else max(form, beside)
+    alone = not any(atoms[i].is_discrepancy for i in found.members)
+    large = _CARRIES * analysis.gap
+    carries = {i for i, e in zip(found.members, found.energy, strict=True) if alone and e > large}
+    # What leaves more than the noise when it goes is missed, however small it is.
+    missed = _unexplained(analysis, found)
+    idle = [
+        i
+        for i, (share, without) in shares.items()
+        if i not in carries and share < limits[i] and (missed or not _unexplained(analysis, tried[without]))
+    ]
+    if not idle:
+        return found
+    # A catch-all can stand in for much of the library, so it is the first to go; else what is missed least.
+    least = max(idle, key=lambda i: (atoms[i].is_discrepancy, tried[shares[i][1]].log_posterior))
+    return tried[shares[least][1]]
+
+
+def _plainest(found: list[FittedSet]) -> FittedSet:
+    """Of sets that come to the same names the smallest, and of those the most probable."""
+    return min(found, key=lambda f: (len(f.members), -f.log_posterior))
+
+
+def _named(analysis: Analysis, found: FittedSet) -> tuple[frozenset[str], str | None]:
+    atoms = analysis.dictionary.atoms
+    names = frozenset(atoms[i].name for i in found.members if not atoms[i].is_discrepancy)
+    driver = next((atoms[i].name for i in found.members if atoms[i].is_discrepancy), None)
+    if driver is not None and driver.endswith(ANY):
+        driver = _leader(analysis, driver.removesuffix(ANY))
+    return names, driver
+
+
+def _leader(analysis: Analysis, kind: str) -> str:
+    """Of drivers of one kind the one that explains most by itself."""
+    atoms = analysis.dictionary.atoms
+    alone = (f for f in analysis.found if len(f.members) == 1)
+    names = (atoms[f.members[0]].name for f in alone)
+    return next(n for n in names if n.startswith(kind) and not n.endswith(ANY))
+
+
+def _energy(analysis: Analysis, found: FittedSet, name: str) -> float:
+    return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.dictionary.atoms[i].name == name)
+
+
+def _above_noise(analysis: Analysis, found: FittedSet) -> bool:
+    """Whether a set leaves more than the noise by three standard deviations."""
+    count = analysis.dictionary.grams.values
+    return found.rss / max(count - found.effective, 1.0) > analysis.floor * (1 + 3 * math.sqrt(2 / count))
+
+
+def _unexplained(analysis: Analysis, found: FittedSet) -> bool:
+    """Whether what a set leaves is clearly more than the noise (given, or of the richest fit)."""
+    count = analysis.dictionary.grams.values
+    left = found.rss / max(count - found.effective, 1.0)
+    floor = analysis.floor
+    significant = left > floor * (1 + _CLEARLY * math.sqrt(2 / count))
+    gap = float(analysis.dictionary.grams.yy) / count
+    much = left - floor > _VETO * max(gap - floor, 0.0) and left > _MUCH * floor
+    return significant and (much or left > _VETO_NOISE * floor or _exact(analysis, found.members))
+
+
+def _exact(analysis: Analysis, members: Sequence[int]) -> bool:
+    """Whether there are library effects among these, and none could have another form than it was fitted with."""
+    atoms = (analysis.dictionary.atoms[i] for i in members)
+    names = {a.name for a in atoms if not a.is_discrepancy}
+    return bool(names) and names <= EXACT
+
+
+def _driver_of_remainder(analysis: Analysis) -> str | None:
+    """The driver of the most probable set that has one."""
+    for found in analysis.found:
+        driver = _named(analysis, found)[1]
+        if driver is not None:
+            return driver
+    return None
+
+
+def _driver_alone(analysis: Analysis) -> str | None:
+    """The driver that explains most by itself."""
+    atoms = analysis.dictionary.atoms
+    alone = (f for f in analysis.found if len(f.members) == 1 and atoms[f.members[0]].is_discrepancy)
+    return next((_named(analysis, f)[1] for f in alone), None)
+
+
+def _classes(
+    analysis: Analysis, found: FittedSet, names: frozenset[str], tried: dict[tuple[int, ...], FittedSet]
+) -> dict[str, tuple[str, ...]]:
+    """For each name of the set those that can stand in its place, as far as these rows can tell."""
+    atoms = analysis.dictionary.atoms
+    library = [i for i, a in enumerate(atoms) if not a.is_discrepancy]
+    classes: dict[str, tuple[str, ...]] = {}
+    for i in found.members:
+        if atoms[i].is_discrepancy:
+            continue
+        others = [j for j in library if atoms[j].name not in names]
+        sets = [tuple(sorted(j if m == i else m for m in found.members)) for j in others]
+        trials = _fits(analysis, sets, tried)
+        like = {
+            atoms[j].name: t.log_posterior
+            for j, t in zip(others, trials, strict=True)
+            if t.log_posterior > found.log_posterior - _ODDS
+        }
+        classes[atoms[i].name] = tuple(sorted(like, key=lambda n: -like[n]))
+    return classes
+
+
+def _equals(members: frozenset[str], names: frozenset[str], classes: dict[str, tuple[str, ...]]) -> bool:
+    """Whether a set of names is the verdict's, up to its classes."""
+    if len(members) != len(names):
+        return False
+    left = list(names - members)
+    new = members - names
+    return all(any(n in classes.get(e, ()) for e in left) for n in new)
