@@ -113,7 +113,7 @@ def test_a_mechanism_that_is_at_hand_needs_no_name() -> None:
 
 
 def test_the_page_on_planning_lists_every_key_as_it_is() -> None:
-    page = (Path(__file__).parent.parent / "docs" / "planning.md").read_text()
+    page = (Path(__file__).parent.parent / "docs" / "how_to" / "planning.md").read_text()
     for key, default, description in describe_plan_keys():
         assert f"| `{key}` | `{default}` | {description} |" in page
 

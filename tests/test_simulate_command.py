@@ -198,7 +198,7 @@ def test_a_file_that_is_no_csv_or_cannot_be_written_is_said(cli: Cli, tmp_path: 
 
 def test_the_help_and_the_page_name_every_effect_and_key(cli: Cli, tmp_path: Path) -> None:
     _, told, _ = cli("simulate", "--help")
-    page = (ROOT / "docs" / "effects.md").read_text()
+    page = (ROOT / "docs" / "how_to" / "effects.md").read_text()
     for name in EFFECTS:
         assert name in told and f"| `{name}` | " in page and make_effect(name).description in page
     for key, default, description in describe_simulate_keys():

@@ -277,7 +277,7 @@ def test_odd_rows_give_finite_predictions(kind: Any) -> None:
 def test_the_page_shows_the_example_and_it_runs(tmp_path: Path) -> None:
     example = ROOT / "experiments" / "scikit_learn.py"
     code = example.read_text().partition('"""\n\n')[2]
-    assert f"```python\n{code}```" in (ROOT / "docs" / "scikit_learn.md").read_text()
+    assert f"```python\n{code}```" in (ROOT / "docs" / "how_to" / "scikit_learn.md").read_text()
     told = subprocess.run(
         [sys.executable, "-W", "error", str(example)],
         cwd=tmp_path,

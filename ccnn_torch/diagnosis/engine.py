@@ -187,7 +187,8 @@ def _notes(
         share = (judgement.found.rss - judgement.fullest.rss) / analysis.gap
         notes.append(
             f"the values of {' and '.join(judgement.names)} are from a fit that also holds "
-            f"{' and '.join(corrections)}, which would explain {100 * share:.2g} % more of the residual: too little to be named"
+            f"{' and '.join(corrections)}; it would explain {100 * share:.2g} % more of the residual, too little to be "
+            "named"
         )
     if judgement.outside and not proposed:
         notes.append(

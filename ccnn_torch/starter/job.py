@@ -52,7 +52,7 @@ def starter_config(
         what = "joint (q1, J1, A1, joint_1 …)" if not found.joints else "measured pose (x, y, z …)"
         raise InputError(
             f"{records}: no column looks like a {what}; it has {', '.join(table.names)}: rename columns, or write the "
-            "config by hand (docs/records.md)"
+            "config by hand (docs/how_to/records.md)"
         )
     machine, name, why = _machine(found, table, mechanism, ask)
     columns = _columns(found, table, machine, units, ask)
@@ -130,7 +130,7 @@ def _mechanism_lines(name: str | None, why: str, out: Path) -> list[str]:
     fitting = f" ({why} would fit)" if why else ""
     return [
         f"# FILL IN the machine{fitting}: a built-in name, or an arm's geometry as a DH file (.yaml) or URDF;",
-        "# docs/mechanisms.md shows both. `ccnn run` says so until it is there.",
+        "# docs/how_to/mechanisms.md shows both. `ccnn run` says so until it is there.",
         "# mechanism: my_arm.yaml",
     ]
 

@@ -48,7 +48,7 @@ def _slider(**changes: object) -> Simulator:
 
 def test_the_docs_show_the_file() -> None:
     text = (EXAMPLES / "my_simulator.py").read_text(encoding="utf-8")
-    assert text in (EXAMPLES.parent / "docs" / "mechanisms.md").read_text(encoding="utf-8")
+    assert text in (EXAMPLES.parent / "docs" / "how_to" / "mechanisms.md").read_text(encoding="utf-8")
 
 
 def test_it_is_a_mechanism() -> None:

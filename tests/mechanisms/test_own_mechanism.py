@@ -12,7 +12,7 @@ from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.mechanisms._pose import frame_jacobian
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
 
-DOCS = Path(__file__).parents[2] / "docs" / "mechanisms.md"
+DOCS = Path(__file__).parents[2] / "docs" / "how_to" / "mechanisms.md"
 
 
 def _mechanism():

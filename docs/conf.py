@@ -1,0 +1,52 @@
+"""Sphinx configuration. The reference pages of commands, keys and file formats are generated from the package."""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from pathlib import Path
+
+# One thread: the tensors of the gallery are small.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "agg")
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+from reference.generate import write_reference  # noqa: E402
+
+project = "ccnn_torch"
+author = "The ccnn_torch founders"
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["_build", "results/*.in", "gallery/README.rst", "auto_gallery/*.ipynb"]
+html_theme = "furo"
+html_title = "ccnn_torch"
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_heading_anchors = 3
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery",
+    "gallery_dirs": "auto_gallery",
+    "filename_pattern": r"plot_",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "remove_config_comments": True,
+    "show_memory": False,
+    "within_subsection_order": "FileNameSortKey",
+}
+# Docstrings have Markdown-like backticks and mathematics in Unicode; nothing of them is a cross-reference.
+default_role = "code"
+suppress_warnings = ["config.cache"]
+warnings.filterwarnings("ignore", category=DeprecationWarning)
+
+write_reference(HERE / "reference")
