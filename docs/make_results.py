@@ -125,7 +125,9 @@ def render_readme_table() -> str:
 def _cell(table: str, row: str, column: str | int) -> str:
     """A cell by the first cell of its row and the header or number of its column."""
     head, *rows = read_rows(table)
-    found = next(line for line in rows if line[0] == row)
+    found = next((line for line in rows if line[0] == row), None)
+    if found is None:
+        sys.exit(f"docs/results/{table}.csv has no row {row!r}, which the README shows")
     return found[column if isinstance(column, int) else head.index(column)]
 
 
@@ -133,7 +135,7 @@ def case_rows(rows: Rows, runs: Sequence[Results]) -> Rows:
     """Mean squared error on held-out rows of a case study [1e-10 m²], beside the paper's for all joints."""
     (results,) = runs
     joints = [*(joint["name"] for joint in results["joints"]), "all"]
-    paper, reach = PAPER[results["case"]].methods, results["reach"]["methods"]
+    paper, reach = PAPER[results["case"]].methods, (results["reach"] or {"methods": {}})["methods"]
     lines = []
     for name, block in results["methods"].items():
         effort = reach.get(name)
@@ -144,7 +146,9 @@ def case_rows(rows: Rows, runs: Sequence[Results]) -> Rows:
                 interval_text(block["ratio_to_floor"], 1, 3),
                 interval_text(block["coverage"], 1, 3),
                 number_text(block["seconds"]["median"], 2),
-                "never" if effort is None else f"{effort['seconds']:.2g} / {effort['evaluations']:.0f}",
+                ("–" if results["reach"] is None else "never")
+                if effort is None
+                else f"{effort['seconds']:.2g} / {effort['evaluations']:.0f}",
                 number_text(paper[name][0][-1] / 1e-10, 3) if name in paper else "–",
             ]
         )
@@ -207,6 +211,8 @@ def refresh(name: str, folders: Sequence[str]) -> None:
     runs = [json.loads((Path(folder) / "results.json").read_text(encoding="utf-8")) for folder in folders]
     write_rows(name, REFRESH[kind](read_rows(name), runs))
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+    if reach := runs[0].get("reach"):
+        tables[name]["title"] = re.sub(r"level \S+", f"level {reach['level'] / 1e-10:.3g}e-10", tables[name]["title"])
     tables[name] |= {"date": datetime.date.today().isoformat(), "commit": commit.stdout.strip()}
     (DATA / "tables.json").write_text(json.dumps(tables, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
