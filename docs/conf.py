@@ -6,6 +6,7 @@ import os
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 # One thread: the tensors of the gallery are small.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -25,7 +26,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["_build", "results/*.in", "gallery/README.rst", "auto_gallery/*.ipynb"]
+exclude_patterns = ["_build", "gallery"]
 html_theme = "furo"
 html_title = "ccnn_torch"
 myst_enable_extensions = ["dollarmath", "colon_fence"]
@@ -34,6 +35,7 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
+napoleon_use_ivar = True
 sphinx_gallery_conf = {
     "examples_dirs": "gallery",
     "gallery_dirs": "auto_gallery",
@@ -46,7 +48,19 @@ sphinx_gallery_conf = {
 }
 # Docstrings have Markdown-like backticks and mathematics in Unicode; nothing of them is a cross-reference.
 default_role = "code"
-suppress_warnings = ["config.cache"]
+# Attributes of one name in several classes are no references either.
+suppress_warnings = ["config.cache", "ref.python"]
 warnings.filterwarnings("ignore", category=DeprecationWarning)
 
 write_reference(HERE / "reference")
+
+
+def _escape(app: object, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
+    """A bar is a magnitude or an or, never a substitution of reStructuredText."""
+    for i, line in enumerate(lines):
+        parts = line.split("`")
+        lines[i] = "`".join(part if k % 2 else part.replace("|", "\\|") for k, part in enumerate(parts))
+
+
+def setup(app: Any) -> None:
+    app.connect("autodoc-process-docstring", _escape)

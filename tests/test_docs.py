@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import ast
 import re
+import runpy
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+import typer
+
+from ccnn_torch.cli import app
+
 ROOT = Path(__file__).parent.parent
 DIAGNOSIS = ROOT / "ccnn_torch" / "diagnosis"
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*/*.md"))]
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 CONSTANTS = ROOT / "docs" / "explanation" / "diagnosis_constants.md"
 
 
@@ -35,3 +44,36 @@ def test_every_constant_of_the_diagnosis_is_in_the_table_with_its_value() -> Non
     }
     assert set(table) == code
     assert len(table) > 100
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The fenced blocks of a page in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
+
+
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_python_in_tutorials_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    for number, code in enumerate(blocks(page, "python")):
+        file = tmp_path / f"block_{number}.py"
+        file.write_text(code, encoding="utf-8")
+        runpy.run_path(str(file))
+
+
+def test_every_command_on_the_pages_is_one_that_there_is() -> None:
+    group = typer.main.get_command(app)
+    parsed = 0
+    for page in PAGES:
+        if page.parent.name == "reference":
+            continue
+        text = "\n".join(blocks(page, "bash") + blocks(page, ""))
+        for line in text.replace("\\\n", " ").splitlines():
+            command = line.partition("&& ccnn ")[2] or (line[5:] if line.startswith("ccnn ") else "")
+            if not command:
+                continue
+            name, *words = shlex.split(command, comments=True)
+            assert name in group.commands, f"{page.name}: {line}"  # type: ignore[attr-defined]
+            if "--help" not in words and "--keys" not in words:
+                group.commands[name].make_context(name, words)  # type: ignore[attr-defined]
+                parsed += 1
+    assert parsed > 25

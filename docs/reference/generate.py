@@ -1,8 +1,10 @@
-"""Write the reference pages that follow from the package: commands, config keys, file formats."""
+"""Write the reference pages that follow from the package: Python names, commands, config keys, file formats."""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator, Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +25,46 @@ SCHEMAS = {
     "suite": "`suite.json` of `ccnn suite`",
     "blind": "`blind.json` of `ccnn blind-check`",
 }
+PACKAGES = (
+    "ccnn_torch",
+    *(
+        f"ccnn_torch.{name}"
+        for name in ("mechanisms", "records", "effects", "learners", "training", "compensation", "identification")
+    ),
+    *(f"ccnn_torch.{name}" for name in ("planning", "diagnosis", "testing", "sklearn")),
+)
 CONFIGS = ("run", "identify", "suite", "plan", "diagnose")
 
 
 def write_reference(folder: Path) -> None:
-    """Write `cli.md`, `config_keys.md` and `file_formats.md`; a page that has not changed is left as it is."""
-    pages = {"cli": _commands(), "config_keys": _keys(), "file_formats": _formats()}
+    """Write `api.md`, `cli.md`, `config_keys.md` and `file_formats.md`, each only where it has changed."""
+    pages = {"api": _api(), "cli": _commands(), "config_keys": _keys(), "file_formats": _formats()}
     for name, text in pages.items():
         path = folder / f"{name}.md"
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
+
+
+def _api() -> str:
+    """Every public class and function, once: in the first package that gives it."""
+    parts = ["# Python\n", "Arrays are float64 and in SI units; `...` stands for any leading batch dimensions.\n"]
+    seen: set[int] = set()
+    for package in PACKAGES:
+        module = import_module(package)
+        names = getattr(module, "__all__", None) or sorted(n for n in vars(module) if not n.startswith("_"))
+        found = {name: getattr(module, name) for name in names if name != "__version__"}
+        parts += [f"## {package}\n", "```{eval-rst}"]
+        for name, thing in found.items():
+            ours = getattr(thing, "__module__", "").startswith("ccnn_torch")
+            if id(thing) in seen or not ours or not (inspect.isclass(thing) or inspect.isfunction(thing)):
+                continue
+            seen.add(id(thing))
+            kind = "autoclass" if inspect.isclass(thing) else "autofunction"
+            # scikit-learn adds methods of its own to estimators, with links into its pages.
+            members = "   :members: fit, predict" if package.endswith("sklearn") else "   :members:"
+            parts += [f".. {kind}:: {package}.{name}", members if kind == "autoclass" else "", ""]
+        parts.append("```\n")
+    return "\n".join(parts)
 
 
 def _commands() -> str:
