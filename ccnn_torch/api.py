@@ -8,7 +8,7 @@ from typing import Any
 from ccnn_torch.calibration.calibrate import Calibration
 from ccnn_torch.calibration.calibrate import calibrate as _calibrate
 from ccnn_torch.calibration.config import make_config
-from ccnn_torch.calibration.prepare import prepare
+from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.config.held_out import given_records, name_given
 from ccnn_torch.identification.config import make_identify_config

@@ -17,12 +17,12 @@ from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import load_config, make_config
-from ccnn_torch.calibration.prepare import prepare
+from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.cli._main import app
 from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
-from ccnn_torch.compensation._networks import describe_network, network_from_description
-from ccnn_torch.compensation._session import open_onnx
-from ccnn_torch.compensation._to_onnx import quiet_exporter, to_onnx
+from ccnn_torch.compensation.export.to_onnx import quiet_exporter, to_onnx
+from ccnn_torch.compensation.model_files.onnx_session import open_onnx
+from ccnn_torch.compensation.networks import describe_network, network_from_description
 from ccnn_torch.diagnosis.from_file import Verdict, read_verdict
 from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, measured_pose, reached
 from ccnn_torch.effects.covariates import draw_covariates

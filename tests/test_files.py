@@ -79,7 +79,7 @@ def test_nothing_in_the_package_writes_files_in_another_way() -> None:
     package = ROOT / "ccnn_torch"
     found = {str(p.relative_to(package)) for p in package.rglob("*.py") if ways.search(p.read_text(encoding="utf-8"))}
     # A private key is made with its own rights, and never in the place of another.
-    assert found == {"files/write.py", "report/event_file.py", "compensation/_signature.py"}
+    assert found == {"files/write.py", "report/event_file.py", "compensation/model_files/signature.py"}
 
 
 def test_a_full_disk_keeps_the_old_commands(cli: Cli, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from mechanisms.catalogue import make
 
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import make_config
-from ccnn_torch.calibration.prepare import Prepared, prepare
+from ccnn_torch.calibration.rows.prepare import Prepared, prepare
 from ccnn_torch.identification import fit_links
 from ccnn_torch.mechanisms import fit_frames, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ccnn_torch.calibration.config import make_config
-from ccnn_torch.calibration.prepare import Prepared, prepare
+from ccnn_torch.calibration.rows.prepare import Prepared, prepare
 from ccnn_torch.errors import InputError
 from ccnn_torch.simulation.machines.arm import ArmStructure
 from ccnn_torch.simulation.machines.causes import _GRID, CAUSES, _follow

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.fitting import Fitted
-from ccnn_torch.calibration.prepare import Prepared
+from ccnn_torch.calibration.learning.fitting import Fitted
+from ccnn_torch.calibration.rows.prepare import Prepared
 from ccnn_torch.mechanisms import PoseError
 
 __all__ = ["Outcome", "evaluate", "pose_before", "pose_with_effects", "pose_with_geometry"]

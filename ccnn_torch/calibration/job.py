@@ -8,12 +8,12 @@ from pathlib import Path
 
 from ccnn_torch.calibration.calibrate import Calibration, calibrate, makers
 from ccnn_torch.calibration.config import RunConfig, dump_config, load_config
+from ccnn_torch.calibration.learning.progress import HeldOut, ProgressBar
 from ccnn_torch.calibration.outputs import write_outputs
 from ccnn_torch.calibration.page.tables import print_tables
 from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback
-from ccnn_torch.calibration.prepare import Prepared, prepare
-from ccnn_torch.calibration.progress import HeldOut, ProgressBar
 from ccnn_torch.calibration.result import plan_of
+from ccnn_torch.calibration.rows.prepare import Prepared, prepare
 from ccnn_torch.calibration.statistics import share_unit
 from ccnn_torch.errors import WriteError
 from ccnn_torch.report.screen import note, say_place, stdout

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.calibration.calibrate import Calibration
+from ccnn_torch.calibration.learning.progress import genome
 from ccnn_torch.calibration.page.reach import reach_block
 from ccnn_torch.calibration.page.tables import write_tables
-from ccnn_torch.calibration.progress import genome
 from ccnn_torch.calibration.result import by_score
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import MethodFailedError

@@ -22,7 +22,7 @@ from safetensors.torch import load_file, save_file
 from stand_ins import tripod_joints
 
 from ccnn_torch.compensation import load_model
-from ccnn_torch.compensation._facts import _digest, to_json
+from ccnn_torch.compensation.model_files.metadata import _digest, to_json
 from ccnn_torch.errors import FallbackWarning, ModelFileError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from ccnn_torch.compensation import (
     Compensator,
-    _geometry,
     fit_compensator,
     fit_geometry_module,
     geometric_deviation,
@@ -21,10 +20,11 @@ from ccnn_torch.compensation import (
     save_model,
     settled_damping,
 )
-from ccnn_torch.compensation._expanded_geometry import ExpandedGeometry, expand_geometry
-from ccnn_torch.compensation._serial_geometry import SerialGeometry
-from ccnn_torch.compensation._session import check_graph, open_onnx
-from ccnn_torch.compensation._to_onnx import quiet_exporter, to_onnx
+from ccnn_torch.compensation.export.to_onnx import quiet_exporter, to_onnx
+from ccnn_torch.compensation.geometry import identified as _geometry
+from ccnn_torch.compensation.geometry.expanded import ExpandedGeometry, expand_geometry
+from ccnn_torch.compensation.geometry.serial import SerialGeometry
+from ccnn_torch.compensation.model_files.onnx_session import check_graph, open_onnx
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism

@@ -13,8 +13,8 @@ from stand_ins import fields, tripod_joints
 from torch import Tensor, nn
 
 from ccnn_torch.compensation import fit_compensator, load_model, save_model
-from ccnn_torch.compensation._networks import describe_network, network_from_description
-from ccnn_torch.compensation._to_onnx import to_onnx
+from ccnn_torch.compensation.export.to_onnx import to_onnx
+from ccnn_torch.compensation.networks import describe_network, network_from_description
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings

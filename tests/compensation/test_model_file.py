@@ -31,9 +31,9 @@ from ccnn_torch.compensation import (
     load_model,
     save_model,
 )
-from ccnn_torch.compensation._export import probe_points, verify
-from ccnn_torch.compensation._session import OUTPUTS
-from ccnn_torch.compensation._to_onnx import to_onnx
+from ccnn_torch.compensation.export.export import probe_points, verify
+from ccnn_torch.compensation.export.to_onnx import to_onnx
+from ccnn_torch.compensation.model_files.onnx_session import OUTPUTS
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.mechanisms import Tripod, load_mechanism

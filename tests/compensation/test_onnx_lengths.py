@@ -7,7 +7,7 @@ import onnxruntime
 import pytest
 import torch
 
-from ccnn_torch.compensation._to_onnx import to_onnx
+from ccnn_torch.compensation.export.to_onnx import to_onnx
 
 
 class _Wide(torch.nn.Module):

@@ -1,0 +1,123 @@
+"""What measured records say of the machine itself: its frames, and with `geometry: identify` all its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.calibration.rows.dataset import Dataset, pad_rows
+from ccnn_torch.compensation import Geometry, default_limit, fit_geometry_module, geometric_deviation, settled_damping
+from ccnn_torch.errors import InputError
+from ccnn_torch.identification import fit_geometry
+from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
+from ccnn_torch.mechanisms.frames import ROTATION_WEIGHT
+from ccnn_torch.records import Records
+from ccnn_torch.records.splits import Split
+
+__all__ = ["Fitted", "Identified", "fit_machine"]
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Identified geometry beside the nominal one, of every repeat.
+
+    Attributes:
+        nominal: fitted frames and the maker's links, `r x 1 x k` [SI].
+        values: identified parameters, `r x 1 x k` [SI].
+        damping: of a serial arm's deviation, see `SerialGeometry`.
+    """
+
+    mechanism: Mechanism
+    nominal: Tensor
+    values: Tensor
+    damping: float
+
+    def deviation(self, guess: Tensor | None = None) -> Callable[[Tensor], Tensor]:
+        """γ of commanded joints `r x s x n`, the same [SI]; guess: poses near by, `r x s x p`."""
+        return geometric_deviation(self.mechanism, self.nominal, self.values, ROTATION_WEIGHT, self.damping, guess)
+
+    def module(self, repeat: int, joints: Tensor, margin: float) -> Geometry:
+        """γ of one repeat for a model file; joints: commanded, of the training rows, `s x n` [SI].
+
+        Raises:
+            InputError, MethodFailedError: see `fit_geometry_module`.
+        """
+        own = (self.nominal[repeat, 0], self.values[repeat, 0])
+        return fit_geometry_module(self.mechanism, *own, joints, margin, ROTATION_WEIGHT, self.damping)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What was fitted to the training rows of each repeat.
+
+    Attributes:
+        parameters: with fitted frames, `r x 1 x k`, or `r x s x k` where frames are per group; None = nominal.
+        geometry: all parameters identified, `r x 1 x k`, for comparison or to be learned beside; None = not fitted.
+    """
+
+    parameters: Tensor | None
+    geometry: Tensor | None
+    notes: list[str]
+
+    def beside(
+        self, mechanism: Mechanism, joints: Tensor, total: Tensor, splits: list[Split], margin: float
+    ) -> Identified:
+        """The identified geometry as a part of a compensator whose network learns what it leaves.
+
+        Args:
+            joints: commanded, `s x n` [SI].
+            total: deviations of the nominal machine, `[r x] s x n` [SI].
+            splits: one a repeat; the rows that are not held out tell how far a correction goes.
+            margin: of the compensator's domain.
+        """
+        assert self.geometry is not None
+        nominal = mechanism.nominal.expand_as(self.geometry) if self.parameters is None else self.parameters
+        each = total.expand(len(splits), *total.shape[-2:])
+        limits = [default_limit(part[Dataset.part(s, "fit")]) for part, s in zip(each, splits, strict=True)]
+        limit = torch.stack(limits).amin(0).clamp_min(1e-12)
+        damping = settled_damping(mechanism, nominal, self.geometry, joints, limit, ROTATION_WEIGHT, margin)
+        return Identified(mechanism, nominal, self.geometry, damping)
+
+
+def fit_machine(mechanism: Mechanism, records: Records, splits: list[Split], identify: bool) -> Fitted:
+    """Fit frames that are unknown, and the geometry where it is asked for or costs nothing (a serial arm).
+
+    Args:
+        splits: one a repeat; only rows that are not held out are looked at.
+        identify: whether the geometry is to be a part of the compensator.
+
+    Raises:
+        InputError: the geometry cannot be identified from such records.
+    """
+    rows = pad_rows([Dataset.part(split, "fit") for split in splits])
+    weights = torch.zeros(len(splits), len(records.joints), dtype=torch.float64)
+    weights.scatter_add_(1, rows.index, rows.weights)
+    arm = mechanism if isinstance(mechanism, SerialArm) else None
+    grouped = arm is not None and bool(arm.frame_per or arm.tool_per)
+    if identify and grouped:
+        raise InputError(
+            f"geometry: {mechanism.name} has frames per group of rows (frame_per, tool_per), and one compensator needs "
+            "one frame; take the rows of one group, or write geometry=none"
+        )
+    notes = []
+    parameters = geometry = None
+    if arm is not None and arm.unknown_frames:
+        parameters = fit_frames(arm, records.joints, records.pose, weights, columns=records.columns)
+        if not grouped:
+            parameters = parameters.unsqueeze(-2)
+        about = (records.joints, records.pose, parameters, weights, records.path, records.name_rows)
+        notes += judge_frames(arm, *about)
+        frames = " and ".join(arm.unknown_frames)
+        notes.append(f"Frames fitted first, on the training rows of each repeat: {frames}.")
+    if identify or (parameters is not None and not grouped):
+        start = mechanism.nominal.expand(len(splits), -1) if parameters is None else parameters.squeeze(-2)
+        geometry = fit_geometry(mechanism, records.joints, records.pose, start, weights).unsqueeze(-2)
+    if identify:
+        notes.append(
+            f"Geometry identified on the training rows of each repeat: {len(mechanism.geometry)} parameters, each "
+            "drawn to its nominal value by a plausible error; the network learns only what they leave."
+        )
+    return Fitted(parameters, geometry, notes)

@@ -1,0 +1,142 @@
+"""Train one method on a dataset: choose how long by rows held out if asked, then refit on all training rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.calibration.learning.early_stop import (
+    Choice,
+    Plan,
+    WatchPhase,
+    choose,
+    evaluations_until,
+    moved,
+    predictive_variance,
+)
+from ccnn_torch.calibration.rows.dataset import Dataset
+from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.learners import Learner, TrainingData
+from ccnn_torch.run_folder.folder import RunFolder
+from ccnn_torch.training import Scaling, Training, train, weighted_mse
+
+__all__ = ["Fitted", "Plan", "fit_method", "refit"]
+
+
+@dataclass
+class Fitted:
+    """A trained method: the learner in its chosen state, its scaling, and how it went.
+
+    Attributes:
+        data: the training rows that the learner was fitted to.
+        training, choice: the fit on all training rows, and what held-out rows said before it (None = none were).
+        score: what repeats and methods are compared by, lower is better, `r`: the mean squared standardised error on
+            the held-out rows, or where none were held out on the training rows.
+        sd_scale: what the learner's predictive sd is multiplied by so that its intervals cover what they claim, by the
+            held-out rows; 1 where there were none. `r x n` [1].
+        seconds: inside the learner, both trainings.
+    """
+
+    name: str
+    learner: Learner
+    scaling: Scaling
+    data: TrainingData
+    training: Training
+    choice: Choice | None
+    score: Tensor
+    sd_scale: Tensor
+    seconds: float
+
+    def predict(self, inputs: Tensor) -> Tensor:
+        """Joint deviations. inputs: `r x s x i` [SI]; returns `r x s x n` [SI]."""
+        device = self.training.best_step.device
+        with torch.no_grad():
+            return self.scaling.restore(self.learner.predict(self.scaling.features(inputs).to(device)).cpu())
+
+    def sd(self, inputs: Tensor) -> Tensor:
+        """Standard deviation of a newly measured joint deviation. inputs: `r x s x i` [SI]; returns `r x s x n` [SI].
+
+        Raises:
+            MethodFailedError: the learner's variance is not finite, or not above 0.
+        """
+        device = self.training.best_step.device
+        with torch.no_grad():
+            features = self.scaling.features(inputs).to(device)
+            variance = predictive_variance(self.learner, self.data, features).cpu()
+        return variance.sqrt() * (self.scaling.deviation * self.sd_scale).unsqueeze(1)
+
+    @property
+    def converged(self) -> Tensor | None:
+        """Whether the learner met its own criterion by its last step, `r` bool; None = it does not say.
+
+        Where rows were held out this is of the training before the refit, since the refit ends where they said.
+        """
+        found = self.training.converged if self.choice is None else self.choice.converged
+        return None if found is None else found.cpu()
+
+    @property
+    def evaluations(self) -> Tensor | None:
+        """Passes of all training rows through one model, both trainings, `r`; None = the learner does not count."""
+        own = evaluations_until(self.training)
+        before = None if self.choice is None else self.choice.evaluations
+        return own if own is None or before is None else own + before
+
+
+def fit_method(
+    name: str,
+    make: Callable[[], Learner],
+    dataset: Dataset,
+    plan: Plan,
+    folder: RunFolder | None,
+    watch: WatchPhase,
+) -> Fitted:
+    """Train one method in one or two phases, each with its own checkpoint.
+
+    Args:
+        make: makes a fresh learner.
+        folder: where checkpoints go; None = nowhere.
+
+    Raises:
+        InputError: too few rows.
+        MethodFailedError: the learner cannot go on, or gives numbers that are not finite.
+    """
+    choice = choose(name, make, dataset, plan, folder, watch) if plan.holds_out else None
+    return refit(name, make, dataset, plan, choice, folder, watch)
+
+
+def refit(
+    name: str,
+    make: Callable[[], Learner],
+    dataset: Dataset,
+    plan: Plan,
+    choice: Choice | None,
+    folder: RunFolder | None,
+    watch: WatchPhase,
+) -> Fitted:
+    """The second phase of `fit_method`: train on all training rows, for as long as the choice says."""
+    learner = make()
+    data, scaling = dataset.scaled("fit", False, learner)
+    data = moved(data, plan.device)
+    training = train(
+        learner,
+        data,
+        callbacks=watch("fit", scaling),
+        checkpoint=folder.checkpoint(name, "fit") if folder else None,
+        facts=folder.facts if folder else None,
+        every=plan.checkpoint_every,
+        stop_at=choice.best_step.to(plan.device) if choice is not None and plan.early_stop else None,
+    )
+    if choice is not None:
+        score, scale, before = choice.best_validation, choice.sd_scale, choice.seconds
+    else:
+        score = weighted_mse(learner.predict(data.inputs), data.targets, data.weights).cpu()
+        scale, before = torch.ones_like(scaling.deviation), 0.0
+    fitted = Fitted(name, learner, scaling, data, training, choice, score, scale, before + training.seconds)
+    bad = ~(fitted.predict(dataset.inputs).isfinite() & fitted.sd(dataset.inputs).isfinite()).all((1, 2))
+    if bool(bad.any()):
+        which = ", ".join(str(k) for k in torch.nonzero(bad).squeeze(-1).tolist())
+        raise MethodFailedError(f"{name} gives predictions that are not finite in repeat {which}")
+    return fitted

@@ -1,0 +1,222 @@
+"""`methods=auto`: the method that cross-validation prefers within a time budget, and the comparison behind it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.calibration.learning.early_stop import Choice, Plan, WatchPhase, choose
+from ccnn_torch.calibration.rows.dataset import Dataset
+from ccnn_torch.calibration.statistics import spread
+from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.learners import Learner
+from ccnn_torch.report.json_files import plain, read_json, write_json
+from ccnn_torch.run_folder.folder import RunFolder
+
+__all__ = ["Comparison", "compare"]
+
+_SIMPLEST = "constant"
+
+
+@dataclass
+class Comparison:
+    """What cross-validation said of each method, and which one that makes the choice.
+
+    A method that the budget ended between two steps is compared with what it has: its best step so far is what its
+    refit would take, so the comparison is fair to the model that the user would get. One that did not get to its first
+    step is not compared.
+
+    Attributes:
+        budget: seconds inside the learners that were given.
+        compared: by name, in the order tried.
+        skipped: why a method was not compared, a sentence each.
+        spent: seconds of the budget that are gone.
+    """
+
+    budget: float
+    folds: int
+    compared: dict[str, Choice] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    spent: float = 0.0
+
+    def error(self, name: str) -> float:
+        """Mean cross-validation error over the repeats [1]; 1 is about that of a constant."""
+        return float(self.compared[name].best_validation.mean())
+
+    def standard_error(self, name: str) -> float:
+        """Of that mean, from the scatter over the folds: mean over the repeats [1]."""
+        errors = self.compared[name].errors
+        return float(errors.std(1).mean()) / math.sqrt(errors.shape[1])
+
+    @property
+    def order(self) -> list[str]:
+        """Best first; but the constant comes first where it is within one standard error of the best."""
+        found = sorted(self.compared, key=self.error)
+        if self._constant_will_do(found[0]):
+            found.remove(_SIMPLEST)
+            found.insert(0, _SIMPLEST)
+        return found
+
+    def why(self) -> str:
+        """One sentence about the choice."""
+        best = min(self.compared, key=self.error)
+        error = f"{self.error(best):.4g} ± {self.standard_error(best):.2g}"
+        if self._constant_will_do(best):
+            return (
+                f"The constant is chosen: its cross-validation error ({self.error(_SIMPLEST):.4g}) is within one "
+                f"standard error of the best ({best}, {error}), so nothing more is to be learned from these rows."
+            )
+        return f"{best} is chosen: its cross-validation error is the lowest ({error})."
+
+    def block(self, chosen: str) -> dict[str, Any]:
+        """For `results.json`."""
+        return {
+            "budget": self.budget,
+            "folds": self.folds,
+            "compared": {
+                name: {
+                    "cv": spread(choice.best_validation),
+                    "standard_error": self.standard_error(name),
+                    "seconds": choice.seconds,
+                    "steps": choice.step,
+                    "stopped": not choice.ended,
+                }
+                for name, choice in self.compared.items()
+            },
+            "skipped": dict(self.skipped),
+            "chosen": chosen,
+            "why": self.why() + f" It could not be refitted, so {chosen} is taken." * (chosen != self.order[0]),
+        }
+
+    def _constant_will_do(self, best: str) -> bool:
+        if _SIMPLEST not in self.compared or best == _SIMPLEST:
+            return False
+        return self.error(_SIMPLEST) <= self.error(best) + self.standard_error(best)
+
+
+def compare(
+    makers: Mapping[str, Callable[[], Learner] | None],
+    dataset: Dataset,
+    plan: Plan,
+    budget: float,
+    folder: RunFolder | None,
+    watch: Callable[[str], WatchPhase],
+) -> Comparison:
+    """Cross-validate one method after the other while budget is left.
+
+    What is decided is written to `auto.json` in the run folder after each method, and read back when the run is
+    resumed: how far a budget reaches differs from run to run, and a resumed run must end as it would have.
+
+    Args:
+        makers: what makes the learner of each method, in the order to try them; None = this version has none.
+        budget: seconds inside the learners, for all methods together.
+        folder: where checkpoints and decisions go; None = nowhere.
+        watch: gives the callbacks of a method.
+
+    Raises:
+        InputError: `auto.json` is damaged.
+        MethodFailedError: no method could be compared: they failed, or the budget was too small.
+    """
+    comparison = Comparison(budget, plan.folds)
+    if folder is not None and folder.auto.is_file():
+        _read(folder, comparison)
+    for name, make in makers.items():
+        if name in comparison.compared or name in comparison.skipped:
+            continue
+        found = _judge(name, make, dataset, plan, comparison, folder, watch)
+        if isinstance(found, Choice):
+            comparison.compared[name] = found
+            comparison.spent += found.seconds
+        else:
+            comparison.skipped[name] = found
+        if folder is not None:
+            _write(folder, comparison)
+    if not comparison.compared:
+        raise MethodFailedError("; ".join(f"{name}: {sentence}" for name, sentence in comparison.skipped.items()))
+    return comparison
+
+
+def _judge(
+    name: str,
+    make: Callable[[], Learner] | None,
+    dataset: Dataset,
+    plan: Plan,
+    comparison: Comparison,
+    folder: RunFolder | None,
+    watch: Callable[[str], WatchPhase],
+) -> Choice | str:
+    """Cross-validate one method; returns a sentence where that is not to be had."""
+    budget = comparison.budget
+    left = budget - comparison.spent
+    if make is None:
+        return f"this version has no learner {name!r}"
+    if left <= 0:
+        return f"the budget of {budget:g} s was spent before it began"
+    began = time.perf_counter()
+    try:
+        choice = choose(name, make, dataset, plan, folder, watch(name), left)
+    except MethodFailedError as problem:
+        comparison.spent += time.perf_counter() - began
+        return str(problem)
+    if choice is None:
+        comparison.spent = budget
+        return f"the budget of {budget:g} s was spent before its first step"
+    return choice
+
+
+def _write(folder: RunFolder, comparison: Comparison) -> None:
+    compared = {
+        name: {
+            "best_step": choice.best_step,
+            "errors": choice.errors,
+            "sd_scale": choice.sd_scale,
+            "converged": choice.converged,
+            "evaluations": choice.evaluations,
+            "step": choice.step,
+            "seconds": choice.seconds,
+            "ended": choice.ended,
+        }
+        for name, choice in comparison.compared.items()
+    }
+    decided = {"compared": compared, "skipped": comparison.skipped, "spent": comparison.spent}
+    write_json(folder.auto, {**decided, "sha256": _seal(decided)})
+
+
+def _read(folder: RunFolder, comparison: Comparison) -> None:
+    found = read_json(folder.auto)
+    real = partial(torch.tensor, dtype=torch.float64)
+
+    def optional(value: Any, make: Callable[[Any], Tensor]) -> Tensor | None:
+        return None if value is None else make(value)
+
+    try:
+        if found.pop("sha256") != _seal(found):
+            raise ValueError("was altered")
+        for name, entry in found["compared"].items():
+            comparison.compared[name] = Choice(
+                best_step=torch.tensor(entry["best_step"], dtype=torch.int64),
+                errors=real(entry["errors"]),
+                sd_scale=real(entry["sd_scale"]),
+                converged=optional(entry["converged"], partial(torch.tensor, dtype=torch.bool)),
+                evaluations=optional(entry["evaluations"], real),
+                step=int(entry["step"]),
+                seconds=float(entry["seconds"]),
+                ended=bool(entry["ended"]),
+            )
+        comparison.skipped |= found["skipped"]
+        comparison.spent = float(found["spent"])
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise InputError(f"{folder.auto} is damaged; delete it and resume, which compares the methods again") from None
+
+
+def _seal(decided: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(plain(decided), sort_keys=True).encode()).hexdigest()

@@ -1,0 +1,315 @@
+"""From a config to the rows of a run: a case study simulated, or measured records with their frames fitted."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.calibration.config import RunConfig
+from ccnn_torch.calibration.geometry.choice import GeometryChoice, choose_geometry
+from ccnn_torch.calibration.geometry.identified import Fitted, Identified, fit_machine
+from ccnn_torch.calibration.geometry.known_effects import KnownEffects, fit_effects, verdict_of
+from ccnn_torch.calibration.rows.dataset import Dataset, by_repeat, dataset_of
+from ccnn_torch.calibration.rows.memory import check_memory
+from ccnn_torch.config.held_out import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
+from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
+from ccnn_torch.records import Records, check_rows, load_records
+from ccnn_torch.records.splits import Column, Split
+from ccnn_torch.simulation.case_study import CaseSimulation, Simulation, simulate_realistic
+from ccnn_torch.simulation.cases import build_case
+from ccnn_torch.simulation.machines.realistic import build_machine
+
+__all__ = ["Prepared", "damping_of", "prepare"]
+
+# Of the realistic machines.
+_MOST_JOINTS = 6
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Everything that is fixed before the first training step.
+
+    Attributes:
+        parameters: geometry with the fitted frames of each repeat, `r x 1 x k` (`r x s x k` where frames are per group
+            of rows), or None for a nominal machine.
+        joints: commanded joints, `r x s x n` [SI]; the repeats of measured records share their rows.
+        covariates: `r x s x m` [SI].
+        pose: measured poses, `r x s x p` [SI].
+        pseudoerror: what the poses say about the joints, and what is learned: with `geometry`, that of the identified
+            machine, and with `effects` what they leave of it.
+        total: deviation of the joints of the nominal machine, `r x s x n` [SI]; without these two that is learned.
+        identified: geometry with all parameters fitted to the training rows of each repeat, like `parameters`: what a
+            geometric calibration would command by, to be compared with; None where it was not fitted.
+        geometry: the same where it is a part of the compensator, so that the network learns what it leaves.
+        effects: known effects that are a part of it, likewise.
+        choice: what `geometry` ended as; None for a case.
+        simulation: the machine behind simulated rows, or None for measured records.
+        notes: sentences for the person who reads the results.
+    """
+
+    mechanism: Mechanism
+    parameters: Tensor | None
+    joints: Tensor
+    covariates: Tensor
+    covariate_coordinates: tuple[Coordinate, ...]
+    pose: Tensor
+    pseudoerror: Pseudoerror
+    total: Tensor
+    dataset: Dataset
+    data_hash: str
+    identified: Tensor | None = None
+    geometry: Identified | None = None
+    effects: KnownEffects | None = None
+    choice: GeometryChoice | None = None
+    simulation: Simulation | None = None
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def simulated(self) -> bool:
+        return self.simulation is not None
+
+    @property
+    def default_method(self) -> str:
+        """The learner where the config names none."""
+        return "ccnn" if self.choice is None else self.choice.method
+
+    @property
+    def noise(self) -> Tensor | None:
+        """What noise adds to the joint deviations, `r x s x n` [SI]; None where that is not known."""
+        return None if self.simulation is None else self.simulation.noise
+
+    def set_aside(self) -> dict[str, int]:
+        """How many rows are not trained on in the first repeat, by reason."""
+        return {
+            reason: int(flags.expand(self.dataset.usable.shape)[0].sum())
+            for reason, flags in self.pseudoerror.reasons.items()
+        }
+
+    def repeat_parameters(self, repeat: int) -> Tensor | None:
+        """Geometry of one repeat, `k`; None where it is nominal, or differs from row to row."""
+        if self.parameters is None or self.parameters.shape[1] > 1:
+            return None
+        return self.parameters[repeat, 0]
+
+
+def prepare(config: RunConfig, given: Given | None = None) -> Prepared:
+    """Build the rows of a run.
+
+    Args:
+        given: records that Python has, in place of the config's file.
+
+    Raises:
+        InputError: the config names no data, or the data cannot be used; the sentence says what to change.
+    """
+    seeds = [config.seed + k for k in range(config.repeats)]
+    if config.case == "realistic":
+        return _from_realistic(config, seeds)
+    if config.case is not None:
+        return _from_case(config, seeds)
+    return _from_records(config, seeds, given)
+
+
+def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
+    assert config.case is not None
+    case = build_case(config.case, config.variant or "printed", config.order or "raster")
+    mechanism = case.mechanism
+    doubts = check_memory(config, len(case.time), len(mechanism.joints))
+    columns = {"t": (case.time, Coordinate("t", "1"))}
+    unknown = [name for name in config.covariates or [] if name not in columns]
+    if unknown:
+        raise InputError(f"covariates: {unknown[0]!r} is no column of the case {config.case}; it has only 't'")
+    chosen = [columns[name] for name in config.covariates or []]
+    covariates = (
+        torch.stack([values for values, _ in chosen], -1) if chosen else case.joints.new_zeros(len(case.time), 0)
+    )
+    noise = case.noise(seeds)
+    pose = case.measured(noise)
+    deviations = joint_deviations(
+        mechanism,
+        case.joints,
+        pose,
+        **_pseudoerror_settings(config, mechanism),
+    )
+    splits = _splits(config, mechanism.frame(case.pose)[0], {"t": case.time}, seeds)
+    notes = [*doubts, *deviations.notes()]
+    if config.covariates is None:
+        notes.append("The time t is not given to the learner; covariates=[t] adds it.")
+    return Prepared(
+        mechanism=mechanism,
+        parameters=None,
+        joints=by_repeat(case.joints, seeds),
+        covariates=by_repeat(covariates, seeds),
+        covariate_coordinates=tuple(coordinate for _, coordinate in chosen),
+        pose=pose,
+        pseudoerror=deviations,
+        total=by_repeat(deviations.deviation, seeds),
+        dataset=dataset_of(mechanism, case.joints, covariates, deviations, splits, seeds),
+        data_hash=_hash(case.joints, covariates, pose),
+        simulation=CaseSimulation(case, noise),
+        notes=notes,
+    )
+
+
+def _from_realistic(config: RunConfig, seeds: list[int]) -> Prepared:
+    about = config.realistic
+    doubts = check_memory(config, about.rows, _MOST_JOINTS)
+    machine = build_machine(about.machine, about.cause, about.strength, about.rows, about.noise, seeds)
+    mechanism, joints = machine.mechanism, machine.joints
+    chosen = _choose(list(machine.columns), config.covariates, f"{about.machine} with the cause {about.cause}")
+    covariates = torch.stack([machine.columns[c] for c in chosen], -1) if chosen else joints[..., :0]
+
+    def solved(pose: Tensor) -> Pseudoerror:
+        return joint_deviations(mechanism, joints, pose, **_pseudoerror_settings(config, mechanism))
+
+    deviations = solved(machine.measured)
+    splits = [
+        _splits(config, positions, {c.name: values[k] for c, values in machine.columns.items()}, [seed])[0]
+        for k, (seed, positions) in enumerate(zip(seeds, mechanism.frame(machine.pose)[0], strict=True))
+    ]
+    jacobian = mechanism.jacobian(joints, guess=machine.measured)
+    return Prepared(
+        mechanism=mechanism,
+        parameters=None,
+        joints=joints,
+        covariates=covariates,
+        covariate_coordinates=tuple(chosen),
+        pose=machine.measured,
+        pseudoerror=deviations,
+        total=deviations.deviation,
+        dataset=dataset_of(mechanism, joints, covariates, deviations, splits, seeds, jacobian, machine.turns_far),
+        data_hash=_hash(joints, covariates, machine.measured),
+        simulation=simulate_realistic(machine, lambda pose: solved(pose).deviation, deviations.deviation),
+        notes=[*doubts, *deviations.notes()],
+    )
+
+
+def _choose(there: list[Coordinate], wanted: list[str] | None, what: str) -> list[Coordinate]:
+    """The columns that names or patterns ask for, in the order recorded; all of them where nothing is asked."""
+    if wanted is None:
+        return there
+    for pattern in wanted:
+        if not any(fnmatchcase(coordinate.name, pattern) for coordinate in there):
+            known = ", ".join(coordinate.name for coordinate in there) or "no covariates"
+            raise InputError(f"covariates: {pattern!r} is no column of the {what}; it has {known}")
+    return [coordinate for coordinate in there if any(fnmatchcase(coordinate.name, p) for p in wanted)]
+
+
+def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> Prepared:
+    if config.records is None or config.mechanism is None:
+        missing = "records" if config.records is None else "mechanism"
+        raise InputError(
+            f"the config names no {missing}: write {missing}=… "
+            "(records: a CSV file; mechanism: tripod, machine_tool, a DH file, a URDF, or file.py:Name)"
+        )
+    mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
+    verdict = None if config.effects == "none" else verdict_of(config.effects, mechanism)
+    source = with_test_file(config.records if given is None else given, config.split)
+    records = load_records(source, mechanism, config.covariates, columns=config.columns)
+    doubts = check_memory(config, len(records), len(mechanism.joints))
+    check_rows(records, mechanism)
+    if isinstance(mechanism, SerialArm) and records.orientation == "none":
+        mechanism = mechanism.with_orientation("none")
+    held = rows_of_test_file(config.split, records.parts)
+    splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds, held)
+    settings = _pseudoerror_settings(config, mechanism)
+    choice = _choice(config, mechanism, records, splits[0], settings)
+    fitted = fit_machine(mechanism, records, splits, choice.identify)
+
+    def solved(parameters: Tensor | None) -> Pseudoerror:
+        return joint_deviations(mechanism, records.joints, records.pose, parameters=parameters, **settings)
+
+    total = deviations = solved(fitted.parameters)
+    learned, identified, effects, margin = fitted.parameters, None, None, config.compensation.margin
+    identify, notes = choice.identify, [*doubts, *records.notes, choice.why, *fitted.notes]
+    beside: Fitted | None = fitted if identify else None
+    if verdict is not None:
+        about = (splits, fitted.parameters, total.deviation, total.usable, identify, margin)
+        of_pose = (settings["rotation_weight"], settings["damping"])
+        effects, values, said = fit_effects(verdict, mechanism, records, *about, of_pose)
+        beside = None if values is None else replace(fitted, geometry=values)
+        notes += said
+    if beside is not None:
+        learned = beside.geometry
+        deviations = solved(learned)
+        identified = beside.beside(mechanism, records.joints, total.deviation, splits, margin)
+    if effects is not None:
+        joints, whole = (by_repeat(rows, seeds) for rows in (records.joints, deviations.deviation))
+        deviations = replace(deviations, deviation=effects.remainder(joints, whole))
+    jacobian = mechanism.jacobian(records.joints, learned, guess=records.pose)
+    return Prepared(
+        mechanism=mechanism,
+        parameters=fitted.parameters,
+        joints=by_repeat(records.joints, seeds),
+        covariates=by_repeat(records.covariates, seeds),
+        covariate_coordinates=records.covariate_coordinates,
+        pose=by_repeat(records.pose, seeds),
+        pseudoerror=deviations,
+        total=by_repeat(total.deviation, seeds),
+        dataset=dataset_of(mechanism, records.joints, records.covariates, deviations, splits, seeds, jacobian),
+        data_hash=records.data_hash,
+        identified=fitted.geometry,
+        geometry=identified,
+        effects=effects,
+        choice=choice,
+        notes=[*held_out_notes(config.split, len(splits[0].test)), *notes, *deviations.notes()],
+    )
+
+
+def _choice(
+    config: RunConfig, mechanism: Mechanism, records: Records, split: Split, settings: dict[str, Any]
+) -> GeometryChoice:
+    """What `geometry` comes to for these records."""
+    if config.geometry != "auto":
+        return GeometryChoice(config.geometry == "identify", "ccnn", f"geometry={config.geometry} was asked for.")
+    if config.effects != "none":
+        return GeometryChoice(False, "ccnn", "The effects of a diagnosis are taken in place of identified geometry.")
+    return choose_geometry(mechanism, records, split, config.split.kind, config.seed, settings)
+
+
+def damping_of(config: RunConfig, mechanism: Mechanism) -> float:
+    """Weight of the joint deviation beside the pose error that it explains [m/rad]: the config's, or the default."""
+    if config.damping is not None:
+        return config.damping
+    return 0.01 if isinstance(mechanism, SerialArm) else 0.0
+
+
+def _pseudoerror_settings(config: RunConfig, mechanism: Mechanism) -> dict[str, Any]:
+    """Damping and bounds, by default those that suit the mechanism.
+
+    Six-joint arms pass near singular poses all over their workspace: half of a UR10's rows have a condition number
+    above 50. Damped, all of them can be learned from, and the deviation stays a smooth function of the joints.
+    """
+    damping = damping_of(config, mechanism)
+    bound = config.max_condition
+    if bound is None:
+        bound = math.inf if damping > 0 else 50.0
+    return {
+        "rotation_weight": config.rotation_weight,
+        "damping": damping,
+        "max_condition": bound,
+        "max_deviation": config.max_deviation,
+    }
+
+
+def _splits(
+    config: RunConfig, positions: Tensor, columns: Mapping[str, Column], seeds: list[int], held: Tensor | None = None
+) -> list[Split]:
+    split = config.split
+    return [split_by(split, positions, columns, seed, split.validation, held) for seed in seeds]
+
+
+def _hash(*tensors: Tensor) -> str:
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()

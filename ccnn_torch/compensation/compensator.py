@@ -1,0 +1,374 @@
+"""From ideal joints to commands that make the machine reach them, and back."""
+
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ccnn_torch.compensation.contraction import STEEPEST_DEVIATION, iterations_needed, steepest
+from ccnn_torch.compensation.domain import Domain
+from ccnn_torch.compensation.effects.effects import PhysicalEffects
+from ccnn_torch.compensation.geometry.identified import Geometry
+from ccnn_torch.compensation.networks import UncertainNetwork
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError, MethodFailedError, OutsideDomainWarning
+from ccnn_torch.training import Scaling
+
+__all__ = ["Compensator", "Solution", "default_limit", "fit_compensator"]
+
+# Rounds of damping, and the share of what was learned below which a compensator is not worth having.
+_DAMPINGS = 6
+_LEAST_SHARE = 0.1
+
+Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
+
+
+class Solution(NamedTuple):
+    """Both directions at once, since the first step of the one is the other.
+
+    Attributes:
+        command: joints to command for the ideal joints given, `... x n` [SI].
+        deviation: δ at that command, `... x n` [SI].
+        inside_domain: whether that command is inside the domain, `...`, bool.
+        ideal: ideal joints, were the joints given a command, `... x n` [SI].
+        ideal_inside_domain: whether the joints given are inside the domain, `...`, bool.
+        deviation_sd: standard deviation of a newly measured δ at the command, `... x n` [SI].
+    """
+
+    command: Tensor
+    deviation: Tensor
+    inside_domain: Tensor
+    ideal: Tensor
+    ideal_inside_domain: Tensor
+    deviation_sd: Tensor
+
+
+class _Deviation(NamedTuple):
+    """δ `... x n` [SI]; its weight against the safe correction, and the guard's excess, `... x 1` [1] each; and the
+    network's features there, `... x i` [1]."""
+
+    value: Tensor
+    weight: Tensor
+    excess: Tensor
+    features: Tensor
+
+    @property
+    def inside(self) -> Tensor:
+        """Whether inside the domain, `...`, bool."""
+        return self.excess.squeeze(-1) <= 0
+
+
+class Compensator(nn.Module):
+    """A learned deviation δ(q) of commanded joints, guarded and limited, with the command that undoes it.
+
+    Sign: δ is what the machine does beyond the command, ideal = q + δ(q); the command for ideal joints q* solves
+    q + δ(q) = q* by `iterations` steps of q ← q* - δ(q) from q*. δ is `scaling.restore(network(features))` clamped to
+    ± `limit`, faded by the domain's guard into the constant `safe`. Inputs that are no number give the command of the
+    domain's centre, infinite ones that of its edge, both with `safe` and outside the domain.
+
+    With `geometry` the network has learned only what identified geometry leaves: with r(q) the network's guarded part
+    and γ(q) the deviation of the identified geometry, δ(q) = r(q) + γ(q + r(q)), clamped to ± `limit`. Outside the
+    domain r fades into `safe`; γ stays where the geometry `extrapolates` (an arm's links are what they are everywhere)
+    and fades to 0 with r where it does not (a polynomial).
+
+    How far a newly measured δ may be from this one is told by `sd`: inside the domain by the network's own `variance`
+    and `sd_scale`, outside by how the training deviations scatter about `safe`, between the two by the guard's weight.
+
+    Attributes:
+        network: features -> standardised deviation; operators that ONNX Runtime has in double. Its method `variance`
+            gives the variance of a newly measured standardised deviation; without one that is 1 everywhere.
+        scaling: of one repeat.
+        limit: hard limit of |δ|, `n` [SI].
+        safe: correction outside the domain, beside that of a geometry that extrapolates, `n` [SI].
+        sd_scale: what the network's standard deviation is multiplied by, as held-out rows demand, `n` [1].
+        safe_sd: standard deviation outside the domain, `n` [SI].
+        joints, covariates: coordinates in order.
+        lipschitz: bound of |∂δ/∂q| with joints in units of their limits (maximum row sum), 1.
+        iterations: smallest k with lipschitzᵏ · max|δ| below 1e-12 of the limit.
+        share: of what the network learned beside its mean that is applied [1]; below 1 where all of it was too steep.
+            It is in the scaling already, and a model file does not tell it.
+        geometry: commanded joints `... x n` -> γ `... x n` [SI], bounded for finite joints; None without one.
+        effects: commanded joints and covariates -> ε `... x n` [SI]; None without one.
+    """
+
+    limit: Tensor
+    safe: Tensor
+    sd_scale: Tensor
+    safe_sd: Tensor
+
+    def __init__(
+        self,
+        network: nn.Module,
+        scaling: Scaling,
+        domain: Domain,
+        limit: Tensor,
+        safe: Tensor,
+        joints: Sequence[Coordinate],
+        covariates: Sequence[Coordinate],
+        lipschitz: float,
+        iterations: int,
+        sd_scale: Tensor | None = None,
+        safe_sd: Tensor | None = None,
+        geometry: Geometry | None = None,
+        effects: PhysicalEffects | None = None,
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.geometry = geometry
+        self.effects = effects
+        self.scaling = scaling
+        self.domain = domain
+        self.register_buffer("limit", limit)
+        self.register_buffer("safe", safe)
+        # The training deviations are seldom at hand where a compensator is put together by hand; their standard
+        # deviation about their mean is in the scaling.
+        self.register_buffer("sd_scale", torch.ones_like(safe) if sd_scale is None else sd_scale)
+        self.register_buffer("safe_sd", scaling.deviation.clone() if safe_sd is None else safe_sd)
+        self.joints = tuple(joints)
+        self.covariates = tuple(covariates)
+        self.lipschitz = lipschitz
+        self.iterations = iterations
+        self.share = 1.0
+
+    def forward(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Command, δ at the command `... x n` [SI] each, and whether it is inside the domain `...`.
+
+        Args:
+            joints: ideal joints, `... x n` [SI].
+            covariates: `... x m` [SI], in the order of `covariates`; None where there are none.
+
+        Raises:
+            InputError: covariates are missing, or a last dimension is wrong.
+        """
+        _, command, last, _ = self._solve(joints, covariates)
+        return command, last.value, last.inside
+
+    def deviation(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
+        """Guarded and limited δ at *commanded* joints, `... x n` [SI]; arguments and errors as `forward`."""
+        joints, covariates, strange = self._inputs(joints, covariates)
+        return self._deviation(joints, covariates, strange).value
+
+    def sd(self, joints: Tensor, covariates: Tensor | None = None) -> Tensor:
+        """Standard deviation of a newly measured δ at *commanded* joints, model and noise, `... x n` [SI].
+
+        Finite for every input; arguments and errors as `forward`.
+        """
+        joints, covariates, strange = self._inputs(joints, covariates)
+        return self._sd(self._deviation(joints, covariates, strange))
+
+    def back(self, command: Tensor, covariates: Tensor | None = None) -> Tensor:
+        """Ideal joints of a command (or of the joints fed back), `... x n` [SI]; arguments and errors as `forward`."""
+        command, covariates, strange = self._inputs(command, covariates)
+        return command + self._deviation(command, covariates, strange).value
+
+    def solve(self, joints: Tensor, covariates: Tensor | None = None) -> Solution:
+        """Command of ideal joints, and the ideal joints were they a command; arguments and errors as `forward`."""
+        joints, command, last, first = self._solve(joints, covariates)
+        return Solution(command, last.value, last.inside, joints + first.value, first.inside, self._sd(last))
+
+    def guarded(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As `solve`, told by deviations and weights instead of joints, which single precision cannot hold.
+
+        Returns:
+            δ at the command `... x n` [SI], its weight `... x 1` [1] (1 inside the domain); δ and weight were the
+            joints given a command.
+        """
+        joints, covariates, strange = self._inputs(joints, covariates)
+        first = last = self._deviation(joints, covariates, strange)
+        for _ in range(self.iterations):
+            last = self._deviation(joints - last.value, covariates, strange)
+        return last.value, last.weight, first.value, first.weight
+
+    def hook(self, warn: bool = True) -> Hook:
+        """For `mechanism.inverse_kinematics.register_forward_hook(compensator.hook(), with_kwargs=True)`.
+
+        Covariates travel as the keyword `covariates` of the call, `... x m`. A pose without inverse kinematics stays
+        NaN, since no correction makes it reachable; joints whose command is not finite (a network out of a file may
+        give anything) stay as they are.
+
+        Args:
+            warn: warn once with `OutsideDomainWarning` when a command is outside the domain; False inside torch.func
+                transforms, where nothing can be asked of a value.
+        """
+        told = not warn
+
+        def compensate(module: nn.Module, args: tuple[Any, ...], kwargs: Mapping[str, Any], output: Tensor) -> Tensor:
+            nonlocal told
+            covariates = kwargs.get("covariates")
+            if covariates is not None:
+                covariates = covariates.expand(*output.shape[:-1], covariates.shape[-1])
+            command, _, inside = self(output, covariates)
+            solved = torch.isfinite(output).all(-1)
+            if not told and bool((solved & ~inside).any()):
+                told = True
+                warnings.warn(
+                    "a command is outside the domain that the compensator was trained on, where it falls back to the "
+                    "mean training deviation; this is said once",
+                    OutsideDomainWarning,
+                    stacklevel=2,
+                )
+            good = solved & torch.isfinite(command).all(-1)
+            return torch.where(good.unsqueeze(-1), command, output)
+
+        return compensate
+
+    def _inputs(self, joints: Tensor, covariates: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Finite joints and covariates, and how many inputs were not finite, `... x 1`."""
+        n, m = len(self.joints), len(self.covariates)
+        if joints.shape[-1] != n:
+            names = ", ".join(c.header for c in self.joints)
+            raise InputError(f"the compensator takes the {n} joints {names}; got {joints.shape[-1]}")
+        if m == 0:
+            finite = self.domain.clean(joints)
+            return finite.inputs, joints.new_zeros(*joints.shape[:-1], 0), finite.strange
+        names = ", ".join(c.header for c in self.covariates)
+        if covariates is None:
+            raise InputError(f"the compensator needs the covariates {names}; give covariates=… with {m} columns")
+        if covariates.shape[-1] != m:
+            raise InputError(f"the compensator needs the covariates {names}; got {covariates.shape[-1]} columns")
+        finite = self.domain.clean(torch.cat([joints, covariates.to(joints.dtype)], -1))
+        return finite.inputs[..., :n], finite.inputs[..., n:], finite.strange
+
+    def _solve(self, joints: Tensor, covariates: Tensor | None) -> tuple[Tensor, Tensor, _Deviation, _Deviation]:
+        """Finite joints, their command, δ at the command, and δ at the joints themselves."""
+        joints, covariates, strange = self._inputs(joints, covariates)
+        first = last = self._deviation(joints, covariates, strange)
+        command = joints
+        for _ in range(self.iterations):
+            command = joints - last.value
+            last = self._deviation(command, covariates, strange)
+        return joints, command, last, first
+
+    def _deviation(self, joints: Tensor, covariates: Tensor, strange: Tensor) -> _Deviation:
+        """δ at commanded, finite joints."""
+        inputs = torch.cat([joints, covariates], -1) if self.covariates else joints
+        caged = self.domain.cage(inputs)
+        features = self.scaling.features(caged)
+        raw = self.scaling.restore(self.network(features))
+        excess = self.domain.excess(caged) + strange
+        fade = torch.relu(1 - excess)
+        weight = fade * fade
+        # Two products instead of safe + weight · (limited - safe): each end is then exact.
+        value = self._limited(weight * self._limited(raw) + (1 - weight) * self.safe)
+        if self.effects is not None:
+            moved = self.effects(caged[..., : len(self.joints)] + value, caged[..., len(self.joints) :])
+            value = self._limited(value + weight * moved)
+        if self.geometry is not None:
+            moved = self.geometry(caged[..., : len(self.joints)] + value)
+            value = self._limited(value + (moved if self.geometry.extrapolates else weight * moved))
+        return _Deviation(value, weight, excess, features)
+
+    def _sd(self, deviation: _Deviation) -> Tensor:
+        """Of a newly measured δ, where this one was found."""
+        weight = deviation.weight
+        scale = self.scaling.deviation * self.sd_scale
+        variance = scale * scale
+        if isinstance(self.network, UncertainNetwork):
+            variance = variance * self.network.variance(deviation.features)
+        outside = (1 - weight) * self.safe_sd
+        return torch.sqrt(weight * weight * variance + outside * outside)
+
+    def _limited(self, deviation: Tensor) -> Tensor:
+        return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)
+
+
+def default_limit(deviations: Tensor) -> Tensor:
+    """Limit of a correction by the training deviations `s x n`: 1.5 times the largest of each joint, `n` [SI]."""
+    return 1.5 * deviations.abs().amax(0)
+
+
+def fit_compensator(
+    network: nn.Module,
+    scaling: Scaling,
+    inputs: Tensor,
+    deviations: Tensor,
+    joints: Sequence[Coordinate],
+    covariates: Sequence[Coordinate] = (),
+    limit: Tensor | None = None,
+    margin: float = 0.1,
+    transition: float = 0.5,
+    sd_scale: Tensor | None = None,
+    geometry: Geometry | None = None,
+    effects: PhysicalEffects | None = None,
+) -> Compensator:
+    """Put guard, limit and fixed point around a trained network, and identified geometry and effects beside it.
+
+    What the network learned is damped about its mean where δ is otherwise too steep for a command to be solved for.
+
+    Args:
+        network: features -> standardised deviation, of one repeat.
+        scaling: of that repeat, without the leading dimension.
+        inputs: training inputs, commanded joints and then covariates, `s x (n + m)` [SI].
+        deviations: training deviations of what the network learned, `s x n` [SI]; with `geometry` or `effects` what
+            these leave. The mean of the deviations that fade out is the safe correction outside the domain.
+        joints, covariates: coordinates in the order of the inputs.
+        limit: hard limit of |δ|, `n` [SI]; 1.5 times the largest training deviation of each joint, geometry included,
+            when None.
+        margin: how far beyond the training inputs δ is trusted, as a share of their half range.
+        transition: width over which it then fades into the safe correction, as a share of the half range.
+        sd_scale: what the network's standard deviation is multiplied by, `n` [1]; 1 when None.
+        geometry: deviation of the identified geometry, of one repeat.
+        effects: deviation of known effects, of one repeat.
+
+    Raises:
+        InputError: shapes do not fit together, or a limit or a scale is out of its range.
+        MethodFailedError: δ is too steep for that even where little of what was learned is left.
+    """
+    n = len(joints)
+    if inputs.shape[-1] != n + len(covariates) or deviations.shape != (len(inputs), n):
+        raise InputError(
+            f"training inputs {tuple(inputs.shape)} and deviations {tuple(deviations.shape)} do not fit "
+            f"{n} joints and {len(covariates)} covariates"
+        )
+    inputs, deviations = inputs.detach(), deviations.detach()
+    total = fading = deviations
+    with torch.no_grad():
+        if effects is not None:
+            effects = copy.deepcopy(effects)
+            total = fading = deviations + effects(inputs[:, :n] + deviations, inputs[:, n:])
+        if geometry is not None:
+            geometry = copy.deepcopy(geometry)
+            total = fading + geometry(inputs[:, :n] + fading)
+            fading = fading if geometry.extrapolates else total
+    limit = default_limit(total) if limit is None else limit.detach()
+    if limit.shape != (n,) or not bool((limit >= 0).all() & torch.isfinite(limit).all()):
+        raise InputError(f"limit must be one finite number of at least 0 for each of the {n} joints")
+    sd_scale = torch.ones_like(limit) if sd_scale is None else sd_scale.detach().clone()
+    if sd_scale.shape != (n,) or not bool((sd_scale > 0).all() & torch.isfinite(sd_scale).all()):
+        raise InputError(f"sd_scale must be one finite number above 0 for each of the {n} joints")
+    safe = torch.minimum(torch.maximum(fading.mean(0), -limit), limit)
+    safe_sd = (fading - safe).square().mean(0).sqrt()
+    reach = torch.cat([limit, limit.new_zeros(len(covariates))])
+    domain = Domain.fit(inputs, reach, margin, transition)
+    # A copy: what is compensated with does not change when the learner trains on.
+    frozen = copy.deepcopy(network).requires_grad_(False)
+    size = {} if geometry is None and effects is None else {"count": 512, "at_once": 1024}
+    share = 1.0
+    for _ in range(_DAMPINGS):
+        scaled = copy.deepcopy(scaling)
+        scaled.deviation.mul_(share)
+        compensator = Compensator(
+            *(frozen, scaled, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale / share, safe_sd),
+            *(geometry, effects),
+        )
+        found = steepest(compensator.deviation, inputs, domain, limit, **size)
+        if not math.isfinite(found.lipschitz):
+            raise MethodFailedError("the trained network gives values that are not finite within its domain")
+        if found.lipschitz <= STEEPEST_DEVIATION:
+            compensator.lipschitz, compensator.share = found.lipschitz, share
+            compensator.iterations = iterations_needed(found)
+            return compensator
+        share *= 0.9 * STEEPEST_DEVIATION / found.lipschitz
+        if share < _LEAST_SHARE:
+            break
+    raise MethodFailedError(
+        f"the learned deviation changes by up to {found.lipschitz:.2g} of a joint's motion, and above "
+        f"{STEEPEST_DEVIATION:g} the command cannot be solved for safely; train with more rows, fewer nodes or "
+        "regularisation, and leave out rows near singular poses (max_condition)"
+    )

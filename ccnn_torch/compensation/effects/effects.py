@@ -1,0 +1,254 @@
+"""Physical effects as a deviation of the joints: the objects that a diagnosis fits, at work in a compensator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ccnn_torch.compensation.effects.exact_numbers import exact_numbers
+from ccnn_torch.compensation.effects.kinematic_fields import Fields, looked_at, make_fields
+from ccnn_torch.compensation.geometry.serial import _inverse
+from ccnn_torch.effects import Acting, Situation, make_effect
+from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
+
+__all__ = ["Care", "PhysicalEffects", "effect_deviation", "expand_effects", "gains"]
+
+# Joints that move the platform less than this are held back [m per joint unit]: a thousandth of what is usual.
+_LEAST_DAMPING = 1e-3
+# A Jacobian from here on is none.
+_LOST = 1e6
+
+
+class Care(NamedTuple):
+    """How effects are brought to the joints, and where they are not, since near a singular pose they are out of hand.
+
+    Attributes:
+        rotation_weight: of rotation against position [m/rad].
+        damping: directions in which a joint moves the platform less than this are held back [m per joint unit].
+        gain: where the joints move the platform by more than this (Frobenius norm of the weighted Jacobian), what the
+            effects take from the kinematics is held, and falls beyond with its square [m per joint unit].
+        inverse_gain: the same of the Jacobian's damped inverse, for effects on the pose [joint unit per m].
+        free: names of effects that look at nothing of the kinematics, and are never held back.
+    """
+
+    rotation_weight: float
+    damping: float
+    gain: float = math.inf
+    inverse_gain: float = math.inf
+    free: tuple[str, ...] = ()
+
+
+def effect_deviation(
+    here: Situation, acting: Sequence[Acting], jacobian: Callable[[Tensor], Tensor], care: Care
+) -> Tensor:
+    """Joint deviation with which the nominal machine stands where the machine with the effects stands.
+
+    Effects on joints count as they are. The change of the pose by the others is brought to the joints by the damped
+    inverse of the Jacobian half way (the midpoint rule), which leaves the third order of the deviation.
+
+    Args:
+        here: the rows as commanded.
+        acting: effects with their numbers.
+        jacobian: of position and rotation vector, at joints `... x s x n` -> `... x s x c x n`.
+        care: what is done near singular poses.
+
+    Returns:
+        `... x s x n` [joint's unit], finite.
+    """
+    free, moved, shift = torch.zeros_like(here.joints), torch.zeros_like(here.joints), None
+    for one in acting:
+        change = one.change(here)
+        if one.effect.kind == "joints":
+            free, moved = (free + change, moved) if one.effect.name in care.free else (free, moved + change)
+            continue
+        if one.effect.kind == "parameters":
+            change = (here.parameter_jacobian @ change.unsqueeze(-1)).squeeze(-1)
+        shift = change if shift is None else shift + change
+    if all(one.effect.name in care.free for one in acting):
+        return free
+    slope, lost = _weighted(here.jacobian, care.rotation_weight)
+    share = _held(slope.square().sum((-2, -1)) + lost, care.gain).unsqueeze(-1)
+    moved = share * torch.nan_to_num(moved, posinf=0.0, neginf=0.0)
+    if shift is None:
+        return free + moved
+    shift = _weights(here.jacobian, care.rotation_weight) * torch.nan_to_num(shift, posinf=0.0, neginf=0.0)
+    inverse = _lifting(slope, care.damping)
+    share = share * _held(inverse.square().sum((-2, -1)), care.inverse_gain).unsqueeze(-1)
+    first = (inverse @ shift.unsqueeze(-1)).squeeze(-1)
+    half_way = _weighted(jacobian(here.joints + free + moved + 0.5 * share * first), care.rotation_weight)[0]
+    return free + moved + share * (_lifting(half_way, care.damping) @ shift.unsqueeze(-1)).squeeze(-1)
+
+
+class PhysicalEffects(nn.Module):
+    """`effect_deviation` of one machine with known numbers, for one row at a time, as a graph that can be exported.
+
+    A row knows nothing of the rows before it: effects act as on a machine that has settled under its covariates.
+
+    Attributes:
+        mechanism: the nominal one, frames fitted.
+        covariates: names of the columns that come with the joints.
+        acting: effects with their numbers; their own code runs on the fields.
+        fields: what the effects see of the nominal machine.
+        care: what is done near singular poses.
+        gravity: `3` [m/s²].
+        numbers: of every effect by name and coefficient, for the model's card.
+        export_tolerance: share of the limit to which exports agree.
+    """
+
+    export_tolerance = 1e-9
+    gravity: Tensor
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        gravity: Tensor,
+        covariates: Sequence[str],
+        acting: Sequence[Acting],
+        fields: Fields,
+        care: Care,
+        numbers: Mapping[str, Mapping[str, float]],
+    ) -> None:
+        super().__init__()
+        # In a tuple, since the mechanism's own buffers are no part of the model.
+        self._mechanism = (mechanism,)
+        self.covariates = list(covariates)
+        self.fields = fields
+        self.care = care
+        self.numbers = {name: dict(values) for name, values in numbers.items()}
+        self.register_buffer("gravity", gravity.detach().clone())
+        self._effects = [one.effect for one in acting]
+        for i, one in enumerate(acting):
+            self.register_buffer(f"shape{i}", one.shape.detach().clone())
+            self.register_buffer(f"coefficients{i}", one.coefficients.detach().clone())
+
+    @property
+    def acting(self) -> list[Acting]:
+        """The effects with their numbers."""
+        return [
+            Acting(effect, getattr(self, f"shape{i}"), getattr(self, f"coefficients{i}"))
+            for i, effect in enumerate(self._effects)
+        ]
+
+    def forward(self, joints: Tensor, covariates: Tensor) -> Tensor:
+        """joints: commanded, `... x n` [SI]; covariates: `... x m` [SI]; returns the deviation, `... x n` [SI]."""
+        rows = joints.reshape(-1, joints.shape[-1])
+        columns = covariates.reshape(-1, covariates.shape[-1]) if self.covariates else covariates
+        given = {name: columns[:, i] for i, name in enumerate(self.covariates) if name != "time"}
+        with exact_numbers():
+            here = self.fields.fill(Situation(self._mechanism[0], rows, given, self.gravity))
+            found = effect_deviation(here, self.acting, self.fields.jacobian, self.care)
+        return found.reshape(joints.shape)
+
+    def describe(self) -> dict[str, Any]:
+        """Everything `from_description` needs; the tensors stand beside it."""
+        return {
+            "kind": "physical_effects",
+            "mechanism": self._mechanism[0].describe(),
+            "covariates": self.covariates,
+            "acting": [[one.effect.name, len(one.shape), len(one.coefficients)] for one in self.acting],
+            "fields": self.fields.describe(),
+            "care": [None if value == math.inf else value for value in self.care],
+            "numbers": self.numbers,
+        }
+
+    @classmethod
+    def from_description(cls, description: dict[str, Any]) -> PhysicalEffects:
+        """The module as it was described, its tensors 0."""
+        # Whether code may run says whoever reads the file that this stands in.
+        mechanism = mechanism_from_description(description["mechanism"], allow_code=True)
+        weight, damping, *most, free = description["care"]
+        gain, inverse_gain = (math.inf if m is None else float(m) for m in most)
+        acting = [
+            Acting(make_effect(name), *(torch.zeros(size, dtype=torch.float64) for size in sizes))
+            for name, *sizes in description["acting"]
+        ]
+        return cls(
+            mechanism,
+            torch.zeros(3, dtype=torch.float64),
+            description["covariates"],
+            acting,
+            Fields.from_description(description["fields"], mechanism),
+            Care(weight, damping, gain, inverse_gain, tuple(free)),
+            description["numbers"],
+        )
+
+
+def expand_effects(
+    situation: Situation,
+    acting: Sequence[Acting],
+    covariates: Sequence[str],
+    margin: float,
+    care: Care,
+) -> PhysicalEffects:
+    """Effects with their numbers as a module that a model file can hold.
+
+    Args:
+        situation: the training rows, `s x n`; of its parameters the nominal ones are taken.
+        acting: effects of the library, without time.
+        covariates: names of the compensator's covariates, in order.
+        margin: of the compensator's domain.
+        care: what is done near singular poses; its `free` is found here.
+
+    Raises:
+        InputError, MethodFailedError: what the effects see of the machine cannot be expanded over these joints.
+    """
+    mechanism, few = situation.mechanism, slice(0, 8)
+    given = {name: value[few] for name, value in situation.covariates.items()}
+    names: set[str] = set()
+    free = []
+    for one in acting:
+        own = looked_at(Situation(mechanism, situation.joints[few], given, situation.gravity), one.change)
+        if one.effect.kind == "joints" and not own:
+            free.append(one.effect.name)
+            continue
+        names |= own | {"jacobian"} | ({"parameter_jacobian"} if one.effect.kind == "parameters" else set())
+    fields = make_fields(mechanism, situation.gravity, names, situation.joints, margin)
+    numbers: dict[str, dict[str, float]] = {}
+    for one in acting:
+        named = [c.name for c in one.effect.coefficients(situation)] + [s.name for s in one.effect.shapes(situation)]
+        values = [*one.coefficients.tolist(), *one.shape.tolist()]
+        numbers[one.effect.name] = dict(zip(named, values, strict=True))
+    care = care._replace(free=tuple(free))
+    module = PhysicalEffects(mechanism, situation.gravity, covariates, acting, fields, care, numbers)
+    module.requires_grad_(False)
+    # Effects that ask which of their columns the workspace shows keep the answer; a traced graph could not ask.
+    columns = [given.get(name, torch.zeros_like(situation.joints[few, 0])) for name in module.covariates]
+    module(situation.joints[few], torch.stack(columns, -1) if columns else situation.joints[few, :0])
+    return module
+
+
+def gains(jacobian: Tensor, care: Care) -> tuple[Tensor, Tensor]:
+    """What `Care` bounds as `gain` and `inverse_gain`, of `... x c x n`, `...` each."""
+    slope, lost = _weighted(jacobian, care.rotation_weight)
+    inverse = _lifting(slope, care.damping)
+    return (slope.square().sum((-2, -1)) + lost).sqrt(), inverse.square().sum((-2, -1)).sqrt()
+
+
+def _weighted(jacobian: Tensor, rotation_weight: float) -> tuple[Tensor, Tensor]:
+    """Jacobian with its rotation weighted, `... x c x n`, 0 where there is none, and there a large number, `...`."""
+    # A comparison with NaN is false.
+    there = jacobian.abs() < _LOST
+    slope = torch.where(there, jacobian, torch.zeros_like(jacobian))
+    lost = torch.where(there, torch.zeros_like(jacobian), torch.full_like(jacobian, _LOST**2)).sum((-2, -1))
+    return slope * _weights(jacobian, rotation_weight).unsqueeze(-1), lost
+
+
+def _weights(jacobian: Tensor, rotation_weight: float) -> Tensor:
+    return torch.tensor([1.0] * 3 + [rotation_weight] * (jacobian.shape[-2] - 3), dtype=jacobian.dtype)
+
+
+def _held(square: Tensor, most: float) -> Tensor:
+    """1 up to `most` squared, and falling in proportion beyond, `...`: what grows with the square is held there."""
+    if math.isinf(most):
+        return torch.ones_like(square)
+    return 1 / (square / most**2).clamp_min(1.0)
+
+
+def _lifting(slope: Tensor, damping: float) -> Tensor:
+    """Damped inverse of a weighted Jacobian, `... x n x c`."""
+    unit = torch.eye(slope.shape[-1], dtype=slope.dtype)
+    return _inverse(slope.mT @ slope + max(damping, _LEAST_DAMPING) ** 2 * unit, unit) @ slope.mT

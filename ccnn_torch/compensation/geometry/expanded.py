@@ -1,0 +1,50 @@
+"""Identified geometry of a mechanism without closed forms as a polynomial: a Chebyshev expansion over the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion, expand
+
+__all__ = ["ExpandedGeometry", "expand_geometry"]
+
+
+class ExpandedGeometry(ChebyshevExpansion):
+    """δ(q), commanded joints `... x n` -> `... x n` [SI], as a polynomial.
+
+    Attributes:
+        extrapolates: a polynomial says nothing outside the points it was fitted to.
+        export_tolerance: share of the limit to which exports agree; sums of many terms are rounded.
+    """
+
+    extrapolates = False
+    export_tolerance = 1e-10
+
+    def describe(self) -> dict[str, Any]:
+        """Everything `from_description` needs; the tensors stand beside it."""
+        return {"kind": "expanded_geometry", "joints": len(self.centre), "degree": self.degree}
+
+    @classmethod
+    def from_description(cls, description: dict[str, Any]) -> ExpandedGeometry:
+        """An expansion of the described size, 0 everywhere."""
+        blank = torch.ones(description["joints"], dtype=torch.float64)
+        return cls(blank.clone(), blank.clone(), description["degree"])
+
+
+def expand_geometry(deviation: Callable[[Tensor], Tensor], joints: Tensor, margin: float = 0.1) -> ExpandedGeometry:
+    """Expand a geometric deviation over the domain of the training rows.
+
+    Args:
+        deviation: commanded joints `s x n` -> δ `s x n` [SI]; NaN where the mechanism cannot stand.
+        joints: commanded joints of the training rows, `s x n` [SI].
+        margin: as in `fit_compensator`.
+
+    Raises:
+        InputError, MethodFailedError: as `expand`.
+    """
+    found = expand(deviation, joints, margin, "geometric deviation")
+    return ExpandedGeometry(found.centre, found.half_range, found.degree, found.coefficients)

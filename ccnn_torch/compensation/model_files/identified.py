@@ -1,0 +1,197 @@
+"""An identified machine as a model: commands by its real kinematics, without any network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from ccnn_torch.compensation.guard import Promise, as_matrix, kept
+from ccnn_torch.compensation.model_files.card import MODEL_FORMS, card_of, read_model
+from ccnn_torch.compensation.model_files.load import LoadedModel, load_model
+from ccnn_torch.compensation.model_files.signature import check_signature, sign_content, signature_path
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError, ModelFileError
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.mechanisms import Mechanism, mechanism_of_file
+from ccnn_torch.mechanisms.mechanism_file import MechanismFile, read_mechanism_file
+
+__all__ = ["IdentifiedGeometry", "load_compensation", "load_geometry", "sign_model"]
+
+Array = NDArray[Any]
+
+# How near to a pose the joints must bring a machine [m, rad].
+_CLOSE = 1e-8
+# How far joints may be from those that the inverse kinematics give for their pose [SI].
+_SAME = 1e-6
+# No machine has joints as far [SI]; a double has lost what is small there.
+_FARTHEST = 1e6
+_FORMS = (".yaml", ".yml", ".json")
+
+
+class IdentifiedGeometry:
+    """What `LoadedModel` is for a network, for identified geometry; the same call, the same names.
+
+    An ideal joint vector means the pose f(q; nominal); the command is g(that pose; identified), on the same branch.
+
+    Attributes:
+        path: the mechanism file.
+        nominal, identified: the mechanism with either geometry.
+        joints, covariates, pose: coordinates in order; geometry has no covariates.
+        facts: `mechanism`: the nominal one's description.
+    """
+
+    def __init__(self, path: Path, nominal: Mechanism, identified: Mechanism) -> None:
+        """Take both geometries of one mechanism."""
+        self.path, self.nominal, self.identified = path, nominal, identified
+        self.joints: tuple[Coordinate, ...] = nominal.joints
+        self.pose: tuple[Coordinate, ...] = nominal.pose
+        self.covariates: tuple[Coordinate, ...] = ()
+        self.facts: dict[str, Any] = {"mechanism": nominal.describe()}
+
+    @property
+    def middle(self) -> Array:
+        """Joints to begin a search from, `n` [SI]."""
+        home: Array = self.nominal.home_joints.numpy()
+        return home
+
+    def __call__(self, joints: ArrayLike, covariates: ArrayLike | None = None) -> dict[str, Array]:
+        """Commands of ideal joints, and ideal joints were they commands.
+
+        Args:
+            joints: `... x n` [SI].
+            covariates: none.
+
+        Returns:
+            `command`, `deviation` and `ideal`, `... x n` [SI], all finite; `inside_domain` and `ideal_inside_domain`,
+            `...`, bool: False where the machine cannot take the pose, and the joints come back as they are (the home
+            joints for what is no number); `fallback`, `...`, bool: where the file gives what is no command, and the
+            joints come back as well.
+
+        Raises:
+            InputError: the last dimension is wrong.
+        """
+        array = as_matrix(joints, self.joints, "joints")
+        rows = array.reshape(-1, array.shape[-1])
+        promise = Promise.without_card(self.middle)
+        given, strange = (torch.from_numpy(v) for v in promise.cleaned(rows))
+        known = ~strange.any(-1)
+        command, inside = _carried(self.nominal, self.identified, given, known)
+        ideal, ideal_inside = _carried(self.identified, self.nominal, given, known)
+        found = {
+            "command": command.numpy(),
+            "deviation": (given - command).numpy(),
+            "inside_domain": inside.numpy(),
+            "ideal": ideal.numpy(),
+            "ideal_inside_domain": ideal_inside.numpy(),
+        }
+        checked = kept(found, rows, None, promise)
+        return {name: value.reshape((*array.shape[:-1], *value.shape[1:])) for name, value in checked.items()}
+
+
+def load_geometry(
+    path: str | Path, *, public_key: str | Path | None = None, allow_code: bool = False
+) -> IdentifiedGeometry:
+    """Read `identified.yaml`, or the `identified.yaml` beside an `identified.json`.
+
+    Args:
+        path: the file.
+        public_key, allow_code: as `load_model`.
+
+    Raises:
+        ModelFileError: the file is not one that `ccnn identify` wrote.
+        InputError: it lacks a key or a parameter, or names code that was not allowed.
+    """
+    path = Path(path)
+    source, content = _read_geometry(path)
+    if public_key is not None:
+        check_signature(source, content, b"", public_key)
+    file = _parsed(path, source, content)
+    nominal, identified = (mechanism_of_file(file, what, allow_code) for what in ("nominal", "value"))
+    return IdentifiedGeometry(path, nominal, identified)
+
+
+def load_compensation(
+    path: str | Path, *, public_key: str | Path | None = None, allow_code: bool = False
+) -> LoadedModel | IdentifiedGeometry:
+    """A model file (.safetensors, .onnx) or an identified machine (.yaml, .json), by what the name ends in.
+
+    Args:
+        path: the file.
+        public_key, allow_code: as `load_model`.
+
+    Raises:
+        ModelFileError, InputError: see `load_model` and `load_geometry`.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in (*_FORMS, *MODEL_FORMS, ".pt2") and Path(path).is_file():
+        raise ModelFileError(
+            f"{path}: is no model file; one ends in {', '.join(MODEL_FORMS)}, or is an identified.yaml"
+        )
+    load = load_geometry if suffix in _FORMS else load_model
+    return load(path, public_key=public_key, allow_code=allow_code)
+
+
+def sign_model(path: str | Path, key: str | Path) -> Path:
+    """Write MODEL.sig beside a model: the signature of the file and of the card that vouches for it.
+
+    Args:
+        path: as for `load_compensation`; an identified.yaml has no card.
+        key: PEM file with a private Ed25519 key.
+
+    Raises:
+        ModelFileError: the file cannot be read, or no card vouches for it.
+        InputError: the key is none, or the package for signatures is missing.
+    """
+    path = Path(path)
+    if path.suffix.lower() in _FORMS:
+        source, content = _read_geometry(path)
+        _parsed(path, source, content)
+        path, card = source, b""
+    else:
+        content = read_model(path)
+        card = card_of(path, content)[1]
+    signature = sign_content(content, card, key)
+    write_whole(signature_path(path), signature)
+    return signature_path(path)
+
+
+def _read_geometry(path: Path) -> tuple[Path, bytes]:
+    """The mechanism file of an identified machine, and its bytes."""
+    source = path.with_suffix(".yaml") if path.suffix == ".json" else path
+    try:
+        return source, source.read_bytes() if source.is_file() else b""
+    except OSError as reason:
+        raise ModelFileError(f"{source}: cannot be read: {reason.strerror}") from None
+
+
+def _parsed(path: Path, source: Path, content: bytes) -> MechanismFile:
+    try:
+        file = read_mechanism_file(str(source), content)
+    except InputError as reason:
+        raise ModelFileError(f"{reason}; {path} is no model file: give identified.yaml or model.safetensors") from None
+    if file is None:
+        raise ModelFileError(
+            f"{path}: there is no identified machine; give the identified.yaml that ccnn identify writes, which holds "
+            "the nominal parameters, too"
+        )
+    return file
+
+
+@torch.no_grad()
+def _carried(first: Mechanism, second: Mechanism, joints: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Joints of `second` at the poses that `first` takes with `joints`, and where there are any among those `known`."""
+    pose = first.forward_kinematics(joints)
+    found = second.solve_inverse(pose, guess=joints)
+    error = second.pose_error(second.forward_kinematics(found, guess=pose), pose)
+    # A comparison with NaN is false, so a pose without joints is not reached either.
+    reached = error.position < _CLOSE
+    if error.rotation is not None:
+        reached = reached & (error.rotation < _CLOSE)
+    # Joints in another working mode take a pose that our inverse kinematics would take with far-off joints.
+    reached &= first.wrap(first.solve_inverse(pose, guess=joints) - joints).abs().amax(-1) < _SAME
+    reached &= known & (joints.abs().amax(-1) < _FARTHEST)
+    return torch.where(reached[..., None], found, joints), reached

@@ -1,0 +1,93 @@
+"""Writing model files: one safetensors master, its exports, and the card that vouches for them all by SHA-256."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from safetensors.torch import save
+
+from ccnn_torch.compensation.compensator import Compensator
+from ccnn_torch.compensation.export.export import export_float32, export_onnx, export_pt2, trace
+from ccnn_torch.compensation.model_files.metadata import facts_of, to_json
+from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
+from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.files.write import write_whole
+
+__all__ = ["FORMS", "card_name", "save_model"]
+
+FORMS = ("safetensors", "onnx", "pt2", "float32.onnx")
+
+# Written by this command itself; a field of these names would be lost.
+_OWN = ("files", "date", "notes")
+
+
+def card_name(method: str) -> str:
+    """`card.json` for the run's model, `METHOD.card.json` beside it for one of several."""
+    return "card.json" if method == "model" else f"{method}.card.json"
+
+
+def save_model(
+    folder: str | Path,
+    compensator: Compensator,
+    fields: Mapping[str, Any],
+    method: str = "model",
+    forms: Collection[str] = FORMS,
+) -> dict[str, Path]:
+    """Write METHOD.safetensors, .onnx, .float32.onnx, .pt2 and the card; each whole or not at all, the card last.
+
+    The master and the exports are byte-identical for one model and one set of fields; what changes from run to run
+    stands in the card alone.
+
+    Args:
+        folder: made where it is not there.
+        compensator: fitted.
+        fields: `mechanism` (its `describe()`), `metrics`, `data_sha256`, `seed`: these go into every file and must not
+            hold times or paths; further ones go into the card alone.
+        method: name of the files.
+        forms: which to write; the master is always written, and the exports take seconds each.
+
+    Returns:
+        The files by what they are: `safetensors`, `onnx`, `float32.onnx`, `pt2`, `card`. Where single precision cannot
+        hold the model, `float32.onnx` is missing and the card's `notes` say so.
+
+    Raises:
+        InputError: a field is missing or no JSON, or the network cannot be described.
+        MethodFailedError: an export does not give the model's numbers, to 1e-12 of the limit or what the network needs.
+    """
+    facts = facts_of(compensator, fields)
+    text = to_json(facts)
+    taken = sorted(set(fields) & {*_OWN, *facts} - {"mechanism", "metrics", "data_sha256", "seed"})
+    if taken:
+        raise InputError(f"a model's field may not be named {taken[0]!r}, which the card holds itself")
+    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in compensator.state_dict().items()}
+    contents = {"safetensors": save(tensors, metadata={METADATA_KEY: text})}
+    notes = []
+    if "onnx" in forms or "pt2" in forms:
+        program = trace(compensator)
+        # In this order: writing a .pt2 takes the example inputs out of the program.
+        for form, export in (("onnx", export_onnx), ("pt2", export_pt2)):
+            if form in forms:
+                contents[form] = export(compensator, program, text)
+    if "float32.onnx" in forms:
+        try:
+            contents["float32.onnx"] = export_float32(compensator, text)
+        except MethodFailedError as reason:
+            notes.append(f"{method}.float32.onnx was not written: {reason}")
+    folder = Path(folder)
+    paths = {kind: folder / f"{method}.{kind}" for kind in contents}
+    for kind, content in contents.items():
+        write_whole(paths[kind], content)
+    card = {
+        **{key: value for key, value in fields.items() if key not in facts},
+        **facts,
+        "files": {paths[kind].name: hashlib.sha256(content).hexdigest() for kind, content in contents.items()},
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "notes": notes,
+    }
+    paths["card"] = folder / card_name(method)
+    write_whole(paths["card"], to_json(card, indent=2) + "\n")
+    return paths

@@ -1,0 +1,88 @@
+"""Networks in model files: described by JSON beside their tensors, built again from it, never unpickled."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any, Protocol, cast, runtime_checkable
+
+from torch import Tensor, nn
+
+from ccnn_torch.errors import InputError, ModelFileError
+
+__all__ = ["DescribedNetwork", "UncertainNetwork", "describe_network", "network_from_description", "register_network"]
+
+# Kind -> the class, or where it stands; imported when a file asks for it.
+_KINDS: dict[str, str | type[DescribedNetwork]] = {
+    "constant": "ccnn_torch.learners.constant:ConstantNetwork",
+    "grnn": "ccnn_torch.learners._grnn_network:GRNNNetwork",
+    "gp": "ccnn_torch.learners._gp_posterior:GPNetwork",
+    "masked": "ccnn_torch.evolution.masked_network:MaskedNetwork",
+    "serial_geometry": "ccnn_torch.compensation.geometry.serial:SerialGeometry",
+    "physical_effects": "ccnn_torch.compensation.effects.effects:PhysicalEffects",
+    "expanded_geometry": "ccnn_torch.compensation.geometry.expanded:ExpandedGeometry",
+}
+
+
+class DescribedNetwork(Protocol):
+    """What a learner's network offers so that a model file can hold it; a class that is an `nn.Module` as well."""
+
+    def describe(self) -> dict[str, Any]:
+        """JSON with the key `kind` and whatever `from_description` needs; the tensors are stored beside it."""
+
+    @classmethod
+    def from_description(cls, description: dict[str, Any]) -> nn.Module:
+        """A network of the described shape, whatever its values: its `state_dict` is loaded afterwards."""
+
+
+@runtime_checkable
+class UncertainNetwork(Protocol):
+    """A network that knows how sure it is."""
+
+    def variance(self, features: Tensor) -> Tensor:
+        """Variance of a newly measured standardised output, above 0 and finite: `... x i` -> `... x o`."""
+
+
+def register_network(kind: str, network: type[DescribedNetwork]) -> None:
+    """Make a kind of network known to model files; call it where the class is defined.
+
+    Raises:
+        InputError: the kind is taken by another class.
+    """
+    if _KINDS.get(kind, network) is not network:
+        raise InputError(f"a network of kind '{kind}' is registered already; give the new one another kind")
+    _KINDS[kind] = network
+
+
+def describe_network(network: nn.Module) -> dict[str, Any]:
+    """The network's own description.
+
+    Raises:
+        InputError: it has none, or one of an unknown kind.
+    """
+    if not callable(getattr(network, "describe", None)):
+        raise InputError(
+            f"the network {type(network).__name__} cannot be stored: give it describe() and from_description(), "
+            "and register_network(kind, class)"
+        )
+    description = cast(DescribedNetwork, network).describe()
+    if description.get("kind") not in _KINDS:
+        raise InputError(f"networks of kind {description.get('kind')!r} are unknown; call register_network first")
+    return description
+
+
+def network_from_description(description: dict[str, Any]) -> nn.Module:
+    """Inverse of `describe_network`, without the values.
+
+    Raises:
+        ModelFileError: the kind is unknown here.
+    """
+    kind = description.get("kind")
+    found = _KINDS.get(kind) if isinstance(kind, str) else None
+    if found is None:
+        raise ModelFileError(
+            f"the model holds a network of kind {kind!r}, which is unknown here; import the file that registers it"
+        )
+    if isinstance(found, str):
+        module, _, name = found.partition(":")
+        found = cast(type[DescribedNetwork], getattr(importlib.import_module(module), name))
+    return found.from_description(description)
