@@ -11,7 +11,7 @@ from torch import Tensor
 from ccnn_torch.calibration.config import load_config
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.errors import MethodFailedError
-from ccnn_torch.evolution._gauss_newton import dense_jacobian, network_of
+from ccnn_torch.evolution.gauss_newton import dense_jacobian, network_of
 from ccnn_torch.evolution.network import forward
 from ccnn_torch.learners import TrainingData
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings, _nguyen_widrow

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.learners._gp_evidence import GPPrior, log_evidence
-from ccnn_torch.learners._gp_posterior import KERNELS, GPNetwork
 from ccnn_torch.learners.gp import GaussianProcess, GPSettings
+from ccnn_torch.learners.gp_evidence import GPPrior, log_evidence
+from ccnn_torch.learners.gp_posterior import KERNELS, GPNetwork
 from ccnn_torch.testing import check_learner
 from ccnn_torch.training import train
 

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import MethodFailedError
-from ccnn_torch.learners import TrainingData, _kernel
+from ccnn_torch.learners import TrainingData
+from ccnn_torch.learners import kernel as _kernel
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.identification import fit_links
-from ccnn_torch.mechanisms.frames import fit_frames
-from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.mechanisms.frames.fit import fit_frames
+from ccnn_torch.mechanisms.machines.serial import SerialArm
 
 HALF = math.pi / 2
 SIX = [

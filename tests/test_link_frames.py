@@ -9,7 +9,7 @@ import torch
 
 from ccnn_torch.identification import fit_links
 from ccnn_torch.mechanisms import SerialArm
-from ccnn_torch.mechanisms.frames import fit_frames
+from ccnn_torch.mechanisms.frames.fit import fit_frames
 
 HALF = math.pi / 2
 LINKS = [[0.1, HALF, 0.4, 0.2], [-0.5, 0, 0.0, -0.3], [-0.4, 0, 0, 0], [0, HALF, 0.12, 0.4], [0.05, -HALF, 0.1, 0]]

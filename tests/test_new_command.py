@@ -13,7 +13,7 @@ from ccnn_torch.calibration.config import load_config
 from ccnn_torch.cli._complete import MECHANISMS, complete_mechanism
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.mechanisms._registry import REGISTRY
+from ccnn_torch.mechanisms.registry import REGISTRY
 from ccnn_torch.starter.job import starter_config
 
 Cli = Callable[..., tuple[int, str, str]]

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution._gauss_newton import dense_jacobian, linearise, network_of, residual
+from ccnn_torch.evolution.gauss_newton import dense_jacobian, linearise, network_of, residual
 from ccnn_torch.evolution.refinement import (
     RefinementSettings,
     RefinementState,

@@ -29,7 +29,7 @@ SHIPPED = ROOT / "checkpoints" / "tripod"
 FLOORS = [
     ["version", "errors", "coordinates", "units", "display", "files", "plugins", "numerics", "records"],
     ["mechanisms", "pseudoerror"],
-    ["learners/_protocol", "training", "evolution", "learners", "effects"],
+    ["learners/protocol", "training", "evolution", "learners", "effects"],
     ["identification/problems", "identification/solvers", "identification/identifiability", "identification/__init__"],
     ["compensation"],
     ["diagnosis"],

@@ -14,8 +14,8 @@ __all__ = ["DescribedNetwork", "UncertainNetwork", "describe_network", "network_
 # Kind -> the class, or where it stands; imported when a file asks for it.
 _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "constant": "ccnn_torch.learners.constant:ConstantNetwork",
-    "grnn": "ccnn_torch.learners._grnn_network:GRNNNetwork",
-    "gp": "ccnn_torch.learners._gp_posterior:GPNetwork",
+    "grnn": "ccnn_torch.learners.grnn_network:GRNNNetwork",
+    "gp": "ccnn_torch.learners.gp_posterior:GPNetwork",
     "masked": "ccnn_torch.evolution.masked_network:MaskedNetwork",
     "serial_geometry": "ccnn_torch.compensation.geometry.serial:SerialGeometry",
     "physical_effects": "ccnn_torch.compensation.effects.effects:PhysicalEffects",

@@ -1,22 +1,22 @@
 """Physical causes of a gap between model and machine, one file each, all of one protocol."""
 
-from ccnn_torch.effects._own import owned as owned
-from ccnn_torch.effects._protocol import Coefficient as Coefficient
-from ccnn_torch.effects._protocol import Effect as Effect
-from ccnn_torch.effects._protocol import Kind as Kind
-from ccnn_torch.effects._protocol import Shape as Shape
-from ccnn_torch.effects._registry import EFFECTS as EFFECTS
-from ccnn_torch.effects._registry import EXACT as EXACT
-from ccnn_torch.effects._registry import OUTLIER as OUTLIER
-from ccnn_torch.effects._registry import effect_names as effect_names
-from ccnn_torch.effects._registry import make_effect as make_effect
-from ccnn_torch.effects._situation import PLATFORM_WEIGHT as PLATFORM_WEIGHT
-from ccnn_torch.effects._situation import Situation as Situation
-from ccnn_torch.effects._situation import default_gravity as default_gravity
-from ccnn_torch.effects._trial import refuse_one_name as refuse_one_name
-from ccnn_torch.effects._trial import tried as tried
 from ccnn_torch.effects.apply import Acting as Acting
 from ccnn_torch.effects.apply import measured_pose as measured_pose
 from ccnn_torch.effects.apply import pose_residual as pose_residual
 from ccnn_torch.effects.apply import reached as reached
 from ccnn_torch.effects.apply import signature as signature
+from ccnn_torch.effects.protocol import Coefficient as Coefficient
+from ccnn_torch.effects.protocol import Effect as Effect
+from ccnn_torch.effects.protocol import Kind as Kind
+from ccnn_torch.effects.protocol import Shape as Shape
+from ccnn_torch.effects.registry import EFFECTS as EFFECTS
+from ccnn_torch.effects.registry import EXACT as EXACT
+from ccnn_torch.effects.registry import OUTLIER as OUTLIER
+from ccnn_torch.effects.registry import effect_names as effect_names
+from ccnn_torch.effects.registry import make_effect as make_effect
+from ccnn_torch.effects.situation import PLATFORM_WEIGHT as PLATFORM_WEIGHT
+from ccnn_torch.effects.situation import Situation as Situation
+from ccnn_torch.effects.situation import default_gravity as default_gravity
+from ccnn_torch.effects.trial import refuse_one_name as refuse_one_name
+from ccnn_torch.effects.trial import tried as tried
+from ccnn_torch.effects.user_effect import owned as owned

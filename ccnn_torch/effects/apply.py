@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._protocol import Effect
-from ccnn_torch.effects._situation import Situation
+from ccnn_torch.effects.protocol import Effect
+from ccnn_torch.effects.situation import Situation
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 __all__ = ["Acting", "measured_pose", "pose_residual", "reached", "signature"]

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import per_force
-from ccnn_torch.effects._members import arm_axes, members
-from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
-from ccnn_torch.effects._situation import Situation
+from ccnn_torch.effects.columns import per_force
+from ccnn_torch.effects.members import arm_axes, members
+from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
 __all__ = ["SCALE", "Compliance"]

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import by_joint, of_rows, one_by_one
-from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
-from ccnn_torch.effects._situation import Situation
-from ccnn_torch.effects._time import elapsed
+from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one
+from ccnn_torch.effects.lag import elapsed
+from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
 __all__ = ["Drift"]

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import TWIST, shown_columns, twist_columns
-from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
-from ccnn_torch.effects._situation import Situation
+from ccnn_torch.effects.columns import TWIST, shown_columns, twist_columns
+from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
 __all__ = ["Frame"]

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import by_joint, of_rows, one_by_one, per_force
-from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
-from ccnn_torch.effects._situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.effects.backlash import Backlash
+from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one, per_force
 from ccnn_torch.effects.compliance import SCALE
+from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.mechanisms import Mechanism
 
 __all__ = ["Friction"]

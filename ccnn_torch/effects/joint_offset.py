@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter, plausible_error
-from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
-from ccnn_torch.effects._situation import Situation
+from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
 __all__ = ["JointOffset"]

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.effects._columns import by_joint
-from ccnn_torch.effects._protocol import Coefficient, Kind, Shape
-from ccnn_torch.effects._situation import Situation
-from ccnn_torch.effects._time import velocity
+from ccnn_torch.effects.columns import by_joint
+from ccnn_torch.effects.lag import velocity
+from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
 __all__ = ["Latency"]

@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution._gauss_newton import linearise, network_of, residual
-from ccnn_torch.evolution._priors import prior_groups, wave_groups
-from ccnn_torch.evolution._refinement_state import (
+from ccnn_torch.evolution.gauss_newton import linearise, network_of, residual
+from ccnn_torch.evolution.priors import prior_groups, wave_groups
+from ccnn_torch.evolution.refinement_state import (
     Refined,
     RefinementProblem,
     RefinementSettings,

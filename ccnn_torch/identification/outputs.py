@@ -9,8 +9,8 @@ from ccnn_torch.identification.identify import Identification
 from ccnn_torch.identification.page.report import save_identified_arrays, write_identified_report
 from ccnn_torch.identification.page.tables import identified_markdown, write_identified_csv
 from ccnn_torch.mechanisms import SerialArm
-from ccnn_torch.mechanisms.arm_files import dh_text, urdf_text
-from ccnn_torch.mechanisms.mechanism_file import mechanism_text
+from ccnn_torch.mechanisms.files.mechanism_file import mechanism_text
+from ccnn_torch.mechanisms.files.write_arm import dh_text, urdf_text
 from ccnn_torch.report.json_files import write_json
 
 __all__ = ["RESULTS", "write_machine", "write_outputs"]

@@ -26,8 +26,8 @@ from ccnn_torch.evolution.refinement import (
     step_refinement,
 )
 from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
-from ccnn_torch.learners._protocol import TrainingData
-from ccnn_torch.learners._rows import mean_square, usable_rows
+from ccnn_torch.learners.protocol import TrainingData
+from ccnn_torch.learners.rows import mean_square, usable_rows
 
 __all__ = ["BPLM", "BPLMSettings"]
 

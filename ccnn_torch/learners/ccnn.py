@@ -17,8 +17,8 @@ from ccnn_torch.evolution.random import member_seeds
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
 from ccnn_torch.evolution.waves import Waves
-from ccnn_torch.learners._protocol import TrainingData
-from ccnn_torch.learners._structure import MemberRows, Structure
+from ccnn_torch.learners.protocol import TrainingData
+from ccnn_torch.learners.structure import MemberRows, Structure
 
 __all__ = ["CCNN", "CCNNSettings"]
 

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ccnn_torch.learners._protocol import TrainingData
-from ccnn_torch.learners._rows import mean_square, usable_rows
+from ccnn_torch.learners.protocol import TrainingData
+from ccnn_torch.learners.rows import mean_square, usable_rows
 
 __all__ = ["Constant", "ConstantNetwork"]
 

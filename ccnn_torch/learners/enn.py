@@ -24,8 +24,8 @@ from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import check_evolution
 from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
-from ccnn_torch.learners._protocol import TrainingData
-from ccnn_torch.learners._rows import mean_square, usable_rows
+from ccnn_torch.learners.protocol import TrainingData
+from ccnn_torch.learners.rows import mean_square, usable_rows
 
 __all__ = ["ENN", "ENNSettings"]
 

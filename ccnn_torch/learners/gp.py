@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
-from ccnn_torch.learners._gp_posterior import GPNetwork, covariance, spread_factor
-from ccnn_torch.learners._protocol import TrainingData
-from ccnn_torch.learners._rows import usable_rows
+from ccnn_torch.learners.gp_posterior import GPNetwork, covariance, spread_factor
+from ccnn_torch.learners.protocol import TrainingData
+from ccnn_torch.learners.rows import usable_rows
 
 if TYPE_CHECKING:
-    from ccnn_torch.learners._gp_evidence import GPPrior
+    from ccnn_torch.learners.gp_evidence import GPPrior
 
 __all__ = ["GPSettings", "GaussianProcess"]
 
@@ -116,7 +116,7 @@ class GaussianProcess:
         Raises:
             MethodFailedError: a training row is not finite.
         """
-        from ccnn_torch.learners._gp_evidence import GPPrior
+        from ccnn_torch.learners.gp_evidence import GPPrior
 
         settings, data = self.settings, usable_rows(data)
         r, _, i = data.inputs.shape
@@ -162,7 +162,7 @@ class GaussianProcess:
 
     def step(self) -> dict[str, Tensor]:
         """One marginal likelihood of every output whose search goes on, and one step of Rprop."""
-        from ccnn_torch.learners._gp_evidence import log_evidence
+        from ccnn_torch.learners.gp_evidence import log_evidence
 
         state = self._state
         slope = torch.zeros_like(state["theta"])

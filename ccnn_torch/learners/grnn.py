@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.random import uniform
-from ccnn_torch.learners._grnn_network import GRNNNetwork, KernelVariance
-from ccnn_torch.learners._kernel import FARTHEST, blocked_means
-from ccnn_torch.learners._protocol import TrainingData
-from ccnn_torch.learners._rows import mean_square, usable_rows
+from ccnn_torch.learners.grnn_network import GRNNNetwork, KernelVariance
+from ccnn_torch.learners.kernel import FARTHEST, blocked_means
+from ccnn_torch.learners.protocol import TrainingData
+from ccnn_torch.learners.rows import mean_square, usable_rows
 
 __all__ = ["GRNN", "GRNNSettings"]
 

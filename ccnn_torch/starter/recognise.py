@@ -10,7 +10,7 @@ import numpy as np
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
-from ccnn_torch.mechanisms._registry import REGISTRY
+from ccnn_torch.mechanisms.registry import REGISTRY
 from ccnn_torch.records import DEFAULT_COVARIATES
 from ccnn_torch.records.pose_columns import EULER_ANGLES
 from ccnn_torch.records.table import Table

@@ -1,5 +1,5 @@
 """Conformance checks for plug-ins: each raises AssertionError with a sentence that says what is wrong."""
 
-from ccnn_torch.testing._effect import check_effect as check_effect
-from ccnn_torch.testing._learner import check_learner as check_learner
-from ccnn_torch.testing._mechanism import check_mechanism as check_mechanism
+from ccnn_torch.testing.effect import check_effect as check_effect
+from ccnn_torch.testing.learner import check_learner as check_learner
+from ccnn_torch.testing.mechanism import check_mechanism as check_mechanism

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution._gauss_newton import dense_jacobian, linearise, network_of, residual
+from ccnn_torch.evolution.gauss_newton import dense_jacobian, linearise, network_of, residual
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves, wave_signal
 from ccnn_torch.learners import TrainingData
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Overconstrained2Dof, load_mechanism
-from ccnn_torch.mechanisms._closed_forms import crank_angle
+from ccnn_torch.mechanisms.machines.closed_forms import crank_angle
 from ccnn_torch.numerics.least_squares import jacobian_of
 
 A, H, L, H_S = 0.150, 0.402, 0.317, 0.080

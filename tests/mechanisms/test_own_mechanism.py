@@ -9,7 +9,7 @@ from catalogue import OWN_MECHANISM
 from ccnn_torch.coordinates import Coordinate, Parameter, plausible_error
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
-from ccnn_torch.mechanisms._pose import frame_jacobian
+from ccnn_torch.mechanisms.pose import frame_jacobian
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
 
 DOCS = Path(__file__).parents[2] / "docs" / "how_to" / "mechanisms.md"

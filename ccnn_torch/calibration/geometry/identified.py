@@ -13,7 +13,7 @@ from ccnn_torch.compensation import Geometry, default_limit, fit_geometry_module
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry
 from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
-from ccnn_torch.mechanisms.frames import ROTATION_WEIGHT
+from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
 

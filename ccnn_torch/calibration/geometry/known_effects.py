@@ -18,7 +18,7 @@ from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry
 from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.mechanisms.frames import fit_frames
+from ccnn_torch.mechanisms.frames.fit import fit_frames
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split

@@ -17,7 +17,7 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism, mechanism_of_file
-from ccnn_torch.mechanisms.mechanism_file import MechanismFile, read_mechanism_file
+from ccnn_torch.mechanisms.files.mechanism_file import MechanismFile, read_mechanism_file
 
 __all__ = ["IdentifiedGeometry", "load_compensation", "load_geometry", "sign_model"]
 

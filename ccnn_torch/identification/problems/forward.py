@@ -13,7 +13,7 @@ from ccnn_torch.identification.problems.problem import Problem
 from ccnn_torch.identification.problems.rows import check_finite, covariance, gather_rows
 from ccnn_torch.identification.problems.whitened import Geometry, whitened_problem
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ccnn_torch.mechanisms.frames import ROTATION_WEIGHT, TOOL_SPREAD
-from ccnn_torch.mechanisms.serial import SerialArm
+from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, TOOL_SPREAD
+from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
 from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector

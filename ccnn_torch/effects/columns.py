@@ -1,0 +1,119 @@
+"""What several effects share: columns by joint, typical sizes by unit, moves about a point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.effects.situation import Situation
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
+from ccnn_torch.numerics.rotations import skew
+
+__all__ = [
+    "TWIST",
+    "by_joint",
+    "caused_by",
+    "of_rows",
+    "one_by_one",
+    "own_parameters",
+    "parameter_columns",
+    "per_force",
+    "shown_columns",
+    "twist_columns",
+]
+
+_SHOWN = 1e-9
+
+TWIST = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
+"""A small shift and a small turn, as names and units of its six numbers."""
+
+
+def by_joint(values: Tensor, joints: Sequence[int] | None = None) -> Tensor:
+    """Columns that move one joint each: those of the first joint, then those of the second …
+
+    Args:
+        values: change of each joint per unit of its own coefficients, `... x s x n x m`.
+        joints: numbers, from 0, of the joints that have columns; None = all.
+
+    Returns:
+        `... x s x n x (number of joints · m)`.
+    """
+    n, m = values.shape[-2:]
+    eye = torch.eye(n, dtype=values.dtype, device=values.device).unsqueeze(-1)
+    blocks = values.unsqueeze(-2) * eye
+    if joints is not None and list(joints) != list(range(n)):
+        blocks = blocks[..., list(joints), :]
+    return blocks.reshape(*values.shape[:-1], blocks.shape[-2] * m)
+
+
+def one_by_one(values: Tensor, joints: Sequence[int] | None = None) -> Tensor:
+    """`by_joint` without its zeros: of each column the change of the one joint that it moves, `... x s x m`."""
+    chosen = values if joints is None else values[..., list(joints), :]
+    return chosen.flatten(-2)
+
+
+def of_rows(values: Tensor, rows: Tensor | None, dim: int = -2) -> Tensor:
+    """Some of the rows, which count along `dim`; all where rows is None."""
+    return values if rows is None else values.index_select(dim, rows)
+
+
+def per_force(unit: str) -> str:
+    """Unit of a compliance of a joint of this unit."""
+    return f"{unit}/{'N' if unit == 'm' else 'N/m'}"
+
+
+def own_parameters(mechanism: Mechanism) -> list[int]:
+    """Numbers of the parameters that are the mechanism's own: not those of its base frame and tool frame."""
+    first, last = 0, len(mechanism.geometry)
+    if isinstance(mechanism, SerialArm):
+        return list(range(6, last - 6))
+    if isinstance(mechanism, Framed):
+        first, last = (6 if mechanism.base else 0), last - (6 if mechanism.tool else 0)
+    return list(range(first, last))
+
+
+def caused_by(mechanism: Mechanism, cause: str) -> list[int]:
+    """Numbers of the mechanism's own parameters that are wrong by this cause, ``geometry`` where they name none."""
+    return [k for k in own_parameters(mechanism) if (mechanism.geometry[k].cause or "geometry") == cause]
+
+
+def parameter_columns(situation: Situation, cause: str) -> Tensor:
+    """Change of the mechanism's parameters by one in each of those that `caused_by` gives, `... x s x k x m`."""
+    chosen = torch.eye(len(situation.mechanism.geometry), dtype=situation.joints.dtype, device=situation.joints.device)
+    chosen = chosen[:, caused_by(situation.mechanism, cause)]
+    return chosen.expand(*situation.joints.shape[:-1], *chosen.shape)
+
+
+def twist_columns(situation: Situation, arm: Tensor, axes: Tensor) -> Tensor:
+    """Change of the measured frame by a shift along and a turn about three axes, as far as the pose shows it.
+
+    Args:
+        situation: `... x s` rows.
+        arm: from the point that the turn leaves where it is to the measured point, `... x s x 3` [m].
+        axes: unit vectors in its columns, `... x s x 3 x 3`.
+
+    Returns:
+        `... x s x c x 6`.
+    """
+    shift = torch.cat([axes, -skew(arm) @ axes], -1)
+    turn = torch.cat([torch.zeros_like(axes), axes], -1)
+    whole = shift if situation.visible.shape[-1] == 3 else torch.cat([shift, turn], -2)
+    return situation.visible @ whole
+
+
+def shown_columns(situation: Situation, columns: Callable[[Situation], Tensor]) -> list[int]:
+    """Numbers of the columns that change what is measured anywhere in the workspace, whatever the rows are.
+
+    Args:
+        situation: whose mechanism counts.
+        columns: rows -> `... x s x c x m`.
+    """
+    samples = situation.samples
+    # Kept with the samples: a graph that is traced can ask no values.
+    known: dict[Callable[[Situation], Tensor], list[int]] = samples.__dict__.setdefault("_shown", {})
+    if columns not in known:
+        largest = torch.nan_to_num(columns(samples)).abs().amax((-3, -2))
+        known[columns] = torch.nonzero(largest > _SHOWN).flatten().tolist()
+    return known[columns]

@@ -1,0 +1,126 @@
+"""What an effect is: one physical cause of a gap. A new one is one file that fills in these verbs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+from torch import Tensor
+
+from ccnn_torch.effects.situation import Situation
+from ccnn_torch.mechanisms import Mechanism
+
+__all__ = ["Coefficient", "Effect", "Kind", "Shape", "missing_verbs"]
+
+Kind = Literal["joints", "parameters", "pose"]
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """A parameter that the effect is linear in; 0 = the effect is absent.
+
+    Attributes:
+        name: as results name it, with the joint or leg that it belongs to, e.g. ``q2`` or ``leg 1 l``.
+        unit: SI unit.
+        scale: plausible size in a machine as built [unit], one standard deviation.
+        joint: name of the joint that it belongs to alone, or None.
+        leg: number of the leg that it belongs to alone, or None.
+        secondary: whether it stands for what the textbook form leaves out (a stiffening spring, a second harmonic); a
+            simulation leaves it 0 unless told otherwise.
+        borrowed: whether by itself it is what another effect does (a constant part): it does not speak for this
+            one.
+        doubtful: whether something else may do the same as time goes by (a mount that follows the temperature, which
+            rises from morning to noon): it speaks for this effect where the gap follows what the effect needs.
+        mends: whether it is but a correction of the form of the others, and cannot be many times as large as they are.
+        positive: whether physics allows it no negative value (play, compliance); for drawing it in a simulation.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    joint: str | None = None
+    leg: int | None = None
+    secondary: bool = False
+    borrowed: bool = False
+    doubtful: bool = False
+    mends: bool = False
+    positive: bool = False
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A parameter that the effect is not linear in: a period, a lag, a width. Found by search over `grid`.
+
+    Attributes:
+        name: as results name it.
+        unit: SI unit.
+        grid: values to look at, ascending; the search refines between neighbours and never leaves the grid's ends.
+        columns: which coefficients depend on it, or None where all do; shapes without a common coefficient are
+            searched one by one.
+        refined: whether values between those of the grid are possible.
+        usual: what a simulation takes unless told otherwise; drawn from the lower half of the grid where None.
+    """
+
+    name: str
+    unit: str
+    grid: tuple[float, ...]
+    columns: tuple[int, ...] | None = None
+    usual: float | None = None
+    refined: bool = True
+
+
+@runtime_checkable
+class Effect(Protocol):
+    """One physical cause, linear in its coefficients for given shapes.
+
+    The same object is injected in a simulation, fitted in a diagnosis, and used in a compensator.
+
+    Attributes:
+        name: by which configs and verdicts call it.
+        kind: what it changes: the ``joints`` that the machine really takes, the mechanism's ``parameters``, or the
+            measured ``pose`` (position and rotation vector in the base frame).
+        description: one line for people.
+        ordered: whether it needs the rows in the order measured.
+    """
+
+    name: str
+    kind: Kind
+    description: str
+    ordered: bool
+
+    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
+        """What the records lack for it, in words that say which column to add; empty where nothing is missing."""
+
+    def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
+        """Its `m` coefficients on this mechanism with these covariates."""
+
+    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
+        """Its `h` shapes; () where it has none."""
+
+    def basis(self, situation: Situation, shape: Tensor) -> Tensor:
+        """Change per unit of each coefficient.
+
+        Args:
+            situation: `... x s` rows.
+            shape: `... x h` [SI].
+
+        Returns:
+            `... x s x d x m`, d = joints [joint's unit], parameters [parameter's unit], or channels of the pose (3
+            without orientation, else 6) [m, rad], each per unit of the coefficient. Finite for every finite input.
+        """
+
+
+_VERBS = ("missing", "coefficients", "shapes", "basis")
+_KINDS = ("joints", "parameters", "pose")
+
+
+def missing_verbs(effect: object) -> list[str]:
+    """What `effect` lacks of `Effect`."""
+    lacking = [verb for verb in _VERBS if not callable(getattr(effect, verb, None))]
+    lacking += [a for a in ("name", "description") if not isinstance(getattr(effect, a, None), str)]
+    if getattr(effect, "kind", None) not in _KINDS:
+        lacking.append(f"kind (one of {', '.join(_KINDS)})")
+    if not isinstance(getattr(effect, "ordered", None), bool):
+        lacking.append("ordered (True or False)")
+    return lacking

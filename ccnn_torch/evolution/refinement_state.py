@@ -1,0 +1,201 @@
+"""What a refinement is of and how far it is, as plain values, and some of its networks picked from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Literal, NamedTuple
+
+from torch import Tensor
+
+from ccnn_torch.evolution.gauss_newton import Network
+from ccnn_torch.evolution.waves import Waves
+
+__all__ = [
+    "Refined",
+    "RefinementProblem",
+    "RefinementSettings",
+    "RefinementState",
+    "SecondOrder",
+    "part_of_problem",
+    "part_of_state",
+    "put_part",
+]
+
+# Calm iterations after which a network is done.
+_CALM = 3
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """How to refine.
+
+    Attributes:
+        iterations: Levenberg-Marquardt iterations.
+        bayesian: estimate the precisions of prior and noise; else `ridge` is the prior's and 1 the noise's.
+        ridge: precision of the prior where `bayesian` is off.
+        groups: which weights share a prior precision: all of the `network`; those of a `layer`, its biases apart; or
+            those of a `unit`: as `layer`, but one for each input of the network and one for each of its outputs. The
+            biases of the output are never held back: they are the mean.
+        noise: one noise precision for all channels (`shared`) or one for each (`channel`).
+        first_prior: prior precision before its first estimate.
+        warm_up: iterations before the first estimate of the precisions.
+        prior_shape, prior_rate: Gamma distribution that the prior precisions themselves are drawn from; they then are
+            (gamma + 2 shape) / (sum w^2 + 2 rate). With a hundred rows and small groups of weights this holds back
+            what the estimate of gamma alone would let through; with many rows it makes no difference.
+        damping: first damping, relative to the diagonal of H.
+        trials: dampings tried in an iteration before it is given up.
+        tolerance: a network whose objective falls by less than this share in each of three iterations running is done;
+            0 = all iterations are made.
+    """
+
+    iterations: int = 50
+    bayesian: bool = True
+    ridge: float = 1e-6
+    groups: Literal["network", "layer", "unit"] = "unit"
+    noise: Literal["shared", "channel"] = "channel"
+    first_prior: float = 1e-3
+    warm_up: int = 3
+    prior_shape: float = 1.0
+    prior_rate: float = 0.1
+    damping: float = 1e-2
+    trials: int = 6
+    tolerance: float = 1e-5
+
+
+@dataclass(frozen=True)
+class RefinementProblem:
+    """What stays fixed: `b` networks (the leading dimensions in one), their data and the settings.
+
+    Attributes:
+        network: masks of the `b` networks and what follows from them.
+        inputs: `b x s x i`.
+        targets: `b x s x o`.
+        rows: row weights, `b x s`.
+        metric: `b x s x c x o`, or None.
+        groups: prior group of every weight, `k`, int64; the last group is never held back.
+        leading: the leading dimensions as given.
+        group_count: number of prior groups, that last one included.
+        wave_groups: which of them are of periodic nodes, int64.
+        settings: as given.
+    """
+
+    network: Network
+    inputs: Tensor
+    targets: Tensor
+    rows: Tensor
+    metric: Tensor | None
+    groups: Tensor
+    leading: tuple[int, ...]
+    group_count: int
+    wave_groups: Tensor
+    settings: RefinementSettings
+
+
+@dataclass(frozen=True)
+class RefinementState:
+    """What changes from iteration to iteration.
+
+    Attributes:
+        weights: `b x k`.
+        damping: `b`.
+        prior: precision of each prior group, `b x g`.
+        noise: precision of each channel's noise, `b x c`.
+        effective: weights determined by the data, per prior group, `b x g`.
+        calm: iterations running that lowered the objective by less than the tolerance, `b` int64.
+        iteration: iterations done, 0-d, int64.
+    """
+
+    weights: Tensor
+    damping: Tensor
+    prior: Tensor
+    noise: Tensor
+    effective: Tensor
+    calm: Tensor
+    iteration: Tensor
+
+    @property
+    def done(self) -> Tensor:
+        """Networks that do not move any more, `b` bool."""
+        return self.calm >= _CALM
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    @classmethod
+    def from_state_dict(cls, state: dict[str, Tensor]) -> RefinementState:
+        """Inverse of `state_dict`."""
+        return cls(**{f.name: state[f.name] for f in fields(cls)})
+
+
+class SecondOrder(NamedTuple):
+    """Gradient `b x m` and Gauss-Newton matrix `b x m x m` of the objective in the network's kept weights.
+
+    Inactive ones among them have the gradient 0 and 1 on the diagonal.
+    """
+
+    gradient: Tensor
+    matrix: Tensor
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Refined networks.
+
+    Attributes:
+        weights: per layer `... x out x in (+ 1)`; those that take no part are as they were given.
+        waves: periodic nodes with their refined frequencies, `... x k`.
+        error: weighted mean square of the residual in its channels, on the rows refined on, `...`.
+        objective: misfit and penalty under the last precisions, `...`.
+        effective_parameters: weights determined by the data, `...`.
+        noise: precision of each channel's noise, `... x c`.
+        log_evidence: logarithm of the probability of the targets given the masks and precisions, up to a constant of
+            the data (MacKay 1992, eq. 2.23); compares networks refined on the same rows. `...`.
+        iterations: iterations done.
+    """
+
+    weights: list[Tensor]
+    waves: Waves
+    error: Tensor
+    objective: Tensor
+    effective_parameters: Tensor
+    noise: Tensor
+    log_evidence: Tensor
+    iterations: int
+
+
+def part_of_problem(problem: RefinementProblem, index: Tensor) -> RefinementProblem:
+    """The problem of some of the networks, numbered as they stand in the batch; they lead in one dimension."""
+    if len(index) == len(problem.rows):
+        return problem
+    network = problem.network
+    return replace(
+        problem,
+        leading=(len(index),),
+        network=replace(
+            network,
+            masks=[mask[index] for mask in network.masks],
+            alive=[alive[index] for alive in network.alive],
+            active=network.active[index],
+            source=network.source[index],
+            kept=[kept[index] for kept in network.kept],
+        ),
+        inputs=problem.inputs[index],
+        targets=problem.targets[index],
+        rows=problem.rows[index],
+        metric=None if problem.metric is None else problem.metric[index],
+    )
+
+
+def part_of_state(state: RefinementState, index: Tensor) -> RefinementState:
+    """The state of some of the networks."""
+    tensors = state.state_dict()
+    return RefinementState(**{name: value[index] if value.dim() else value for name, value in tensors.items()})
+
+
+def put_part(state: RefinementState, index: Tensor, part: RefinementState) -> RefinementState:
+    """A state with that of some of the networks renewed."""
+    old, new = state.state_dict(), part.state_dict()
+    return RefinementState(
+        **{name: old[name].index_copy(0, index, new[name]) if old[name].dim() else new[name] for name in old}
+    )

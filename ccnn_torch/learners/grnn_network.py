@@ -1,0 +1,137 @@
+"""The general regression neural network of one repeat as a plain module, for export."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ccnn_torch.learners.kernel import block_size
+
+__all__ = ["GRNNNetwork", "KernelVariance"]
+
+# Rows' worth of belief in the overall variance: a few squared residuals scatter by a factor of several.
+_PRIOR_ROWS = 10.0
+# A power of two: the ONNX exporter rounds numbers in the code to single precision.
+_SMALLEST_VARIANCE = 2.0**-40
+
+
+class KernelVariance(NamedTuple):
+    """Squared leave-one-out residuals, and what they are compared with.
+
+    Attributes:
+        rows: inputs of the judged rows, `m x i` [1].
+        log_weights: `m`.
+        squares: squared residuals without the error of the mean they are taken from, `m x o` [1].
+        whole: variance of the targets, `o` [1].
+    """
+
+    rows: Tensor
+    log_weights: Tensor
+    squares: Tensor
+    whole: Tensor
+
+
+class GRNNNetwork(nn.Module):
+    """Kernel sums over stored rows; finite for features up to 1e100.
+
+    It does not bound features itself: a compensator does, and bounded twice (for output and variance) they are exported
+    to a graph that cannot be loaded.
+
+    Args:
+        rows, targets: `n x i` and `n x o` [1].
+        log_weights: logarithms of the rows' weights, `n`.
+        inverse_bandwidths: 1 / h, `i`; 0 = the input is switched off.
+        residuals: for the variance.
+    """
+
+    rows: Tensor
+    targets: Tensor
+    log_weights: Tensor
+    inverse_bandwidths: Tensor
+    judged: Tensor
+    judged_log_weights: Tensor
+    squares: Tensor
+    noise: Tensor
+    explained: Tensor
+
+    def __init__(
+        self,
+        rows: Tensor,
+        targets: Tensor,
+        log_weights: Tensor,
+        inverse_bandwidths: Tensor,
+        residuals: KernelVariance,
+    ) -> None:
+        super().__init__()
+        shares = torch.softmax(residuals.log_weights, 0)
+        noise = (residuals.squares * shares.unsqueeze(-1)).sum(0)
+        for name, value in (
+            ("rows", rows),
+            ("targets", targets),
+            ("log_weights", log_weights),
+            ("inverse_bandwidths", inverse_bandwidths),
+            ("judged", residuals.rows),
+            ("judged_log_weights", residuals.log_weights),
+            ("squares", residuals.squares),
+            ("noise", noise),
+            ("explained", (residuals.whole - noise).clamp_min(0)),
+        ):
+            self.register_buffer(name, value.clone())
+
+    def forward(self, features: Tensor) -> Tensor:
+        """features: `... x i` [1]; returns `... x o` [1]."""
+        return self._by_blocks(self._output, features)
+
+    def variance(self, features: Tensor) -> Tensor:
+        """Variance of a newly measured output. features: `... x i` [1]; returns `... x o` [1]."""
+        return self._by_blocks(self._variance, features)
+
+    def _output(self, features: Tensor) -> Tensor:
+        kernels, _ = self._kernels(features, self.rows, self.log_weights)
+        return kernels @ self.targets / kernels.sum(-1, keepdim=True)
+
+    def _variance(self, features: Tensor) -> Tensor:
+        kernels, _ = self._kernels(features, self.judged, self.judged_log_weights)
+        total = kernels.sum(-1, keepdim=True)
+        count = total * total / (kernels * kernels).sum(-1, keepdim=True)
+        noise = (count * (kernels @ self.squares / total) + _PRIOR_ROWS * self.noise) / (count + _PRIOR_ROWS)
+        kernels, nearest = self._kernels(features, self.rows, self.log_weights)
+        total = kernels.sum(-1, keepdim=True)
+        unsure = noise * (1 + (kernels * kernels).sum(-1, keepdim=True) / (total * total))
+        backed = torch.minimum(torch.exp(nearest) * total, torch.ones_like(total))
+        found = unsure + (1 - backed) * self.explained
+        return torch.maximum(found, torch.full_like(found, _SMALLEST_VARIANCE))
+
+    def _kernels(self, features: Tensor, rows: Tensor, log_weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Kernels of all rows in units of the largest, `... x n`, and its logarithm, `... x 1`."""
+        apart = features.unsqueeze(-2) - rows
+        exponents = log_weights - (apart * apart) @ (self.inverse_bandwidths * self.inverse_bandwidths / 2)
+        nearest = exponents.amax(-1, keepdim=True)
+        return torch.exp(exponents - nearest), nearest
+
+    def _by_blocks(self, of: Callable[[Tensor], Tensor], features: Tensor) -> Tensor:
+        """Any number of rows in bounded memory; one block while the network is traced for a file."""
+        count = max(1, block_size(features) // self.rows.numel())
+        if torch.compiler.is_exporting() or features.shape[:-1].numel() <= count:
+            return of(features)
+        parts = [of(part) for part in torch.split(features.reshape(-1, features.shape[-1]), count)]
+        return torch.cat(parts).reshape(*features.shape[:-1], -1)
+
+    def describe(self) -> dict[str, Any]:
+        """What a model file needs to build the module again, beside its tensors."""
+        (rows, inputs), (judged, outputs) = self.rows.shape, self.squares.shape
+        return {"kind": "grnn", "rows": rows, "inputs": inputs, "judged": judged, "outputs": outputs}
+
+    @classmethod
+    def from_description(cls, description: dict[str, Any]) -> GRNNNetwork:
+        """An empty module of the described shape, for its tensors to be loaded into."""
+        rows, inputs, judged, outputs = (int(description[key]) for key in ("rows", "inputs", "judged", "outputs"))
+
+        def empty(*shape: int) -> Tensor:
+            return torch.zeros(*shape, dtype=torch.float64)
+
+        residuals = KernelVariance(empty(judged, inputs), empty(judged), empty(judged, outputs), empty(outputs))
+        return cls(empty(rows, inputs), empty(rows, outputs), empty(rows), empty(inputs), residuals)

@@ -1,0 +1,33 @@
+"""Training rows without what stands in padded ones, and the error on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.learners.protocol import TrainingData
+
+__all__ = ["mean_square", "usable_rows"]
+
+
+def usable_rows(data: TrainingData) -> TrainingData:
+    """The same rows with zeros in those of weight 0, which may hold anything, NaN included.
+
+    Raises:
+        MethodFailedError: a row that counts is not finite.
+    """
+    there = (data.weights > 0).unsqueeze(-1)
+    inputs, targets = (torch.where(there, part, 0.0) for part in (data.inputs, data.targets))
+    metric = None if data.metric is None else torch.where(there.unsqueeze(-1), data.metric, 0.0)
+    for part, name in ((inputs, "inputs"), (targets, "outputs"), (metric, "metric")):
+        if part is not None and not bool(part.isfinite().all()):
+            raise MethodFailedError(f"the training rows' {name} are not all finite; remove those rows")
+    return replace(data, inputs=inputs, targets=targets, metric=metric)
+
+
+def mean_square(error: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean over rows, mean over outputs. error: `... x s x o`; weights: `... x s`; returns `...`."""
+    return (error.square().mean(-1) * weights).sum(-1) / weights.sum(-1)

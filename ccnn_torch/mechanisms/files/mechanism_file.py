@@ -1,0 +1,117 @@
+"""Our own mechanism file: which mechanism, which keys, and every parameter's nominal and identified value.
+
+mechanism: five_bar
+keys: {}
+parameters:
+  A1x: {value: -0.5057, nominal: -0.5, unit: m}
+  …
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+from ruamel.yaml import YAML
+
+from ccnn_torch.display import visible
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.read import CONFIG_LIMIT, read_text
+from ccnn_torch.files.yaml_file import parse_yaml
+from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.units import LARGEST
+
+__all__ = ["MechanismFile", "mechanism_text", "read_mechanism_file"]
+
+_FORM = "a mechanism file has mechanism, keys and parameters: {NAME: {value: …, nominal: …, unit: …}}"
+
+
+class MechanismFile:
+    """What a mechanism file says; `recipe` builds the mechanism, `values` and `nominal` are its parameters by name."""
+
+    def __init__(self, path: str, content: Mapping[str, Any]) -> None:
+        """Check the form; names and units are checked against the mechanism by `parameters_of`.
+
+        Raises:
+            InputError: names the file and the key.
+        """
+        self.path = path
+        spec, keys, parameters = (content.get(k) for k in ("mechanism", "keys", "parameters"))
+        if not isinstance(spec, str) or not isinstance(keys, Mapping) or not isinstance(parameters, Mapping):
+            raise InputError(f"{path}: {_FORM}")
+        self.spec, self.keys = spec, dict(keys)
+        self._entries: Mapping[str, Any] = parameters
+
+    def parameters_of(self, mechanism: Mechanism, what: str) -> dict[str, float]:
+        """Values by name, `what` being "value" or "nominal" [SI].
+
+        Raises:
+            InputError: a parameter is missing, unknown, in another unit, or no number; names it.
+        """
+        known = {p.name: p.unit for p in mechanism.geometry}
+        wrong = sorted(set(known) ^ set(self._entries))
+        if wrong:
+            raise InputError(
+                f"{self.path}: parameters: {mechanism.name} has {', '.join(known)}; check {', '.join(map(str, wrong))}"
+            )
+        found = {}
+        for name, unit in known.items():
+            entry = self._entries[name]
+            value = entry.get(what) if isinstance(entry, Mapping) else None
+            if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+                shown = visible(repr(value))
+                raise InputError(f"{self.path}: parameters.{name}.{what}: must be a finite number, not {shown}")
+            if entry.get("unit") != unit:
+                raise InputError(f"{self.path}: parameters.{name}.unit: must be {unit}, not {entry.get('unit')!r}")
+            found[name] = float(value)
+        return found
+
+
+def read_mechanism_file(path: str, content: bytes | None = None) -> MechanismFile | None:
+    """What the file says, or None where it is no mechanism file: has no key `mechanism`, or cannot be read at all.
+
+    Args:
+        path: of the file.
+        content: its bytes, where they were read already.
+
+    Raises:
+        InputError: it has the key `mechanism` and lacks another one.
+    """
+    try:
+        text = read_text(path, CONFIG_LIMIT) if content is None else content.decode("utf-8")
+        tree = parse_yaml(text, path)
+    except (InputError, UnicodeDecodeError):
+        # Whoever asked knows what else the file should have been, and says so.
+        return None
+    if not isinstance(tree, Mapping) or "mechanism" not in tree:
+        return None
+    return MechanismFile(path, tree)
+
+
+def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float]) -> str:
+    """A mechanism file's text; `load_mechanism` of it gives the same mechanism with the same parameters, bit by bit.
+
+    Args:
+        mechanism: with the identified parameters as its nominal ones.
+        nominal: what was there before, by name [SI].
+
+    Raises:
+        InputError: the mechanism's class stands in no file.
+    """
+    about = mechanism.describe()
+    tree = {
+        "mechanism": about["spec"],
+        "keys": about["keys"],
+        "parameters": {
+            p.name: {"value": about["parameters"][p.name], "nominal": nominal[p.name], "unit": p.unit}
+            for p in mechanism.geometry
+        },
+    }
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.width = 120
+    setattr(yaml, "sort_base_mapping_type_on_output", False)  # noqa: B010 - ruamel declares its type as None
+    text = io.StringIO()
+    yaml.dump(tree, text)
+    return text.getvalue()

@@ -1,0 +1,109 @@
+"""A serial arm for other tools: its DH table as a file that `read_dh_file` reads, and the arm as a URDF."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+import torch
+from ruamel.yaml import YAML
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.machines.link_frames import compose
+from ccnn_torch.mechanisms.machines.serial import SerialArm
+from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, rotation_vector_to_matrix
+
+__all__ = ["dh_text", "urdf_text"]
+
+_CONVENTIONS = {
+    "standard": "standard Denavit-Hartenberg; link i = Rz(q_i + theta_i) * Tz(d_i) * Tx(a_i) * Rx(alpha_i)",
+    "modified": "modified Denavit-Hartenberg (Craig); link i = Rx(alpha_i) * Tx(a_i) * Rz(q_i + theta_i) * Tz(d_i)",
+}
+
+
+def dh_text(arm: SerialArm) -> str:
+    """The arm's nominal parameters as a DH file in m and rad; `read_dh_file` gives the same floats back.
+
+    Frames that are per group of rows stay unknown, as they are no one transform.
+
+    Raises:
+        InputError: the arm came from a URDF, whose links are no DH table.
+    """
+    if arm.convention not in _CONVENTIONS:
+        raise InputError(f"arm '{arm.name}' is described by a URDF and has no Denavit-Hartenberg table; write a URDF")
+    values = arm.nominal.tolist()
+    links = arm.nominal[6:-6].reshape(len(arm.joints), -1).T.tolist()
+    tree: dict[str, Any] = {
+        "robot": arm.name,
+        "dof": len(arm.joints),
+        "convention": _CONVENTIONS[arm.convention],
+        "units": {"length": "m", "angle": "rad"},
+        "joint_types": ["revolute" if r else "prismatic" for r in arm.revolute.tolist()],
+        "joint_sign": arm.signs.tolist(),
+        **dict(zip(("a", "alpha", "d", "theta"), links, strict=True)),
+        "parallel_axes": [list(group) for group in arm.parallel_axes],
+        "base_frame": "unknown" if arm.frame_per else values[:6],
+        "tool_frame": "unknown" if arm.tool_per else values[-6:],
+        "frame_per": list(arm.frame_per),
+        "tool_per": list(arm.tool_per),
+    }
+    if arm.orientation == "none" and arm.recipe["keys"]["tool_offset"] is not None:
+        tree["tool_offset"] = "unknown" if arm.tool_per else values[-6:-3]
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.width = 200
+    setattr(yaml, "sort_base_mapping_type_on_output", False)  # noqa: B010 - ruamel declares its type as None
+    text = io.StringIO()
+    yaml.dump(tree, text)
+    return text.getvalue()
+
+
+def urdf_text(arm: SerialArm) -> str:
+    """The arm's nominal parameters as a URDF chain `base_link` … `tool`, base and tool frame as fixed joints.
+
+    Each link's fixed transform becomes the origin of the joint behind it (standard DH: the motion comes first) or of
+    its own joint (modified DH, URDF). Roll, pitch and yaw are the file's form of a rotation, so a number may differ
+    from ours in its last digit. Limits are those that joints are sampled from; URDF wants an effort and a speed, which
+    a calibration does not know and which are written as 0.
+    """
+    n = len(arm.joints)
+    values = arm.nominal
+    links = values[6:-6].reshape(n, -1)
+    still = torch.zeros(n, dtype=torch.float64)
+    rotations, translations = arm._transform(links, still, still, arm.axes)
+    fixed = [(rotations[i], translations[i]) for i in range(n)]
+    base = rotation_vector_to_matrix(values[3:6]), values[:3]
+    tool = rotation_vector_to_matrix(values[-3:]), values[-6:-3]
+    if arm._axis_before:
+        origins, last = [base, *fixed[:-1]], compose(fixed[-1], tool)
+    else:
+        origins, last = [compose(base, fixed[0]), *fixed[1:]], tool
+    root = Element("robot", name=arm.name)
+    names = ["base_link", *(f"link{i + 1}" for i in range(n)), "tool"]
+    for name in names:
+        SubElement(root, "link", name=name)
+    for i, origin in enumerate(origins):
+        kind = "revolute" if bool(arm.revolute[i]) else "prismatic"
+        joint = _joint(root, arm.joints[i].name, kind, names[i], names[i + 1], origin)
+        SubElement(joint, "axis", xyz=_numbers(arm.axes[i] * arm.signs[i]))
+        low, high = arm.limits[i].tolist()
+        SubElement(joint, "limit", lower=repr(low), upper=repr(high), effort="0", velocity="0")
+    _joint(root, "tool_frame", "fixed", names[-2], names[-1], last)
+    ElementTree.indent(root)
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _joint(root: Element, name: str, kind: str, parent: str, child: str, origin: tuple[Tensor, Tensor]) -> Element:
+    joint = SubElement(root, "joint", name=name, type=kind)
+    SubElement(joint, "parent", link=parent)
+    SubElement(joint, "child", link=child)
+    roll_pitch_yaw = matrix_to_euler_zyx(origin[0]).flip(-1)
+    SubElement(joint, "origin", xyz=_numbers(origin[1]), rpy=_numbers(roll_pitch_yaw))
+    return joint
+
+
+def _numbers(values: Tensor) -> str:
+    return " ".join(repr(v) for v in values.tolist())

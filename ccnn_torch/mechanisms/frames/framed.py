@@ -1,0 +1,270 @@
+"""Any mechanism seen from a measuring device: base and tool frame as parameters beside its own."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.coordinates import Condition, Coordinate, Parameter
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.frames.closed_form_start import best_closed_form, rigid_body_frame
+from ccnn_torch.mechanisms.machines.link_frames import compose
+from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.mechanisms.newton import carry_derivative
+from ccnn_torch.mechanisms.pose import Frame
+from ccnn_torch.numerics.batching import expand_leading
+from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation, rotation_vector_to_matrix, skew
+
+__all__ = ["Framed"]
+
+_FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
+
+
+class Framed(Mechanism):
+    """base · mechanism · tool: its pose is the measured frame x, y, z [m], rx, ry, rz [rad] (a rotation vector).
+
+    A mechanism without orientation has the pose x, y, z. Parameters in order: base_x … base_rz (where the mechanism's
+    base stands in the measuring frame; with `base`), those of the mechanism, tool_x … tool_rz (the measured point and
+    axes on its platform; with `tool`); all frames are nominally the identity. A measured frame may have more
+    coordinates than the mechanism has joints: `solve_inverse` gives the joints of the closest pose in
+    (position, rotation_weight x rotation vector), where `closure` tells what remains. The frame of the mechanism's pose
+    is that of the nominal machine: a parameter that moves the platform at given pose coordinates acts by the joints
+    only.
+
+    Attributes:
+        mechanism: a copy of the mechanism, without hooks.
+        rotation_weight: [m/rad].
+    """
+
+    def __init__(
+        self, mechanism: Mechanism, base: bool = True, tool: bool = False, rotation_weight: float = 0.04
+    ) -> None:
+        """See the class.
+
+        Raises:
+            InputError: a tool on a mechanism without orientation, where it would be a shift of the base.
+        """
+        inner = mechanism.with_nominal(mechanism.nominal)
+        turns = inner.frame(inner.home_pose)[1] is not None
+        if tool and not turns:
+            raise InputError(
+                f"mechanism '{inner.name}' has no orientation: a tool frame would only shift the base; use tool=False"
+            )
+        taken = {f"{place}_{c}" for place in ("base", "tool") for c, _ in _FRAME} & {g.name for g in inner.geometry}
+        if taken:
+            raise InputError(f"mechanism '{inner.name}' has frames of its own: {', '.join(sorted(taken))}")
+        frames = {place: [Parameter(f"{place}_{c}", u, 0.0) for c, u in _FRAME] for place in ("base", "tool")}
+        start = inner.frame(inner.home_pose)
+        super().__init__(
+            name=f"framed_{inner.name}",
+            joints=inner.joints,
+            pose=[Coordinate(c, u) for c, u in (_FRAME if turns else _FRAME[:3])],
+            geometry=[*(frames["base"] if base else []), *inner.geometry, *(frames["tool"] if tool else [])],
+            low=(0.0,) * (6 if turns else 3),
+            high=(0.0,) * (6 if turns else 3),
+            home_pose=_coordinates(*start).tolist(),
+            home_joints=inner.home_joints.tolist(),
+        )
+        self.mechanism = inner
+        self.takes = inner.takes
+        self.base, self.tool, self.rotation_weight = base, tool, rotation_weight
+        # Where the coordinates of the mechanism's pose are those of its frame there is nothing to search.
+        plain = type(inner).frame is Mechanism.frame and type(inner).pose_near is Mechanism.pose_near
+        self._plain = plain and (not turns or len(inner.pose) == 6)
+        self._follow_nominal()
+
+    def _own_file(self) -> dict[str, Any]:
+        keys = {"base": self.base, "tool": self.tool, "rotation_weight": self.rotation_weight}
+        return {"spec": "framed", "keys": {"mechanism": self.mechanism.describe(), **keys}}
+
+    def _follow_nominal(self) -> None:
+        """The mechanism's own nominal parameters; the box around 256 fixed samples, since frames turn it."""
+        self.mechanism.nominal.copy_(self._split(self.nominal)[1])
+        self.mechanism._follow_nominal()
+        self.home_joints.copy_(self.mechanism.home_joints)
+        self.home_pose.copy_(self._seen(self.mechanism.home_pose, self.nominal))
+        samples = self.sample_workspace(256, torch.Generator().manual_seed(0))
+        # Coordinates that the mechanism does not move still need a box that is not empty.
+        self.low.copy_(samples.amin(0) - 1e-6)
+        self.high.copy_(samples.amax(0) + 1e-6)
+
+    def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
+        """Samples of the mechanism, as the measuring device sees them; `count x p` [SI]."""
+        return self._seen(self.mechanism.sample_workspace(count, generator), self.nominal)
+
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """The mechanism's pose of the joints, seen through both frames."""
+        values = self.resolve(parameters)
+        near = None if guess is None else self.mechanism.pose_near(*self._unseen(guess, values)).detach()
+        return self._seen(self.mechanism.forward_kinematics(joints, self._split(values)[1], near), values)
+
+    def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x p`."""
+        return _gap(self.frame(self.forward_kinematics(joints, parameters, pose)), self.frame(pose), 1.0)
+
+    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        """Joints of the closest pose: both frames are taken off, then the mechanism's own inverse kinematics."""
+        return self.nearest_joints(pose, parameters, guess, self.rotation_weight)
+
+    def nearest_joints(
+        self,
+        pose: Tensor,
+        parameters: Tensor | None,
+        guess: Tensor | None,
+        rotation_weight: float,
+        damping: float = 0.0,
+    ) -> Tensor:
+        """As `solve_inverse` with another weight [m/rad]."""
+        values = self.resolve(parameters)
+        return self.mechanism.solve_inverse(self._closest(pose, values, rotation_weight), self._split(values)[1], guess)
+
+    def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        """The mechanism's Jacobian, turned by the base and carried to the tool; see `Mechanism.jacobian`."""
+        values = self.resolve(parameters)
+        base, inner, tool = self._split(values)
+        near = None if guess is None else self.mechanism.pose_near(*self._unseen(guess, values))
+        rows = self.mechanism.jacobian(joints, inner, near)
+        turn = rotation_vector_to_matrix(base[..., 3:])
+        linear = turn @ rows[..., :3, :]
+        platform = self.mechanism.frame(self.mechanism.forward_kinematics(joints, inner, near))[1]
+        if platform is None:
+            return linear
+        angular = turn @ rows[..., 3:, :]
+        lever = (turn @ platform @ tool[..., :3, None])[..., 0]
+        return torch.cat([linear - skew(lever) @ angular, angular], dim=-2)
+
+    def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Whether the mechanism reaches its closest pose; `...`, bool."""
+        values = self.resolve(parameters)
+        closest = self._closest(pose, values, self.rotation_weight)
+        return self.mechanism.reachable(closest, self._split(values)[1])
+
+    def under(self, conditions: Mapping[str, Tensor]) -> Framed:
+        """The mechanism inside under them."""
+        inner = self.mechanism.under(conditions)
+        if inner is self.mechanism:
+            return self
+        twin = copy.copy(self)
+        twin._modules = {**self._modules, "mechanism": inner}
+        return twin
+
+    def lacking(self, conditions: Sequence[str]) -> list[Condition]:
+        """As of the mechanism inside."""
+        return self.mechanism.lacking(conditions)
+
+    def fitted_frames(self, joints: Tensor, measured: Frame) -> Tensor:
+        """Closed-form frames between the nominal mechanism's poses of the joints and measured ones.
+
+        Args:
+            joints: `... x s x n` [SI].
+            measured: position `... x s x 3` [m] and rotation `... x s x 3 x 3` (or None).
+
+        Returns:
+            All parameters, `... x k` [SI], the mechanism's own nominal. Where fewer than three joints have a pose all
+            are nominal.
+        """
+        values = self.nominal.expand(*joints.shape[:-2], -1)
+        inner = self._split(self.nominal)[1]
+        guess = None
+        # Iterative forward kinematics that start at home may end on another branch than from near the measured pose.
+        for _ in range(2):
+            position, rotation = self.mechanism.frame(self.mechanism.forward_kinematics(joints, inner, guess))
+            known = torch.isfinite(position).all(-1)
+            here = torch.where(known[..., None], position, 0.0), rotation
+            if rotation is not None:
+                here = here[0], torch.where(known[..., None, None], rotation, torch.eye(3, dtype=rotation.dtype))
+            enough = (known.sum(-1) >= 3)[..., None]
+            found = self._frames_between(here, measured, torch.where(enough, known, True).to(position.dtype))
+            values = torch.where(enough, found, self.nominal)
+            guess = self.mechanism.pose_near(*self._unframed(measured, values[..., None, :]))
+        return values.detach()
+
+    def _frames_between(self, here: Frame, measured: Frame, weights: Tensor) -> Tensor:
+        """All parameters, `... x k`, with the free frames in closed form."""
+        inner = self._split(self.nominal)[1].expand(*weights.shape[:-1], -1)
+        if self.base and not self.tool:
+            return torch.cat([rigid_body_frame(here, measured, weights, self.rotation_weight), inner], dim=-1)
+        assert here[1] is not None and measured[1] is not None  # a tool without orientation is refused
+        if self.base:
+            tool = self._split(self.nominal)[2]
+            both = best_closed_form(here[1], here[0], measured, tool, weights, self.rotation_weight)
+            return torch.cat([both[..., :6], inner, both[..., 6:]], dim=-1)
+        share = (weights / weights.sum(-1, keepdim=True))[..., None]
+        back = here[1].mT
+        place = (share * (back @ (measured[0] - here[0])[..., None])[..., 0]).sum(-2)
+        turn = nearest_rotation((share[..., None] * (back @ measured[1])).sum(-3))
+        return torch.cat([inner, place, matrix_to_rotation_vector(turn)], dim=-1)
+
+    def _split(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Base frame `... x 6`, the mechanism's parameters, tool frame `... x 6`; 0 where a frame is no parameter."""
+        none = torch.zeros_like(values[..., :1]).expand(*values.shape[:-1], 6)
+        first, last = 6 if self.base else 0, values.shape[-1] - (6 if self.tool else 0)
+        return (
+            values[..., :6] if self.base else none,
+            values[..., first:last],
+            values[..., last:] if self.tool else none,
+        )
+
+    def _seen(self, inner_pose: Tensor, values: Tensor) -> Tensor:
+        """The mechanism's pose as the measuring device sees it, `... x p`."""
+        base, _, tool = self._split(values)
+        position, rotation = self.mechanism.frame(inner_pose)
+        if rotation is None:
+            return base[..., :3] + (rotation_vector_to_matrix(base[..., 3:]) @ position[..., None])[..., 0]
+        whole = compose(compose(_transform(base), (rotation, position)), _transform(tool))
+        return _coordinates(whole[1], whole[0])
+
+    def _unseen(self, pose: Tensor, values: Tensor) -> Frame:
+        """The frame in the mechanism's base that the measuring device sees as the pose."""
+        return self._unframed(self.frame(pose), values)
+
+    def _unframed(self, seen: Frame, values: Tensor) -> Frame:
+        """As `_unseen`, of a frame."""
+        base, _, tool = self._split(values)
+        position, rotation = seen
+        turn = rotation_vector_to_matrix(base[..., 3:]).mT
+        there = (turn @ (position - base[..., :3])[..., None])[..., 0]
+        if rotation is None:
+            return there, None
+        platform = turn @ rotation @ rotation_vector_to_matrix(tool[..., 3:]).mT
+        return there - (platform @ tool[..., :3, None])[..., 0], platform
+
+    def _closest(self, pose: Tensor, values: Tensor, rotation_weight: float) -> Tensor:
+        """The mechanism's pose whose frame is closest to the measured one, `... x p'`, differentiable."""
+        target = self._unseen(pose, values)
+        start = self.mechanism.pose_near(*target)
+        if self._plain:
+            return start
+
+        def gap(point: Tensor, position: Tensor, *rotation: Tensor) -> Tensor:
+            there = rotation[0].reshape(*position.shape, 3) if rotation else None
+            return _gap(self.mechanism.frame(point), (position, there), rotation_weight)
+
+        data = (target[0],) if target[1] is None else (target[0], target[1].flatten(-2))
+        plain = tuple(d.detach() for d in data)
+        found = levenberg_marquardt(gap, expand_leading(start, *data).detach(), data=plain).value
+        slope = jacobian_of(lambda point: gap(point, *plain), found)[1]
+        return carry_derivative(found, slope, gap(found, *data))
+
+
+def _transform(frame: Tensor) -> tuple[Tensor, Tensor]:
+    return rotation_vector_to_matrix(frame[..., 3:]), frame[..., :3]
+
+
+def _coordinates(position: Tensor, rotation: Tensor | None) -> Tensor:
+    return position if rotation is None else torch.cat([position, matrix_to_rotation_vector(rotation)], dim=-1)
+
+
+def _gap(there: Frame, here: Frame, rotation_weight: float) -> Tensor:
+    """Position difference and weighted rotation vector from `here` to `there`, `... x 6` or `... x 3`."""
+    if there[1] is None or here[1] is None:
+        return there[0] - here[0]
+    turn = matrix_to_rotation_vector(there[1] @ here[1].mT)
+    return torch.cat([there[0] - here[0], rotation_weight * turn], dim=-1)

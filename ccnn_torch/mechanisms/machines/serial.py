@@ -1,0 +1,312 @@
+"""Serial arms of any number of revolute and prismatic joints, from a DH table or a URDF chain."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.coordinates import Coordinate, Parameter
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.machines.link_frames import LINKS, compose
+from ccnn_torch.mechanisms.mechanism import Mechanism
+from ccnn_torch.mechanisms.newton import carry_derivative, least_norm
+from ccnn_torch.numerics.batching import expand_leading
+from ccnn_torch.numerics.least_squares import levenberg_marquardt
+from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
+
+__all__ = ["MOST_JOINTS", "SerialArm"]
+
+MOST_JOINTS = 100
+"""Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
+
+_FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
+
+
+class SerialArm(Mechanism):
+    """base · link 1 · … · link n · tool; pose x, y, z [m] and rotation vector rx, ry, rz [rad] in the record's frame.
+
+    Parameters in order: the base frame (6: position, rotation vector), each link's (DH: a, alpha, d, theta; URDF: x, y,
+    z, roll, pitch, yaw), the tool frame (6). `solve_inverse` is damped Newton to the closest pose in
+    (position, rotation_weight x rotation vector), from `guess`: for records the guess is the commanded joints.
+
+    Attributes:
+        unknown_frames: those of "base" and "tool" that must be fitted to records first (`frames.fit_frames`).
+        frame_per, tool_per: record columns that number the groups with a base or tool frame of their own.
+        parallel_axes: groups of joints (counted from 1) with parallel axes.
+        orientation: "rotation_vector", or "none": the pose is x, y, z alone.
+        rotation_weight: [m/rad].
+    """
+
+    orientations = ("rotation_vector", "quaternion", "none")
+    axes: Tensor
+    signs: Tensor
+    revolute: Tensor
+    limits: Tensor
+
+    def __init__(
+        self,
+        name: str,
+        convention: str,
+        links: Sequence[Sequence[float]],
+        joint_types: Sequence[str] | None = None,
+        joint_sign: Sequence[float] | None = None,
+        axes: Sequence[Sequence[float]] | None = None,
+        base: Sequence[float] = (0.0,) * 6,
+        tool: Sequence[float] = (0.0,) * 6,
+        limits: Sequence[Sequence[float]] | None = None,
+        tool_offset: Sequence[float] | str | None = None,
+        unknown_frames: Sequence[str] = (),
+        frame_per: Sequence[str] = (),
+        tool_per: Sequence[str] = (),
+        parallel_axes: Sequence[Sequence[int]] = (),
+        orientation: str = "rotation_vector",
+        rotation_weight: float = 0.04,
+    ) -> None:
+        """Build from plain numbers [SI].
+
+        Args:
+            name: what the arm is called in cards and messages.
+            convention: "standard" or "modified" (Denavit-Hartenberg), or "urdf".
+            links: a row of link parameters per joint, `n x 4` or (urdf) `n x 6`.
+            joint_types: "revolute" or "prismatic" per joint; all revolute when None.
+            joint_sign: +1 or -1 per joint.
+            axes: joint axes in the link's frame, `n x 3`; z when None.
+            base, tool: frames, position and rotation vector.
+            tool_offset: position of the tool, or "unknown"; replaces `tool` where the pose has no orientation.
+            limits: lowest and highest value per joint, for sampling only; a full turn or a metre when None.
+            unknown_frames, frame_per, tool_per, parallel_axes, orientation, rotation_weight: see the class.
+
+        Raises:
+            InputError: unknown convention or orientation.
+        """
+        keys = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
+        if convention not in LINKS or orientation not in ("rotation_vector", "none"):
+            raise InputError(
+                f"arm '{name}': convention is one of {', '.join(LINKS)}, orientation 'rotation_vector' or 'none'; "
+                f"got '{convention}', '{orientation}'"
+            )
+        if not 1 <= len(links) <= MOST_JOINTS:
+            raise InputError(f"arm '{name}': has {len(links)} joints that move; 1 to {MOST_JOINTS} can be handled")
+        unknown = set(unknown_frames)
+        if orientation == "none" and tool_offset is not None:
+            tool = (0.0,) * 6 if isinstance(tool_offset, str) else (*tool_offset, 0.0, 0.0, 0.0)
+            unknown = unknown - {"tool"} | ({"tool"} if isinstance(tool_offset, str) else set())
+        n = len(links)
+        types = tuple(joint_types or ["revolute"] * n)
+        self._transform, names, units, self._axis_before = LINKS[convention]
+        geometry = [Parameter(f"base_{c}", u, v) for (c, u), v in zip(_FRAME, base, strict=True)]
+        for i, row in enumerate(links):
+            geometry += [Parameter(f"{p}{i + 1}", u, v) for p, u, v in zip(names, units, row, strict=True)]
+        geometry += [Parameter(f"tool_{c}", u, v) for (c, u), v in zip(_FRAME, tool, strict=True)]
+        pose = _FRAME if orientation == "rotation_vector" else _FRAME[:3]
+        super().__init__(
+            name=name,
+            joints=[Coordinate(f"q{i + 1}", "rad" if t == "revolute" else "m") for i, t in enumerate(types)],
+            pose=[Coordinate(c, u) for c, u in pose],
+            geometry=geometry,
+            low=[-math.pi] * len(pose),
+            high=[math.pi] * len(pose),
+            home_joints=[0.0] * n,
+        )
+        self.convention, self.orientation, self.rotation_weight = convention, orientation, rotation_weight
+        self.unknown_frames, self.parallel_axes = tuple(sorted(unknown)), tuple(map(tuple, parallel_axes))
+        self.frame_per, self.tool_per = tuple(frame_per), tuple(tool_per)
+        turn = [t == "revolute" for t in types]
+        span = limits or [(-math.pi, math.pi) if t else (0.0, 1.0) for t in turn]
+        self.register_buffer("axes", torch.tensor(axes or [[0.0, 0.0, 1.0]] * n, dtype=torch.float64))
+        self.register_buffer("signs", torch.tensor(joint_sign or [1.0] * n, dtype=torch.float64))
+        self.register_buffer("revolute", torch.tensor(turn))
+        self.register_buffer("limits", torch.tensor(span, dtype=torch.float64))
+        self.recipe = {"spec": "serial", "keys": json.loads(json.dumps(keys))}
+        self._follow_nominal()
+
+    def _follow_nominal(self) -> None:
+        """The best-conditioned of 64 fixed draws (many arms are singular at zero); the box of poses from the reach."""
+        draws = self.sample_joints(64, torch.Generator().manual_seed(0))
+        self.home_joints.copy_(draws[self.condition_number(draws, self.rotation_weight).argmin()])
+        self.home_pose.copy_(self.forward_kinematics(self.home_joints))
+        self.low[:3], self.high[:3] = self.nominal[:3] - self.reach, self.nominal[:3] + self.reach
+
+    @property
+    def reach(self) -> float:
+        """Sum of the lengths of links and tool and of prismatic travel [m]; nothing is farther from the base."""
+        rows = self.nominal[6:-6].reshape(len(self.joints), -1)
+        lengths = rows[:, :3] if self.convention == "urdf" else rows[:, (0, 2)]
+        travel = self.limits.abs().amax(-1)[~self.revolute].sum()
+        return float(lengths.norm(dim=-1).sum() + self.nominal[-6:-3].norm() + travel)
+
+    def with_link_frames(self) -> SerialArm:
+        """The same arm with six parameters a link, in the URDF form, nominal parameters and kinematics unchanged.
+
+        Four Denavit-Hartenberg parameters cannot tilt one of two parallel axes about the direction that lies across
+        both (Hayati 1983); a UR10 has three such axes. The nominal tool frame takes in the constant part of the last
+        link; frames that are unknown stay so.
+        """
+        if self.convention == "urdf":
+            return self
+        keys, zero = self.recipe["keys"], torch.zeros(len(self.joints), dtype=torch.float64)
+        rotations, places = self.link_transforms(zero, self.nominal)
+        angles = matrix_to_euler_zyx(rotations).flip(-1)
+        links = torch.cat([places, angles], dim=-1)
+        tool_rotation, tool = rotation_vector_to_matrix(self.nominal[-3:]), self.nominal[-6:-3]
+        if self._axis_before:
+            links = torch.cat([torch.zeros_like(links[:1]), links[:-1]])
+            tool_rotation, tool = compose((rotations[-1], places[-1]), (tool_rotation, tool))
+        return SerialArm(
+            **{
+                **keys,
+                "convention": "urdf",
+                "links": links.tolist(),
+                "base": self.nominal[:6].tolist(),
+                "tool": [*tool.tolist(), *matrix_to_rotation_vector(tool_rotation).tolist()],
+                "tool_offset": None,
+                "unknown_frames": list(self.unknown_frames),
+            }
+        )
+
+    def with_orientation(self, orientation: str) -> SerialArm:
+        """The same arm, nominal parameters included, for poses of another kind: "rotation_vector" or "none"."""
+        twin = SerialArm(**{**self.recipe["keys"], "orientation": orientation})
+        kept = len(self.nominal) - (6 if self.recipe["keys"]["tool_offset"] is not None else 0)
+        twin.nominal[:kept] = self.nominal[:kept]
+        twin._follow_nominal()
+        return twin
+
+    def sample_joints(self, count: int, generator: torch.Generator) -> Tensor:
+        """Uniform within the joint limits, `count x n` [SI]."""
+        draw = torch.rand(count, len(self.joints), generator=generator, dtype=torch.float64)
+        return self.limits[:, 0] + (self.limits[:, 1] - self.limits[:, 0]) * draw
+
+    def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
+        """Poses of joints that are uniform within their limits, `count x p` [SI]."""
+        return self.forward_kinematics(self.sample_joints(count, generator))
+
+    def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Positions no farther from the base than the reach: necessary, not sufficient; `...`, bool."""
+        values = self.resolve(parameters)
+        distance: Tensor = torch.linalg.vector_norm(pose[..., :3] - values[..., :3], dim=-1)
+        return distance <= self.reach
+
+    def flange(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Flange in the arm's own base, without base and tool frame: rotation `... x 3 x 3`, position `... x 3` [m]."""
+        return self.link_frames(joints, self.resolve(parameters))[-1]
+
+    def link_transforms(self, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """From each link to the one before: rotation `... x n x 3 x 3` and translation `... x n x 3` [m]."""
+        links = values[..., 6:-6].reshape(*values.shape[:-1], len(self.joints), -1)
+        motion = joints * self.signs
+        return self._transform(links, motion * self.revolute, motion * ~self.revolute, self.axes)
+
+    def link_frames(self, joints: Tensor, values: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Frames of the links one after the other, n + 1 of them, from the arm's own base to the flange."""
+        rotations, translations = self.link_transforms(joints, values)
+        lead = translations.shape[:-2]
+        start = torch.eye(3, dtype=joints.dtype).expand(*lead, 3, 3), torch.zeros(*lead, 3, dtype=joints.dtype)
+        frames = [start, (rotations[..., 0, :, :], translations[..., 0, :])]
+        for i in range(1, len(self.joints)):
+            frames.append(compose(frames[-1], (rotations[..., i, :, :], translations[..., i, :])))
+        return frames
+
+    def forward_frame(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Position `... x 3` [m] and rotation `... x 3 x 3` of the tool, also where the pose has no orientation."""
+        values = self.resolve(parameters)
+        base = rotation_vector_to_matrix(values[..., 3:6]), values[..., :3]
+        tool = rotation_vector_to_matrix(values[..., -3:]), values[..., -6:-3]
+        rotation, position = compose(compose(base, self.link_frames(joints, values)[-1]), tool)
+        return position, rotation
+
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """Closed form; see `Mechanism.forward_kinematics`."""
+        position, rotation = self.forward_frame(joints, parameters)
+        if self.orientation == "none":
+            return position
+        return torch.cat([position, matrix_to_rotation_vector(rotation)], dim=-1)
+
+    def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        """Geometric Jacobian, closed form; see `Mechanism.jacobian`."""
+        values = self.resolve(parameters)
+        frames = self.link_frames(joints, values)
+        rotation, position = frames[-1]
+        tip = position + (rotation @ values[..., -6:-3, None])[..., 0]
+        holders = frames[:-1] if self._axis_before else frames[1:]
+        axes = (torch.stack([f[0] for f in holders], dim=-3) @ self.axes[..., None])[..., 0]
+        # A point on the axis gives the lever arm of a revolute joint; a prismatic one only moves along its axis.
+        swept = torch.linalg.cross(axes, tip[..., None, :] - torch.stack([f[1] for f in holders], dim=-2), dim=-1)
+        turning, signs = self.revolute[:, None], self.signs[:, None]
+        base = rotation_vector_to_matrix(values[..., 3:6]).mT
+        linear = (torch.where(turning, swept, axes) * signs) @ base
+        if self.orientation == "none":
+            return linear.mT
+        return torch.cat([linear, (axes * turning * signs) @ base], dim=-1).mT
+
+    def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Position difference [m] and rotation vector [rad] from the pose to the arm's, `... x 6` (or `... x 3`)."""
+        position, rotation = self.frame(pose)
+        return self._gap(joints, position, rotation, self.resolve(parameters), 1.0)
+
+    def _gap(self, joints: Tensor, position: Tensor, rotation: Tensor | None, values: Tensor, weight: float) -> Tensor:
+        tool_position, tool_rotation = self.forward_frame(joints, values)
+        if rotation is None:
+            return tool_position - position
+        turn = matrix_to_rotation_vector(tool_rotation @ rotation.mT)
+        return torch.cat([tool_position - position, weight * turn], dim=-1)
+
+    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        """Joints of the closest pose, as `nearest_joints`. Never NaN: `pose_error` tells how close it comes."""
+        x = self.nearest_joints(pose, parameters, guess, self.rotation_weight)
+        values = self.resolve(parameters)
+        position, rotation = self.frame(pose)
+        weights = self._weights(self.rotation_weight)
+        return carry_derivative(
+            x,
+            self.jacobian(x, values.detach()) * weights,
+            self._gap(x, position, rotation, values, self.rotation_weight),
+        )
+
+    def nearest_joints(
+        self,
+        pose: Tensor,
+        parameters: Tensor | None,
+        guess: Tensor | None,
+        rotation_weight: float,
+        damping: float = 0.0,
+    ) -> Tensor:
+        """Joints whose pose is closest in (position, rotation_weight x rotation vector), by damped Newton from `guess`.
+
+        Where joints are more than pose coordinates (redundant arms, poses without orientation) the deviation from the
+        guess has the least norm. With `damping` [m per joint unit] the squared deviation times damping² is part of what
+        is minimised, which bounds it near singularities. No gradient flows through this; it does through
+        `solve_inverse`.
+        """
+        values = self.resolve(parameters)
+        position, rotation = self.frame(pose)
+        parts = (position,) if rotation is None else (position, rotation.flatten(-2))
+        anchor = expand_leading(self.home_joints if guess is None else guess, position, values).detach()
+        weights = self._weights(rotation_weight)
+        ridge = damping * torch.eye(len(self.joints), dtype=torch.float64)
+
+        def residual(q: Tensor, start: Tensor, v: Tensor, x: Tensor, *turn: Tensor) -> Tensor:
+            gap = self._gap(q, x, turn[0].reshape(*x.shape, 3) if turn else None, v, rotation_weight)
+            return torch.cat([gap, damping * (q - start)], dim=-1) if damping else gap
+
+        def slope(q: Tensor, start: Tensor, v: Tensor, *rest: Tensor) -> Tensor:
+            rows = self.jacobian(q, v) * weights
+            return torch.cat([rows, ridge.expand(*q.shape[:-1], -1, -1)], dim=-2) if damping else rows
+
+        data = tuple(d.detach() for d in (anchor, values, *parts))
+        found = levenberg_marquardt(residual, anchor, slope, data, tolerance=1e-10, damping=1e-8)
+        if damping == 0 and len(self.joints) > len(weights):
+            return least_norm(residual, slope, found, anchor, data)
+        return found.value
+
+    def _weights(self, rotation_weight: float) -> Tensor:
+        """Weights of the rows of the Jacobian, `6 x 1` or `3 x 1`."""
+        column = torch.ones(6, 1, dtype=torch.float64)
+        column[3:] = rotation_weight
+        return column if self.orientation == "rotation_vector" else column[:3]

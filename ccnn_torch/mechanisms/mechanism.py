@@ -1,0 +1,389 @@
+"""What every mechanism is: named joints, pose coordinates and parameters, and batched differentiable kinematics."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from ccnn_torch.coordinates import Condition, Coordinate, Parameter
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import newton as _numeric
+from ccnn_torch.mechanisms.inverse_kinematics import InverseKinematics
+from ccnn_torch.mechanisms.pose import (
+    PoseError,
+    coordinates_jacobian,
+    frame_from_coordinates,
+    frame_jacobian,
+    pose_error,
+)
+from ccnn_torch.numerics.batching import expand_leading
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, wrap_angle
+
+__all__ = ["Mechanism"]
+
+
+class Mechanism(nn.Module):
+    """Base class of mechanisms. A new one gives `closure` or `solve_inverse`; all else has a numerical default.
+
+    Everything is float64 and SI, broadcasts over leading dims, parameters included (`r x 1 x k` parameters and `s x n`
+    joints give `r x s x p` poses), and is differentiable in joints, pose and parameters. A row without a solution
+    comes back as NaN: ask `reachable` first.
+
+    Attributes:
+        name: name in configs and model cards.
+        joints, pose: coordinates in order, `n` and `p` of them.
+        geometry: the `k` parameters in order.
+        orientations: forms in which records may give the orientation; empty when the pose has its own coordinates.
+        nominal: nominal parameters, `k` [SI], buffer.
+        low, high: box of poses that `sample_workspace` draws from, `p` [SI], buffers.
+        home_pose, home_joints: a configuration on the nominal branch, `p` and `n` [SI], buffers; where Newton starts.
+        closed_form: which direction is a closed form of sums, products, roots, sines and cosines, so that it can stand
+            in an exported graph: ``forward``, ``inverse``, or None.
+        inverse_kinematics: child module around `solve_inverse`, the place for forward hooks.
+        takes: covariates that the nominal machine itself depends on: a simulator's; () for all others.
+    """
+
+    nominal: Tensor
+    low: Tensor
+    high: Tensor
+    home_pose: Tensor
+    home_joints: Tensor
+    orientations: tuple[str, ...] = ()
+    takes: tuple[Condition, ...] = ()
+    closed_form: Literal["forward", "inverse"] | None = None
+
+    def __init__(
+        self,
+        name: str,
+        joints: Sequence[Coordinate],
+        pose: Sequence[Coordinate],
+        geometry: Sequence[Parameter],
+        low: Sequence[float],
+        high: Sequence[float],
+        home_pose: Sequence[float] | None = None,
+        home_joints: Sequence[float] | None = None,
+    ) -> None:
+        """Name the parts; `home_pose` defaults to the middle of the box, `home_joints` to its inverse (from zeros)."""
+        super().__init__()
+        if all(getattr(type(self), verb) is getattr(Mechanism, verb) for verb in ("closure", "solve_inverse")):
+            raise InputError(
+                f"mechanism '{name}' must define closure(pose, joints, parameters) or solve_inverse(pose, …)"
+            )
+        self.name = name
+        self.joints = tuple(joints)
+        self.pose = tuple(pose)
+        self.geometry = tuple(geometry)
+        self.register_buffer("nominal", _tensor([g.nominal for g in self.geometry]))
+        self.register_buffer("low", _tensor(low))
+        self.register_buffer("high", _tensor(high))
+        middle = (self.low + self.high) / 2
+        self.register_buffer("home_pose", middle if home_pose is None else _tensor(home_pose))
+        self.register_buffer("home_joints", torch.zeros(len(self.joints), dtype=torch.float64))
+        self.home_joints.copy_(self.solve_inverse(self.home_pose) if home_joints is None else _tensor(home_joints))
+        self.inverse_kinematics = InverseKinematics(self.solve_inverse)
+        # How to build it again: `spec` and `keys` of `load_mechanism`, which fills this in.
+        self.recipe: dict[str, Any] = {}
+
+    # The maths: a mechanism overrides closure or solve_inverse, and what it has in closed form.
+
+    def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Loop closure, zero where pose and joints fit together.
+
+        Args:
+            pose: `... x p` [SI].
+            joints: `... x n` [SI].
+            parameters: `... x k` [SI], nominal when None.
+
+        Returns:
+            `... x c` [SI].
+        """
+        return self.wrap(self.solve_inverse(pose, parameters, joints) - joints)
+
+    def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        """Joints of a pose, the plain function behind `inverse_kinematics`; no hook ever acts on it.
+
+        Args:
+            pose: `... x p` [SI].
+            parameters: `... x k` [SI], nominal when None.
+            guess: `... x n` [SI], joints on the wanted branch; `home_joints` when None. Closed forms ignore it.
+
+        Returns:
+            `... x n` [SI].
+        """
+        start = self.home_joints if guess is None else guess
+        return _numeric.solve(
+            lambda joints, pose, parameters: self.closure(pose, joints, parameters),
+            start,
+            (pose, self.resolve(parameters)),
+        )
+
+    def forward_kinematics(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """Pose of the joints, on the nominal branch.
+
+        Args:
+            joints: `... x n` [SI].
+            parameters: `... x k` [SI], nominal when None.
+            guess: `... x p` [SI], a pose on the wanted branch; `home_pose` when None. Closed forms ignore it.
+
+        Returns:
+            `... x p` [SI].
+        """
+        start = self.home_pose if guess is None else guess
+        return _numeric.solve(
+            lambda pose, joints, parameters: self.closure(pose, joints, parameters),
+            start,
+            (joints, self.resolve(parameters)),
+        )
+
+    def frame(self, pose: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Position `... x 3` [m] and rotation matrix `... x 3 x 3` of the platform; None without orientation.
+
+        The default reads x, y, z and rx, ry, rz (a rotation vector) by name; what is not there is 0.
+
+        Raises:
+            InputError: the pose has another angle: a mechanism with one overrides this and says how it turns.
+        """
+        return frame_from_coordinates(pose, self.pose, self.name)
+
+    def frame_slope(self, pose: Tensor) -> Tensor:
+        """Derivative of position and (with orientation) rotation vector in the base frame by the pose coordinates.
+
+        Closed form for the frame by name, by differentiation for another; pose `... x p` [SI].
+
+        Returns:
+            `... x 6 x p`, or `... x 3 x p` without orientation.
+        """
+        if type(self).frame is Mechanism.frame:
+            return coordinates_jacobian(pose, self.pose, self.name)
+        return frame_jacobian(self.frame, pose)
+
+    def pose_near(self, position: Tensor, rotation: Tensor | None) -> Tensor:
+        """A pose whose frame is close to a given one: where a search for the closest pose starts, `... x p` [SI].
+
+        The default reads x, y, z and rx, ry, rz by name and takes other coordinates from `home_pose`. A mechanism that
+        overrides `frame` may override this as well, so that the search starts on the right side of the workspace.
+
+        Args:
+            position: `... x 3` [m].
+            rotation: `... x 3 x 3`, or None where it is not known.
+        """
+        known = dict(zip(("x", "y", "z"), position.unbind(-1), strict=True))
+        if rotation is not None:
+            known |= zip(("rx", "ry", "rz"), matrix_to_rotation_vector(rotation).unbind(-1), strict=True)
+        home = self.home_pose.expand(*position.shape[:-1], -1)
+        return torch.stack([known.get(c.name, home[..., i]) for i, c in enumerate(self.pose)], dim=-1)
+
+    # Bookkeeping, the same for all.
+
+    def resolve(self, parameters: Tensor | None) -> Tensor:
+        """The parameters given, or the nominal ones."""
+        return self.nominal if parameters is None else parameters
+
+    def values(self, parameters: Tensor | None) -> tuple[Tensor, ...]:
+        """The parameters one by one in the order of `geometry`, each `...`."""
+        return self.resolve(parameters).unbind(-1)
+
+    def wrap(self, deviation: Tensor) -> Tensor:
+        """A difference of joints, `... x n` [SI], with revolute ones (unit rad) brought to [-pi, pi]."""
+        revolute = torch.tensor([j.unit == "rad" for j in self.joints], device=deviation.device)
+        return torch.where(revolute, wrap_angle(deviation), deviation)
+
+    def nearest_joints(
+        self,
+        pose: Tensor,
+        parameters: Tensor | None,
+        guess: Tensor | None,
+        rotation_weight: float,
+        damping: float = 0.0,
+    ) -> Tensor:
+        """Joints whose pose is closest in (position, rotation_weight x rotation vector) [m].
+
+        The default is `solve_inverse`: a mechanism with as many pose coordinates as joints reaches every pose exactly,
+        and its joints are not damped.
+        """
+        return self.solve_inverse(pose, parameters, guess)
+
+    def pose_error(self, measured: Tensor, reference: Tensor) -> PoseError:
+        """Distance [m] and geodesic angle [rad] between two poses, `... x p` each."""
+        return pose_error(self.frame(measured), self.frame(reference))
+
+    def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        """Derivative of position and (with orientation) rotation vector in the base frame; joints `... x n`.
+
+        Returns:
+            `... x 6 x n` ([m] above [rad], per joint unit), or `... x 3 x n` without orientation.
+        """
+        parameters = self.resolve(parameters)
+        others = (parameters,) if guess is None else (parameters, guess)
+        return frame_jacobian(
+            lambda q: self.frame(self.forward_kinematics(q, parameters, guess)), expand_leading(joints, *others)
+        )
+
+    def parameter_jacobian(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """The same by the parameters, at joints `... x n`; `... x 6 x k` or `... x 3 x k`, per parameter's unit."""
+        values = self.resolve(parameters).expand(*joints.shape[:-1], -1)
+        return frame_jacobian(lambda theta: self.frame(self.forward_kinematics(joints, theta, guess)), values)
+
+    def jacobian_at(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """As `jacobian`, where the pose of the joints is known, `... x p` [SI]; NaN where that is.
+
+        The default finds it again from there; a closed form at the pose saves that.
+        """
+        return self.jacobian(joints, parameters, pose)
+
+    def parameter_jacobian_at(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """As `parameter_jacobian`, where the pose of the joints is known."""
+        return self.parameter_jacobian(joints, parameters, pose)
+
+    def under(self, conditions: Mapping[str, Tensor]) -> Mechanism:
+        """The machine under conditions of the rows that it is then asked about, `...` each [SI], by covariate.
+
+        Itself, unless it `takes` some of them: closed forms know neither loads nor temperatures.
+        """
+        return self
+
+    def lacking(self, conditions: Sequence[str]) -> list[Condition]:
+        """Covariates that it depends on and that neither these names nor `under` have told it."""
+        return []
+
+    def condition_number(
+        self,
+        joints: Tensor,
+        rotation_weight: float = 0.04,
+        parameters: Tensor | None = None,
+        guess: Tensor | None = None,
+    ) -> Tensor:
+        """Condition number of the Jacobian with its rotation rows times `rotation_weight` [m/rad]; `...` [1]."""
+        values = self.singular_values(joints, rotation_weight, parameters, guess)
+        ratio = values[..., 0] / values[..., -1]
+        return torch.where(torch.isfinite(ratio), ratio, torch.inf)
+
+    def singularity(
+        self,
+        joints: Tensor,
+        rotation_weight: float = 0.04,
+        parameters: Tensor | None = None,
+        guess: Tensor | None = None,
+    ) -> Tensor:
+        """How far from a singularity: 1 where all directions are alike, 0 at a singularity; `...` [1].
+
+        With the loop closure F(X, q) = 0 the Jacobian is J = -(∂F/∂X)⁻¹ ∂F/∂q. Where ∂F/∂q is singular (first kind:
+        a leg stretched or folded, a serial arm's singularity) the smallest singular value of J goes to 0; where ∂F/∂X
+        is (second kind: the platform can move with the joints held) the largest goes to infinity (Gosselin and Angeles
+        1990). The measure is their ratio, the reciprocal condition number of J with its rotation rows times
+        `rotation_weight` [m/rad]. Unlike determinants of the two matrices it does not depend on how F is written.
+        Which kind is near, `singular_values` tells.
+        """
+        return 1 / self.condition_number(joints, rotation_weight, parameters, guess)
+
+    def singular_values(
+        self,
+        joints: Tensor,
+        rotation_weight: float = 0.04,
+        parameters: Tensor | None = None,
+        guess: Tensor | None = None,
+    ) -> Tensor:
+        """Singular values of the Jacobian with its rotation rows times `rotation_weight`, largest first [m per joint].
+
+        The last is how little the platform moves when the joints do: 0 at a singularity of the first kind. The first is
+        how much: infinite at one of the second kind.
+
+        Returns:
+            `... x n` (or fewer, as many as the Jacobian has rows); NaN where the joints have no pose.
+        """
+        jacobian = self.jacobian(joints, parameters, guess).clone()
+        jacobian[..., 3:, :] *= rotation_weight
+        known = torch.isfinite(jacobian).all(-1).all(-1)[..., None]
+        values = torch.linalg.svdvals(torch.where(known[..., None], jacobian, torch.zeros_like(jacobian)))
+        return torch.where(known, values, torch.nan)
+
+    def reachable(self, pose: Tensor, parameters: Tensor | None = None) -> Tensor:
+        """Which poses `... x p` have joints on the nominal branch; `...`, bool."""
+        return torch.isfinite(self.solve_inverse(pose, parameters)).all(-1)
+
+    @property
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Box of poses that samples are drawn from: low and high, `p` each [SI]."""
+        return self.low, self.high
+
+    def sample_workspace(self, count: int, generator: torch.Generator) -> Tensor:
+        """Reachable poses, uniform in the box; `count x p` [SI].
+
+        Raises:
+            InputError: fewer than one pose in a hundred of the box is reachable.
+        """
+        found: list[Tensor] = []
+        for _ in range(100):
+            draw = torch.rand(count, len(self.pose), generator=generator, dtype=torch.float64)
+            pose = self.low + (self.high - self.low) * draw
+            found.append(pose[self.reachable(pose)])
+            if sum(map(len, found)) >= count:
+                return torch.cat(found)[:count]
+        raise InputError(f"mechanism '{self.name}' reaches hardly any pose of its sampling box; check low and high")
+
+    def sample_joints(self, count: int, generator: torch.Generator) -> Tensor:
+        """Joints of sampled poses, `count x n` [SI]."""
+        return self.solve_inverse(self.sample_workspace(count, generator))
+
+    def with_nominal(self, parameters: Tensor) -> Mechanism:
+        """A copy with other nominal parameters, `k` [SI] (fitted frames, identified geometry), without any hook."""
+        twin = copy.deepcopy(self)
+        twin.nominal.copy_(parameters)
+        twin.inverse_kinematics = InverseKinematics(twin.solve_inverse)
+        twin._follow_nominal()
+        return twin
+
+    def _follow_nominal(self) -> None:
+        """Called when the nominal parameters have changed; for what is derived from them."""
+
+    def describe(self) -> dict[str, Any]:
+        """Everything `mechanism_from_description` needs, as JSON; floats survive it exactly.
+
+        Raises:
+            InputError: the class stands in no file (an interactive session), so that nobody could build it again.
+        """
+        names = [g.name for g in self.geometry]
+        return {
+            "name": self.name,
+            **(self.recipe or self._own_file()),
+            "joints": [j.header for j in self.joints],
+            "pose": [c.header for c in self.pose],
+            "parameters": dict(zip(names, self.nominal.tolist(), strict=True)),
+        }
+
+    def _own_file(self) -> dict[str, Any]:
+        """Recipe of a mechanism that was made by its class and not by `load_mechanism`."""
+        try:
+            file = inspect.getfile(type(self))
+        except (TypeError, OSError):
+            raise InputError(
+                f"mechanism '{self.name}': its class {type(self).__name__} stands in no file; write it to one and use "
+                f"load_mechanism('file.py:{type(self).__name__}')"
+            ) from None
+        return {"spec": f"{file}:{type(self).__qualname__}", "keys": {}}
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Set nominal parameters by name [SI].
+
+        Raises:
+            InputError: a name that the mechanism does not have, or one that is missing.
+        """
+        names = [g.name for g in self.geometry]
+        wrong = sorted(set(values) ^ set(names))
+        if wrong:
+            raise InputError(f"mechanism '{self.name}' has the parameters {', '.join(names)}; check {', '.join(wrong)}")
+        self.nominal.copy_(_tensor([float(values[n]) for n in names]))
+        self._follow_nominal()
+
+
+def _tensor(values: Sequence[float]) -> Tensor:
+    return torch.tensor([float(v) for v in values], dtype=torch.float64)

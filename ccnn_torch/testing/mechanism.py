@@ -1,0 +1,277 @@
+"""What a mechanism must do for the rest of the package to work with it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
+from ccnn_torch.mechanisms.assembly_mode import jump_sentence
+from ccnn_torch.numerics.rotations import vee
+
+__all__ = ["check_mechanism"]
+
+_BATCHES: tuple[tuple[int, ...], ...] = ((), (2,), (2, 3))
+# A root is settled to about 1e-12; a pose closes to this [m, rad].
+_CLOSES = 1e-8
+_STEP = 1e-5
+_SLOPE_TOLERANCE = 2e-5
+# Differences of nearly singular configurations say nothing about the derivative.
+_REGULAR = 200.0
+
+
+_ARGUMENT = ("joints", "pose", "parameters")
+_Call = Callable[[Tensor, Tensor, Tensor | None], Tensor]
+_RowFunction = Callable[[Tensor], Tensor]
+
+
+def check_mechanism(mechanism: Mechanism, seed: int = 0) -> None:
+    """Check names and units, the branch of a numeric inverse, IK∘FK, derivatives, batch shapes, hooks, the description.
+
+    Numeric inverse kinematics are held against a walk from home in small steps, which must end on the same branch.
+
+    Args:
+        mechanism: any `Mechanism`, at its nominal parameters.
+        seed: of the configurations that are tried.
+
+    Raises:
+        AssertionError: one sentence that says what is wrong.
+    """
+    _check_names(mechanism)
+    jump = jump_sentence(mechanism, seed)
+    _require(not jump, mechanism, jump)
+    joints, pose = _configurations(mechanism, seed)
+    _check_round_trip(mechanism, joints, pose)
+    _check_batches(mechanism, joints, pose)
+    _check_derivatives(mechanism, joints, pose)
+    _check_hooks(mechanism, joints, pose)
+    _check_description(mechanism, joints, pose)
+
+
+def _require(fine: bool, m: Mechanism, sentence: str) -> None:
+    if not fine:
+        raise AssertionError(f"mechanism '{m.name}': {sentence}")
+
+
+def _check_names(m: Mechanism) -> None:
+    _require(bool(m.name), m, "has no name")
+    for kind, things in (("joints", m.joints), ("pose", m.pose), ("geometry", m.geometry)):
+        names = [t.name for t in things]
+        _require(len(set(names)) == len(names), m, f"{kind} has a name twice: {names}")
+    wanted = [f"q{i + 1}" for i in range(len(m.joints))]
+    _require([j.name for j in m.joints] == wanted, m, f"its joints must be named {', '.join(wanted)}")
+    units = {c.unit for c in (*m.joints, *m.pose)}
+    _require(units <= {"m", "rad"}, m, f"joints and pose are in m or rad, got {sorted(units)}")
+    for name, buffer, count in (("nominal", m.nominal, len(m.geometry)), ("low", m.low, len(m.pose))):
+        _require(buffer.shape == (count,), m, f"{name} has shape {tuple(buffer.shape)}, expected ({count},)")
+        _require(buffer.dtype == torch.float64, m, f"{name} is {buffer.dtype}, expected torch.float64")
+    _require(bool((m.low < m.high).all()), m, "its sampling box is empty: low must be below high")
+
+
+def _configurations(m: Mechanism, seed: int) -> tuple[Tensor, Tensor]:
+    """Six regular configurations, `6 x n` and `6 x p`."""
+    generator = torch.Generator().manual_seed(seed)
+    joints = m.sample_joints(64, generator)
+    again = m.sample_joints(64, torch.Generator().manual_seed(seed))
+    _require(torch.equal(joints, again), m, "sample_joints depends on more than its generator")
+    _require(bool(torch.isfinite(joints).all()), m, "sample_workspace gives poses that have no joints")
+    joints = joints[m.condition_number(joints) < _REGULAR][:6]
+    _require(len(joints) == 6, m, "nearly all its sampled configurations are singular, or its forward map fails there")
+    pose = m.forward_kinematics(joints)
+    _require(bool(torch.isfinite(pose).all()), m, "forward_kinematics gives no pose for joints of a reachable pose")
+    _require(bool(m.reachable(pose).all()), m, "reachable() denies poses that its own joints reach")
+    return joints, pose
+
+
+def _pose_gap(m: Mechanism, first: Tensor, second: Tensor) -> float:
+    error = m.pose_error(first, second)
+    return max(float(e.max()) for e in error if e is not None)
+
+
+def _check_round_trip(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
+    _require(pose.shape == (len(joints), len(m.pose)), m, f"forward_kinematics has shape {tuple(pose.shape)}")
+    near = joints + 1e-3
+    back = m.solve_inverse(pose, guess=near)
+    gap = _pose_gap(m, pose, m.forward_kinematics(back, guess=pose))
+    _require(gap <= _CLOSES, m, f"forward_kinematics(solve_inverse(pose)) misses the pose by {gap:.2g}")
+    closed = float(m.closure(pose, back).abs().max())
+    _require(closed <= _CLOSES, m, f"closure(pose, solve_inverse(pose)) is {closed:.2g}, expected 0")
+    if len(m.joints) <= len(m.pose):
+        off = float(m.wrap(back - joints).abs().max())
+        _require(
+            off <= _CLOSES * _REGULAR, m, f"solve_inverse(forward_kinematics(joints)) misses the joints by {off:.2g}"
+        )
+    off_closure = float(m.closure(pose, near).abs().max())
+    _require(off_closure > _CLOSES, m, "closure is 0 for joints that do not belong to the pose")
+
+
+def _calls(m: Mechanism) -> dict[str, _Call]:
+    """Functions of joints, pose and parameters, by name.
+
+    The forward map is looked at through `frame`: a rotation vector jumps at half a turn, the frame does not.
+    """
+
+    def placed(q: Tensor, x: Tensor, k: Tensor | None) -> Tensor:
+        position, rotation = m.frame(m.forward_kinematics(q, k, x))
+        return position if rotation is None else torch.cat([position, rotation.flatten(-2)], dim=-1)
+
+    return {
+        "solve_inverse": lambda q, x, k: m.solve_inverse(x, k, q),
+        "forward_kinematics": placed,
+        "closure": lambda q, x, k: m.closure(x, q, k),
+        "jacobian": lambda q, x, k: m.jacobian(q, k, x).flatten(-2),
+    }
+
+
+def _check_batches(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
+    """Every leading shape, of configurations and of parameters, gives what single calls give."""
+    for name, call in _calls(m).items():
+        single = torch.stack([call(q, x, None) for q, x in zip(joints, pose, strict=True)])
+        _require(single.dtype == torch.float64, m, f"{name} returns {single.dtype}, expected torch.float64")
+        for lead in _BATCHES:
+            count = 1 if not lead else int(torch.tensor(lead).prod())
+            q, x = joints[:count].reshape(*lead, -1), pose[:count].reshape(*lead, -1)
+            got = call(q, x, None)
+            expected = single[:count].reshape(*lead, -1)
+            _require(got.shape == expected.shape, m, f"{name} of batch shape {lead} has shape {tuple(got.shape)}")
+            _close(m, got, expected, f"{name} of batch shape {lead} differs from single calls")
+        if len(m.geometry):
+            factors = torch.tensor([1.0, 1.0 + 1e-4], dtype=torch.float64)[:, None, None]
+            sets = m.nominal * factors
+            got = call(joints, pose, sets)
+            expected = torch.stack([call(joints, pose, s) for s in sets[:, 0]])
+            shapes = f"{tuple(sets.shape)} with {len(joints)} rows"
+            _require(got.shape == expected.shape, m, f"{name} of parameters {shapes} has shape {tuple(got.shape)}")
+            _close(m, got, expected, f"{name} of parameters {shapes} differs from one set at a time")
+
+
+def _close(m: Mechanism, got: Tensor, expected: Tensor, sentence: str) -> None:
+    gap = float((got - expected).abs().max())
+    _require(gap <= _CLOSES, m, f"{sentence} by {gap:.2g}")
+
+
+def _check_derivatives(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
+    """Reverse-mode derivatives of a weighted sum, and the Jacobian, against central differences."""
+    k = m.nominal.expand(len(joints), -1)
+    # solve_inverse of a redundant arm stays at the guess's side, whose derivative Newton's last step does not see.
+    arguments = {"solve_inverse": (1, 2), "forward_kinematics": (0, 2), "closure": (0, 1, 2)}
+    if len(m.joints) > len(m.pose):
+        del arguments["solve_inverse"]
+    point = (joints, pose, k)
+    for name, places in arguments.items():
+        call = _calls(m)[name]
+        value = call(*point)
+        weights = torch.cos(torch.arange(value.numel(), dtype=torch.float64)).reshape(value.shape)
+        for place in places:
+            if point[place].shape[-1] == 0:
+                continue
+            along = _weighted(call, point, place, weights)
+            moving = point[place].detach().clone().requires_grad_()
+            total = along(moving).sum()
+            _require(total.requires_grad, m, f"{name} is not differentiable in its {_ARGUMENT[place]}")
+            slope = torch.autograd.grad(total, moving)[0]
+            expected = _differences(along, point[place])
+            gap = float(((slope - expected).abs() / (1 + expected.abs())).max())
+            _require(
+                gap <= _SLOPE_TOLERANCE, m, f"the derivative of {name} in its {_ARGUMENT[place]} is off by {gap:.2g}"
+            )
+    _check_jacobians(m, joints, pose)
+
+
+def _weighted(call: _Call, point: tuple[Tensor, Tensor, Tensor], place: int, weights: Tensor) -> _RowFunction:
+    """The weighted sum of a call's outputs, row by row, as a function of one of its arguments."""
+
+    def along(values: Tensor) -> Tensor:
+        joints, pose, parameters = (values if i == place else fixed for i, fixed in enumerate(point))
+        return (call(joints, pose, parameters) * weights).sum(-1)
+
+    return along
+
+
+def _differences(function: _RowFunction, point: Tensor) -> Tensor:
+    """Central differences of a row-wise function: `... x k` -> `...`; returns `... x k`."""
+    steps = _STEP * torch.eye(point.shape[-1], dtype=point.dtype)
+    steps = steps.reshape(-1, *([1] * (point.dim() - 1)), point.shape[-1])
+    return ((function(point + steps) - function(point - steps)) / (2 * _STEP)).movedim(0, -1)
+
+
+def _check_jacobians(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
+    """By the joints and by the parameters, against central differences of the forward kinematics; the frame's by the
+    pose."""
+
+    def by_joints(step: Tensor) -> Tensor:
+        return m.forward_kinematics(joints + step, guess=pose)
+
+    def by_parameters(step: Tensor) -> Tensor:
+        return m.forward_kinematics(joints, m.nominal + step, guess=pose)
+
+    found = {"jacobian": m.jacobian(joints, guess=pose), "jacobian_at": m.jacobian_at(pose, joints)}
+    for name, slopes in found.items():
+        _check_slopes(m, name, slopes, by_joints, [f"joint {j.name}" for j in m.joints], pose)
+    if len(m.geometry):
+        along = [f"parameter {g.name}" for g in m.geometry]
+        found = {
+            "parameter_jacobian": m.parameter_jacobian(joints, guess=pose),
+            "parameter_jacobian_at": m.parameter_jacobian_at(pose, joints),
+        }
+        for name, slopes in found.items():
+            _check_slopes(m, name, slopes, by_parameters, along, pose)
+    along = [f"pose coordinate {c.name}" for c in m.pose]
+    _check_slopes(m, "frame_slope", m.frame_slope(pose), lambda step: pose + step, along, pose)
+
+
+def _check_slopes(
+    m: Mechanism, name: str, slopes: Tensor, pose_at: Callable[[Tensor], Tensor], along: Sequence[str], pose: Tensor
+) -> None:
+    """slopes: `s x c x k`, what `name` returned; pose_at: poses `s x p` at a step `k`; along: names of the k."""
+    rows = 3 if m.frame(pose)[1] is None else 6
+    expected = (len(pose), rows, len(along))
+    _require(slopes.shape == expected, m, f"{name} has shape {tuple(slopes.shape)}, not {expected}")
+    for i, what in enumerate(along):
+        step = torch.zeros(len(along), dtype=torch.float64)
+        step[i] = _STEP
+        ahead, behind = m.frame(pose_at(step)), m.frame(pose_at(-step))
+        slope = (ahead[0] - behind[0]) / (2 * _STEP)
+        if ahead[1] is not None and behind[1] is not None:
+            slope = torch.cat([slope, vee(ahead[1] @ behind[1].mT) / (2 * _STEP)], dim=-1)
+        gap = float(((slopes[..., i] - slope).abs() / (1 + slope.abs())).max())
+        _require(gap <= _SLOPE_TOLERANCE, m, f"{name} is off by {gap:.2g} for {what}")
+
+
+def _check_hooks(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
+    """A hook fires on `mechanism.inverse_kinematics`, sees the covariates, and never touches the plain functions."""
+    plain = m.solve_inverse(pose, guess=joints)
+    seen: list[object] = []
+
+    def hook(module: object, args: object, kwargs: dict[str, object], output: Tensor) -> Tensor:
+        seen.append(kwargs.get("covariates"))
+        return output + 1.0
+
+    covariates = torch.zeros(len(joints), 1, dtype=torch.float64)
+    handle = m.inverse_kinematics.register_forward_hook(hook, with_kwargs=True)
+    try:
+        hooked = m.inverse_kinematics(pose, guess=joints, covariates=covariates)
+        _require(len(seen) == 1, m, "a hook on inverse_kinematics does not fire exactly once per call")
+        _require(seen[0] is covariates, m, "a hook on inverse_kinematics does not get the covariates keyword")
+        _require(torch.equal(hooked, plain + 1.0), m, "inverse_kinematics does not return what its hook returns")
+        m.solve_inverse(pose, guess=joints)
+        m.forward_kinematics(joints)
+        _require(len(seen) == 1, m, "solve_inverse or forward_kinematics goes through the hooked module")
+    finally:
+        handle.remove()
+    _require(torch.equal(m.inverse_kinematics(pose, guess=joints), plain), m, "inverse_kinematics is not solve_inverse")
+
+
+def _check_description(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
+    """The description survives JSON and gives the same mechanism, also with other nominal parameters."""
+    other = m.with_nominal(m.nominal * (1.0 + 1e-4) + 1e-5)
+    for original in (m, other):
+        twin = mechanism_from_description(json.loads(json.dumps(original.describe())), allow_code=True)
+        _require(torch.equal(twin.nominal, original.nominal), m, "parameters do not survive describe()")
+        same = (twin.joints, twin.pose) == (original.joints, original.pose)
+        _require(same and twin.name == original.name, m, "names do not survive describe()")
+        first, second = (t.solve_inverse(pose, guess=joints) for t in (original, twin))
+        _require(torch.equal(first, second), m, "the described mechanism gives other joints")
