@@ -139,5 +139,5 @@ def test_an_arm_is_planned_for_what_poses_can_tell(cli: Cli, tmp_path: Path) -> 
     code, told, _ = cli("plan", "--mechanism", arm, "--poses", 12, "--out", out, "candidates=300")
     assert code == 0
     for text in (told.replace("\n", " "), out.with_suffix(".md").read_text()):
-        assert "No pose tells apart: base_z and d1 only as 1.00 base_z + 1.00 d1;" in text
+        assert "No pose distinguishes: base_z and d1 only as 1.00 base_z + 1.00 d1;" in text
         assert "theta6 and tool_rz only as" in text

@@ -93,7 +93,7 @@ def test_overrides_reach_every_case_and_sections_are_merged(tmp_path: Path) -> N
         ("cases: []\n", "cases: must have at least 1 item"),
         ("cases: [{case: tripod}]\n", "case 1: name: must be letters"),
         ("cases: [{name: a/b, case: tripod}]\n", "not 'a/b'"),
-        ("cases: [{name: a, case: tripod}, {name: a, case: tripod}]\n", "'a' stands twice"),
+        ("cases: [{name: a, case: tripod}, {name: a, case: tripod}]\n", "'a' is given twice"),
         (
             "cases: [{name: a, case: tripod, repeat: 3}]\n",
             "'a': there is no key 'repeat'; did you mean 'repeats'?",

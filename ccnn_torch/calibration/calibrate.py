@@ -1,4 +1,4 @@
-"""The main job in memory: rows, learners, figures, and a compensator from the best repeat of the best method."""
+"""From rows to trained methods, their figures, and the compensator of the best repeat."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def calibrate(
     """Train the methods of a config and judge them on held-out rows.
 
     Args:
-        folder: where checkpoints go; None = nowhere.
+        folder: folder of the checkpoints; None = none are written.
         watch: makes the callbacks of every training.
         prepared: the rows, where the caller has them already.
 

@@ -137,7 +137,7 @@ def _checked(methods: list[str], choices: tuple[str, ...]) -> list[str]:
             hint = f"did you mean '{near}'?" if near else f"known are {', '.join(choices)} and file.py:Name"
             raise ValueError(f"there is no method '{method}'; {hint}")
         if methods.count(method) > 1:
-            raise ValueError(f"'{method}' stands twice")
+            raise ValueError(f"'{method}' is given twice")
     return methods
 
 

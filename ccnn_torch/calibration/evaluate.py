@@ -1,4 +1,4 @@
-"""What a trained method does for the machine: predicted deviations, and the pose error before and after."""
+"""Predicted deviations of a trained method, and the pose error before and after."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Everything that a finished run leaves in its folder, results.json last: a folder that has it is finished."""
+"""Write the run folder; `results.json` is written last."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Put the figures of a run together in the form of `results.json`; everything on held-out rows."""
+"""Assemble the content of `results.json`."""
 
 from __future__ import annotations
 

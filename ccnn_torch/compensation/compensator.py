@@ -196,17 +196,17 @@ class Compensator(nn.Module):
             warn: warn once with `OutsideDomainWarning` when a command is outside the domain; False inside torch.func
                 transforms, where nothing can be asked of a value.
         """
-        told = not warn
+        warned = not warn
 
         def compensate(module: nn.Module, args: tuple[Any, ...], kwargs: Mapping[str, Any], output: Tensor) -> Tensor:
-            nonlocal told
+            nonlocal warned
             covariates = kwargs.get("covariates")
             if covariates is not None:
                 covariates = covariates.expand(*output.shape[:-1], covariates.shape[-1])
             command, _, inside = self(output, covariates)
             solved = torch.isfinite(output).all(-1)
-            if not told and bool((solved & ~inside).any()):
-                told = True
+            if not warned and bool((solved & ~inside).any()):
+                warned = True
                 warnings.warn(
                     "a command is outside the domain that the compensator was trained on, where it falls back to the "
                     "mean training deviation; this is said once",

@@ -1,4 +1,4 @@
-"""How steep a deviation is, hence how many steps of q ← q* - δ(q) solve for the command."""
+"""Lipschitz constant of a deviation, and the number of iterations that the command needs."""
 
 from __future__ import annotations
 

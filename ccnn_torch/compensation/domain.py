@@ -1,4 +1,4 @@
-"""Where a learned deviation may be trusted, and how it fades out beyond."""
+"""Domain of a learned deviation, and how it fades outside."""
 
 from __future__ import annotations
 

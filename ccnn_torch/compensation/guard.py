@@ -1,4 +1,4 @@
-"""What comes out of a model is held to what its card promises, whatever the file computes."""
+"""Check of every output of a model against the limits of its card."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Physical causes of a gap between model and machine, one file each, all of one protocol."""
+"""Physical causes of error, one file each, all of one protocol."""
 
 from ccnn_torch.effects.apply import Acting as Acting
 from ccnn_torch.effects.apply import measured_pose as measured_pose

@@ -1,4 +1,4 @@
-"""Effects at work: the pose that a machine with them reaches, and what they do to it to first order."""
+"""The pose that a machine with effects reaches, and the first-order change of the pose by an effect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Play between motor and joint: where a joint comes to rest depends on the side that it comes from."""
+"""Backlash between motor and joint: the rest position depends on the direction of approach."""
 
 from __future__ import annotations
 

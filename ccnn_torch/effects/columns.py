@@ -1,4 +1,4 @@
-"""What several effects share: columns by joint, typical sizes by unit, moves about a point."""
+"""Functions that several effects share: columns by joint, typical sizes by unit, motions about a point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Joints, legs and links that give under an external load, and stiffen."""
+"""Deflection of joints, legs and links under an external load."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _TYPICAL = {"m": 100.0, "rad": 30.0}
 
 
 class Compliance:
-    """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0 + h_i τ_i³ / τ_0², τ = what the load asks of the joint; and members that
-    give, e_k.
+    """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0 + h_i τ_i³ / τ_0², τ = force or torque of the load on the joint; and
+    members that give, e_k.
 
     τ_0 = 100 N or 30 N·m: d and h are changes of compliance there. Secondary as well, the members: a leg stretches in
-    all its lengths p in proportion to what the load asks of them, Δp = e (∂x/∂p) · load (virtual work); a link of an
+    all its lengths p in proportion to the force of the load on them, Δp = e (∂x/∂p) · load (virtual work); a link of an
     arm tilts at its joint under the part of the moment that the joint does not carry. All to first order about the
     nominal pose, so that the effect is one on the pose.
     """
@@ -84,9 +84,9 @@ class Compliance:
 def _stretching(situation: Situation) -> Tensor:
     """Change of the pose by the members of a machine with legs, `... x s x c x (members)`."""
     slope = torch.nan_to_num(situation.parameter_jacobian)
-    asked = slope.mT @ situation.wrench.unsqueeze(-1)
+    torques = slope.mT @ situation.wrench.unsqueeze(-1)
     found = members(situation.mechanism)
-    moved = [slope[..., m.lengths] @ asked[..., m.lengths, :] for m in found]
+    moved = [slope[..., m.lengths] @ torques[..., m.lengths, :] for m in found]
     return torch.cat(moved, -1) if found else slope[..., :0]
 
 

@@ -1,4 +1,4 @@
-"""One joint's motion that moves another: a wrist's gears, a belt over several axes, crosstalk of encoders."""
+"""Motion of one joint caused by another: gears of a wrist, belts over several axes, crosstalk of encoders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Conditions under which rows might have been measured: times, temperatures, loads, directions of approach."""
+"""Plausible covariates of rows: times, temperatures, loads, directions of approach."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Joints that wander in time: a slipping coupling, a warming encoder, a base that settles."""
+"""Drift of the joints in time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The measuring device stands elsewhere than the model believes."""
+"""The frame of the measuring device differs from that of the model."""
 
 from __future__ import annotations
 

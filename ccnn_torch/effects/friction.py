@@ -1,4 +1,4 @@
-"""Friction that winds up the drives: it acts against the last motion and grows with what the joint carries."""
+"""Friction that winds up the drives: opposite to the last motion, growing with the load of the joint."""
 
 from __future__ import annotations
 

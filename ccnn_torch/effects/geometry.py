@@ -1,4 +1,4 @@
-"""Lengths, places and angles of a machine as built that are not those of its drawing."""
+"""Errors of the geometric parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A machine that sags under its own weight, more in one place of its workspace than in another."""
+"""Deflection under the machine's own weight."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MOMENT = 5.0
 
 
 class Gravity:
-    """Δq_i = c_i τ_i, τ = what the machine's own weight asks of the joint per newton, by virtual work.
+    """Δq_i = c_i τ_i, τ = force or torque of the machine's own weight on the joint per newton, by virtual work.
 
     For an arm the newton is spread evenly over the origins of its links and the tool; for other machines it hangs on
     the measured point of the platform. c is compliance times weight: a sag for each metre of lever (turning joints), or
@@ -97,5 +97,5 @@ def _off_centre(situation: Situation) -> Tensor:
     moment = torch.linalg.cross(rotation.mT, situation.down.expand_as(rotation), dim=-1)
     scale = torch.tensor([SCALE[j.unit] for j in situation.mechanism.joints], dtype=rotation.dtype)
     jacobian = torch.nan_to_num(situation.jacobian)
-    asked: Tensor = jacobian[..., 3:, :].mT @ moment.mT
-    return scale[:, None] * asked
+    torques: Tensor = jacobian[..., 3:, :].mT @ moment.mT
+    return scale[:, None] * torques

@@ -1,4 +1,4 @@
-"""A measuring device whose axes are off: each of another scale, and not square to each other."""
+"""Errors of the measuring device: scale of its axes, and their squareness."""
 
 from __future__ import annotations
 

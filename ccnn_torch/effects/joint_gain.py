@@ -1,4 +1,4 @@
-"""A scale error of each joint: a screw's lead, a gear ratio, an encoder's count."""
+"""Scale error of each joint: lead of a screw, gear ratio, counts of an encoder."""
 
 from __future__ import annotations
 

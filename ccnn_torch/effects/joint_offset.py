@@ -1,4 +1,4 @@
-"""A constant error of each joint: a mounted encoder, a lost reference."""
+"""Constant error of each joint: mounting of an encoder, reference position."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happened before each row, by the column of times: lagged values and velocities, without a loop over rows."""
+"""Lagged values and velocities from the column of times, without a loop over rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses taken on the move, some milliseconds after the joints that stand beside them."""
+"""Delay between the recorded joints and the recorded pose of a moving machine."""
 
 from __future__ import annotations
 

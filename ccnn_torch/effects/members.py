@@ -1,4 +1,4 @@
-"""The parts that a machine is made of, as its parameters tell: legs, links of an arm, or lengths of their own."""
+"""Members of a machine by its parameters: legs, links of an arm, single lengths."""
 
 from __future__ import annotations
 

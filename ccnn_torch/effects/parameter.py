@@ -1,4 +1,4 @@
-"""A parameter of a simulator that is no length and no angle: a stiffness, a mass, a friction of another value."""
+"""Error of a parameter of a simulator that is neither a length nor an angle."""
 
 from __future__ import annotations
 

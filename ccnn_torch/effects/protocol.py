@@ -1,4 +1,4 @@
-"""What an effect is: one physical cause of a gap. A new one is one file that fills in these verbs."""
+"""The protocol of an effect. A new effect is one file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Coefficient:
         joint: name of the joint that it belongs to alone, or None.
         leg: number of the leg that it belongs to alone, or None.
         secondary: whether it stands for what the textbook form leaves out (a stiffening spring, a second harmonic); a
-            simulation leaves it 0 unless told otherwise.
+            simulation leaves it 0 unless given.
         borrowed: whether by itself it is what another effect does (a constant part): it does not speak for this
             one.
         doubtful: whether something else may do the same as time goes by (a mount that follows the temperature, which
@@ -59,7 +59,7 @@ class Shape:
         columns: which coefficients depend on it, or None where all do; shapes without a common coefficient are
             searched one by one.
         refined: whether values between those of the grid are possible.
-        usual: what a simulation takes unless told otherwise; drawn from the lower half of the grid where None.
+        usual: what a simulation takes unless given; drawn from the lower half of the grid where None.
     """
 
     name: str

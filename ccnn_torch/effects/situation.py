@@ -1,4 +1,4 @@
-"""What an effect sees: rows of commanded joints with their covariates, and what follows from the nominal machine."""
+"""The rows of commanded joints with covariates, and quantities of the nominal machine derived from them."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["PLATFORM_WEIGHT", "WEIGHTS", "Situation", "default_gravity"]
 PLATFORM_WEIGHT = 100.0
 """Weight of a platform of which nothing is known [N]."""
 WEIGHTS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
-"""Weights that a machine may have [N], for what asks of the joints together with a load that was recorded."""
+"""Weights that a machine may have [N], for weights that act on the joints together with a load that was recorded."""
 _STANDARD = 9.80665
 _SAMPLES = 128
-# What 1 N asks of a joint at least [N], [N·m], where gravity does not.
+# Smallest force or torque of 1 N on a joint [N], [N·m], where gravity does not.
 _LEAST = 0.1
 
 
@@ -83,7 +83,7 @@ class Situation:
     def visible(self) -> Tensor:
         """Projection onto what the pose coordinates can express, `... x s x c x c`.
 
-        A machine with the pose y, z, phi is measured in these three: nobody sees its platform shift along x.
+        A machine with the pose y, z, phi is measured in these three: its shift along x is not measured.
         """
         rows = self.frame_slope
         if rows.shape[-1] == rows.shape[-2]:
@@ -164,7 +164,7 @@ class Situation:
 
     @cached_property
     def load_torque(self) -> Tensor:
-        """What the external load asks of each joint, by virtual work, `... x s x n` [N or N·m]; 0 without a load.
+        """Force or torque of the load on each joint, by virtual work, `... x s x n` [N or N·m]; 0 without a load.
 
         Drives hold minus this.
         """
@@ -175,14 +175,14 @@ class Situation:
 
     @cached_property
     def weight_torque(self) -> Tensor:
-        """What 1 N of weight on the platform asks of each joint, `... x s x n` [N or N·m per N]."""
+        """Force or torque on each joint of 1 N of weight on the platform, `... x s x n` [N or N·m per N]."""
         # As a matrix product: the ONNX exporter gets that of a stack of matrices with one vector wrong.
         torque: Tensor = _known(self.jacobian)[..., :3, :].mT @ self.down.unsqueeze(-1)
         return torque.squeeze(-1)
 
     @cached_property
     def own_weight_torque(self) -> Tensor:
-        """What 1 N of the machine's own weight asks of each joint, `... x s x n` [N or N·m per N].
+        """Force or torque on each joint of 1 N of the machine's own weight, `... x s x n` [N or N·m per N].
 
         Of an arm it is spread evenly over the origins of its links and the tool; of others it is the platform's.
         """
@@ -222,11 +222,11 @@ class Situation:
 
     @cached_property
     def typical_torque(self) -> Tensor:
-        """What 1 N of its own weight typically asks of joints in this one's unit, `n` [N or N·m per N]."""
-        asked = self.samples.own_weight_torque.square().mean(0)
+        """Typical force or torque of 1 N of its own weight on joints in this one's unit, `n` [N or N·m per N]."""
+        torques = self.samples.own_weight_torque.square().mean(0)
         units = [j.unit for j in self.mechanism.joints]
-        alike = torch.tensor([[a == b for b in units] for a in units], dtype=asked.dtype)
-        return (alike @ asked / alike.sum(-1)).sqrt().clamp_min(_LEAST)
+        alike = torch.tensor([[a == b for b in units] for a in units], dtype=torques.dtype)
+        return (alike @ torques / alike.sum(-1)).sqrt().clamp_min(_LEAST)
 
     @cached_property
     def directed(self) -> list[int]:

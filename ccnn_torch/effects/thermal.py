@@ -1,4 +1,4 @@
-"""A machine that grows with the temperature of its surroundings, and follows it late."""
+"""Thermal growth with a first-order lag."""
 
 from __future__ import annotations
 

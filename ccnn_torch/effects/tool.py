@@ -1,4 +1,4 @@
-"""The measured point is elsewhere on the platform than the model believes."""
+"""Error of the tool frame on the platform."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Periodic errors of the drives: a gear's eccentricity, a screw's wobble, an encoder's interpolation."""
+"""Periodic errors of the drives: eccentricity of gears, wobble of screws, interpolation of encoders."""
 
 from __future__ import annotations
 

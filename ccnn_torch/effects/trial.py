@@ -1,4 +1,4 @@
-"""A user's own effect is tried on the rows at hand, before a search or a simulation rests on it."""
+"""Trial of a user's effect on the rows, before it is used."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _wrong_with(effect: OwnEffect, situation: Situation) -> str:
     middle, low, high = ([g[share * (len(g) - 1) // 2] for g in grids] for share in (1, 0, 2))
     at = torch.tensor(middle, dtype=torch.float64)
     if not torch.equal(effect.basis(situation, at), effect.basis(situation, at)):
-        return "basis() gives something else when asked again; an effect draws no random numbers and keeps no state"
+        return "basis() gives other values when called again; an effect draws no random numbers and keeps no state"
     if grids:
         # As a search asks: several sets of shapes at once.
         effect.basis(situation, torch.tensor([middle, low, high], dtype=torch.float64))

@@ -1,4 +1,4 @@
-"""A user's own effect: every call is checked, and what is wrong becomes one sentence that names file and method."""
+"""A user's effect with checked calls: an error becomes one sentence that names file and method."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def owned(effect: object, label: str | None = None) -> Effect:
     if lacking:
         raise InputError(
             f"effects: {called} is no effect, it lacks {', '.join(lacking)} "
-            "(ccnn_torch.testing.check_effect tells all that an effect needs)"
+            "(ccnn_torch.testing.check_effect checks the whole protocol of an effect)"
         )
     return OwnEffect(cast(Effect, effect), called)
 

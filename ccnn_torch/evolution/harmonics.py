@@ -90,7 +90,7 @@ def fit_harmonics(
         inputs: `r x s x i` [1], the angles last.
         step: their size, `r x a` [rad].
         targets: `r x s x o` [1].
-        rows: row weights, `r x s`; 0 leaves a row out, whatever stands in it.
+        rows: row weights, `r x s`; 0 leaves a row out, whatever its value.
         owners: the output that is the deviation of each turning joint, `a`.
         metric: channels in which errors are judged, `r x s x c x o`, as in refinement; None = the outputs.
         count: harmonics of a joint.

@@ -23,7 +23,7 @@ class MaskedNetwork(nn.Module):
     Args:
         masks, weights: one a layer, `out x in` and `out x (in or in + 1)`; missing connections become zeros.
         factors, noise: its predictive variance (`evolution.spread.Spread`), `o x q x (h + 1)` and `o`; 1 without them.
-        waves: periodic nodes (`evolution.waves`), `k`, whose columns stand last in the output's mask and weights.
+        waves: periodic nodes (`evolution.waves`), `k`, whose columns are last in the output's mask and weights.
         inputs: features in all, where the first layer reads but the leading ones; None = those that it reads.
         harmonics: of one repeat (`evolution.harmonics`), or None.
     """
@@ -184,7 +184,7 @@ def _used_slots(mask: Tensor, slots: int) -> Tensor:
 
 
 def _kept_columns(values: Tensor, hidden: int, used: Tensor) -> Tensor:
-    """Columns of the hidden nodes, of the slots in use, and what stands behind them."""
+    """Columns of the hidden nodes, of the slots in use, and the columns after them."""
     slots = len(used)
     sines, cosines = values[..., hidden : hidden + slots], values[..., hidden + slots : hidden + 2 * slots]
     return torch.cat(

@@ -1,4 +1,4 @@
-"""What a refinement is of and how far it is, as plain values, and some of its networks picked from them."""
+"""The state of a refinement as plain tensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every knob of the cooperative coevolutionary network, with the reason for its value."""
+"""Settings of the cooperative coevolutionary network, with the reason for each default."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class ParameterConfig(Section):
 class FrameConfig(Section):
     """Whether the measuring frame and the tool frame are unknown, too (parallel mechanisms)."""
 
-    base: bool = Field(default=False, description="identify where the mechanism stands in the measuring frame")
+    base: bool = Field(default=False, description="identify the pose of the mechanism in the measuring frame")
     tool: bool = Field(default=False, description="identify where the measured target sits on the platform")
 
 
@@ -232,7 +232,7 @@ class IdentifyConfig(Section):
                 hint = f"did you mean '{near}'?" if near else f"known are {known}, each also as NAME_per_leg, and all"
                 raise ValueError(f"there is no method '{method}'; {hint}")
             if methods.count(method) > 1:
-                raise ValueError(f"'{method}' stands twice")
+                raise ValueError(f"'{method}' is given twice")
         return methods
 
     @model_validator(mode="after")
@@ -270,12 +270,12 @@ class IdentifyConfig(Section):
             "methods": (self.methods != ["lm"], "is identified by lm alone; write methods=[lm]"),
             "residual": (self.residual != "auto", "has a residual of its own; remove the key"),
             "per_leg": (self.per_leg, "depends on all legs; remove the key"),
-            "frame.base": (self.frame.base, "stands anywhere and cannot show the base frame; remove the key"),
+            "frame.base": (self.frame.base, "has no known place and cannot determine the base frame; remove the key"),
             "noise": (isinstance(self.noise, dict), "has one noise; write one size, e.g. noise='0.02 mm'"),
             "joint_noise": (self.joint_noise is not None, "has one noise, that of the whole; remove the key"),
             "transfer": (self.transfer is not None, "has no measured poses to transfer to; remove the key"),
             "bootstrap": (self.bootstrap > 0, "has the formula's intervals alone; remove the key"),
-            "paper": (self.paper is not None, "stands in no paper; remove the key"),
+            "paper": (self.paper is not None, "is in no paper; remove the key"),
             "split.kind": (self.split.kind == "block", "measures no positions to sort by; write random or group"),
             "constraint.plate_tolerance": (
                 constraint.kind != "sockets" and constraint.plate_tolerance is not None,

@@ -1,4 +1,4 @@
-"""What speaks against an identification, in sentences that stand before its figures."""
+"""Warnings about an identification, one sentence each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The job in memory: rows, methods, figures; then what is written."""
+"""From rows to the identified parameters of every method, and their figures."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Identification:
         """Write what `ccnn identify` writes into a folder, which is made; a DataFrame's rows as `records.csv`.
 
         Raises:
-            InputError: a class of a mechanism stands in no file, so that nobody could build it again.
+            InputError: a class of a mechanism is not defined in a file, so it cannot be built again.
         """
         from ccnn_torch.identification.outputs import write_outputs
 
@@ -117,7 +117,7 @@ def identify(
     Args:
         store: folder beside config.yaml in which each method's outcome is kept, and from which finished ones are
             taken.
-        watch: where progress goes.
+        watch: receives the progress.
         given: records that Python has, in place of the config's file.
 
     Raises:

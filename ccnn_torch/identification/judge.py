@@ -1,4 +1,4 @@
-"""How good an identified geometry is: the pose it predicts, and the pose of the machine that is commanded by it."""
+"""Pose error of an identified geometry: predicted, and under commands computed with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `ccnn identify` writes: figures, tables, pictures, and the identified machine for us and for other tools."""
+"""Files of `ccnn identify`: figures, tables, pictures, and the identified machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers of many machines as one: the median, and 5 % to 95 % in `spread` beside it."""
+"""Figures of many machines as one: the median, and the 5 % and 95 % quantiles in `spread`."""
 
 from __future__ import annotations
 

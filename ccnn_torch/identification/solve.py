@@ -1,4 +1,4 @@
-"""One method on the rows of an identification: joint or leg by leg, on all machines side by side."""
+"""One method on the rows of an identification, jointly or leg by leg, on all machines at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a method found, in a checkpoint: an interrupted identification goes on behind the last finished method."""
+"""Checkpoints of an identification: one for each finished method."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether identified links hold where the arm stands elsewhere: on another series of measurements of the same arm."""
+"""Whether identified links hold in another series of measurements, with the same arm mounted elsewhere."""
 
 from __future__ import annotations
 

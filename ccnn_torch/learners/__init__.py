@@ -1,4 +1,4 @@
-"""Learners: what the trainer drives. Protocol in `_protocol.py`, one file a learner."""
+"""Learners behind one protocol, one file each."""
 
 from ccnn_torch.learners.protocol import Learner as Learner
 from ccnn_torch.learners.protocol import TrainingData as TrainingData

@@ -1,4 +1,4 @@
-"""The trivial baseline: the mean deviation of the training rows, wherever the machine stands."""
+"""The trivial baseline: the mean deviation of the training rows, in every pose."""
 
 from __future__ import annotations
 

@@ -137,8 +137,8 @@ class GPNetwork(nn.Module):
         points = self.points.reshape(-1, *self.own.shape)[..., :known].flatten(1)
         correlation = self._correlation(features, points, self.own[:, :known])
         # One output at a time: a product of all at once would copy the factors for every row of the features.
-        told = [correlation[..., k, :] @ factor.mT for k, factor in enumerate(self.spread)]
-        explained = torch.stack([(part * part).sum(-1) for part in told], -1)
+        weighted = [correlation[..., k, :] @ factor.mT for k, factor in enumerate(self.spread)]
+        explained = torch.stack([(part * part).sum(-1) for part in weighted], -1)
         return (self.output_scale - explained).clamp_min(0.0) + self.noise
 
     def _correlation(self, features: Tensor, points: Tensor, own: Tensor) -> Tensor:

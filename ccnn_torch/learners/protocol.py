@@ -1,4 +1,4 @@
-"""What the trainer drives. A new learner is one file that fills in these verbs."""
+"""The protocol of a learner. A new learner is one file."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class Learner(Protocol):
     A learner with the attribute `reads_angles` set gets the scaled angles of turning joints as its last features.
 
     All repeats advance together in one call, as the leading dimension of every tensor. Two learners started on the
-    same data with the same seeds give the same tensors; a learner whose state was saved and loaded goes on to the same
-    result, bit by bit. No global random state is read or set.
+    same data with the same seeds give the same tensors; a learner whose state was saved and loaded continues to the
+    same result, bit by bit. No global random state is read or set.
 
     A learner may also have
         variance(inputs: Tensor) -> Tensor: predictive variance of a *newly measured* standardised output, that of the

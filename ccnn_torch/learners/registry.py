@@ -41,7 +41,7 @@ def make_learner(name: str, settings: dict[str, Any] | None = None) -> Learner:
         if missing:
             raise InputError(
                 f"methods: {name} is no learner, it lacks {', '.join(missing)} "
-                "(ccnn_torch.testing.check_learner tells all that a learner needs)"
+                "(ccnn_torch.testing.check_learner checks the whole protocol of a learner)"
             )
         return cast(Learner, learner)
     if name not in LEARNERS:

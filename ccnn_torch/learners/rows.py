@@ -1,4 +1,4 @@
-"""Training rows without what stands in padded ones, and the error on them."""
+"""Training rows without padding, and the error on them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One structure of a CCNN: the coevolutions of its members, their refinement, and the search for periodic nodes."""
+"""One structure of a CCNN: coevolution of its members, refinement, search for periodic nodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Inverse kinematics as a module of its own, for torch forward hooks to sit on."""
+"""Inverse kinematics as a torch module, for forward hooks."""
 
 from __future__ import annotations
 

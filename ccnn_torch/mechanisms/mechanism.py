@@ -1,4 +1,4 @@
-"""What every mechanism is: named joints, pose coordinates and parameters, and batched differentiable kinematics."""
+"""Base class of mechanisms: named joints, pose coordinates and parameters, and batched differentiable kinematics."""
 
 from __future__ import annotations
 
@@ -349,7 +349,7 @@ class Mechanism(nn.Module):
         """Everything `mechanism_from_description` needs, as JSON; floats survive it exactly.
 
         Raises:
-            InputError: the class stands in no file (an interactive session), so that nobody could build it again.
+            InputError: the class is not defined in a file (an interactive session), so it cannot be built again.
         """
         names = [g.name for g in self.geometry]
         return {
@@ -366,8 +366,8 @@ class Mechanism(nn.Module):
             file = inspect.getfile(type(self))
         except (TypeError, OSError):
             raise InputError(
-                f"mechanism '{self.name}': its class {type(self).__name__} stands in no file; write it to one and use "
-                f"load_mechanism('file.py:{type(self).__name__}')"
+                f"mechanism '{self.name}': its class {type(self).__name__} is not defined in a file; write it to one "
+                f"and use load_mechanism('file.py:{type(self).__name__}')"
             ) from None
         return {"spec": f"{file}:{type(self).__qualname__}", "keys": {}}
 

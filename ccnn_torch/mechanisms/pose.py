@@ -1,4 +1,4 @@
-"""Poses as frames: position and rotation apart, whatever coordinates the mechanism has."""
+"""Poses as frames: position and rotation."""
 
 from __future__ import annotations
 

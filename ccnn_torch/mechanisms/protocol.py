@@ -1,4 +1,4 @@
-"""A user's mechanism is tried when it is loaded: what is wrong becomes one sentence."""
+"""Trial of a user's mechanism when it is loaded; an error becomes one sentence."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["checked_plugin"]
 
 # A root is settled to about 1e-12; a user's own closed form may close a little worse [m, rad].
 _CLOSES = 1e-6
-_ADVICE = "ccnn_torch.testing.check_mechanism tells more"
+_ADVICE = "ccnn_torch.testing.check_mechanism says more"
 
 
 def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:

@@ -1,4 +1,4 @@
-"""Leading batch dims: the two moves that recur wherever tensors of different batch shapes meet."""
+"""Broadcasting of leading batch dimensions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gross outliers among rows, by the spread of the residuals of the others."""
+"""Gross outliers among rows, by the spread of the other residuals."""
 
 from __future__ import annotations
 

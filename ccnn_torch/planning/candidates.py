@@ -1,4 +1,4 @@
-"""Poses to choose from: reachable, inside the limits, away from singularities; and what they show of the parameters."""
+"""Candidate poses: reachable, inside the limits, away from singularities; and their rows of the Jacobian."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Limits = Mapping[str, tuple[float, float]]
 
 # Candidates drawn and looked at in one call.
 _AT_ONCE = 20_000
-# Configurations after which progress is told.
+# Configurations after which progress is shown.
 _TOLD = 4000
 # Machines with plausible errors that must reach a pose, too.
 _MACHINES = 8
@@ -68,7 +68,7 @@ def draw_candidates(
         uncertainty: by how much each of the mechanism's parameters may be off, `K` [SI]; configurations that are out of
             reach of one of eight machines, every parameter of which is off by so much to one side or the other, are
             left out: the most informative ones are at the edge of the workspace. Serial arms reach all of theirs.
-        progress: told the share that is found.
+        progress: called with the share that is found.
 
     Raises:
         InputError: a limit on something that the mechanism does not have, or fewer than one draw in a hundred is left.

@@ -31,7 +31,7 @@ class PlannedParameters(Section):
 
 
 class PlanConfig(Section):
-    """What `ccnn plan` may be told."""
+    """What `ccnn plan` accepts."""
 
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
     parameters: PlannedParameters = Field(default_factory=PlannedParameters)

@@ -1,4 +1,4 @@
-"""A pose plan: where the poses are, and what each further one gives."""
+"""Figure of a pose plan: the poses, and the gain of each further one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much each further pose still gives, and where to stop."""
+"""Gain of each further pose, and the recommended number."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a mechanism and a config to the poses to measure, in a file for the machine and a page for the person."""
+"""From a config to the poses to measure, as a CSV file and a page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def make_plan(
         mechanism: a name, a file, or a mechanism.
         poses: how many; with `per_leg` for each leg.
         config: defaults when None.
-        progress: told the share that is done.
+        progress: called with the share that is done.
 
     Raises:
         InputError: as `load_mechanism` and `plan_poses`; a size that is none, or of something unknown.

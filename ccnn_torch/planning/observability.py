@@ -1,4 +1,4 @@
-"""How well a set of poses shows the parameters: the indices O1 to O5."""
+"""Observability indices O1 to O5 of a set of poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exchange by an index that is no determinant: O2 to O5."""
+"""Exchange of poses for the indices O2 to O5."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def exchange_by_index(
         prior: information without any pose, `k x k`.
         index: `O2` … `O5`.
         repeat: whether a candidate may be chosen more than once.
-        tell: told the share that is done.
+        tell: called with the share that is done.
 
     Returns:
         The design, and whether no exchange betters it.

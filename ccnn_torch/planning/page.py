@@ -1,4 +1,4 @@
-"""The page of a pose plan: what the poses show, what each further one gives, and where to stop."""
+"""The page of a pose plan: standard deviations, gain of each further pose, recommended number."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ __all__ = ["gain_table", "left_out_sentence", "parameter_table", "plan_markdown"
 def plan_sentence(plan: Plan, least_gain: float) -> str:
     """What a plan gives against random poses, and how many poses are recommended."""
     count = len(plan.pose)
-    whose = f"leg {plan.leg}" if plan.leg is not None else count_text(len(plan.parameters), "parameter")
+    subject = f"leg {plan.leg}" if plan.leg is not None else count_text(len(plan.parameters), "parameter")
     against = plan.o1 / plan.choice.random_o1 if plan.choice.random_o1 > 0 else float("inf")
-    text = f"{count_text(count, 'pose')} for {whose}: O1 is {number_text(against, 3)} times that of random ones"
+    text = f"{count_text(count, 'pose')} for {subject}: O1 is {number_text(against, 3)} times that of random ones"
     if plan.choice.bound is not None:
         text += f", and at least {100 * plan.choice.bound:.0f} % of what is possible in det^(1/k)"
     percent = f"{100 * least_gain:g} %"
@@ -29,13 +29,13 @@ def plan_sentence(plan: Plan, least_gain: float) -> str:
 
 
 def left_out_sentence(plan: Plan) -> str:
-    """What no pose tells, and that the plan is for the rest; empty where every parameter shows."""
+    """What no pose determines, and that the plan is for the rest; empty where every parameter shows."""
     if not plan.choice.left_out:
         return ""
-    whose = f"Of leg {plan.leg} no" if plan.leg is not None else "No"
+    subject = f"Of leg {plan.leg} no" if plan.leg is not None else "No"
     return (
-        f"{whose} pose tells apart: {'; '.join(plan.choice.left_out)}. The plan is for all that poses tell: as if "
-        "those without a row in the table kept their values. A prior or another instrument would tell them."
+        f"{subject} pose distinguishes: {'; '.join(plan.choice.left_out)}. The plan is for what poses determine: "
+        "parameters without a row in the table keep their values. A prior or another instrument would determine them."
     )
 
 

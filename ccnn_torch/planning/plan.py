@@ -79,7 +79,7 @@ class Plan:
 
     Attributes:
         leg: whose parameters they are for; None for all.
-        parameters: what the poses are planned for, `k`: without those that are held since no pose tells them.
+        parameters: what the poses are planned for, `k`: without those that are held since no pose determines them.
         scale: their plausible errors, `k` [SI].
         joints: commands for the machine, `N x n` [SI].
         pose: where they bring the nominal machine, `N x p` [SI].
@@ -133,7 +133,7 @@ def choose_poses(
         index: `O1` … `O5`, of parameters in plausible errors and measurements in noise.
         repeat: whether a row may be chosen more than once.
         least_gain: what a further pose must give to be worth measuring, a share.
-        progress: told the share that is done.
+        progress: called with the share that is done.
 
     Raises:
         InputError: too few poses or candidates, an unknown index, or no parameter shows in any candidate.
@@ -225,7 +225,7 @@ def plan_poses(
         repeat, least_gain: as `choose_poses`.
         margin: poses stay in reach of machines whose free parameters are off by so many plausible errors.
         seed: of the draws.
-        progress: told the share that is done.
+        progress: called with the share that is done.
 
     Returns:
         One plan, or one a leg.

@@ -1,4 +1,4 @@
-"""From `NAME:parameter=value,…` to an effect with its numbers."""
+"""Parse `NAME:parameter=value,…` into an effect with values."""
 
 from __future__ import annotations
 

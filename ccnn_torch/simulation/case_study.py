@@ -1,4 +1,4 @@
-"""What preparing and judging a run need of a simulated machine, whichever it is."""
+"""The interface of a simulated machine to a run, for the case studies and for realistic machines."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["CaseSimulation", "RealisticSimulation", "Simulation", "simulate_real
 
 
 class Simulation(Protocol):
-    """A machine whose true behaviour is known.
+    """A machine with known true behaviour.
 
     Attributes:
         pose: poses wanted, `r x s x p` [SI].

@@ -18,7 +18,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class SimulateConfig(Section):
-    """What `ccnn simulate` may be told."""
+    """What `ccnn simulate` accepts."""
 
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
     covariates: list[str] | None = Field(

@@ -1,4 +1,4 @@
-"""What a machine cannot have: parameters of an effect that physics, the mechanism or common sense rule out."""
+"""Limits of the parameters of a simulated effect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bad rows: a ball that was not seated, a beam that was broken, a wrong row copied."""
+"""Gross outliers for simulated records."""
 
 from __future__ import annotations
 

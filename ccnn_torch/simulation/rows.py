@@ -1,4 +1,4 @@
-"""Which configurations a simulated machine is measured in: poses at rest over its workspace, or moves."""
+"""Configurations of simulated records: poses at rest over the workspace, or moves."""
 
 from __future__ import annotations
 

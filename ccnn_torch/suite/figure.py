@@ -1,4 +1,4 @@
-"""All cases of a suite on one axis: how far each method is from the noise floor."""
+"""Figure of a suite: error of each method relative to the noise floor, for all cases."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
 def run_suite(suite: Suite, quiet: bool = False) -> Path:
     """Run the cases that are not finished yet, then compare the methods over all of them.
 
-    A case in which no method can be trained is told and left out of the comparison; the next call tries it again.
+    A case in which no method can be trained is reported and left out of the comparison; the next call tries it again.
 
     Returns:
         The path of `suite.json`.
@@ -173,7 +173,7 @@ def _comparable(config: RunConfig) -> dict[str, Any]:
 
 
 def _about(config: RunConfig) -> dict[str, Any]:
-    """What the comparison tells of a case besides its results."""
+    """What the comparison states about a case besides its results."""
     about: dict[str, Any] = {"split": config.split.kind}
     if config.case == "realistic":
         about |= config.realistic.model_dump(mode="json")
@@ -185,7 +185,7 @@ def _name(keys: Mapping[str, Any], where: str, taken: Iterable[str]) -> str:
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][\w.-]*", name):
         raise InputError(f"{where}: name: must be letters, digits, '-', '_' and '.', it names a folder; not {name!r}")
     if name in taken:
-        raise InputError(f"{where}: name: '{name}' stands twice; give each case its own")
+        raise InputError(f"{where}: name: '{name}' is given twice; give each case its own")
     return name
 
 

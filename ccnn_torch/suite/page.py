@@ -116,8 +116,8 @@ def _summary(cases: list[Block]) -> dict[str, Block]:
     names = dict.fromkeys(method for case in cases for method in (*case["methods"], *case["failed_methods"]))
     summary: dict[str, Block] = {}
     for method in names:
-        asked = [case for case in cases if method in case["methods"] or method in case["failed_methods"]]
-        found = [case["methods"][method] for case in asked if method in case["methods"]]
+        searched = [case for case in cases if method in case["methods"] or method in case["failed_methods"]]
+        found = [case["methods"][method] for case in searched if method in case["methods"]]
         counts = {
             "best": sum(block["best"] for block in found),
             "best_or_tied": sum(block["tied"] for block in found),
@@ -126,10 +126,10 @@ def _summary(cases: list[Block]) -> dict[str, Block]:
         versus = [block["ratio_to_best"]["median"] for block in found if block["ratio_to_best"]["median"] is not None]
         seconds = [block["seconds"]["median"] for block in found if block["seconds"]]
         summary[method] = {
-            "cases": len(asked),
-            "failed": len(asked) - len(found),
+            "cases": len(searched),
+            "failed": len(searched) - len(found),
             **counts,
-            "share": {key: count / len(asked) for key, count in counts.items()},
+            "share": {key: count / len(searched) for key, count in counts.items()},
             "typical_ratio_to_best": float(np.exp(np.mean(np.log(versus)))) if versus and min(versus) > 0 else None,
             "seconds": float(np.median(seconds)) if seconds else None,
         }

@@ -52,16 +52,16 @@ def verdict(comparison: Mapping[str, Any]) -> str:
 
 def case_line(results: Mapping[str, Any]) -> str:
     """One line while a suite runs: each method's median ratio to the floor (or its error), and the best."""
-    told = []
+    texts = []
     for name, block in results["methods"].items():
         if block["test"] is None:
-            told.append(f"{name} failed")
+            texts.append(f"{name} failed")
             continue
         ratio = block["ratio_to_floor"]
         value = ratio["median"] if ratio else block["test"].get("all", {}).get("mse", {}).get("median")
-        told.append(f"{name} {number_text(value, 3)}")
+        texts.append(f"{name} {number_text(value, 3)}")
     what = "ratio to the floor" if results["floor"] else "mean squared error"
-    return f"{what}: {', '.join(told)}"
+    return f"{what}: {', '.join(texts)}"
 
 
 def _cases_table(comparison: Mapping[str, Any]) -> Table:
@@ -86,12 +86,12 @@ def _cases_table(comparison: Mapping[str, Any]) -> Table:
 
 
 def _case_text(case: Mapping[str, Any]) -> str:
-    told = [case["split"], count_text(case["counts"]["train"] + case["counts"]["validation"], "row")]
+    texts = [case["split"], count_text(case["counts"]["train"] + case["counts"]["validation"], "row")]
     if case["floor"] is not None:
         floor = case["floor"]["median"] ** 0.5
         scale, unit = display_unit(case["unit"], floor)
-        told.append(f"{number_text(floor / scale, 3)} {unit}")
-    return f"{case['name']} ({', '.join(told)})"
+        texts.append(f"{number_text(floor / scale, 3)} {unit}")
+    return f"{case['name']} ({', '.join(texts)})"
 
 
 def _standing(case: Mapping[str, Any]) -> str:
@@ -120,12 +120,12 @@ def _methods_table(comparison: Mapping[str, Any]) -> Table:
 
 
 def _failures(comparison: Mapping[str, Any]) -> list[str]:
-    told = [f"case '{name}' failed: {sentence}" for name, sentence in comparison["failed"].items()]
+    texts = [f"case '{name}' failed: {sentence}" for name, sentence in comparison["failed"].items()]
     # A learner that is not there fails alike in every case: said once.
     where: dict[tuple[str, str], list[str]] = {}
     for case in comparison["cases"]:
         for method, sentence in case["failed_methods"].items():
             where.setdefault((method, sentence), []).append(f"'{case['name']}'")
     for (method, sentence), cases in where.items():
-        told.append(f"{method} failed in {count_text(len(cases), 'case')} ({', '.join(cases)}): {sentence}")
-    return told
+        texts.append(f"{method} failed in {count_text(len(cases), 'case')} ({', '.join(cases)}): {sentence}")
+    return texts

@@ -1,4 +1,4 @@
-"""Does an effect keep what simulation, diagnosis and compensation rely on? See `ccnn_torch.effects.Effect`."""
+"""Conformance checks of an effect. See `ccnn_torch.effects.Effect`."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _check_basis(effect: Effect, situation: Situation) -> None:
     found = effect.coefficients(situation)
     shape = _shape(effect, situation)
     basis = effect.basis(situation, shape)
-    _require(torch.equal(basis, effect.basis(situation, shape)), effect, "basis is not the same when asked again")
+    _require(torch.equal(basis, effect.basis(situation, shape)), effect, "basis differs when called again")
     primary = [k for k, c in enumerate(found) if not c.secondary]
     moved = signature(situation, effect, shape)[..., primary].abs().amax()
     _require(bool(moved > 0), effect, f"does nothing to mechanism '{situation.mechanism.name}'")
@@ -120,7 +120,7 @@ def _check_basis(effect: Effect, situation: Situation) -> None:
 
 
 def _check_order(effect: Effect, situation: Situation) -> None:
-    """An effect that does not need the order gives each row the same wherever it stands."""
+    """An effect that does not need the order gives each row the same wherever it is in the table."""
     if effect.ordered:
         return
     turned = replace(

@@ -1,4 +1,4 @@
-"""Does a learner keep what the trainer relies on? See `ccnn_torch.learners.Learner`."""
+"""Conformance checks of a learner. See `ccnn_torch.learners.Learner`."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def _check_padding(factory: Callable[[], Learner], data: TrainingData) -> None:
     )
     one, two = _train(factory(), data).predict(data.inputs), _train(factory(), other).predict(data.inputs)
     worst = float((one - two).abs().max())
-    _require(worst <= 1e-9, f"what stands in rows of weight 0 changes the predictions by {worst:.3g}")
+    _require(worst <= 1e-9, f"values in rows of weight 0 change the predictions by {worst:.3g}")
 
 
 def _check_resume(factory: Callable[[], Learner], whole: Learner, data: TrainingData) -> None:

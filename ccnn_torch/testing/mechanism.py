@@ -1,4 +1,4 @@
-"""What a mechanism must do for the rest of the package to work with it."""
+"""Conformance checks of a mechanism. See `ccnn_torch.mechanisms.Mechanism`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What may watch a training: a small protocol, filled in by the progress bar, TensorBoard and held-out curves."""
+"""The protocol of a callback of a training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checkpoints: tensors in safetensors, written whole or not at all, so that a kill at any moment leaves a good file."""
+"""Checkpoints: tensors in safetensors files that are written whole or not at all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ctrl-C held back while something is written that must not be cut in the middle."""
+"""Defer Ctrl-C while something is written that must not be cut."""
 
 from __future__ import annotations
 

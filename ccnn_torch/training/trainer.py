@@ -76,7 +76,7 @@ def train(
     it differs from run to run (`Training.clock` has it).
 
     Args:
-        checkpoint: file to write every `every` steps and before the first; if it is there, the training goes on from
+        checkpoint: file to write every `every` steps and before the first; if it is there, the training continues from
             it and ends in the same tensors as one that was never stopped.
         facts: JSON-able, kept in the checkpoint under its hash: what the training was begun with.
         stop_at: steps of each repeat, `r` int64.

@@ -1,4 +1,4 @@
-"""Pictures of a verification: what the model says against what was measured, and the pose error row by row."""
+"""Figures of a verification: predicted against measured deviations, and the pose error of every row."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def predicted_plot(arrays: RunArrays) -> Plot:
     columns = min(count, 3)
     lines = -(-count // columns)
     figure = Figure(figsize=(2.9 * columns, 2.8 * lines + 0.2), layout="constrained")
-    told = []
+    texts = []
     for i, axes in enumerate(figure.subplots(lines, columns, squeeze=False).flat):
         if i >= count:
             axes.set_visible(False)
@@ -35,8 +35,8 @@ def predicted_plot(arrays: RunArrays) -> Plot:
         axes.set_xlabel(f"measured [{unit}]")
         axes.set_ylabel(f"predicted [{unit}]")
         if np.ptp(measured) > 0 and np.ptp(predicted) > 0:
-            told.append(f"{arrays.joints[i].name} {number_text(float(np.corrcoef(measured, predicted)[0, 1]), 2)}")
-    also = f" Correlation: {', '.join(told)}." if told else ""
+            texts.append(f"{arrays.joints[i].name} {number_text(float(np.corrcoef(measured, predicted)[0, 1]), 2)}")
+    also = f" Correlation: {', '.join(texts)}." if texts else ""
     return Plot(
         "predicted",
         figure,

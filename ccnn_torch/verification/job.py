@@ -1,4 +1,4 @@
-"""Judging a model on rows that it has never seen, against what was promised when it was made."""
+"""Judge a model on new rows against what it promised."""
 
 from __future__ import annotations
 

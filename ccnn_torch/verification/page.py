@@ -1,4 +1,4 @@
-"""What `ccnn verify` writes: one page, and the figures, which come last."""
+"""Write the page of `ccnn verify` with its figures."""
 
 from __future__ import annotations
 

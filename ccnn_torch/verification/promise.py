@@ -1,4 +1,4 @@
-"""What a model promises for rows that nobody has measured yet, by the rows that were held out when it was made."""
+"""The promise of a model for new rows, from the rows held out when it was made."""
 
 from __future__ import annotations
 

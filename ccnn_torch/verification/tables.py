@@ -1,4 +1,4 @@
-"""A verification in words and tables, from the content of `verify.json` alone."""
+"""Tables and sentences of a verification, from the content of `verify.json`."""
 
 from __future__ import annotations
 

@@ -174,7 +174,7 @@ class Random(Good):
         (OneSet, "differs from single calls"),
         (Ordered, "depends on the order of the rows"),
         (Idle, "does nothing to mechanism 'five_bar'"),
-        (Random, "something else when asked again"),
+        (Random, "gives other values when called again"),
     ],
 )
 def test_the_check_names_a_broken_promise(broken: type[Good], sentence: str) -> None:

@@ -65,7 +65,7 @@ def test_no_prior_is_an_infinite_one() -> None:
         (ParameterChoice(free=["leg1.A2*"]), "did you mean"),
         (ParameterChoice(fixed=["*"]), "nothing is left free"),
         (ParameterChoice(tied=[["A1x", "A2x"]]), "A2x and A1x start at different values"),
-        (ParameterChoice(tied=["l*", ["l1", "l2"]]), "'l1' stands in two groups"),
+        (ParameterChoice(tied=["l*", ["l1", "l2"]]), "'l1' is in two groups"),
         (ParameterChoice(fixed=["l2"], tied=["l*"]), "'l2' is fixed but tied to l1"),
         (ParameterChoice(prior={"gain": 0.0}), "parameters.prior: 'gain' has the standard deviation 0.0"),
         (ParameterChoice(prior={"gian": 1.0}), "did you mean 'gain'"),

@@ -179,7 +179,7 @@ def test_distances_and_planes_identify_too(kind: str, tmp_path: Path) -> None:
         (["split.kind=group", "split.by=[placement]"], "split: a socket of placement . has held-out rows but none"),
         (["methods=[hga]"], "methods: a constraint is identified by lm alone; write methods=\\[lm\\]"),
         (["bootstrap=9"], "bootstrap: a constraint has the formula's intervals alone"),
-        (["frame={base: true}"], "frame.base: a constraint stands anywhere"),
+        (["frame={base: true}"], "frame.base: a constraint has no known place"),
         (["frame={tool: true}"], "frame.tool: an arm has a tool offset of its own"),
         (["constraint.tolerance=0"], "constraint.tolerance: 0 is no standard deviation"),
         (["constraint.tolerance={mm: 1}"], "constraint.tolerance.mm: there is no such name"),

@@ -46,7 +46,7 @@ def test_every_key_is_described() -> None:
         ({}, "no data is named"),
         ({"simulate": {}, "records": "a.csv"}, "both records and simulate are given"),
         ({"simulate": {}, "methods": ["lm_per_legs"]}, "no method 'lm_per_legs'; did you mean 'lm_per_leg'"),
-        ({"simulate": {}, "methods": ["lm", "lm"]}, "'lm' stands twice"),
+        ({"simulate": {}, "methods": ["lm", "lm"]}, "'lm' is given twice"),
         ({"simulate": {"machine": 3}}, "no key 'simulate.machine'; did you mean 'simulate.machines'"),
         ({"simulate": {}, "noise": 1e-5}, "simulated data has simulate.noise"),
         ({"simulate": {"as_built": True}}, "give simulate.points"),

@@ -198,7 +198,7 @@ def _islands(commands: np.ndarray, covariates: object, parameters: np.ndarray) -
         ({"simulate": lambda c, *o: c[:, :1]}, r"returned shape \(1, 1\) for 1 row, expected \(1, 2\).*of x, y; wrap"),
         ({"simulate": lambda c, *o: None}, r"returned shape \(\) for 1 row"),
         ({"simulate": lambda c, *o: c * 0}, "no joint changes the pose"),
-        ({"simulate": _noisy}, "not deterministic: asked twice about q1 = .*seed its random numbers"),
+        ({"simulate": _noisy}, "not deterministic: evaluated twice at q1 = .*seed its random numbers"),
         ({"simulate": _coupled}, "not deterministic.*let no row depend on others"),
         ({"simulate": _failing}, r"simulate fails at line \d+ of .*test_black_box.py on 1 row: ValueError: operands"),
         ({"pose": ("x", "theta")}, "pose: 'theta' is none of x, y, z.*frame"),

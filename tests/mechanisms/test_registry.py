@@ -83,7 +83,7 @@ def test_a_directly_made_mechanism_describes_itself():
     twin = mechanism_from_description(json.loads(json.dumps(bar.describe())), allow_code=True)
     assert torch.equal(twin.nominal, bar.nominal)
     homeless = type("Homeless", (FiveBar,), {"__module__": "__nowhere__"})()
-    with pytest.raises(InputError, match="Homeless stands in no file"):
+    with pytest.raises(InputError, match="Homeless is not defined in a file"):
         homeless.describe()
 
 

@@ -1,4 +1,4 @@
-"""`geometry: auto`: identified geometry or the nominal one, and whether there is anything left for a learner."""
+"""`geometry: auto`: nominal or identified geometry, with or without a learner, by cross-validation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What measured records say of the machine itself: its frames, and with `geometry: identify` all its parameters."""
+"""Frames fitted to measured records, and with `geometry: identify` all parameters."""
 
 from __future__ import annotations
 

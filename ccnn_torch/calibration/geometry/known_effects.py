@@ -1,4 +1,4 @@
-"""`effects: from:FILE`: what a diagnosis named, fitted to the training rows, as a part of the compensator."""
+"""`effects: from:FILE`: effects of a diagnosis, fitted to the training rows, as a part of the compensator."""
 
 from __future__ import annotations
 

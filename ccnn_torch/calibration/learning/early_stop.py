@@ -1,4 +1,4 @@
-"""What rows held out from training say about a method: how long to train, how well it does, how sure it may be."""
+"""Early stopping, score and scale of the predictive standard deviation, on rows held out from training."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def choose(
 
     Args:
         make: makes a fresh learner.
-        folder: where the checkpoint goes; None = nowhere.
+        folder: folder of the checkpoint; None = none is written.
         budget: seconds inside the learner after which no further step begins.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Train one method on a dataset: choose how long by rows held out if asked, then refit on all training rows."""
+"""Train one method: choose the number of steps on rows held out, then refit on all training rows."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def fit_method(
 
     Args:
         make: makes a fresh learner.
-        folder: where checkpoints go; None = nowhere.
+        folder: folder of the checkpoints; None = none are written.
 
     Raises:
         InputError: too few rows.

@@ -1,4 +1,4 @@
-"""`methods=auto`: the method that cross-validation prefers within a time budget, and the comparison behind it."""
+"""`methods=auto`: cross-validation of the methods within a time budget."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Is the predictive standard deviation right? Found on rows held out from training, corrected, and measured again."""
+"""Calibration and coverage of the predictive standard deviation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables that set methods side by side beyond their errors: cross-validation, effort, and the pose error left."""
+"""Tables that compare methods: cross-validation, effort, remaining pose error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A picture of a masked network: one matrix a layer of connections, dead nodes greyed."""
+"""Figure of a masked network: one matrix for each layer of connections."""
 
 from __future__ import annotations
 

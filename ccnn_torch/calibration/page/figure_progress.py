@@ -1,4 +1,4 @@
-"""How fast each method gets how far: held-out error against time and against evaluations, all methods on one axis."""
+"""Held-out error against time and against evaluations, all methods on one axis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What it costs each method to reach the same error on held-out rows."""
+"""Effort of each method to reach the same held-out error."""
 
 from __future__ import annotations
 

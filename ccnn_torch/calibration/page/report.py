@@ -1,4 +1,4 @@
-"""From the numbers in a run folder to everything a person reads: tables, pictures, one HTML page."""
+"""Write the tables, figures and HTML page of a run folder."""
 
 from __future__ import annotations
 

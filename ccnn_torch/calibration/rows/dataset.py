@@ -1,4 +1,4 @@
-"""Rows of many repeats side by side: from splits to the padded tensors that a learner takes."""
+"""The rows of all repeats as padded tensors."""
 
 from __future__ import annotations
 

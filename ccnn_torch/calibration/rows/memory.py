@@ -1,4 +1,4 @@
-"""How much memory a run will take, told before it begins: a process that the system kills says nothing."""
+"""Memory that a run will need, checked before it begins."""
 
 from __future__ import annotations
 

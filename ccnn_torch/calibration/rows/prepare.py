@@ -1,4 +1,4 @@
-"""From a config to the rows of a run: a case study simulated, or measured records with their frames fitted."""
+"""The rows of a run: a simulated case study, or measured records with their frames fitted."""
 
 from __future__ import annotations
 

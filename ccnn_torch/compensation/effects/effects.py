@@ -1,4 +1,4 @@
-"""Physical effects as a deviation of the joints: the objects that a diagnosis fits, at work in a compensator."""
+"""Physical effects as a joint deviation in a compensator."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Care(NamedTuple):
 def effect_deviation(
     here: Situation, acting: Sequence[Acting], jacobian: Callable[[Tensor], Tensor], care: Care
 ) -> Tensor:
-    """Joint deviation with which the nominal machine stands where the machine with the effects stands.
+    """Joint deviation with which the nominal machine has the pose of the machine with the effects.
 
     Effects on joints count as they are. The change of the pose by the others is brought to the joints by the damped
     inverse of the Jacobian half way (the midpoint rule), which leaves the third order of the deviation.

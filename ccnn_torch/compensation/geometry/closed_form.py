@@ -42,7 +42,7 @@ class ClosedKinematics(nn.Module):
     def quantities(self, joints: Tensor, names: set[str]) -> dict[str, Tensor]:
         """What a `Situation` calls by these names, and the pose, at joints `s x n`."""
         mechanism = self._mechanism[0]
-        joints, pose, stands = self._standing(joints)
+        joints, pose, reachable = self._standing(joints)
         found = {"pose": pose}
         needed = self.start is not None or names & {"frame_slope", "holding", "visible"}
         seen = _frame_slope(mechanism.frame, pose) if needed else pose
@@ -60,7 +60,7 @@ class ClosedKinematics(nn.Module):
                 rates = _slope(lambda p: mechanism.solve_inverse(pose, p), values)
                 found["parameter_jacobian"] = -found["jacobian"] @ rates
         found["jacobian"] = torch.where(
-            stands.unsqueeze(-1), found["jacobian"], torch.full_like(pose[:1, :1, None], _LOST)
+            reachable.unsqueeze(-1), found["jacobian"], torch.full_like(pose[:1, :1, None], _LOST)
         )
         if "frame_slope" in names:
             found["frame_slope"] = seen
@@ -75,17 +75,17 @@ class ClosedKinematics(nn.Module):
         mechanism = self._mechanism[0]
         if self.start is None:
             pose = mechanism.forward_kinematics(joints)
-            stands = torch.isfinite(pose).all(-1, keepdim=True)
-            joints = torch.where(stands, joints, mechanism.home_joints)
-            return joints, torch.where(stands, pose, mechanism.home_pose), stands
+            reachable = torch.isfinite(pose).all(-1, keepdim=True)
+            joints = torch.where(reachable, joints, mechanism.home_joints)
+            return joints, torch.where(reachable, pose, mechanism.home_pose), reachable
         pose = self.start(joints).detach()
         for _ in range(_NEWTON_STEPS):
             pose = self._newton(pose, joints).detach()
         # A comparison with NaN is false.
-        stands = ((mechanism.solve_inverse(pose) - joints).abs() < _FOUND).all(-1, keepdim=True)
-        joints = torch.where(stands, joints, mechanism.home_joints)
+        reachable = ((mechanism.solve_inverse(pose) - joints).abs() < _FOUND).all(-1, keepdim=True)
+        joints = torch.where(reachable, joints, mechanism.home_joints)
         # The last step has the derivative by the joints.
-        return joints, self._newton(torch.where(stands, pose, mechanism.home_pose), joints), stands
+        return joints, self._newton(torch.where(reachable, pose, mechanism.home_pose), joints), reachable
 
     def _newton(self, pose: Tensor, joints: Tensor) -> Tensor:
         inverse = self._mechanism[0].solve_inverse

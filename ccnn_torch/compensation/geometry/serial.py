@@ -21,7 +21,7 @@ _STEPS = 2
 
 
 class SerialGeometry(nn.Module):
-    """Joint deviation with which the nominal arm stands where the identified arm stands: δ(q) = g(f(q)) - q.
+    """Joint deviation with which the nominal arm has the pose of the identified arm: δ(q) = g(f(q)) - q.
 
     f is the identified forward kinematics, g the nominal inverse kinematics: here two damped Gauss-Newton steps from q
     that share the Jacobian at q, which the deviation (milliradians) changes by thousandths. Near a singularity the
@@ -158,7 +158,7 @@ class SerialGeometry(nn.Module):
 def _links(arm: SerialArm, values: Tensor) -> Tensor:
     """`cos q`, `sin q` (or q of a prismatic joint) and constant part of every link's transform, `3 x ... x n x 4 x 4`.
 
-    The base stands before the first link and the tool behind the last one.
+    The base comes before the first link and the tool after the last one.
     """
 
     def at(q: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""Fit of a machine to what holds its tool: the tool's offset first, then all links near nominal, noise re-estimated."""
+"""Fit of an arm to a constraint of its tool: the tool offset first, then all links with a prior."""
 
 from __future__ import annotations
 

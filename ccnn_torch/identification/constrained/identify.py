@@ -100,10 +100,10 @@ def _position(distance: Tensor) -> PoseError:
 
 
 def _known(found: ConstraintFit) -> Known:
-    """The machine's part of what is known; a parameter that only its prior tells has no interval."""
+    """The machine's part of what is known; a parameter that only its prior determines has no interval."""
     k, knowledge = len(found.selection.parameters), found.knowledge
-    told = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * found.after.problem.prior_sd)
-    sd = torch.where(told, knowledge.sd, math.inf)[:, :k]
+    determined = knowledge.identifiable & (knowledge.sd < _AS_PRIOR * found.after.problem.prior_sd)
+    sd = torch.where(determined, knowledge.sd, math.inf)[:, :k]
     noise = knowledge.noise if found.after.problem.noise_known else torch.ones(1, dtype=torch.float64)
     return Known(
         sd=sd,

@@ -1,4 +1,4 @@
-"""Records of a tool that something holds, as rows of a constraint: sockets of a plate, distances, points on a plane."""
+"""Rows of a constraint on the tool: sockets of a plate, distances from an anchor, points on a plane."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a fit varies when the rows are drawn again: intervals that do not rest on the linearised problem."""
+"""Bootstrap over rows: intervals that do not rely on the linearised problem."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Directions that cannot be known, said in words: which parameters, and what of them is known after all."""
+"""Directions of the parameters that the rows do not determine, in words."""
 
 from __future__ import annotations
 

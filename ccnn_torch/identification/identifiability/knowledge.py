@@ -1,4 +1,4 @@
-"""What the measured rows tell of each parameter: standard errors, correlation, and what cannot be known from them."""
+"""Standard errors, correlations and the directions that the rows do not determine."""
 
 from __future__ import annotations
 

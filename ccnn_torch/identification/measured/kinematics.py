@@ -1,4 +1,4 @@
-"""How a machine moves: as its mechanism's forward kinematics say, or as built, off the nominal motion."""
+"""Forward kinematics of the nominal motion, or of a machine as built."""
 
 from __future__ import annotations
 

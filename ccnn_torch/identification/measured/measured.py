@@ -49,7 +49,7 @@ class Measured:
         map: poses of the map, `m x p` [SI]; None where none is drawn.
         pose_noise: standard deviation of each observed coordinate, `o` [SI]; None where it is to be estimated.
         joint_noise: of the recorded joints, `n` [SI]; None where there is none.
-        unknown_frame: parameters that say where the machine stands in the measuring frame, which no maker can know:
+        unknown_frame: parameters that say the pose of the machine in the measuring frame, which the maker cannot know:
             they are fitted before "before" is judged, too.
         data_hash: SHA-256 of the records; empty for simulated data.
         notes: sentences for the person who reads the results.

@@ -1,4 +1,4 @@
-"""Measured records as the rows of an identification: split, and the frames fitted that no maker can know."""
+"""Measured records as the rows of an identification: split, and unknown frames fitted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an identification without a measuring device says of what held the tool, from `identified.json` alone."""
+"""Tables and text of an identification by a constraint, from `identified.json`."""
 
 from __future__ import annotations
 

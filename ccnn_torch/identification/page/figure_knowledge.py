@@ -1,4 +1,4 @@
-"""What is known of the parameters: values with intervals, correlation, singular values."""
+"""Figures of the parameters: values with intervals, correlations, singular values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where an identified machine is off over its workspace, and where it was measured."""
+"""Maps of the pose error of an identified machine over its workspace."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def map_plot(results: Results, arrays: Arrays) -> Plot | None:
     norm = LogNorm(float(np.quantile(after, 0.01)) / scale, float(np.quantile(after, 0.99)) / scale, clip=True)
     first_scale, first_unit = display_unit("m", float(np.median(maps["before"])))
     figure = Figure(figsize=(3.3 * len(maps) + 1.2, 3.5), layout="constrained")
-    told = []
+    texts = []
     drawn: Any = None
     panels = figure.subplots(1, len(maps), squeeze=False)[0]
     for axes, (name, values) in zip(panels, maps.items(), strict=True):
@@ -44,7 +44,7 @@ def map_plot(results: Results, arrays: Arrays) -> Plot | None:
         picture = axes.scatter(*place.T, c=shown, s=14, marker="s", cmap="viridis", norm=None if own else norm)
         # The median: at the edge, which is singular, one place counts more than all others in a mean square.
         middle = number_text(float(np.median(values)) / (first_scale if own else scale), 3)
-        told.append(f"{name} {middle} {first_unit if own else unit}")
+        texts.append(f"{name} {middle} {first_unit if own else unit}")
         axes.set_title(f"{name}: median {middle} {first_unit if own else unit}")
         axes.set_aspect("equal")
         axes.set_xlabel("x [m]")
@@ -59,7 +59,7 @@ def map_plot(results: Results, arrays: Arrays) -> Plot | None:
         "map",
         figure,
         "Position error over the workspace, commanded exactly by the geometry: RMS over the machines at each place, "
-        "and of these the median over the places: " + ", ".join(told) + ".",
+        "and of these the median over the places: " + ", ".join(texts) + ".",
     )
 
 

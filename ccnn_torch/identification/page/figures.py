@@ -1,4 +1,4 @@
-"""Pictures of an identification, in reading order."""
+"""Figures of an identification, in reading order."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def pose_distribution_plot(results: Results, arrays: Arrays) -> Plot | None:
     if not shown:
         return None
     figure = Figure(figsize=(4.6 * len(shown) + 1.0, 3.5), layout="constrained")
-    told = []
+    texts = []
     for axes, (name, si_unit) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
         before, after = (_pooled(arrays[f"{name}_{when}"]) for when in ("before", "after"))
         scale, unit = display_unit(si_unit, float(np.median(before)))
@@ -67,11 +67,11 @@ def pose_distribution_plot(results: Results, arrays: Arrays) -> Plot | None:
         axes.set_title(name.capitalize())
         axes.legend(loc="upper left")
         medians = (number_text(float(np.median(v)) / scale, 3) for v in (before, after))
-        told.append(f"median {name} error {' → '.join(medians)} {unit}")
+        texts.append(f"median {name} error {' → '.join(medians)} {unit}")
     caption = "Share of the held-out poses whose measured pose is at most so far from the predicted one: "
     if "constraint" in results:
         caption = f"Share of the held-out rows that are at most so far from where {holder(results)} the tool: "
-    return Plot("pose_error", figure, caption + " and ".join(told) + ".")
+    return Plot("pose_error", figure, caption + " and ".join(texts) + ".")
 
 
 def _pooled(values: Array) -> Array:

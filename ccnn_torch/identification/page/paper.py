@@ -1,4 +1,4 @@
-"""The printed figures of the two identification papers, beside which ours stand."""
+"""Printed figures of the two identification papers, for comparison."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def identified_verdict(results: Block) -> str:
     free = [p for p in results["parameters"].values() if p["free"]]
     lost = sum(not p["identifiable"] for p in free)
     text += f"; {len(free) - lost} of {len(free)} parameters are identified"
-    return text + (f", {lost} are not told by these rows." if lost else ".")
+    return text + (f", {lost} are not determined by these rows." if lost else ".")
 
 
 def not_settled(results: Block) -> str:

@@ -1,4 +1,4 @@
-"""What makes an identification impossible, said before it is tried."""
+"""Checks that make an identification impossible, before it is tried."""
 
 from __future__ import annotations
 

@@ -142,7 +142,7 @@ def _groups(
         group = sorted(match_parameters(geometry, [tie] if isinstance(tie, str) else tie, "tied"), key=names.index)
         again = [n for n in group if n in leader]
         if again:
-            raise InputError(f"parameters.tied: '{again[0]}' stands in two groups; name it in one")
+            raise InputError(f"parameters.tied: '{again[0]}' is in two groups; name it in one")
         if 0 < len(set(group) & free) < len(group):
             held = next(n for n in group if n not in free)
             raise InputError(f"parameters.tied: '{held}' is fixed but tied to {group[0]}; fix the whole group or none")

@@ -1,4 +1,4 @@
-"""What an identification is: parameters that are free, measured rows, and a residual; and what a solver gives back."""
+"""An identification problem: free parameters, rows and a residual; and the fit that a solver returns."""
 
 from __future__ import annotations
 

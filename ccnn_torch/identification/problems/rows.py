@@ -1,4 +1,4 @@
-"""Measured rows brought into one shape, and the noise of a row: what both kinds of residual begin with."""
+"""Measured rows in one shape, and their noise: shared by both kinds of residual."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the difference of a measured row to a problem whose residuals are decorrelated and of unit variance."""
+"""Whitened residuals: decorrelated and of unit variance."""
 
 from __future__ import annotations
 

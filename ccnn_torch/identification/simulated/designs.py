@@ -1,4 +1,4 @@
-"""Which places a simulated machine is measured at: drawn, even, or planned for what they tell."""
+"""Poses at which simulated machines are measured: random, even, or planned."""
 
 from __future__ import annotations
 

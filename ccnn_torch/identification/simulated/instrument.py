@@ -1,4 +1,4 @@
-"""What is measured of a pose: its coordinates, or points on the platform from which position and rotation follow."""
+"""Measured quantities of a pose: its coordinates, or points on the platform."""
 
 from __future__ import annotations
 

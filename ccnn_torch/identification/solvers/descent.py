@@ -1,4 +1,4 @@
-"""The descent itself: damped Gauss-Newton steps of many problems side by side, from their normal equations alone."""
+"""Damped Gauss-Newton steps of many problems at once, from their normal equations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Geometric parameters of any mechanism from measured rows, for the network to learn only what they leave."""
+"""Geometric parameters of any mechanism from measured rows, before a network learns the residual."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def polish(objective: Objective, points: Tensor, tell: Progress) -> tuple[Tensor
     Args:
         objective: what is minimised.
         points: `r x k` [1].
-        tell: told the share of the rounds that is done.
+        tell: called with the share of the rounds that is done.
 
     Returns:
         points `r x k`, costs `r`, converged `r` (the last round gained nothing that counts), and the evaluations of the
@@ -195,4 +195,4 @@ def _message(settled: Tensor, sqp: bool) -> str:
 
 
 def _silent(_: float) -> None:
-    """Progress that nobody asked for."""
+    """Progress that is not shown."""

@@ -66,7 +66,7 @@ def solve_per_leg(solver: Solver, problem: Problem, seed: int, progress: Progres
         solver: any.
         problem: as `split_by_leg` takes it.
         seed: leg number i (from 0) gets seed + i.
-        progress: told the share that is done over all legs.
+        progress: called with the share that is done over all legs.
 
     Returns:
         Fit of all parameters: the legs' costs added, converged where all legs did, the first leg's message that says

@@ -39,7 +39,7 @@ def solve_lm(
     Args:
         problem: what to minimise.
         seed: of the starts after the first, which is `problem.start`; they are uniform within three plausible errors.
-        progress: told the share of the machines that is done.
+        progress: called with the share of the machines that is done.
         starts: searches of each machine.
         loss: `squared`, `huber` or `cauchy`, by reweighting whole rows (`robust.loss_weights`).
         max_iterations: bound on the trials.

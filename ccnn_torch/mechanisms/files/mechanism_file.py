@@ -97,7 +97,7 @@ def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float]) -> str:
         nominal: what was there before, by name [SI].
 
     Raises:
-        InputError: the mechanism's class stands in no file.
+        InputError: the mechanism's class is not defined in a file.
     """
     about = mechanism.describe()
     tree = {

@@ -1,4 +1,4 @@
-"""Base and tool frame of a serial arm from measured poses: measured data never says where the arm stands."""
+"""Base and tool frame of a serial arm from measured poses: measured data do not determine where the arm is mounted."""
 
 from __future__ import annotations
 

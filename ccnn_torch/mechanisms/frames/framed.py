@@ -29,7 +29,7 @@ class Framed(Mechanism):
     """base · mechanism · tool: its pose is the measured frame x, y, z [m], rx, ry, rz [rad] (a rotation vector).
 
     A mechanism without orientation has the pose x, y, z. Parameters in order: base_x … base_rz (where the mechanism's
-    base stands in the measuring frame; with `base`), those of the mechanism, tool_x … tool_rz (the measured point and
+    base is in the measuring frame; with `base`), those of the mechanism, tool_x … tool_rz (the measured point and
     axes on its platform; with `tool`); all frames are nominally the identity. A measured frame may have more
     coordinates than the mechanism has joints: `solve_inverse` gives the joints of the closest pose in
     (position, rotation_weight x rotation vector), where `closure` tells what remains. The frame of the mechanism's pose

@@ -1,4 +1,4 @@
-"""Whether fitted frames are plausible, and what the rows could not show of them."""
+"""Plausibility of fitted frames, and what the rows do not determine of them."""
 
 from __future__ import annotations
 

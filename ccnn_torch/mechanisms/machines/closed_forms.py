@@ -1,4 +1,4 @@
-"""Closed forms that several parallel mechanisms share: roots that may not be real, cranks, intersecting spheres."""
+"""Closed forms that several parallel mechanisms share: real roots, input links, intersections of spheres."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Delta robots: three legs with parallelograms that keep the platform level, on cranks or on rails (Clavel 1988)."""
+"""Delta robots: three legs with parallelograms, with rotary or linear drives (Clavel 1988)."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Delta(_Parallelograms):
 
     z points up and is 0 in the plane of the cranks' axes, so that the platform's z is negative. Leg i has the
     parameters basei (radius of the crank's axis), anglei (of the leg's plane, from +x), cranki, platformi (radius of
-    the platform's joint), rodi (length of the parallelogram) and offseti (the crank stands at the joint plus this).
+    the platform's joint), rodi (length of the parallelogram) and offseti (the crank is at the joint plus this).
     Base and platform radius of a leg act only by their difference: an identification says so, or one of them is fixed.
     """
 
@@ -129,7 +129,7 @@ class DeltaLinear(_Parallelograms):
     z points up and is 0 where the rails begin; the platform hangs below the carriages. Leg i has the parameters basei
     (radius where the rail begins), anglei (of the leg's plane, from +x), leani and skewi (of the rail: outward in the
     leg's plane, and out of that plane; 0 = upright), platformi (radius of the platform's joint), rodi (length of the
-    parallelogram) and offseti (the carriage stands at the joint plus this). Base and platform radius of a leg act only
+    parallelogram) and offseti (the carriage is at the joint plus this). Base and platform radius of a leg act only
     by their difference.
     """
 

@@ -37,7 +37,7 @@ class MachineTool(Mechanism):
         """Radii of platform and base, height of the spherical joints, leg length [m]; slope of the guideways [rad].
 
         per_leg: leg i has all parameters of its own, for identification: l_ei, l_bi, z_0i, li, gammai, alphai, betai
-        and the offset u_0i of its drive [m] (its carriage stands at the joint plus this); else only alphai and betai.
+        and the offset u_0i of its drive [m] (its carriage is at the joint plus this); else only alphai and betai.
         """
         common = [("l_e", "m", l_e), ("l_b", "m", l_b), ("z_0", "m", z_0), ("l", "m", l), ("gamma", "rad", gamma)]
         geometry = [] if per_leg else [Parameter(*part) for part in common]

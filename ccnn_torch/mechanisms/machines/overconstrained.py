@@ -43,7 +43,7 @@ class Overconstrained2Dof(Mechanism):
 
     Parameters: a, h, l, h_s [m] of the machine, and of limb j the eleven errors of Table 2, nominally 0: dBxj, dByj,
     dBzj (⁰δx, ⁰δy, ⁰δz), dalphaj, dgammaj (⁰δα, ⁰δγ), dl1_j, dl2_j (Δl1, Δl2), dAxj, dAyj, dAzj (⁶δx, ⁶δy, ⁶δz) and
-    dthetaj (Δθ: the crank stands at the commanded angle plus this). All are in the axes of the limb: those of limb 2
+    dthetaj (Δθ: the crank is at the commanded angle plus this). All are in the axes of the limb: those of limb 2
     are those of limb 1 turned by 90° about z, for ⁰δ and ⁶δ alike, as in the appendix.
 
     The sampling box is all of phi and tilts from 0.05 to 1 rad: phi has no value at theta = 0.

@@ -27,7 +27,7 @@ class Tripod(Mechanism):
         """L: length of the legs [m]; r: radius of the platform [m].
 
         per_leg: leg i has parameters of its own, for identification: its length Li, the radius ri of its joint on the
-        platform and the offset di of its drive [m] (its carriage stands at the joint plus this); else L and r are
+        platform and the offset di of its drive [m] (its carriage is at the joint plus this); else L and r are
         common.
         """
         geometry = [Parameter("L", "m", L), Parameter("r", "m", r)]

@@ -106,7 +106,7 @@ class BlackBox(Mechanism):
         return twin
 
     def lacking(self, conditions: Sequence[str]) -> list[Condition]:
-        """What it takes and is not told: it has its usual value."""
+        """An input that it does not receive: it has its usual value."""
         return [c for c in self.takes if c.name not in conditions and c.name not in self.conditions]
 
     def words(self, joints: Tensor, row: int) -> str:
@@ -192,7 +192,7 @@ class BlackBox(Mechanism):
         target, given = pose.expand(*lead, -1), values.expand(*lead, -1)
         start = self._start(target.detach()) if guess is None else guess.expand(*lead, -1)
         names = list(self.conditions)
-        told = [self.conditions[n].expand(lead)[..., None] for n in names]
+        conditions = [self.conditions[n].expand(lead)[..., None] for n in names]
 
         def machine(rows: tuple[Tensor, ...]) -> BlackBox:
             return self.under({n: row[..., 0] for n, row in zip(names, rows, strict=True)})
@@ -205,12 +205,12 @@ class BlackBox(Mechanism):
             found[..., 3:, :] *= rotation_weight
             return torch.nan_to_num(found)
 
-        plain = (target.detach(), given.detach(), *told)
+        plain = (target.detach(), given.detach(), *conditions)
         solved = levenberg_marquardt(gap, start.detach(), slope, plain, tolerance=_SETTLED)
         missed = (2 * solved.cost).sqrt() > _MISSED
         lost = missed if len(self.pose) <= len(self.joints) else ~torch.isfinite(solved.cost)
         x = torch.where(lost[..., None], self.home_joints, solved.value)
-        found = carry_derivative(x, slope(x, *plain), gap(x, target, given, *told))
+        found = carry_derivative(x, slope(x, *plain), gap(x, target, given, *conditions))
         return torch.where(lost[..., None], torch.nan, found)
 
     def _start(self, pose: Tensor) -> Tensor:

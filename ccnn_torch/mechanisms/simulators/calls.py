@@ -1,4 +1,4 @@
-"""Calls of a simulator: shapes are checked, errors become a sentence, rows that came before are looked up."""
+"""Calls of a simulator: checked shapes, errors as one sentence, a cache of rows."""
 
 from __future__ import annotations
 

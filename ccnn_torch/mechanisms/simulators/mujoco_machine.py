@@ -1,4 +1,4 @@
-"""A MuJoCo model that is commanded, pushed, left to settle, and read."""
+"""A MuJoCo model that is commanded and loaded until it is at rest."""
 
 from __future__ import annotations
 

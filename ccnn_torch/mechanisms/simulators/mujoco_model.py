@@ -40,7 +40,7 @@ def mujoco_simulator(
         pose: of x, y, z, rx, ry, rz, phi.
         parameters: of the model that may be wrong.
         name: of the simulator; the file's when None.
-        approach: last bit of the way, from which side it comes being told by covariates `direction1` … [rad, m].
+        approach: last bit of the way, from the side being given by the covariates `direction1` … [rad, m].
         ramp: time of the way [s].
         settle: longest time to wait for rest after it [s].
         still: speed below which it is at rest [rad/s, m/s].

@@ -1,4 +1,4 @@
-"""Numbers of a MuJoCo model that may be wrong: where they stand, what unit they have, and the model with others."""
+"""Uncertain parameters of a MuJoCo model: place, unit, and the model with other values."""
 
 from __future__ import annotations
 

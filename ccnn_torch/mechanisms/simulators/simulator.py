@@ -17,7 +17,7 @@ from ccnn_torch.errors import InputError
 __all__ = ["Joint", "Simulate", "Simulator", "rowwise"]
 
 Simulate = Callable[[Any, dict[str, Any], Any], Any]
-"""`(commands N x n, {name: N}, parameters N x k) -> pose N x p`, all in SI, every row by itself."""
+"""`(commands N x n, {name: N}, parameters N x k) -> pose N x p`, all in SI, every row independently."""
 
 _ANGLES = ("rx", "ry", "rz", "phi")
 _REFERENCE = 293.15

@@ -1,4 +1,4 @@
-"""A simulator is tried before it is believed: whether it repeats itself, row by row, and moves at all."""
+"""Trial of a simulator before use: determinism, independence of rows, response to commands."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def try_simulator(simulator: Simulator, calls: Calls, home: Tensor, joints: Tens
     if apart[worst] > _REPEATS * typical:
         at = described(simulator, some[worst], {})
         raise InputError(
-            f"simulator '{simulator.name}' is not deterministic: asked twice about {at} it gave poses that differ by "
+            f"simulator '{simulator.name}' is not deterministic: evaluated twice at {at} it gave poses that differ by "
             f"{apart[worst]:.2g} m or rad, and a step of a joint changes them by {typical:.2g}; seed its random "
             "numbers, let no row depend on others or on earlier calls, or give a larger step"
         )

@@ -1,4 +1,4 @@
-"""A six-joint arm as built: every joint axis off its place by all six freedoms, compliant gears, its own weight."""
+"""A six-joint arm as built: free frames at all joints, compliant gears, the weight of its links."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ArmStructure:
         self.built = SerialArm("arm as built", "urdf", origins[:-1], tool=origins[-1])
         self.parameters = self.built.nominal.clone()
         row = torch.tensor([LENGTH_TOLERANCE] * 3 + [ANGLE_TOLERANCE] * 3, dtype=torch.float64)
-        # The base frame is where the arm stands: known.
+        # The base frame is where the arm is mounted: known.
         self.tolerances = torch.cat([torch.zeros(6, dtype=torch.float64), row.repeat(7)])
         length = torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64).repeat(8)
         grown = EXPANSION * self.parameters * length

@@ -1,4 +1,4 @@
-"""The machine as built under command: where its drives really stand, how it gives way, and the pose that it reaches."""
+"""A machine as built under command: drives, deflection, and the pose that it reaches."""
 
 from __future__ import annotations
 

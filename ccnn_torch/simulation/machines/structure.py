@@ -1,4 +1,4 @@
-"""What the simulation asks of a machine's structure: geometry with all its tolerances, statics, and thermal growth."""
+"""What the simulation needs of a machine's structure: geometry with all its tolerances, statics, and thermal growth."""
 
 from __future__ import annotations
 
