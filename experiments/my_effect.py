@@ -10,26 +10,26 @@ from ccnn_torch.mechanisms import Mechanism
 
 
 class HosePull:
-    """Δq_i = c_i τ_i, τ = what a pull towards the hook of 1 N for each metre of hose asks of the joint."""
+    """Δq_i = c_i τ_i, τ = torque on the joint of a pull towards the hook of 1 N for each metre of hose."""
 
     name = "hose_pull"
     kind: Kind = "joints"  # what it changes: joints, parameters, or the measured pose
     description = "a hose package that pulls the platform towards its hook"
-    ordered = False  # each row stands for itself
+    ordered = False  # rows are independent
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """A column that is needed and not there, in words; here none is."""
+        """A column that is needed and missing, in words; here none is."""
         return ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """What the effect is linear in: name, SI unit, plausible size."""
+        """The coefficients: name, SI unit, plausible size."""
         sizes = {"m": 1e-4, "rad": 1e-4}
         units = {"m": "m/N", "rad": "rad/N/m"}
         joints = situation.mechanism.joints
         return tuple(Coefficient(j.name, units[j.unit], sizes[j.unit], joint=j.name, positive=True) for j in joints)
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """What it is not linear in, with the values to look at: the height of the hook."""
+        """The shape, with its grid: the height of the hook."""
         return (Shape("height", "m", (0.5, 1.0, 1.5, 2.0, 3.0)),)
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
