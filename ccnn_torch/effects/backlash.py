@@ -33,7 +33,7 @@ class Backlash:
 
     name = "backlash"
     kind: Kind = "joints"
-    description = "play of the drives: joints rest short of the command on the side that they come from"
+    description = "backlash of the drives: the rest position depends on the direction of approach"
     ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:

@@ -34,7 +34,7 @@ class Compliance:
 
     name = "compliance"
     kind: Kind = "pose"
-    description = "joints, legs and links that give under an external load (and stiffen or soften with it)"
+    description = "deflection of joints, legs and links under an external load (linear and stiffening)"
     ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:

@@ -35,7 +35,7 @@ class Drift:
 
     name = "drift"
     kind: Kind = "joints"
-    description = "joints that wander in time: steadily, ever more slowly, or at random"
+    description = "drift of the joints in time: linear, logarithmic, or random"
     ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:

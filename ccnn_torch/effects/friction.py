@@ -33,7 +33,7 @@ class Friction:
 
     name = "friction"
     kind: Kind = "joints"
-    description = "friction that winds up the drives against their last motion, the more the more they carry"
+    description = "friction that winds up the drives against their last motion, growing with their load"
     ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:

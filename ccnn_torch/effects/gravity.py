@@ -35,7 +35,7 @@ class Gravity:
 
     name = "gravity"
     kind: Kind = "joints"
-    description = "a machine that sags under its own weight"
+    description = "deflection under the machine's own weight"
     ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:

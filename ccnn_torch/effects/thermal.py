@@ -46,7 +46,7 @@ class Thermal:
 
     name = "thermal"
     kind: Kind = "pose"
-    description = "growth with the temperature, which the machine follows with a lag"
+    description = "thermal growth with a first-order lag"
     ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
