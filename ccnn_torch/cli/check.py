@@ -43,7 +43,8 @@ def check(
 
     ccnn check --records measured.csv --mechanism my_simulator.py:PRESS
     """
-    from ccnn_torch.diagnosis.job import check_table, check_text, run_check, write_check
+    from ccnn_torch.diagnosis.job import run_check, write_check
+    from ccnn_torch.diagnosis.page.check import check_table, check_text
     from ccnn_torch.report.screen import say, stdout
     from ccnn_torch.report.table import print_table
 

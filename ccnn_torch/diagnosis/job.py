@@ -13,28 +13,20 @@ from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.diagnosis.from_records import naming
 from ccnn_torch.diagnosis.page.arrays import picture_arrays
 from ccnn_torch.diagnosis.page.report import write_diagnosis_report
-from ccnn_torch.diagnosis.verdict.text import aside_text
-from ccnn_torch.display import display_unit, number_text
+from ccnn_torch.diagnosis.verdict.text import noise_text
 from ccnn_torch.effects.covariates import covariate_units
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.json_files import plain, write_json
-from ccnn_torch.report.table import Table
 
 __all__ = [
-    "check_table",
-    "check_text",
     "run_check",
     "run_diagnosis",
     "write_check",
     "write_diagnosis",
     "write_result",
 ]
-
-
-# Effects shown that could take over another one.
-_LIKEST = 3
 
 
 def run_diagnosis(config: DiagnoseConfig) -> Diagnosis:
@@ -92,53 +84,14 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str]
     mechanism = diagnosis.analysis.situation.mechanism
     units = covariate_units(mechanism) | {c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)}
     lines = [diagnosis.lines[row] for row in diagnosis.rows_set_aside] if diagnosis.lines else []
-    told = {"noise": _noise_text(diagnosis), **(about or {}), "units": units, "lines": lines}
+    told = {
+        "noise": noise_text(diagnosis.analysis.whitening.known > 0),
+        **(about or {}),
+        "units": units,
+        "lines": lines,
+    }
     write_diagnosis_report(folder, plain(diagnosis.to_json()), arrays, labels | {"about": told})
     return path
-
-
-def _noise_text(diagnosis: Diagnosis) -> str:
-    if diagnosis.analysis.whitening.known > 0:
-        return "The noise was given."
-    return "The noise was not given: its floor is what the most probable of all explanations leaves."
-
-
-def check_text(check: Check) -> list[str]:
-    """What the records can and cannot show, one sentence a line."""
-    noise = ", ".join(f"{n} {_in_unit(s, 'rad' if n.startswith('r') else 'm')}" for n, s in check.noise.items())
-    lines = [
-        f"{check.rows} rows, {len(check.aside)} of them set aside; Jacobian's condition number up to "
-        f"{check.condition:.3g}.",
-        f"Noise, {'as given' if check.noise_given else 'estimated'}: {noise}.",
-        f"Covariates: {', '.join(check.covariates) or 'none'}.",
-    ]
-    lines += [aside_text(check.aside, check.why_aside, check.lines_aside)] if check.aside else []
-    lines += [f"{remark}." for remark in check.remarks]
-    lines += [f"Caution: {caution}." for caution in check.cautions]
-    lines += [f"{name} cannot be seen without {why}." for name, why in check.missing.items()]
-    lines += [f"{name} could hide: its plausible size is {size:.2g} of the noise." for name, size in check.weak.items()]
-    return lines
-
-
-def _in_unit(value: float, unit: str) -> str:
-    scale, shown = display_unit(unit, value)
-    return f"{number_text(value / scale, 2)} {shown}"
-
-
-def check_table(check: Check) -> Table:
-    """What could take over each effect on these rows, the closest first."""
-    found: dict[str, list[str]] = {}
-    for first, second, share in check.confusable:
-        found.setdefault(first, []).append(f"{second} {share:.3f}")
-    rows = tuple(
-        (name, ", ".join(others[:_LIKEST]) + (f" and {more} more" if (more := len(others) - _LIKEST) > 0 else ""))
-        for name, others in found.items()
-    )
-    note = (
-        "Share of what the effect is likely to do that another can do as well (cosine). A diagnosis still tells them "
-        "apart where the other one would need unlikely numbers, or more of them; all pairs stand in check.json (--out)."
-    )
-    return Table("Confusable", ("effect", "taken over by"), rows, note, ("taken over by",))
 
 
 def _noise(config: DiagnoseConfig, mechanism: Mechanism) -> dict[str, float] | None:

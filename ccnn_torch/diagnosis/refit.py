@@ -13,7 +13,7 @@ from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
 from ccnn_torch.diagnosis.from_file import Known
 from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at, tangent
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
-from ccnn_torch.diagnosis.residual.whitening import Whitening, moving_channels, reweighted
+from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, Whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Situation
 
 __all__ = ["refit"]
@@ -63,7 +63,7 @@ def refit(
         acting = [_acting(k, situation, mean[end - len(k.used) : end]) for k, end in zip(known, ends, strict=False)]
         left = (target - every @ mean)[:, white.channels]
         free = 1 - float(fit.effective[0]) / max(float(fine.sum()) * len(white.channels), 1.0)
-        white = reweighted(white, left, fine, max(free, 0.1))
+        white = reweighted(white, left, fine, max(free, LEAST_FREE))
     return acting
 
 

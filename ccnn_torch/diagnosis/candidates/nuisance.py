@@ -16,6 +16,8 @@ from ccnn_torch.diagnosis.evidence.single_groups import GroupProducts, fit_singl
 __all__ = ["NuisanceFit", "SharedColumns", "TrialColumns", "search_charge"]
 
 _DIGITS = 1e-13
+# Relative ridge of the regression on a candidate.
+_RIDGE = 1e-6
 
 
 def search_charge(gain: Tensor) -> float:
@@ -133,7 +135,7 @@ class NuisanceFit:
     def gain(self, tried: TrialColumns) -> Tensor:
         """Squares that each candidate explains, `... x g`."""
         inner, b = self._beside(tried)
-        ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
+        ridge = _RIDGE * inner.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(1e-300)
         inner = inner + torch.diag_embed(ridge[..., None].expand(*inner.shape[:-1]))
         solved = torch.linalg.solve(inner, b[..., None])[..., 0]
         gain: Tensor = (b * solved).sum(-1)

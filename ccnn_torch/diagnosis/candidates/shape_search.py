@@ -29,6 +29,8 @@ _START, _THEN, _MOST = (900, 4), (1500, 2), 4800
 _AS_WELL, _FEW, _THERE = 20.0, 16, 100.0
 # Shapes that share coefficients are looked for together where that are no more values.
 _TOGETHER = 150
+# Log evidence for each coefficient whose shape is worth its search.
+_PAYS = 1.5
 
 
 class Shaped(NamedTuple):
@@ -259,7 +261,7 @@ class Scan:
         """
         net = [g / 2 - c for g, c in zip(gains, charges, strict=True)]
         best = max(range(len(net)), key=lambda i: net[i])
-        kept = [i for i, p in enumerate(self.parts) if i == best or net[i] > 1.5 * times * len(p.columns)]
+        kept = [i for i, p in enumerate(self.parts) if i == best or net[i] > _PAYS * times * len(p.columns)]
         charge = sum(charges[i] for i in kept)
         if len(kept) == len(self.parts):
             return Shaped(value, None, charge)

@@ -21,6 +21,8 @@ _MENDED = 0.1
 _FEW = 40
 # Mistakes that leave no more than this many times the least are as likely.
 _ALIKE = 1.2
+# Distance in sizes of the machine that a row without a pose counts as.
+_UNREACHED = 10.0
 _TURN = 180 / torch.pi
 
 
@@ -29,10 +31,12 @@ def mistake(situation: Situation, measured: Tensor, size: Size) -> str:
     rows = torch.linspace(0, len(measured) - 1, min(_FEW, len(measured))).round().long()
     here, poses = picked(situation, rows), measured[rows]
     # A row that the machine does not reach is off by its whole workspace, and more.
-    before = float(distance(here, poses, size).nan_to_num(nan=10.0).median())
+    before = float(distance(here, poses, size).nan_to_num(nan=_UNREACHED).median())
     found = []
     for words, other, there in _mistakes(here, poses):
-        left = float(distance(replace(other, guess=_guess(other, there)), there, size).nan_to_num(nan=10.0).median())
+        left = float(
+            distance(replace(other, guess=_guess(other, there)), there, size).nan_to_num(nan=_UNREACHED).median()
+        )
         if left < min(_MENDED * before, USUAL):
             found.append((left, words))
     # On a machine that is its own mirror image two mistakes may come to the same.

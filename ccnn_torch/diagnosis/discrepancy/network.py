@@ -13,7 +13,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, without
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.shrink.held_out import folds, resampled
+from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, folds, resampled
 from ccnn_torch.diagnosis.verdict.blocks import noise_floor
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.learners import Learner, TrainingData
@@ -26,6 +26,8 @@ Progress = Callable[[float], None]
 """Told the share that is done, 0 to 1."""
 
 _FOLDS = 5
+# Updates of the fit of the effects in each fold.
+_UPDATES = 6
 # More rows than this, and more outputs (rows times joints), make the training slow: so many are drawn.
 _ROWS, _VALUES = 600, 2400
 # One coevolution of one structure: on five-bars and a Stewart platform what six of two left was within the interval, at
@@ -97,7 +99,7 @@ def remaining_gain(
     many = resampled(len(rows), torch.Generator().manual_seed(seed))
     drawn = after[many].mean(-1).sqrt()
     gain = before[many].mean(-1).sqrt() - drawn
-    ends = torch.tensor([0.025, 0.975], dtype=drawn.dtype)
+    ends = torch.tensor(INTERVAL, dtype=drawn.dtype)
     reached = math.sqrt(float(after.mean()))
     return told | {
         "gap_after": reached,
@@ -118,7 +120,7 @@ def _left(analysis: Analysis, judgement: Judgement, fold: Tensor) -> Tensor:
     left = []
     for k in range(_FOLDS):
         rest = without(dictionary.grams, x[fold == k], y[fold == k], used)
-        fit = fit_sets(rest, [chosen], dictionary.noise_dof, 6)
+        fit = fit_sets(rest, [chosen], dictionary.noise_dof, _UPDATES)
         index = fit.columns[0][fit.columns[0] >= 0]
         left.append((y - x[..., index] @ fit.mean[0, : len(index)]) / weight)
     return torch.stack(left)

@@ -44,6 +44,18 @@ _BEND = 0.5
 _MOST, _MOST_PLACES = 28, 60
 _PLATFORM = {3: (3e-4, 3e-4, 3e-4), 6: (3e-4, 3e-4, 3e-4, 5e-4, 5e-4, 5e-4)}
 _WAVES = 18
+# Bumps: fewest and most along a driver, rows for each; the same in the workspace; rows for each fine one of a joint.
+_FEWEST, _FEW, _ROWS_A_BUMP = 4, 8, 12
+_FEWEST_PLACES, _PLACES, _ROWS_A_PLACE = 6, 24, 8
+_ROWS_A_FINE_BUMP = 6
+# Rows for each principal column beyond the least number of them; rows for two waves.
+_ROWS_A_COLUMN, _ROWS_FOR_TWO_WAVES = 4, 5
+# Prior size of a driver times the place against the driver alone.
+_TIMES_PLACE = 0.7
+# Lags of a temperature, as shares of the time of all rows.
+_LAGS = (0.05, 0.2)
+# Width of a bump, in distances to the next one.
+_WIDTH = 1.5
 
 
 def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[Atom]:
@@ -55,9 +67,9 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
     mechanism, rows = situation.mechanism, situation.joints.shape[-2]
     place = unit_range(situation.pose)
     one = torch.ones_like(place[:, :1])
-    few = max(4, min(8, rows // 12))
-    around = torch.cat([one, place, _bumps(place, min(24, max(6, rows // 8)))], -1)
-    most = min(_MOST_PLACES, max(_MOST, rows // 4))
+    few = max(_FEWEST, min(_FEW, rows // _ROWS_A_BUMP))
+    around = torch.cat([one, place, _bumps(place, min(_PLACES, max(_FEWEST_PLACES, rows // _ROWS_A_PLACE)))], -1)
+    most = min(_MOST_PLACES, max(_MOST, rows // _ROWS_A_COLUMN))
     found = [_atom(situation, "workspace", around, most=most)]
     found.append(
         _atom(
@@ -68,7 +80,7 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
     for i, joint in enumerate(mechanism.joints):
         q = unit_range(situation.joints[..., i : i + 1])
         found.append(_atom(situation, f"joint {joint.name}", torch.cat([one, q, _BEND * _bumps(q, few)], -1)))
-        fine = torch.cat([one, q, _bumps(q, min(_MOST, rows // 6))], -1)
+        fine = torch.cat([one, q, _bumps(q, min(_MOST, rows // _ROWS_A_FINE_BUMP))], -1)
         own.append(fine)
         found.append(_atom(situation, f"joint {joint.name}", fine, only=i))
     if "transmission" not in beside:
@@ -79,20 +91,22 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
         if driver is None or float(value.max() - value.min()) <= 0:
             continue
         d = unit_range(value.unsqueeze(-1))
-        features = [one, d, 0.7 * d * place]
+        features = [one, d, _TIMES_PLACE * d * place]
         if driver.startswith(SPEED):
             pass
         elif driver.startswith("direction"):
             features.append(_BEND * d * _carried(situation, int(driver.split()[1]) - 1))
         else:
             features.append(_BEND * _bumps(d, few))
-            found.append(_whole(situation, driver, _waves(d, max(4, min(_WAVES, 2 * rows // 5)))))
+            found.append(
+                _whole(situation, driver, _waves(d, max(_FEWEST, min(_WAVES, 2 * rows // _ROWS_FOR_TWO_WAVES))))
+            )
         if driver.startswith("load"):
             # What a load asks of a joint goes with the slope of the kinematics, which is no plane over the workspace.
             features.append(_BEND * d * products(place))
             found.append(_atom(situation, driver, _asked(_under(situation, name)), most=most, log_prior=_NEAR_LIBRARY))
         if driver == "temperature" and "time" in situation.covariates:
-            features += [_lagged(value, situation.covariates["time"], k) for k in (0.05, 0.2)]
+            features += [_lagged(value, situation.covariates["time"], k) for k in _LAGS]
         found.append(_atom(situation, driver, torch.cat(features, -1)))
         if " " in driver:
             together.setdefault(driver.partition(" ")[0], []).extend(features[1:])
@@ -132,7 +146,7 @@ def _bumps(points: Tensor, count: int) -> Tensor:
     centres = spread_out(points, count)
     distance = torch.cdist(points, centres)
     apart = torch.cdist(centres, centres) + 1e9 * torch.eye(len(centres), dtype=points.dtype)
-    width = 1.5 * apart.amin(-1).median().clamp_min(1e-6)
+    width = _WIDTH * apart.amin(-1).median().clamp_min(1e-6)
     features = torch.exp(-0.5 * (distance / width).square())
     return features - features.mean(-2, keepdim=True)
 
@@ -192,7 +206,7 @@ def _waves(values: Tensor, count: int) -> Tensor:
 def joint_moves(situation: Situation, jacobian: Tensor) -> Tensor:
     """What the joints' derivatives, `s x c x n`, make of each joint being as far off as is to be expected."""
     joints = situation.mechanism.joints
-    return jacobian * torch.tensor([_SCALE.get(j.unit, 5e-4) for j in joints], dtype=jacobian.dtype)
+    return jacobian * torch.tensor([_SCALE.get(j.unit, _SCALE["rad"]) for j in joints], dtype=jacobian.dtype)
 
 
 def platform_moves(situation: Situation) -> Tensor:

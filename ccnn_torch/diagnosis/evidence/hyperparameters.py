@@ -12,14 +12,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["LIMIT", "SPREAD", "Scales"]
+__all__ = ["FIRST_NOISE", "LIMIT", "SPREAD", "Scales"]
 
 # Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
 SPREAD = 4.0
 LIMIT = 25.0
+FIRST_NOISE = 10.0
+"""Updates begin with the mean square over this as variance of the noise."""
 # No update changes log α² by more.
 _STEP = 3.0
 _TINY = 1e-12
+# Share of the values that a set leaves free, at least, in an update of the noise.
+_FREE = 0.02
 
 
 class Scales(NamedTuple):
@@ -53,7 +57,7 @@ class Scales(NamedTuple):
         half = 0.5 * size * torch.exp(-step)
         step = step + (half - 0.5 * gamma - (psi + step) * prior) / (half + prior)
         psi = (psi + step.clamp_(-_STEP, _STEP).mul_(self.there)).clamp_(-LIMIT, LIMIT)
-        left = (self.values - gamma.sum(-1)).clamp_min(0.02 * self.values + 1)
+        left = (self.values - gamma.sum(-1)).clamp_min(_FREE * self.values + 1)
         return psi, ((rss + self.noise_dof) / (left + self.noise_dof)).clamp_min(1e-12)
 
     def log_evidence(self, psi: Tensor, gamma: Tensor, noise: Tensor, squares: Tensor, log_det: Tensor) -> Tensor:

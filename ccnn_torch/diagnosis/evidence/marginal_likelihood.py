@@ -10,12 +10,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.hyperparameters import LIMIT, SPREAD, Scales
+from ccnn_torch.diagnosis.evidence.hyperparameters import FIRST_NOISE, LIMIT, SPREAD, Scales
 
 __all__ = ["Fits", "Grams", "fit_sets", "grams_of", "padded", "without"]
 
 # Columns up to which XᵀX is made as a whole.
 _NARROW = 128
+# MacKay updates.
+_UPDATES = 8
 _DIGITS = 1e-13
 
 
@@ -86,7 +88,7 @@ def fit_sets(
     grams: Grams,
     sets: Sequence[Sequence[Tensor]],
     noise_dof: float,
-    iterations: int = 8,
+    iterations: int = _UPDATES,
     spread: float = SPREAD,
     start: tuple[Tensor, Tensor] | None = None,
 ) -> Fits:
@@ -114,7 +116,7 @@ def fit_sets(
     # Start where the prior of each group could make the whole gap, and the noise is a tenth of it.
     trace = (member * g.diagonal(dim1=-2, dim2=-1)[..., None]).sum(1).clamp_min(1e-300)
     psi = torch.log((grams.yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there
-    noise = (grams.yy / grams.values / 10).clamp_min(1e-12).expand(len(columns)).clone()
+    noise = (grams.yy / grams.values / FIRST_NOISE).clamp_min(1e-12).expand(len(columns)).clone()
     noise = torch.where(torch.tensor(noise_dof > 0), torch.ones_like(noise), noise)
     if start is not None:
         psi, noise = start

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.hyperparameters import LIMIT, SPREAD, Scales
+from ccnn_torch.diagnosis.evidence.hyperparameters import FIRST_NOISE, LIMIT, SPREAD, Scales
 
 __all__ = [
     "NO_COLUMNS",
@@ -109,7 +109,7 @@ def fit_in_axes(
     trace = square.sum(-1).clamp_min(1e-300)
     psi = torch.log((yy.clamp_min(1e-300) / trace).clamp(math.exp(-LIMIT), math.exp(LIMIT))) * there
     psi, scales = psi[:, None], Scales(values, noise_dof, there[:, None], spread)
-    noise = torch.ones_like(trace) if noise_dof > 0 else (yy / values / 10).clamp_min(1e-12).expand(len(trace))
+    noise = torch.ones_like(trace) if noise_dof > 0 else (yy / values / FIRST_NOISE).clamp_min(1e-12).expand(len(trace))
     for k in range(_UPDATES + 1):
         scale = psi.exp()
         diagonal = 1 + scale * square / noise[:, None]

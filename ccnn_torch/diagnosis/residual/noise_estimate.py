@@ -19,7 +19,7 @@ from ccnn_torch.diagnosis.evidence.single_groups import (
     fit_single_groups,
     own_products,
 )
-from ccnn_torch.diagnosis.residual.whitening import NO_NOISE, Whitening, reweighted
+from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, LEAST_NOISE, MAD, NO_NOISE, Whitening, reweighted
 
 __all__ = ["fitted_whitening"]
 
@@ -31,6 +31,8 @@ _NEXT = 4
 _SAME_AXES = 0.2
 # Updates of a fit that begins where the one before it ended.
 _UPDATES = 4
+# Weight of a noise that was given, in values, before the number of rows.
+_KNOWN = 50.0
 
 
 def fitted_whitening(
@@ -46,7 +48,7 @@ def fitted_whitening(
         noise: known standard deviation of each of the c0 channels, or None.
         usable: `s`, False where a row is left out from the start.
     """
-    rms = residual[usable][:, channels].abs().median(0).values * 1.4826
+    rms = residual[usable][:, channels].abs().median(0).values * MAD
     rms = rms.clamp_min(NO_NOISE)
     sigma = rms if noise is None else noise[channels]
     white = Whitening(channels, sigma, usable.to(residual.dtype), 0.0)
@@ -58,7 +60,7 @@ def fitted_whitening(
         white = replace(white, sigma=sigma * _noise_share(every, y, white).sqrt())
     chosen: list[int] = []
     log_scale = y.new_zeros(1, 0)
-    least = None if noise is not None else (1e-4 * rms).clamp_min(NO_NOISE)
+    least = None if noise is not None else (LEAST_NOISE * rms).clamp_min(NO_NOISE)
     left, free = y, 1.0
     for _ in range(_RICH):
         if chosen:
@@ -68,7 +70,9 @@ def fitted_whitening(
             grams = grams_of(white.scaled(own), white.scaled(y))
             fit = fit_sets(grams, [parts], 0.0, _UPDATES, _ANY_SIZE, (log_scale, y.new_ones(1)))
             left, log_scale = y - own @ fit.mean[0], fit.log_scale
-            free = max(1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), 0.1)
+            free = max(
+                1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), LEAST_FREE
+            )
             white = _settled(white, left, usable, free, least)
         rest = [k for k in range(len(shown)) if k not in chosen]
         if not rest:
@@ -77,27 +81,27 @@ def fitted_whitening(
         rough = every.roughly_added(white, left)[rest]
         likely = [rest[k] for k in rough.argsort(descending=True)[:_NEXT].tolist()]
         products = [own_products(white.scaled(shown[k]), white.scaled(left), every.size[k]) for k in likely]
-        added = _added(products, squares, y.numel())
+        added = _additions(products, squares, y.numel())
         best = int(added.gain.argmax())
         if float(added.gain[best]) < _SLIGHT:
             break
         chosen.append(likely[best])
         log_scale = torch.cat([log_scale, added.log_scale[None, best : best + 1]], -1)
     white = _settled(white, left, usable, free, least)
-    return replace(white, known=0.0 if noise is None else 50.0)
+    return replace(white, known=0.0 if noise is None else _KNOWN)
 
 
-class _Added(NamedTuple):
+class _Addition(NamedTuple):
     """Log evidence gained by each of the candidates, `k`, and log α² with which it is, `k`."""
 
     gain: Tensor
     log_scale: Tensor
 
 
-def _added(products: Sequence[GroupProducts], squares: Tensor, values: int) -> _Added:
+def _additions(products: Sequence[GroupProducts], squares: Tensor, values: int) -> _Addition:
     """products: of each candidate; squares: of what it is added to, and of how many values."""
     fits = fit_single_groups([NO_COLUMNS, *products], squares, float(values), 0.0, _ANY_SIZE)
-    return _Added(fits.log_evidence[1:] - fits.log_evidence[0], fits.log_scale[1:])
+    return _Addition(fits.log_evidence[1:] - fits.log_evidence[0], fits.log_scale[1:])
 
 
 class _Everything:
@@ -189,6 +193,6 @@ def _settled(white: Whitening, left: Tensor, usable: Tensor, free: float, least:
     """
     if least is not None:
         rows = white.weight > 0
-        spread = left[rows].abs().median(0).values * 1.4826 / free**0.5
+        spread = left[rows].abs().median(0).values * MAD / free**0.5
         white = replace(white, sigma=torch.maximum(spread, least))
     return reweighted(white, left, usable, free)

@@ -10,13 +10,21 @@ from torch import Tensor
 
 from ccnn_torch.effects import Situation
 
-__all__ = ["NO_NOISE", "Whitening", "moving_channels", "reweighted"]
+__all__ = ["LEAST_FREE", "LEAST_NOISE", "MAD", "NO_NOISE", "Whitening", "moving_channels", "reweighted"]
 
 # Degrees of freedom of the row weights (Student t), and beyond how many times its noise a row is set aside.
 _DEGREES = 4.0
 _GROSS = 6.0
 NO_NOISE = 1e-10
-"""Less noise than any device has [m], [rad], and more than solvers leave: what lies below it is rounding."""
+"""Smallest noise [m], [rad]: below that of any device, above the rounding of the solvers."""
+MAD = 1.4826
+"""Standard deviation of a normal variate over its median absolute deviation."""
+LEAST_FREE = 0.1
+"""Share of the values that a fit leaves free, at least: no noise is estimated from fewer."""
+LEAST_NOISE = 1e-4
+"""Estimated noise, at least, as a share of the residual."""
+# Quantile of the rows that are never set aside; ratio of the fourth moment to a normal one from which tails are heavy.
+_KEPT, _HEAVY = 0.8, 1.5
 
 
 @dataclass(frozen=True)
@@ -74,14 +82,14 @@ def reweighted(white: Whitening, left: Tensor, usable: Tensor, free: float) -> W
     nothing.
     """
     c = len(white.channels)
-    size = (left / white.sigma).square().sum(-1) / max(free, 0.1)
+    size = (left / white.sigma).square().sum(-1) / max(free, LEAST_FREE)
     # Brought to the median of chi-squared with c degrees (Wilson and Hilferty).
     size = size * (c * (1 - 2 / (9 * c)) ** 3) / size[usable].median().clamp_min(1e-12)
     gross = size > (_GROSS**2) * max(1.0, c / 2)
-    limit = torch.quantile(size[usable], 0.8)
+    limit = torch.quantile(size[usable], _KEPT)
     aside = (gross & (size > limit)) | ~usable
     inside = size[~aside]
-    heavy = float(inside.square().mean()) > (c * c + 2 * c) * 1.5
+    heavy = float(inside.square().mean()) > (c * c + 2 * c) * _HEAVY
     weight = (_DEGREES + c) / (_DEGREES + size) if heavy else torch.ones_like(size)
     weight = torch.where(aside, torch.zeros_like(weight), weight)
     return replace(white, weight=weight)

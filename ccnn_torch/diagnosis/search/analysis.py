@@ -24,7 +24,15 @@ from ccnn_torch.diagnosis.discrepancy.smooth import smooth_discrepancies
 from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.diagnosis.residual.linearisation import remainder, tangent
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
-from ccnn_torch.diagnosis.residual.whitening import NO_NOISE, Whitening, moving_channels, reweighted
+from ccnn_torch.diagnosis.residual.whitening import (
+    LEAST_FREE,
+    LEAST_NOISE,
+    MAD,
+    NO_NOISE,
+    Whitening,
+    moving_channels,
+    reweighted,
+)
 from ccnn_torch.diagnosis.search.beam import search
 from ccnn_torch.diagnosis.search.convergence import (
     discrepancy_is_active,
@@ -39,6 +47,13 @@ __all__ = ["Analysis", "analyse", "frame_columns"]
 
 # Rows are left out where the Jacobian is worse conditioned than this and than ten times the usual.
 _CONDITION = 50.0
+_TIMES_USUAL = 10.0
+# Length that is worth a radian in that number [m].
+_LEVER = 0.3
+# Share of the rows at which the machine must be linearised about a set; else it is so about the nominal machine.
+_LINEARISED = 0.9
+# Values for which the weight of a noise that was given grows by one: it is right to some per cent.
+_VALUES_A_UNIT = 100
 # Or where the joints move the platform so many times as far as usual.
 _GAIN = 3.0
 _NOISE_REDUCTION = 0.5
@@ -226,7 +241,7 @@ def _search_about_set(
     situation, usable = rows.situation, rows.usable
     there, target = tangent(situation, left, acting)
     ok = usable & torch.isfinite(target).all(-1) & torch.isfinite(there.jacobian).flatten(1).all(-1)
-    if int(ok.sum()) < 0.9 * int(usable.sum()):
+    if int(ok.sum()) < _LINEARISED * int(usable.sum()):
         there, target, ok = situation, rows.residual, usable
     target = torch.where(ok[:, None], target, 0.0)
     white = white if bool((ok == usable).all()) else _renewed(result, rows.noise, ok)
@@ -255,10 +270,10 @@ def _search_about_set(
 def _near_singular(situation: Situation, channels: Tensor) -> Tensor:
     """Rows whose Jacobian is far worse conditioned than the others', `s`."""
     jacobian = torch.nan_to_num(situation.jacobian[:, channels]).clone()
-    jacobian[:, channels >= 3] *= 0.3
+    jacobian[:, channels >= 3] *= _LEVER
     values = torch.linalg.svdvals(jacobian)
     condition = values[:, 0] / values[:, -1].clamp_min(1e-300)
-    far: Tensor = (condition > _CONDITION) & (condition > 10 * condition.median())
+    far: Tensor = (condition > _CONDITION) & (condition > _TIMES_USUAL * condition.median())
     # First order does not hold where the joints move the platform much more, and a few such rows have the whole gap.
     far = far | (values[:, 0] > _GAIN * values[:, 0].median())
     return far
@@ -287,7 +302,7 @@ def _searched(
         y = (y.flatten() - q @ (q.mT @ y.flatten())).reshape(y.shape)
         columns = [(c.flatten(0, 1) - q @ (q.mT @ c.flatten(0, 1))).reshape(c.shape) for c in columns]
     # Noise that was given is right to some per cent, however many rows there are.
-    known = white.known * (1 + y.numel() / 100)
+    known = white.known * (1 + y.numel() / _VALUES_A_UNIT)
     dictionary, found = search(atoms, columns, y, known, quick=few is not None)
     # The richest fit knows no shapes: where these are most of the gap the best set leaves far less.
     left = found[0].rss / max(y.numel() - found[0].effective, 1.0)
@@ -312,9 +327,9 @@ def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitenin
     free = 1 - best.effective / max(result.dictionary.grams.values, 1.0)
     if noise is None:
         rows = (white.weight > 0) & usable
-        spread = raw[rows].abs().median(0).values * 1.4826 / max(free, 0.1) ** 0.5
-        rms = result.residual[rows][:, white.channels].abs().median(0).values * 1.4826
+        spread = raw[rows].abs().median(0).values * MAD / max(free, LEAST_FREE) ** 0.5
+        rms = result.residual[rows][:, white.channels].abs().median(0).values * MAD
         white = Whitening(
-            white.channels, torch.maximum(spread, 1e-4 * rms).clamp_min(NO_NOISE), white.weight, white.known
+            white.channels, torch.maximum(spread, LEAST_NOISE * rms).clamp_min(NO_NOISE), white.weight, white.known
         )
     return reweighted(white, raw, usable, free)

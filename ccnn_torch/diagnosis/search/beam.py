@@ -72,12 +72,12 @@ def search(
             for mine in (tried, {s: f for s, f in tried.items() if discrepancies.isdisjoint(s)})
         )
 
-    look([s for i in firsts for j in (*known, *others) if (s := _joined((i,), j, atoms))])
+    look([s for i in firsts for j in (*known, *others) if (s := _extended((i,), j, atoms))])
     for size in range(2, most):
         if not better(size) or (size > 2 and best(size, 1)[0].log_posterior < _top(tried.values())):
             break
         wide = _BEAM if size == 2 else _BEAM // 2
-        look([s for f in best(size, wide) for j in (*known, *others) if (s := _joined(f.members, j, atoms))])
+        look([s for f in best(size, wide) for j in (*known, *others) if (s := _extended(f.members, j, atoms))])
     return dictionary, sorted(tried.values(), key=lambda f: -f.log_posterior)
 
 
@@ -94,7 +94,7 @@ def _of_several_drivers(ranked: Sequence[int], atoms: Sequence[Atom]) -> list[in
     return chosen[:_CATCH_ALLS] + [i for i in ranked if atoms[i].plain][:_PLAIN]
 
 
-def _joined(members: tuple[int, ...], extra: int, atoms: Sequence[Atom]) -> tuple[int, ...]:
+def _extended(members: tuple[int, ...], extra: int, atoms: Sequence[Atom]) -> tuple[int, ...]:
     """The set with one more, in order; () where that would say something twice."""
     if extra in members or atoms[extra].name in {atoms[i].name for i in members}:
         return ()

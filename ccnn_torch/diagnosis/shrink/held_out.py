@@ -13,7 +13,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, without
 from ccnn_torch.diagnosis.search.analysis import Analysis
 
-__all__ = ["Draws", "Gap", "HeldOut", "draws", "folds", "held_out", "resampled", "shrink_of"]
+__all__ = ["INTERVAL", "Draws", "Gap", "HeldOut", "draws", "folds", "held_out", "resampled", "shrink_of"]
 
 _FOLDS = 5
 # Updates of a fit to the first fold, and to the others.
@@ -21,6 +21,12 @@ _UPDATES, _MORE = 5, 4
 _REPEATS = 400
 # What a 95 % interval leaves out.
 _TAIL = 0.05
+INTERVAL = (_TAIL / 2, 1 - _TAIL / 2)
+"""Quantiles of a 95 % interval."""
+# Rows are dealt and drawn in runs: so many in all, as neighbouring rows may share their errors.
+_RUNS = 50
+# Reducible residual of a bootstrap sample, at least, as a share of that of all rows.
+_LEAST_GAP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -120,7 +126,7 @@ def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, fl
     plain = min(max(1 - (a2 - noise) / (b2 - noise), 0.0), 1.0)
     drawn = noise * (1 + (math.sqrt(2 / floor_dof) if floor_dof > 0 else 0.0) * draws.normal)
     rest, gap = (draws.counts @ torch.stack([new - unsure, old], -1) / len(old) - drawn[:, None]).unbind(-1)
-    share = 1 - rest / gap.clamp_min(1e-3 * (b2 - noise))
+    share = 1 - rest / gap.clamp_min(_LEAST_GAP * (b2 - noise))
     # Less than the noise that was told is left: no cause takes away more than all, and the spread of the draws stays.
     share = (share - (share.mean() - 1).clamp_min(0.0)).clamp(0.0, 1.0)
     # Where draws reach 1, all of the gap, the interval ends there and leaves out draws on the lower side alone.
@@ -142,7 +148,7 @@ def draws(rows: int, seed: int) -> Draws:
 def folds(rows: int, seed: int) -> Tensor:
     """Fold of each row."""
     generator = torch.Generator().manual_seed(seed)
-    run = max(1, rows // 50)
+    run = max(1, rows // _RUNS)
     blocks = -(-rows // run)
     deal = torch.randperm(blocks, generator=generator) % _FOLDS
     return deal.repeat_interleave(run)[:rows]
@@ -150,6 +156,6 @@ def folds(rows: int, seed: int) -> Tensor:
 
 def resampled(rows: int, generator: torch.Generator) -> Tensor:
     """Rows drawn in runs with replacement, `repeats x rows`."""
-    run = max(1, rows // 50)
+    run = max(1, rows // _RUNS)
     starts = torch.randint(rows, (_REPEATS, -(-rows // run)), generator=generator)
     return ((starts[..., None] + torch.arange(run)) % rows).flatten(1)[:, :rows]

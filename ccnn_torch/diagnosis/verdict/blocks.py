@@ -7,6 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.dictionary import covariance
+from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import Gap, HeldOut, draws, held_out, shrink_of
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
@@ -26,7 +27,7 @@ class Blocks:
         self.floor = noise_floor(analysis)
         self.position = white.channels < 3
         atoms = analysis.dictionary.atoms
-        self.candidates = _best_alone(analysis)
+        self.candidates = _most_probable_single(analysis)
         members = judgement.found.members
         alone = [[i] for i in self.candidates.values()]
         # The verdict's effects one after the other, the largest first; the last has them all.
@@ -78,7 +79,7 @@ def noise_floor(analysis: Analysis) -> Tensor:
     left = analysis.y
     for i, mean in zip(best.members, best.mean, strict=True):
         left = left - analysis.dictionary.columns[..., analysis.dictionary.groups[i]] @ mean
-    free = max(1 - best.effective / analysis.dictionary.grams.values, 0.1)
+    free = max(1 - best.effective / analysis.dictionary.grams.values, LEAST_FREE)
     # No more than the richest fit leaves.
     share = min(analysis.floor / max(float(left.square().mean()) / free, 1e-300), 1.0)
     return (left / white.weight[keep].sqrt()[:, None] * white.sigma).square().mean(0) / free * share
@@ -137,7 +138,7 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _best_alone(analysis: Analysis) -> dict[str, int]:
+def _most_probable_single(analysis: Analysis) -> dict[str, int]:
     """Of each library name the atom that the verdict's set uses, or that is most probable by itself."""
     atoms = analysis.dictionary.atoms
     best: dict[str, int] = {}

@@ -99,7 +99,7 @@ def judge(analysis: Analysis) -> Judgement:
         found = fullest = _best_without(analysis, borrowed, tried) or found
         names, driver = _named(analysis, found)
         names, outside = names - borrowed, True
-        driver = driver or _driver_alone(analysis)
+        driver = driver or _driver_of_single(analysis)
     marginal: dict[str, float] = {a.name: 0.0 for a in analysis.dictionary.atoms if not a.is_discrepancy}
     for members, _, p, _ in leading:
         for name in members:
@@ -335,7 +335,7 @@ def _driver_of_remainder(analysis: Analysis) -> str | None:
     return None
 
 
-def _driver_alone(analysis: Analysis) -> str | None:
+def _driver_of_single(analysis: Analysis) -> str | None:
     """The driver that explains most by itself."""
     atoms = analysis.dictionary.atoms
     alone = (f for f in analysis.found if len(f.members) == 1 and atoms[f.members[0]].is_discrepancy)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.shrink.held_out import draws
+from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, draws
 
 __all__ = ["localise"]
 
@@ -48,7 +48,7 @@ class _Drawn:
         """Of the energy above the noise."""
         plain = _normalised(parts.squares.sum(0) - self.floor * parts.noise.sum(0))
         drawn = _normalised(self.counts @ parts.squares - self.floors * (self.counts @ parts.noise))
-        low, high = torch.quantile(drawn, torch.tensor([0.025, 0.975], dtype=drawn.dtype), 0)
+        low, high = torch.quantile(drawn, torch.tensor(INTERVAL, dtype=drawn.dtype), 0)
         return _Shares(plain.tolist(), torch.stack([low.minimum(plain), high.maximum(plain)], -1).tolist())
 
 

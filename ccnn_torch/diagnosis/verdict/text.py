@@ -22,6 +22,7 @@ __all__ = [
     "lacking_text",
     "listed",
     "network_text",
+    "noise_text",
     "probability_words",
     "unseen_text",
     "verdict_text",
@@ -274,3 +275,8 @@ def listed(words: Sequence[str], last: str = "and") -> str:
 
 def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
+
+
+def noise_text(given: bool) -> str:
+    """Where the standard deviation of the noise is from."""
+    return "The noise was given." if given else "The noise was estimated from the residual of the most probable set."
