@@ -30,7 +30,9 @@ def numeric_constants(path: Path) -> Iterator[tuple[str, str]]:
         if not names or not all(name.lstrip("_").isupper() for name in names):
             continue
         text = ast.unparse(node.value)
-        if re.fullmatch(r"[\d\s.,()eE*/+-]+|(2 \* )?LOG_PRIOR|[\d\s(),/-]*_TAIL[\s/,\d_TAIL()-]*|math\.log\([\d.e-]+\)", text):
+        if re.fullmatch(
+            r"[\d\s.,()eE*/+-]+|(2 \* )?LOG_PRIOR|[\d\s(),/-]*_TAIL[\s/,\d_TAIL()-]*|math\.log\([\d.e-]+\)", text
+        ):
             parts = node.value.elts if isinstance(node.value, ast.Tuple) else [node.value]
             yield ", ".join(names), ", ".join(map(ast.unparse, parts))
 

@@ -1,4 +1,4 @@
-"""Which effect causes the gap between model and machine, where it lies, and how far it shrinks."""
+"""Diagnosis: which effects cause the gap between model and machine, where it is, and the share that they explain."""
 
 from ccnn_torch.diagnosis.discrepancy.network import with_network as with_network
 from ccnn_torch.diagnosis.engine import OUTLIER as OUTLIER

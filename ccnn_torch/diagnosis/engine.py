@@ -1,4 +1,4 @@
-"""Diagnosis of rows: which effect makes the gap, where it lies, and how far it shrinks."""
+"""Diagnose rows: which effects cause the gap, where it is, and the share that they explain."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ OUTLIER = "outlier"
 _MOST_ROWS, _MOST_VALUES = 2000, 9000
 _FEWEST_ROWS = 20
 UNSHOWN = "rows in which it shows: in these it changes no pose"
-# Names below this probability are stood by only where rows not used for fitting show what they take away.
+# Names below this probability are accepted only where rows not used for fitting show what they take away.
 _LIKELY = 0.8
 # Times the noise from which a row is bad and not unlucky: by itself; and where more than so many rows in a hundred, one
 # at least, are beyond the second, since the tail of a t distribution with three degrees comes that far now and then.
@@ -135,8 +135,8 @@ def diagnose_rows(
         "text": "",
     }
     why = why_set_aside(analysis, rows, chosen)
-    told = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": texts}
-    verdict["text"] = verdict_text(told | {"rows_set_aside": sorted(why)})
+    content = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": texts}
+    verdict["text"] = verdict_text(content | {"rows_set_aside": sorted(why)})
     places, intervals = localise(analysis, residual, seed)
     proposed = next_measurements(analysis, judgement, seed)
     return Diagnosis(
@@ -179,7 +179,7 @@ def _notes(
         if atom.is_discrepancy and len(atom.shape):
             notes.append(f"what follows the time is a sway with a period of {float(atom.shape):.3g} s")
     if len(analysis.measured) < int(rows.fine.sum()):
-        notes.append(f"{len(analysis.measured)} of {len(rows.fine)} rows, drawn at random, were looked at")
+        notes.append(f"{len(analysis.measured)} of {len(rows.fine)} rows, drawn at random, were evaluated")
     atoms = analysis.dictionary.atoms
     beside = [atoms[i] for i in judgement.fullest.members if i not in judgement.found.members]
     corrections = [a.name for a in beside if not a.is_discrepancy]
@@ -204,7 +204,7 @@ def _notes(
 
 
 def why_set_aside(analysis: Analysis, rows: PlausibleRows, chosen: Tensor) -> dict[int, str]:
-    """Reason by row, counted from 0 in the file; rows: all of them; chosen: those looked at."""
+    """Reason by row, counted from 0 in the file; rows: all of them; chosen: those evaluated."""
     why = dict.fromkeys(torch.nonzero(~rows.fine).squeeze(-1).tolist(), "the machine does not reach it")
     why |= dict.fromkeys(torch.nonzero(rows.astray).squeeze(-1).tolist(), "far from where its joints put it")
     aside, near = analysis.whitening.weight <= 0, analysis.near_singular
@@ -235,7 +235,7 @@ def usable_rows(situation: Situation, measured: Tensor) -> PlausibleRows:
 
 
 def drawn_rows(situation: Situation, measured: Tensor, fine: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:
-    """As many of the fine rows as are looked at, in order, and which they are."""
+    """As many of the fine rows as are evaluated, in order, and which they are."""
     chosen = torch.nonzero(fine).squeeze(-1)
     most = min(_MOST_ROWS, _MOST_VALUES // len(situation.mechanism.pose))
     if len(chosen) > most:

@@ -1,4 +1,4 @@
-"""The effects that a diagnosis.json stands by, built again to be compensated."""
+"""The effects of a diagnosis.json, built again to be compensated."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a file stands by.
+    """The verdict of a file.
 
     Attributes:
         path: the file.
@@ -125,17 +125,18 @@ def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Ver
         InputError: there is no such file, it is none of `ccnn diagnose`, it is of another machine, or its verdict names
             no effect that could be compensated.
     """
-    told = parse_json(read_text(path, _LARGEST, "give effects=from:DIR/diagnosis.json"), str(path))
+    content = parse_json(read_text(path, _LARGEST, "give effects=from:DIR/diagnosis.json"), str(path))
     try:
-        verdict = told["verdict"]
+        verdict = content["verdict"]
         names, outside, nothing = list(verdict["effects"]), bool(verdict["outside_library"]), bool(verdict["none"])
         listed = {
-            str(e["name"]): {str(n): _number(p["value"]) for n, p in e["parameters"].items()} for e in told["effects"]
+            str(e["name"]): {str(n): _number(p["value"]) for n, p in e["parameters"].items()}
+            for e in content["effects"]
         }
-        machine = told.get("mechanism") or {}
+        machine = content.get("mechanism") or {}
         gravity = None if machine.get("gravity") is None else [_number(g) for g in machine["gravity"]]
         theirs = [str(j) for j in machine.get("joints") or joints]
-        covariates = tuple(str(c) for c in told.get("where", {}).get("covariates", {}))
+        covariates = tuple(str(c) for c in content.get("where", {}).get("covariates", {}))
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError):
         raise InputError(f"{path}: is no diagnosis; give the diagnosis.json that ccnn diagnose wrote") from None
     if machine and (machine.get("name") != mechanism or theirs != [*joints]):

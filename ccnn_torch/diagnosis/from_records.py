@@ -1,4 +1,4 @@
-"""From measured records to rows with a situation: covariates by name, frames that nobody knows fitted first."""
+"""From measured records to rows with a situation: covariates by name, frames unknown frames fitted first."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def diagnose(
     seed: int = 0,
     network: bool = False,
 ) -> Diagnosis:
-    """Which effect makes the gap between a model and measured records, where it lies, how far it shrinks.
+    """Which effect makes the gap between a model and measured records, where it is, the share of it that they explain.
 
     Args:
         records: as `load_records` reads them, or a pandas DataFrame with headers ``name[unit]``.
@@ -82,7 +82,7 @@ def _unread(records: Records, situation: Situation) -> list[str]:
         return []
     more = f" and {len(names) - _FEW_NAMES} more" if len(names) > _FEW_NAMES else ""
     return [
-        f"columns that were not looked at: {', '.join(names[:_FEW_NAMES])}{more}; effects go by time, temperature, "
+        f"columns that were not evaluated: {', '.join(names[:_FEW_NAMES])}{more}; effects go by time, temperature, "
         f"load_{mechanism.pose[0].name}, direction1, speed1 and the like"
     ]
 

@@ -1,4 +1,4 @@
-"""What a diagnosis says, in numbers and in words."""
+"""The result of a diagnosis."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ccnn_torch.effects import Acting
 
 __all__ = ["Diagnosis"]
 
-_NOT_TOLD = ("acting", "analysis", "judgement", "lines")
+_NOT_WRITTEN = ("acting", "analysis", "judgement", "lines")
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Diagnosis:
             is None without orientation.
         where: shares of the gap by `outputs`, `joints`, `legs`, `regions`, `covariates`.
         where_ci95: the same with `[low, high]` in the place of each share, regions and regimes as lists of them.
-        effects: every candidate, most probable first; `signatures` says why one cannot be told from another.
+        effects: every candidate, most probable first; `signatures` says why one cannot be distinguished from another.
         in_order: the verdict's effects added one after the other, the largest first.
         by_block: gap and shrink where rows are held out in blocks, along the direction in which the joints vary most;
             None where the verdict names nothing.
-        network: what a network on the remainder would still gain; None where nobody asked.
+        network: what a network on the remainder would still gain; None where it was not asked for.
         verdict: what is stood by.
         next_measurements: rows that would tell the leading explanations apart.
         missing_covariates: columns that would bring more effects into sight, most promising first.
@@ -39,7 +39,7 @@ class Diagnosis:
             more surely than 0.9.
         notes: what was left out and why, one sentence each.
         acting: the verdict's effects with their numbers, to be simulated or compensated.
-        analysis, judgement: everything that was looked at.
+        analysis, judgement: everything that was evaluated.
         lines: line of every row in the file that it came from, the header being line 1; () for rows of no file.
     """
 
@@ -72,5 +72,5 @@ class Diagnosis:
             "joints": [joint.name for joint in situation.mechanism.joints],
             "gravity": situation.gravity.tolist(),
         }
-        told = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NOT_TOLD}
-        return {"mechanism": machine} | told
+        content = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _NOT_WRITTEN}
+        return {"mechanism": machine} | content

@@ -44,8 +44,8 @@ def test_the_verdict_of_each_kind() -> None:
     assert verdict_text(none()[0]).endswith("No cause beyond the noise is to be seen (probability above 0.99).")
     assert "It comes from 2 bad rows, set aside" in verdict_text(outlier()[0])
     assert (
-        "or an error of the geometry or a shifted or tilted base frame (these rows cannot tell which: on these poses "
-        "their signatures are up to 11.5° apart), explains"
+        "or an error of the geometry or a shifted or tilted base frame (these rows do not distinguish them: "
+        "on these poses their signatures are up to 11.5° apart), explains"
     ) in verdict_text(indistinguishable()[0])
     assert "420 µm and 900 µrad is 20 and 8.2 times" in verdict_text(with_rotation()[0])
     results = outside()[0]

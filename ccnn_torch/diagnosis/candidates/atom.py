@@ -1,4 +1,4 @@
-"""Candidates of a diagnosis as groups of whitened columns: library effects at given shapes, and catch-alls."""
+"""Candidates of a diagnosis as groups of whitened columns: library effects at given shapes, and discrepancy terms."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class Atom:
     """One candidate cause with its columns.
 
     Attributes:
-        name: of the effect, or the driver of a catch-all (`workspace`, `joint q1`, `load z`, …).
-        effect: None for a catch-all.
-        shape: values of the effect's shapes, `h` [SI]; of a catch-all that sways its period [s], of others none.
+        name: of the effect, or the driver of a discrepancy term (`workspace`, `joint q1`, `load z`, …).
+        effect: None for a discrepancy term.
+        shape: values of the effect's shapes, `h` [SI]; of a discrepancy term that sways its period [s], of others none.
         columns: first-order change of the pose per plausible size of each coefficient, `s x c x m` [m, rad].
         log_prior: log prior odds, the search over shapes charged.
         used: the coefficients that the columns belong to; None = all, in order.
-        plain: whether a catch-all has straight lines, planes or gentle curves only.
+        plain: whether a discrepancy term has straight lines, planes or gentle curves only.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Atom:
     plain: bool = False
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
-        """Those that the columns belong to; () for a catch-all."""
+        """Those that the columns belong to; () for a discrepancy term."""
         if self.effect is None:
             return ()
         every = self.effect.coefficients(situation)

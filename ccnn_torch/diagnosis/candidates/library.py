@@ -1,4 +1,4 @@
-"""Candidates of a search: every effect at the shapes that suit the rows, at first and about a set that acts."""
+"""Candidates of a search: every effect at its best shapes, about the nominal machine and about a set."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Known(NamedTuple):
 
     Attributes:
         starts: they stay candidates, since what acts now may have hidden the better ones.
-        kept: by names of effects whose shapes are not looked for again those that they have.
-        alone: whether shapes of what acts are looked for with nothing beside it, too.
+        kept: by names of effects whose shapes are not searched again those that they have.
+        alone: whether shapes of what acts are searched with nothing beside it, too.
     """
 
     starts: Sequence[Atom]
@@ -58,7 +58,7 @@ def candidates_about_nominal(
 ) -> tuple[list[Atom], list[Atom]]:
     """Effects without shapes, whole and in part; and those with shapes, at what suits the residual.
 
-    Shapes are looked for by themselves and with the rest of the library beside them: two ways to start, both stay
+    Shapes are searched by themselves and with the rest of the library beside them: two ways to start, both stay
     candidates, and so do the shapes that are usual where an effect has such.
 
     Args:
@@ -97,7 +97,7 @@ def candidates_about_set(
     usable: Tensor,
     fitted: Tensor,
 ) -> list[Atom]:
-    """All effects about the machine `there`, to which those that act bring it; shapes looked for beside these.
+    """All effects about the machine `there`, to which those that act bring it; shapes searched beside these.
 
     Args:
         situation, there: rows on the nominal machine, and on the other.
@@ -161,7 +161,7 @@ def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped
 
 
 def _usual(situation: Situation, effect: Effect) -> list[Shaped]:
-    """The shapes of the textbook, which nobody has to look for; none where an effect has no usual ones."""
+    """The shapes of the textbook, which nobody has to search; none where an effect has no usual ones."""
     usual = [s.usual for s in effect.shapes(situation)]
     if any(value is None for value in usual):
         return []

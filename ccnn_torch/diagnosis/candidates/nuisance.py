@@ -1,4 +1,4 @@
-"""What candidates explain of a residual that others have had their part of; the price of choosing among many."""
+"""Regression on candidates beside nuisance columns, and the cost of a search among many."""
 
 from __future__ import annotations
 

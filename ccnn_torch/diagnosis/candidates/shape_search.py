@@ -1,4 +1,4 @@
-"""Shapes (periods, lags, rates): looked for over their grids with what else may be there projected out."""
+"""Search of shapes (periods, lags, rates) over their grids, with all other columns projected out."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ __all__ = ["Scan", "SearchRows", "Shaped"]
 
 # The grid, then twice this many values between the neighbours of the best.
 _FINE, _ROUNDS = 9, 3
-# Log odds, less than these being chance, for which values between those of the grid are looked at.
+# Log odds, less than these being chance, for which values between those of the grid are evaluated.
 _CHANCE = 5.0
 # Plausible sizes that what else is there may have: it takes what it can explain, and does not leave it to the shapes.
 _LOOSE = 10.0
-# Values of the residual that the grids are looked at on, for a start and then: so many or one in so many, whichever is
+# Values of the residual that the grids are evaluated on, for a start and then: so many or one in so many, whichever is
 # more, but no more than the last.
 _START, _THEN, _MOST = (900, 4), (1500, 2), 4800
 # Values of a grid that explain so little less than the best may be meant, a few of them, where it is more than chance.
 _AS_WELL, _FEW, _THERE = 20.0, 16, 100.0
-# Shapes that share coefficients are looked for together where that are no more values.
+# Shapes that share coefficients are searched together where that are no more values.
 _TOGETHER = 150
 # Log evidence for each coefficient whose shape is worth its search.
 _PAYS = 1.5
@@ -35,7 +35,7 @@ _PAYS = 1.5
 
 class Shaped(NamedTuple):
     """Shapes found: `value` `h`; `used`, the coefficients whose shape is worth its charge (None = all); and `charge`,
-    what looking for them costs in log odds: the logarithm of the share of the values looked at that do as well."""
+    what looking for them costs in log odds: the logarithm of the share of the values evaluated that do as well."""
 
     value: Tensor
     used: tuple[int, ...] | None
@@ -74,13 +74,13 @@ class _Turn(NamedTuple):
 
 
 class SearchRows:
-    """What is to be explained, and what else is there, on the rows that grids are looked at on.
+    """What is to be explained, and what else is there, on the rows that grids are evaluated on.
 
     Attributes:
-        rows: looked at, `t`; None = all.
+        rows: evaluated, `t`; None = all.
         left: what the others leave there.
-        times: how many values there are for each that is looked at.
-        rounds: how often values between the neighbours of the best are looked at.
+        times: how many values there are for each that is evaluated.
+        rounds: how often values between the neighbours of the best are evaluated.
     """
 
     def __init__(self, y: Tensor, others: Tensor, quick: bool = False) -> None:
@@ -147,7 +147,7 @@ class Scan:
         return TrialColumns(_of(self.lead, rows, 0)[..., movers] * one[..., None, :])
 
     def _lead(self, columns: Tensor, which: Sequence[int], rows: Tensor | None) -> SharedColumns:
-        """Some of the columns in the rows looked at, which are the same all along: one object, however often it is
+        """Some of the columns in the rows evaluated, which are the same all along: one object, however often it is
         asked for."""
         key = tuple(which)
         if key not in self.leads:
@@ -167,7 +167,7 @@ class Scan:
 
         Args:
             ground: what is to be explained, and beside what.
-            start: shapes found before, when the effect is known to be there: its parts are then looked for beside each
+            start: shapes found before, when the effect is known to be there: its parts are then searched beside each
                 other.
         """
         value = self.start if start is None else start
@@ -180,7 +180,7 @@ class Scan:
             for candidates, pieces, looked_at in self._level(value, level, ground.rows):
                 chosen = [self._nearest(candidates, value, part) for part in self.parts]
                 spent = [0.0] * len(self.parts)
-                # Beside each other: over the grid once each by itself before, and then about what that has found.
+                # Beside each other: over the grid once each alone before, and then about what that has found.
                 both = start is not None and len(self.parts) > 1
                 for sweep in ((0, 1) if level == 0 else (1,)) if both else (0,):
                     for i, tried in enumerate(looked_at):

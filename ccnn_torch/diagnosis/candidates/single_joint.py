@@ -1,4 +1,4 @@
-"""An effect in one joint or leg alone, or in a few: the coefficients of those that explain most."""
+"""Effects in one joint or leg, or in a few: the coefficients that explain most."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signs that records and model do not fit each other, or that a verdict rests on what was not recorded."""
+"""Cautions: records and model that do not fit, or a verdict that depends on unrecorded covariates."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _LARGE = 0.1
 # Standard deviation left, of that which was given; heavy tails left 0.7 of it in sealed machines.
 _QUIET, _LOUD = 0.5, 2.0
 _MANY = 0.1
-# So many rows set aside are looked at together, against as many drawn anew so often; the share of these as close.
+# So many rows set aside are evaluated together, against as many resampled so often; the share of these as close.
 _SEVERAL, _DRAWS, _BY_CHANCE = 5, 1000, 0.003
 # A joint that moves less than this share of its workspace stands still. Rows that may be copies of others.
 _STILL, _COPIES = 1e-3, 0.2
@@ -54,7 +54,7 @@ def cautions(
 
     Args:
         analysis: of the rows.
-        judgement: what is stood by.
+        judgement: the names of the verdict.
         rows: which of them are of the machine at all.
         missing: as in diagnosis.json.
         together: what the verdict's effects take away on held-out rows.
@@ -106,11 +106,11 @@ def _of_plan(analysis: Analysis, names: Sequence[str]) -> list[Caution]:
     moved = (situation.joints.amax(0) - situation.joints.amin(0)) > _STILL * (high - low)
     still = [j.name for j, moves in zip(situation.mechanism.joints, moved.tolist(), strict=True) if not moves]
     if still and len(still) == len(moved):
-        one = "all rows are at one place, where what depends on the place cannot be told apart"
+        one = "all rows are at one place, where what depends on the place cannot be distinguished"
         said.append(Caution(one, _HOLLOW if _OF_PLACE & {*names} else _DOUBTED))
     elif still:
         named = " and ".join(still)
-        said.append(Caution(f"{named} did not move: errors of {named} cannot be told from those of a frame"))
+        said.append(Caution(f"{named} did not move: errors of {named} cannot be distinguished from those of a frame"))
     columns = [situation.joints, analysis.measured, *(v[:, None] for v in situation.covariates.values())]
     whole = torch.cat(columns, -1)
     copies = 1 - len(torch.unique(whole, dim=0)) / len(whole)
@@ -167,8 +167,8 @@ def _of_nothing_gained(analysis: Analysis, judgement: Judgement, together: Gap) 
     text = "rows not used for fitting do not show that this takes anything away"
     if analysis.whitening.known == 0:
         text += (
-            "; the noise was not given and is taken for nearly all of the gap, so that a cause that follows nothing "
-            "recorded counts as noise"
+            "; the noise was not given and is taken for nearly all of the gap, so that a cause without a recorded "
+            "driver counts as noise"
         )
     return [Caution(text, _HOLLOW)]
 
@@ -222,7 +222,7 @@ def _of_temperature(situation: Situation) -> list[Caution]:
 
 
 def _of_inputs(analysis: Analysis, missing: Sequence[Mapping[str, Any]]) -> list[Caution]:
-    """What the nominal machine itself takes and nobody recorded, where that may be more than the noise."""
+    """What the nominal machine itself takes and that was not recorded, where that may be more than the noise."""
     situation = analysis.situation
     lacking = situation.mechanism.lacking([*situation.covariates])
     sizes = {c.partition("[")[0]: e["effects"] for e in missing for c in e["columns"]}

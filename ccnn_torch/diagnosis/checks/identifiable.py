@@ -1,4 +1,4 @@
-"""What records can show, before any verdict."""
+"""Effects that records can show, before a diagnosis."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ccnn_torch.effects import Effect, Situation
 
 __all__ = ["Check", "check_rows"]
 
-# Cosine of the angle between what two effects can do beyond which these rows do not tell them apart.
+# Cosine of the angle between what two effects can do beyond which these rows do not distinguish them.
 _ALIKE = 0.95
 
 

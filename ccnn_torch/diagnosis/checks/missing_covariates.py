@@ -1,4 +1,4 @@
-"""What was not recorded: columns that would bring further effects into sight, and how large those may be."""
+"""Covariates that were not recorded: the effects that they would make visible, and their plausible size."""
 
 from __future__ import annotations
 
@@ -67,12 +67,14 @@ def missing_covariates(
             size = _usual(pose_residual(other, here.pose), position)
             if size > 0:
                 found.setdefault((condition.name,), {})[mechanism.name] = size
-    told: list[dict[str, Any]] = [
+    entries: list[dict[str, Any]] = [
         {"columns": [f"{n}[{units[n]}]" for n in added], "effects": sizes, "unit": "m" if position else "rad"}
         for added, sizes in found.items()
     ]
     first = "temperature" if driver == "time" else ""
-    return sorted(told, key=lambda e: (not first or not e["columns"][0].startswith(first), -max(e["effects"].values())))
+    return sorted(
+        entries, key=lambda e: (not first or not e["columns"][0].startswith(first), -max(e["effects"].values()))
+    )
 
 
 def _additions(kinds: Mapping[str, list[str]]) -> Iterator[tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Mistakes often made in records: the one without which model and rows would agree is named."""
+"""Common mistakes in records: the one whose correction makes model and rows agree."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Sit
     pose, joints = mechanism.pose, mechanism.joints
     lengths = torch.tensor([c.unit == "m" for c in pose])
     for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
-        mended = torch.where(lengths, factor * measured, measured)
-        yield f"the pose's lengths seem to be in {unit} under m", situation, mended
+        corrected = torch.where(lengths, factor * measured, measured)
+        yield f"the pose's lengths seem to be in {unit} under m", situation, corrected
     words = (
         "the records' lengths are about 1000 times smaller than the model's: metres under mm, or a model in millimetres"
     )
@@ -79,9 +79,9 @@ def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Sit
         return
     turns = torch.tensor([g.unit == "rad" for g in inner.geometry])
     if inner is mechanism and bool(turns.any()):
-        mended = torch.where(turns, inner.nominal / _TURN, inner.nominal)
+        corrected = torch.where(turns, inner.nominal / _TURN, inner.nominal)
         words = "the angles of the model seem to be in degrees under rad: look at the units in its file"
-        yield words, replace(situation, parameters=mended), measured
+        yield words, replace(situation, parameters=corrected), measured
     at = situation.joints
     for i, k in combinations(range(len(joints)), 2):
         if joints[i].unit == joints[k].unit:

@@ -1,4 +1,4 @@
-"""Whether rows are of this machine at all."""
+"""Rows that this machine can have reached."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["PlausibleRows", "plausible_rows"]
 
 # Sizes of the machine: a row farther off is of other joints.
 _ROW = 1.0
-# Rows astray among which a mistake in common is looked for.
+# Rows astray among which a mistake in common is searched.
 _MANY = 5
 
 

@@ -1,4 +1,4 @@
-"""What to measure next: rows that best tell the leading explanations apart, or make the only one sharper."""
+"""Next measurements: rows that best distinguish the leading explanations, or make the only one sharper."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ class _Question(NamedTuple):
     """What a row may answer: coefficients `m` with covariance `m x m`, whose columns are `x` `s x c x m`, whitened.
 
     Between two explanations the coefficients are those of both, the second's with a minus in the columns: `x @ mean` is
-    how far their predictions differ. `weight` is how much the answer is wanted, `names` whom it tells apart.
+    how far their predictions differ. `weight` is how much the answer is wanted, `names` the names that it
+    distinguishes.
     """
 
     x: Tensor
@@ -70,9 +71,10 @@ def next_measurements(analysis: Analysis, judgement: Judgement, seed: int) -> li
 
 
 def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, FittedSet]]:
-    """The most probable sets with other library names, or none, no catch-all among them, and their probabilities.
+    """The most probable sets with other library names, or none, no discrepancy term among them, and their
+    probabilities.
 
-    What cannot be told from the verdict is among them, even where the search did not come across it.
+    What cannot be distinguished from the verdict is among them, even where the search did not come across it.
     """
     atoms, own = analysis.dictionary.atoms, judgement.found
     plain = [

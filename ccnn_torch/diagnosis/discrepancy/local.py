@@ -1,7 +1,7 @@
-"""Catch-alls that are found rather than given: a bump in one place of a joint's track, or of the workspace; a sway.
+"""Local discrepancy terms: a bump along a joint or in the workspace, with searched place and width; a periodic term.
 
 Bumps of every place at once share one prior scale, and the evidence charges each of them; a dent or a table is in one
-place alone. So that place is looked for, and the search is charged as that for a period is.
+place alone. So that place is searched, and the search is charged as that for a period is.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ccnn_torch.effects import Situation
 
 __all__ = ["local_discrepancies"]
 
-# Places looked at along a joint's track and in the workspace, and radii as shares of half the range.
+# Places evaluated along a joint's track and in the workspace, and radii as shares of half the range.
 _ALONG, _WITHIN = 21, 40
 _RADII_ALONG, _RADII_WITHIN = (0.1, 0.17, 0.3), (0.25, 0.4, 0.65)
 # Rows that a bump has to touch: fewer are bad rows.
@@ -31,7 +31,7 @@ _TOUCHED = 4.0
 _POWER, _POWERS = 2.0, (1.0, 8.0)
 # A place is then mended by steps of this share of its radius, halved where none is better, so many times.
 _STEP, _STEPS = 0.4, 10
-# Values of the residual, at most, on which places are looked at.
+# Values of the residual, at most, on which places are evaluated.
 _MOST_VALUES = 1800
 # Times the noise up to which a row's residual counts.
 _BELIEVED = 20.0
@@ -115,7 +115,7 @@ def _searched(points: Tensor, places: Tensor, lead: Tensor, left: NuisanceFit, t
     what looking for it costs in log odds, `n`.
 
     Args:
-        points: of the rows looked at, `n x s x d`.
+        points: of the rows evaluated, `n x s x d`.
         places: to begin with, `g x (d + 2)`.
         lead: whitened columns that a bump multiplies, `n x s x c x m`.
         left: what is to be explained, `n`.

@@ -1,4 +1,4 @@
-"""What a network would still gain on what the verdict's effects leave, judged on rows that it has not seen."""
+"""Gain of a network on the residual of the effects, on held-out rows."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def with_network(diagnosis: Diagnosis, seed: int = 0, progress: Progress | None 
     Args:
         diagnosis: with its analysis.
         seed: as of the diagnosis.
-        progress: told the share that is done, 0 to 1.
+        progress: called with the share that is done, 0 to 1.
     """
     return replace(diagnosis, network=remaining_gain(diagnosis.analysis, diagnosis.judgement, seed, progress))
 
@@ -61,9 +61,9 @@ def remaining_gain(
 
     Args:
         analysis: of the rows.
-        judgement: whose effects count; catch-alls do not.
+        judgement: whose effects count; discrepancy terms do not.
         seed: of folds, network and draws.
-        progress: told the share that is done, 0 to 1.
+        progress: called with the share that is done, 0 to 1.
 
     Returns:
         `{"unit", "rows", "gap_before", "gap_after", "gap_after_ci95", "gain", "gain_ci95", "reason"}`: RMS over
@@ -83,7 +83,7 @@ def remaining_gain(
     here = (fold[rows], torch.arange(len(rows)))
     before = _squares(left[here], white.sigma, channels)
     noise = float(noise_floor(analysis)[channels].sum())
-    told: dict[str, Any] = {
+    block: dict[str, Any] = {
         "unit": "m" if bool(position.any()) else "rad",
         "rows": len(rows),
         "gap_before": math.sqrt(float(before.mean())),
@@ -93,7 +93,7 @@ def remaining_gain(
     chance = float(before.std()) / math.sqrt(len(before))
     # Noise that was estimated is what a fit left: only noise that was given says that nothing is left.
     if white.known > 0 and float(before.mean()) < noise + _CHANCE * chance:
-        return told | {"reason": "what the effects leave is no more than the noise"}
+        return block | {"reason": "what the effects leave is no more than the noise"}
     said = _predicted(analysis, left, rows, fold, seed, progress)
     after = _squares((left - said)[here], white.sigma, channels)
     many = resampled(len(rows), torch.Generator().manual_seed(seed))
@@ -101,10 +101,10 @@ def remaining_gain(
     gain = before[many].mean(-1).sqrt() - drawn
     ends = torch.tensor(INTERVAL, dtype=drawn.dtype)
     reached = math.sqrt(float(after.mean()))
-    return told | {
+    return block | {
         "gap_after": reached,
         "gap_after_ci95": torch.quantile(drawn, ends).tolist(),
-        "gain": told["gap_before"] - reached,
+        "gain": block["gap_before"] - reached,
         "gain_ci95": torch.quantile(gain, ends).tolist(),
     }
 
@@ -137,7 +137,7 @@ def _predicted(
         rows: which of the rows that count were drawn, `t`.
         fold: of the rows that count, `s`.
         seed: of the networks.
-        progress: told the share that is done.
+        progress: called with the share that is done.
     """
     white, situation = analysis.whitening, analysis.situation
     here = white.keep()[rows]

@@ -1,5 +1,5 @@
-"""A catch-all that is found rather than given: the platform sways with a period of its own, faster than the waves that
-stand for any course of time can follow."""
+"""A discrepancy term that is found rather than given: the platform sways with a period of its own, faster than the
+waves that stand for any course of time can follow."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def periodic_discrepancy(time: Tensor, raw: Tensor, lead: Tensor, few: Tensor, l
         time: of each row, `s` [s].
         raw: shifts and turns of the platform, `s x c0 x k` [m, rad].
         lead: the same whitened, `s x c x k`.
-        few: rows looked at, `t`.
+        few: rows evaluated, `t`.
         left: what is to be explained there.
     """
     span = float(time.max() - time.min())

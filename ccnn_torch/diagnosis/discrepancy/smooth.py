@@ -1,8 +1,8 @@
-"""Catch-alls: what no effect of the library describes, one candidate for each driver it may follow.
+"""Discrepancy terms: what no effect of the library describes, one candidate for each driver it may follow.
 
-A catch-all lets the joints deviate by a smooth function of its driver, alone and times the pose: physical causes act
-through the joints, and the Jacobian then carries most of the dependence on the pose. What follows time, temperature or
-a load may also move the platform as a whole, alike wherever it stands, and faster than a smooth function.
+A discrepancy term lets the joints deviate by a smooth function of its driver, alone and times the pose: physical causes
+act through the joints, and the Jacobian then carries most of the dependence on the pose. What follows time, temperature
+or a load may also move the platform as a whole, alike wherever it stands, and faster than a smooth function.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ __all__ = [
     "unit_range",
 ]
 
-# A catch-all is that much less probable than no deviation of its kind, before the data are seen.
+# A discrepancy term is that much less probable than no deviation of its kind, before the data are seen.
 LOG_PRIOR = math.log(1e-3)
 # And one that holds most of what a library effect does has to be better than that effect by as much again.
 _NEAR_LIBRARY = math.log(1e-5)
 # A joint may be off by this much for reasons that nobody thought of [m], [rad].
 _SCALE = {"m": 3e-4, "rad": 5e-4}
 ANY = "*"
-"""Stands in a driver's name for all of its kind; a verdict names the one that explains most by itself."""
+"""Stands in a driver's name for all of its kind; a verdict names the one that explains most alone."""
 SPEED = "speed"
-"""Begins the names of catch-alls that follow a joint's velocity: a verdict knows no such driver."""
+"""Begins the names of discrepancy terms that follow a joint's velocity: a verdict knows no such driver."""
 # What bends with a driver against what is proportional to it.
 _BEND = 0.5
 _MOST, _MOST_PLACES = 28, 60
@@ -62,7 +62,7 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
     """One or two atoms for each driver that the records hold; beside: names of the library effects that are candidates.
 
     Drives of one kind have errors of one kind, each along its own track. A transmission's are of a form that holds
-    elsewhere, too, so where that is a candidate no catch-all of all drives at once takes them from it.
+    elsewhere, too, so where that is a candidate no discrepancy term of all drives at once takes them from it.
     """
     mechanism, rows = situation.mechanism, situation.joints.shape[-2]
     place = unit_range(situation.pose)
@@ -95,16 +95,18 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
         if driver.startswith(SPEED):
             pass
         elif driver.startswith("direction"):
-            features.append(_BEND * d * _carried(situation, int(driver.split()[1]) - 1))
+            features.append(_BEND * d * _load_on_joint(situation, int(driver.split()[1]) - 1))
         else:
             features.append(_BEND * _bumps(d, few))
             found.append(
-                _whole(situation, driver, _waves(d, max(_FEWEST, min(_WAVES, 2 * rows // _ROWS_FOR_TWO_WAVES))))
+                _platform_atom(situation, driver, _waves(d, max(_FEWEST, min(_WAVES, 2 * rows // _ROWS_FOR_TWO_WAVES))))
             )
         if driver.startswith("load"):
-            # What a load asks of a joint goes with the slope of the kinematics, which is no plane over the workspace.
+            # The torque of a load follows the Jacobian, which is not linear over the workspace.
             features.append(_BEND * d * products(place))
-            found.append(_atom(situation, driver, _asked(_under(situation, name)), most=most, log_prior=_NEAR_LIBRARY))
+            found.append(
+                _atom(situation, driver, _load_features(_under(situation, name)), most=most, log_prior=_NEAR_LIBRARY)
+            )
         if driver == "temperature" and "time" in situation.covariates:
             features += [_lagged(value, situation.covariates["time"], k) for k in _LAGS]
         found.append(_atom(situation, driver, torch.cat(features, -1)))
@@ -115,7 +117,9 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
         if sum(a.name.startswith(kind) for a in found) > 1:
             found.append(_atom(situation, f"{kind} {ANY}", torch.cat([one, *features], -1)))
             if kind == "load":
-                found.append(_atom(situation, f"{kind} {ANY}", _asked(situation), most=most, log_prior=_NEAR_LIBRARY))
+                found.append(
+                    _atom(situation, f"{kind} {ANY}", _load_features(situation), most=most, log_prior=_NEAR_LIBRARY)
+                )
     return found
 
 
@@ -169,7 +173,7 @@ def _lagged(value: Tensor, time: Tensor, share: float) -> Tensor:
 
 
 def _configuration(situation: Situation) -> list[Tensor]:
-    """What repeats with the turns of the joints, and what the machine's weight asks of them, `s x …` each."""
+    """What repeats with the turns of the joints, and the torque of the machine's weight on them, `s x …` each."""
     turning = [i for i, j in enumerate(situation.mechanism.joints) if j.unit == "rad"]
     angles = situation.joints[:, turning]
     return [torch.sin(angles), torch.cos(angles), _over_largest(situation.own_weight_torque)]
@@ -180,8 +184,8 @@ def _under(situation: Situation, load: str) -> Situation:
     return situation.with_covariates({load: situation.covariates[load]})
 
 
-def _asked(situation: Situation) -> Tensor:
-    """What the load asks of the joints, and its square with the sign, `s x 2n`, the largest 1."""
+def _load_features(situation: Situation) -> Tensor:
+    """Force or torque of the load on the joints, and its square with the sign, `s x 2n`, the largest 1."""
     torque = _over_largest(situation.load_torque)
     return torch.cat([torque, _BEND * torque * torque.abs()], -1)
 
@@ -190,10 +194,10 @@ def _over_largest(values: Tensor) -> Tensor:
     return values / values.abs().amax().clamp_min(1e-300)
 
 
-def _carried(situation: Situation, joint: int) -> Tensor:
-    """What load and weight ask of a joint, by size, `s x 2 or less`: what holds it where it came from."""
-    asked = torch.stack([t[:, joint].abs() for t in (situation.load_torque, situation.own_weight_torque)], -1)
-    return unit_range(asked[:, (asked.amax(0) - asked.amin(0)) > 1e-9 * asked.amax().clamp_min(1e-300)])
+def _load_on_joint(situation: Situation, joint: int) -> Tensor:
+    """Torques of load and weight on a joint, absolute, `s x 2 or less`: what holds it where it came from."""
+    torques = torch.stack([t[:, joint].abs() for t in (situation.load_torque, situation.own_weight_torque)], -1)
+    return unit_range(torques[:, (torques.amax(0) - torques.amin(0)) > 1e-9 * torques.amax().clamp_min(1e-300)])
 
 
 def _waves(values: Tensor, count: int) -> Tensor:
@@ -215,7 +219,7 @@ def platform_moves(situation: Situation) -> Tensor:
     return visible * torch.tensor(_PLATFORM[visible.shape[-1]], dtype=visible.dtype)
 
 
-def _whole(situation: Situation, driver: str, features: Tensor) -> Atom:
+def _platform_atom(situation: Situation, driver: str, features: Tensor) -> Atom:
     """features: `s x f`; columns = shifts and turns of the platform, alike in all poses, times the features."""
     columns = (platform_moves(situation).unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
     shown = columns.abs().amax((0, 1)) > 0

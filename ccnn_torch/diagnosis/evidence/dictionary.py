@@ -51,14 +51,14 @@ class Dictionary:
 
     Attributes:
         atoms: all candidates.
-        columns: whitened, of the library effects, name by name, and then of the catch-alls that are put beside them,
-            side by side, `s x c x P`; rows that count.
+        columns: whitened, of the library effects, name by name, and then of the discrepancy terms that are put beside
+            them, side by side, `s x c x P`; rows that count.
         groups: which of the columns are those of an atom, for the atoms that have such.
-        grams: of the columns; NaN may stand between catch-alls and between atoms of one name, which are in no set
-            together.
+        grams: of the columns; NaN may stand between discrepancy terms and between atoms of one name, which are in no
+            set together.
         axes: principal axes of the columns of each of these atoms, `m x m`.
         turned: `grams` with every group in its axes, and with a last column of zeros.
-        alone: no atom, and each by itself.
+        alone: no atom, and each alone.
         noise_dof: as for `fit_sets`.
     """
 
@@ -98,7 +98,7 @@ def covariance(dictionary: Dictionary, found: FittedSet) -> Tensor:
 
 
 class Singles(NamedTuple):
-    """Fits of no atom, and of each by itself; the principal axes of each; and the inner products of its columns."""
+    """Fits of no atom, and of each alone; the principal axes of each; and the inner products of its columns."""
 
     found: dict[tuple[int, ...], FittedSet]
     axes: list[Tensor]
@@ -106,7 +106,7 @@ class Singles(NamedTuple):
 
 
 def singles_of(atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof: float) -> Singles:
-    """Fit no atom, and each by itself.
+    """Fit no atom, and each alone.
 
     Args:
         atoms: candidates.
@@ -148,11 +148,11 @@ def dictionary_of(
     noise_dof: float,
     firsts: Sequence[int] | None = None,
 ) -> Dictionary:
-    """Of the library effects and the catch-alls `others`.
+    """Of the library effects and the discrepancy terms `others`.
 
     Args:
         atoms, x, y, noise_dof: as for `singles_of`.
-        others: catch-alls.
+        others: discrepancy terms.
         singles: what that says of them.
         firsts: atoms of which one is in every set that will be asked for; None = any.
     """

@@ -1,4 +1,4 @@
-"""The arrays behind the pictures of a diagnosis: what gives each effect away, and what is left of every row."""
+"""Arrays of the figures of a diagnosis."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["picture_arrays"]
 
 Column = tuple[str, str, Tensor]
 """Name, SI unit and values."""
-# Quantile bins of a driver; the one whose bins hold most of an effect's variance is what gives the effect away.
+# Quantile bins of a driver; the one whose bins hold most of an effect's variance is the signature of the effect.
 _BINS = 12
 _UNITS = {"time": "s", "temperature": "K"}
 # A driver outside the library that is one column by its name.
@@ -60,7 +60,8 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
     parts = [analysis.dictionary.atoms[i].columns @ mean for i, mean in zip(found.members, found.mean, strict=True)]
     columns = _drivers(analysis, place)
     shown = set(diagnosis.verdict["effects"]) | {diagnosis.verdict["driver"]}
-    # What the whole set leaves, catch-all and all: the signature of one cause is drawn with all others taken off.
+    # What the whole set leaves, discrepancy term and all: the signature of one cause is drawn with all others taken
+    # off.
     left = _remainder(analysis, residual, found.members, seed, with_discrepancies=True)
     for i, part in zip(found.members, parts, strict=True):
         name = analysis.dictionary.atoms[i].name
@@ -68,8 +69,8 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
             continue
         # In the pose and in the joints; what follows one column best shows the cause best.
         views = [_along(part, left, keep, columns), _in_joints(analysis, part, left, columns)]
-        told = [_telling(view, keep, name) for view in views]
-        view, (_, (x_name, x_unit, x)) = max(zip(views, told, strict=True), key=lambda pair: pair[1][0])
+        scores = [_telling(view, keep, name) for view in views]
+        view, (_, (x_name, x_unit, x)) = max(zip(views, scores, strict=True), key=lambda pair: pair[1][0])
         fit, rest, y_axis = view.fit, view.rest, {"name": view.axis.name, "unit": view.axis.unit}
         arrays |= {f"signature.{name}.x": x, f"signature.{name}.y": fit + rest, f"signature.{name}.fit": fit}
         labels[name] = {"x": {"name": x_name, "unit": x_unit}, "y": y_axis}

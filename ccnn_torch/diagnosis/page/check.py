@@ -45,7 +45,7 @@ def check_table(check: Check) -> Table:
         for name, others in found.items()
     )
     note = (
-        "Share of what the effect is likely to do that another can do as well (cosine). A diagnosis still tells them "
-        "apart where the other one would need unlikely numbers, or more of them; all pairs stand in check.json (--out)."
+        "Cosine between what an effect is likely to do and what another can do. A diagnosis still distinguishes them "
+        "where the other one needs implausible or more coefficients; all pairs are in check.json (--out)."
     )
     return Table("Confusable", ("effect", "taken over by"), rows, note, ("taken over by",))

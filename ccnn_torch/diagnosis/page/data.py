@@ -71,7 +71,7 @@ class About:
         noise: where the noise floor is from, as a sentence.
         units: SI units of joints, covariates and place coordinates by name.
         notes: further sentences.
-        lines: line in the file of each row of `rows_set_aside`, the header being line 1; () where nobody said.
+        lines: line in the file of each row of `rows_set_aside`, the header being line 1; () where it was not asked for.
     """
 
     name: str = "Diagnosis"
@@ -83,7 +83,7 @@ class About:
     lines: tuple[int, ...] = ()
 
     def unit(self, name: str) -> str:
-        """SI unit of a column; by its name where nobody said, and `SI` where the name tells nothing."""
+        """SI unit of a column; by its name where it was not asked for, and `SI` where the name tells nothing."""
         if name in self.units:
             return self.units[name]
         if name.startswith("load_"):

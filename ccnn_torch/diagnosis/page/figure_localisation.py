@@ -1,4 +1,4 @@
-"""Where the gap lies: a map before and after, and the shares by output, joint, leg and regime."""
+"""Where the gap is: a map before and after, and the shares by output, joint, leg and regime."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def remainder_map(arrays: Mapping[str, Array], about: About) -> Plot | None:
     shapes = [height_of(place, axes, plane) for plane in planes]
     figure = Figure(figsize=(9.2, sum(3.6 * shape + 0.85 for shape in shapes)), layout="constrained")
     grid = figure.subplots(len(planes), 2, squeeze=False, height_ratios=shapes)
-    told = draw_pairs(
+    text = draw_pairs(
         figure,
         grid,
         axes,
@@ -62,7 +62,7 @@ def remainder_map(arrays: Mapping[str, Array], about: About) -> Plot | None:
         si_unit=unit,
     )
     which = "rows not used for fitting" if (held & ~aside).any() else "rows"
-    caption = f"The {quantity} over the {over}, on {len(before)} {which}, on one scale: {told}. A pattern that is left "
+    caption = f"The {quantity} over the {over}, on {len(before)} {which}, on one scale: {text}. A pattern that is left "
     return Plot("map", figure, caption + "on the right is not explained; noise has none.")
 
 

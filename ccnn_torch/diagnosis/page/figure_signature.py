@@ -41,7 +41,7 @@ def signature_plot(
     lines = -(-len(signatures) // columns)
     figure = Figure(figsize=(4.7 * columns if columns > 1 else 6.4, 3.3 * lines + 0.35), layout="constrained")
     panels = list(figure.subplots(lines, columns, squeeze=False).flat)
-    told = []
+    texts = []
     for axes, signature in zip(panels, signatures, strict=False):
         held, aside = used_rows(arrays, len(signature.x))
         name = signature.effect if signature.effect in effects else f"outside the library: {signature.effect}"
@@ -50,7 +50,7 @@ def signature_plot(
         judged = held & ~aside if (held & ~aside).sum() > 2 else ~aside
         share = _explained(signature.y[judged], signature.fit[judged])
         if share is not None:
-            told.append(f"{name} {100 * share:.3g} %")
+            texts.append(f"{name} {100 * share:.3g} %")
     for axes in panels[len(signatures) :]:
         axes.set_axis_off()
     handles = {
@@ -65,8 +65,8 @@ def signature_plot(
     )
     if "set aside" in handles:
         caption += " Crosses: rows set aside, at the edge where they lie beyond it."
-    if told:
-        caption += f" Share of the drawn variance on rows not used for fitting that the fit takes: {', '.join(told)}."
+    if texts:
+        caption += f" Share of the drawn variance on rows not used for fitting that the fit takes: {', '.join(texts)}."
     return Plot("signatures", figure, caption)
 
 

@@ -111,7 +111,8 @@ def _all_words(names: list[str]) -> str:
 
 @styled
 def probability_plot(results: Block) -> Plot | None:
-    """How probable each candidate is; the verdict's stand out, and what cannot be told from them is lighter."""
+    """How probable each candidate is; the verdict's stand out, and what cannot be distinguished from them is
+    lighter."""
     verdict = results["verdict"]
     names = set(verdict["effects"])
     like = {n for e in results["effects"] if e["name"] in names for n in e["indistinguishable_from"]} - names
@@ -141,6 +142,6 @@ def probability_plot(results: Block) -> Plot | None:
     axes.grid(axis="y", visible=False)
     hidden = len(listed) - sum(bar[0] in listed for bar in bars)
     caption = "How probable each explanation is after seeing these rows: dark blue, in the verdict"
-    caption += "; light blue, not told from one in the verdict by these rows" if like else ""
+    caption += "; light blue, not distinguished from one in the verdict by these rows" if like else ""
     caption += "; orange, something that no effect of the library describes" if verdict["outside_library"] else ""
     return Plot("probabilities", figure, caption + (f". {hidden} further effects were tried." if hidden else "."))

@@ -84,7 +84,7 @@ def where_table(results: Block, about: About, *, telling: bool = False) -> Table
     note = _share_note(results)
     if hidden:
         note += f" Not shown: {', '.join(hidden)}, over which the gap is even as far as these rows tell."
-    return Table("Where does the gap lie?", ("part", *_SHARES), tuple(rows), note)
+    return Table("Where is the gap?", ("part", *_SHARES), tuple(rows), note)
 
 
 def region_table(results: Block, about: About) -> Table | None:
@@ -107,7 +107,7 @@ def region_table(results: Block, about: About) -> Table | None:
 
 
 def next_table(results: Block, about: About) -> Table | None:
-    """What to measure next, most telling first: a row each, or a column each where it is told by many numbers."""
+    """What to measure next, most informative first: a row each, or a column each where it has many values."""
     wanted = results["next_measurements"]
     if not wanted:
         return None
@@ -120,13 +120,13 @@ def next_table(results: Block, about: About) -> Table | None:
             for n in covariates
         ]
         rows.append((str(number), *cells, " or ".join(entry["separates"]) or "–", number_text(entry["gain"], 3)))
-    columns = ("number", *joints, *covariates, "tells apart", "gain [nat]")
+    columns = ("number", *joints, *covariates, "separates", "gain [nat]")
     rivals = any(entry["separates"] for entry in wanted)
     aim = "which explanation is right" if rivals else "the numbers of the one explanation, which has no rival"
     note = f"Gain: expected information on {aim}. The same as a file: next_measurements.csv."
     if len(joints) + len(covariates) > _MOST_COLUMNS:
         columns, *rows = zip(columns, *rows, strict=True)
-    return Table("What should be measured next?", columns, tuple(rows), note, ("tells apart",))
+    return Table("What should be measured next?", columns, tuple(rows), note, ("separates",))
 
 
 def write_next_csv(path: Path, results: Block, about: About) -> None:

@@ -79,7 +79,7 @@ def write_diagnosis_report(
     Args:
         folder: where to write; with `diagnosis.json`, `diagnosis.safetensors` and `diagnosis_pictures.json`.
         results: the content of `diagnosis.json`, which is read when None.
-        arrays: what stands behind the pictures (`s` rows in the order of the file, `c` pose channels, float64, SI):
+        arrays: what is drawn in the figures (`s` rows in the order of the file, `c` pose channels, float64, SI):
             `place` `s x 3`, `joints` `s x n`, `residual` and `remainder` `s x c`, `held_out` and `set_aside` `s`, and
             `signature.EFFECT.x`, `.y` and `.fit` `s`; written to the folder first, or read from it when None.
         labels: names and units of the signatures' axes, `{EFFECT: {"x": {"name", "unit"}, "y": …}}`, and under `about`
@@ -157,9 +157,9 @@ def print_diagnosis(results: Block, console: Console, about: About | None = None
         if table is not None:
             print_table(table, console)
     aside = results["rows_set_aside"]
-    why = results.get("why_set_aside") or ["for a reason that is not told"] * len(aside)
-    told = aside_text(aside, why, about.lines)
-    for sentence in ([told] if told else []) + _notes(results, about):
+    why = results.get("why_set_aside") or ["for an unknown reason"] * len(aside)
+    sentence_aside = aside_text(aside, why, about.lines)
+    for sentence in ([sentence_aside] if sentence_aside else []) + _notes(results, about):
         print_text(sentence, console, "yellow")
     if order_table(results) is None and (text := network_text(results)):
         print_text(text, console)
@@ -186,11 +186,11 @@ def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str
         ("Which effect?", ("probabilities",), (effect_table(results), parameter_table(results))),
         ("What gives it away?", ("signatures",), ()),
         (
-            "Where does the gap lie?",
+            "Where is the gap?",
             ("map", "where"),
             (where_table(results, about), region_table(results, about)),
         ),
-        ("What can these rows not tell apart?", (), (confusable_table(results),)),
+        ("Which effects do these rows not distinguish?", (), (confusable_table(results),)),
         ("What can these records not show?", (), (unseen_table(results), record_table(results))),
         ("What should be measured next?", (), (next_table(results, about),)),
         ("Which rows were set aside?", (), (aside_table(results, arrays, about),)),
@@ -207,8 +207,8 @@ def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str
 def _notes(results: Block, about: About) -> list[str]:
     """Notes of the diagnosis and of the report, as sentences."""
     # What has a table of its own needs no sentence.
-    told = {unseen_text(name, why) for name, why in results.get("not_seen", {}).items()}
-    notes = (note for note in (*results["notes"], *about.notes) if note not in told)
+    shown = {unseen_text(name, why) for name, why in results.get("not_seen", {}).items()}
+    notes = (note for note in (*results["notes"], *about.notes) if note not in shown)
     return [note if note.endswith(".") else f"{note}." for note in notes]
 
 

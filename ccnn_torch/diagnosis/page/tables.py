@@ -85,7 +85,14 @@ def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
         )
         for e in shown
     ]
-    columns = ("effect", "what it is", "probability", f"gap with it alone [{unit}]", "removed [%]", "not told from")
+    columns = (
+        "effect",
+        "what it is",
+        "probability",
+        f"gap with it alone [{unit}]",
+        "removed [%]",
+        "indistinguishable from",
+    )
     before = number_text(_over(results["gap"]["before"], scale), 4)
     note = (
         f"● in the verdict. The gap without any of them is {before} {unit}. {_REMOVED} In brackets: 95 % interval. "
@@ -94,7 +101,7 @@ def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
     )
     if hidden := len(results["effects"]) - len(shown):
         note += f" Not shown: {hidden} with a probability below {least:g}."
-    return Table("Which effect?", columns, tuple(rows), note, ("what it is", "not told from"))
+    return Table("Which effect?", columns, tuple(rows), note, ("what it is", "indistinguishable from"))
 
 
 def order_table(results: Block) -> Table | None:
@@ -149,15 +156,15 @@ def parameter_table(results: Block, most: int = 24) -> Table | None:
 
 
 def confusable_table(results: Block) -> Table | None:
-    """Pairs of effects that these rows do not tell apart, why, and which measurement would."""
+    """Pairs of effects that these rows do not distinguish, why, and which measurement would."""
     odds = {e["name"]: e["probability"] for e in results["effects"]}
-    rows, told = [], set()
+    rows, listed = [], set()
     for effect in results["effects"]:
         for other in effect["indistinguishable_from"]:
             pair = frozenset((effect["name"], other))
-            if pair in told:
+            if pair in listed:
                 continue
-            told.add(pair)
+            listed.add(pair)
             apart = effect.get("signatures", {}).get(other)
             number = next(
                 (i for i, m in enumerate(results["next_measurements"], 1) if pair <= set(m["separates"])), None
@@ -179,8 +186,8 @@ def confusable_table(results: Block) -> Table | None:
         "difference: what the second cannot copy over all rows together, in units of the noise: below about 3 it is "
         "hidden. Told apart by: the first of the next measurements that does."
     )
-    columns = ("pair", "probability", "angle [°]", "difference / noise [1]", "told apart by")
-    return Table("What can these rows not tell apart?", columns, tuple(rows), note, ("told apart by",))
+    columns = ("pair", "probability", "angle [°]", "difference / noise [1]", "separated by")
+    return Table("Which effects do these rows not distinguish?", columns, tuple(rows), note, ("separated by",))
 
 
 def unseen_table(results: Block) -> Table | None:

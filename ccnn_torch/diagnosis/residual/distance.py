@@ -1,4 +1,4 @@
-"""How far poses lie from where the model puts them, against the size of the machine."""
+"""Distance of measured poses from nominal ones, relative to the size of the machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ccnn_torch.effects import Situation, pose_residual
 __all__ = ["USUAL", "Size", "distance", "size_of"]
 
 USUAL = 0.3
-"""Sizes of the machine: where the usual row is so far off, no small deviation is to be looked for in any of them."""
+"""Sizes of the machine: where the usual row is so far off, no small deviation is to be searched in any of them."""
 # What a machine that does not move or turn is taken to [m], [rad].
 _LEAST = 1e-6
 

@@ -1,5 +1,4 @@
-"""Linearised anew where a set of effects has brought the machine: at a gap of many times the noise the first order
-about the nominal machine is not enough."""
+"""Linearisation about the machine with a set of effects; at a large gap the nominal machine is not enough."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Noise and row weights before anything is named: what the richest fit leaves."""
+"""Noise and robust row weights from the residual of the richest fit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["fitted_whitening"]
 
 # The richest fit: at most so many candidates, the log evidence from which one is taken in, the spread of its log size.
 _RICH, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
-# Candidates that are looked at with the rows' weights as they are, the most promising when all weigh alike.
+# Candidates that are evaluated with the rows' weights as they are, the most promising when all weigh alike.
 _NEXT = 4
 # The principal axes of all are taken anew where the channels' noise has changed by more among each other (logarithm).
 _SAME_AXES = 0.2
@@ -73,7 +73,7 @@ def fitted_whitening(
             free = max(
                 1 - float(fit.effective[0]) / max(float((white.weight > 0).sum()) * len(channels), 1.0), LEAST_FREE
             )
-            white = _settled(white, left, usable, free, least)
+            white = _reestimated(white, left, usable, free, least)
         rest = [k for k in range(len(shown)) if k not in chosen]
         if not rest:
             break
@@ -87,7 +87,7 @@ def fitted_whitening(
             break
         chosen.append(likely[best])
         log_scale = torch.cat([log_scale, added.log_scale[None, best : best + 1]], -1)
-    white = _settled(white, left, usable, free, least)
+    white = _reestimated(white, left, usable, free, least)
     return replace(white, known=0.0 if noise is None else _KNOWN)
 
 
@@ -107,7 +107,7 @@ def _additions(products: Sequence[GroupProducts], squares: Tensor, values: int) 
 class _Everything:
     """All that may be there, and its inner products channel by channel: these stay when the noise changes.
 
-    Columns count by what they tell, whatever their size: all have the same mean square.
+    Columns count by their information, whatever their size: all have the same mean square.
 
     Attributes:
         columns: of each candidate, `s x c x m` [m, rad].
@@ -143,7 +143,7 @@ class _Everything:
 
     def roughly_added(self, white: Whitening, left: Tensor) -> Tensor:
         """Log evidence that each candidate would gain beside a fit that leaves so much, `s x c`, as if all rows weighed
-        alike and up to a number that all have in common: near enough to tell which may be the best."""
+        alike and up to a number that all have in common: near enough to rank them."""
         per = white.sigma**-2
         share = per * white.weight.sum() / self._weight.sum()
         if self._turned is None or _spread(share / self._turned[1]) > _SAME_AXES:
@@ -186,7 +186,7 @@ def _noise_share(every: _Everything, y: Tensor, white: Whitening) -> Tensor:
     return torch.where(best.values - evidence[0] > _SLIGHT, left, 1.0).clamp(1e-6, 1.0)
 
 
-def _settled(white: Whitening, left: Tensor, usable: Tensor, free: float, least: Tensor | None) -> Whitening:
+def _reestimated(white: Whitening, left: Tensor, usable: Tensor, free: float, least: Tensor | None) -> Whitening:
     """Noise (unless it is known: `least` None) and weights from what a fit leaves, `s x c`.
 
     No channel's noise is below `least`: a perfect fit knows nothing of the noise.

@@ -1,4 +1,4 @@
-"""Some of the rows of a situation."""
+"""Selected rows of a situation."""
 
 from __future__ import annotations
 

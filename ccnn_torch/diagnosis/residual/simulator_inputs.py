@@ -1,4 +1,4 @@
-"""What a simulator is told of the rows, and rows for which it has no answer."""
+"""Inputs of a simulator from the records, and rows without a pose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From metres and radians to units of the noise: channels that carry something, their noise, and robust row weights."""
+"""Whitening of the residual: channels, noise, robust row weights."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ _VALUES_A_UNIT = 100
 # Or where the joints move the platform so many times as far as usual.
 _GAIN = 3.0
 _NOISE_REDUCTION = 0.5
-# No third look where, with its shapes looked for beside its best, the library is so far behind (log odds).
+# No third search where, with its shapes searched beside its best, the library is so far behind (log odds).
 _MUCH_LESS_PROBABLE = 20.0
 # An effect shows where a coefficient of plausible size makes this share of the gap.
 _SHOWN = 1e-9
@@ -100,7 +100,7 @@ class Analysis:
         return max(float(self.dictionary.grams.yy) - self.floor * self.dictionary.grams.values, 1e-300)
 
     def acting(self, found: FittedSet) -> list[Acting]:
-        """The effects of a set with their most probable numbers; catch-alls are left out."""
+        """The effects of a set with their most probable numbers; discrepancy terms are left out."""
         out = []
         for i, mean in zip(found.members, found.mean, strict=True):
             atom = self.dictionary.atoms[i]
@@ -110,7 +110,7 @@ class Analysis:
 
 
 class _Rows(NamedTuple):
-    """What every look goes by: the rows, `measured` poses `s x p`, the `noise` that was given, rows that are `usable`
+    """What every search uses: the rows, `measured` poses `s x p`, the `noise` that was given, rows that are `usable`
     and those `near` a singularity, `s`; and 0 in rows that are left out: the `residual`, `s x c0`, what was `fitted` to
     them before, `s x c0 x r`, and the joints' `jacobian`, `s x c0 x n`."""
 
@@ -125,8 +125,8 @@ class _Rows(NamedTuple):
 
 
 class _Fixed(NamedTuple):
-    """What stays whatever is found: effects that show, catch-alls, those of one place or sway found at first, and the
-    noise of the richest fit, `c`."""
+    """What stays whatever is found: effects that show, discrepancy terms, those of one place or sway found at first,
+    and the noise of the richest fit, `c`."""
 
     effects: list[Effect]
     rest: list[Atom]
@@ -144,8 +144,8 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         noise: standard deviation of each pose channel, `c0` [m, rad], or None.
     """
     rows = _rows_of(situation, measured, noise)
-    result, standing = _search_about_nominal(rows, effects)
-    # Again about the best library set, with shapes looked for beside it and the noise that the best set of all leaves.
+    result, fixed = _search_about_nominal(rows, effects)
+    # Again about the best library set, with shapes searched beside it and the noise that the best set of all leaves.
     before: frozenset[str] | None = None
     for _ in range(2):
         atoms = result.dictionary.atoms
@@ -168,11 +168,11 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
             shapes = shapes._replace(kept=known_shapes(result.dictionary, result.found, best, sought))
         else:
             shapes = shapes._replace(starts=_kept_shapes(situation, shapes.starts, result, act))
-        # A bump is not looked for again where nothing outside the library does anything.
+        # A bump is not searched again where nothing outside the library does anything.
         local = before is None or discrepancy_is_active(result.dictionary, result.found, best)
         before = act
-        result = _search_about_set(rows, standing, result, acting, white, left, shapes, local)
-    shown = {e.name for e in standing.effects}
+        result = _search_about_set(rows, fixed, result, acting, white, left, shapes, local)
+    shown = {e.name for e in fixed.effects}
     return replace(result, idle=tuple(e.name for e in effects if e.name not in shown))
 
 
@@ -201,13 +201,13 @@ def _search_about_nominal(rows: _Rows, effects: Sequence[Effect]) -> tuple[Analy
     everything = [a.columns for a in (*atoms, *rest) if not (a.is_discrepancy and a.name.startswith("joint"))]
     white = fitted_whitening(rows.residual, [rows.fitted, *everything], channels, rows.noise, usable)
 
-    fixed, starts = candidates_about_nominal(situation, atoms, white, rows.residual, usable, rows.fitted)
+    atoms_of_effects, starts = candidates_about_nominal(situation, atoms, white, rows.residual, usable, rows.fitted)
     local = local_discrepancies(situation, rows.jacobian, rows.residual, white, rows.fitted)
     shown = [a.effect for a in atoms if a.effect is not None]
-    standing = _Fixed(shown, rest, [without_unused_rows(a, usable) for a in local], white.sigma)
-    every = [*fixed, *starts, *rest, *standing.local]
+    fixed = _Fixed(shown, rest, [without_unused_rows(a, usable) for a in local], white.sigma)
+    every = [*atoms_of_effects, *starts, *rest, *fixed.local]
     few = _drawn(white.keep(), len(channels))
-    return _searched(rows, rows.residual, white, every, standing.rich, few), standing
+    return _searched(rows, rows.residual, white, every, fixed.rich, few), fixed
 
 
 def _kept_shapes(situation: Situation, starts: Sequence[Atom], result: Analysis, acting: Set[str]) -> list[Atom]:
@@ -219,7 +219,7 @@ def _kept_shapes(situation: Situation, starts: Sequence[Atom], result: Analysis,
 
 def _search_about_set(
     rows: _Rows,
-    standing: _Fixed,
+    fixed: _Fixed,
     result: Analysis,
     acting: Sequence[Acting],
     white: Whitening,
@@ -231,12 +231,12 @@ def _search_about_set(
 
     Args:
         rows, standing: what stays.
-        result: of the look before.
+        result: of the search before.
         acting: effects of its best set.
         white: noise and weights that its most probable set leaves.
         left: what those effects leave by the machine itself, `s x c0` [m, rad].
         shapes: found before.
-        local: whether bumps are looked for again.
+        local: whether bumps are searched again.
     """
     situation, usable = rows.situation, rows.usable
     there, target = tangent(situation, left, acting)
@@ -250,7 +250,7 @@ def _search_about_set(
         there,
         rows.measured,
         target,
-        standing.effects,
+        fixed.effects,
         acting,
         shapes,
         white,
@@ -263,8 +263,8 @@ def _search_about_set(
         newest = {a.name: a.columns for a in reversed(atoms)}
         beside = torch.cat([rows.fitted, *(newest[name] for name in sorted({a.effect.name for a in acting}))], -1)
         again = local_discrepancies(situation, rows.jacobian, target, white, beside)
-    every = [*atoms, *standing.rest, *standing.local, *(without_unused_rows(a, ok) for a in again)]
-    return _searched(rows, target, white, every, standing.rich)
+    every = [*atoms, *fixed.rest, *fixed.local, *(without_unused_rows(a, ok) for a in again)]
+    return _searched(rows, target, white, every, fixed.rich)
 
 
 def _near_singular(situation: Situation, channels: Tensor) -> Tensor:

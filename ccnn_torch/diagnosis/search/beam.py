@@ -17,8 +17,8 @@ __all__ = ["search"]
 _MOST = 4
 # Pairs that go on to sets of three; in a quick search, which ends with pairs, the atoms that these are made of.
 _BEAM, _LIKELIEST = 5, 8
-# Catch-alls that are put beside library effects, how many of these may be of one driver, and how many plain ones are
-# put there, too: nearly of the library's own forms, these often do most by themselves and least beside it.
+# Discrepancy terms that are put beside library effects, how many of these may be of one driver, and how many plain ones
+# are put there, too: nearly of the library's own forms, these often do most by themselves and least beside it.
 _CATCH_ALLS, _OF_ONE_DRIVER, _PLAIN = 4, 2, 1
 # Sets of the same names at other shapes that go on to larger ones.
 _ALIKE = 2
@@ -27,7 +27,7 @@ _ALIKE = 2
 def search(
     atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof: float, quick: bool = False
 ) -> tuple[Dictionary, list[FittedSet]]:
-    """Sets by log posterior, best first; no set holds a name twice, or two catch-alls.
+    """Sets by log posterior, best first; no set holds a name twice, or two discrepancy terms.
 
     Args:
         atoms: candidates.
@@ -46,10 +46,11 @@ def search(
     dictionary = dictionary_of(atoms, x, y, others, alone, noise_dof, firsts if quick else None)
     seen: set[tuple[int, ...]] = set()
 
-    def look(sets: Sequence[tuple[int, ...]]) -> None:
+    def fit_all(sets: Sequence[tuple[int, ...]]) -> None:
         fresh = sorted(set(sets) - seen)
         seen.update(fresh)
-        # Each kind by itself: what the library can do at best is asked for, too, however far a catch-all is ahead.
+        # Each kind by itself: what the library can do at best is asked for, too, however far a discrepancy term is
+        # ahead.
         for wild in (False, True):
             mine = [s for s in fresh if discrepancies.isdisjoint(s) != wild]
             top = _top(f for s, f in tried.items() if discrepancies.isdisjoint(s) != wild)
@@ -72,12 +73,12 @@ def search(
             for mine in (tried, {s: f for s, f in tried.items() if discrepancies.isdisjoint(s)})
         )
 
-    look([s for i in firsts for j in (*known, *others) if (s := _extended((i,), j, atoms))])
+    fit_all([s for i in firsts for j in (*known, *others) if (s := _extended((i,), j, atoms))])
     for size in range(2, most):
         if not better(size) or (size > 2 and best(size, 1)[0].log_posterior < _top(tried.values())):
             break
         wide = _BEAM if size == 2 else _BEAM // 2
-        look([s for f in best(size, wide) for j in (*known, *others) if (s := _extended(f.members, j, atoms))])
+        fit_all([s for f in best(size, wide) for j in (*known, *others) if (s := _extended(f.members, j, atoms))])
     return dictionary, sorted(tried.values(), key=lambda f: -f.log_posterior)
 
 
@@ -86,7 +87,7 @@ def _top(found: Iterable[FittedSet]) -> float:
 
 
 def _of_several_drivers(ranked: Sequence[int], atoms: Sequence[Atom]) -> list[int]:
-    """The first few catch-alls, no more than some of one driver, and the first of the plain ones."""
+    """The first few discrepancy terms, no more than some of one driver, and the first of the plain ones."""
     chosen: list[int] = []
     for i in (i for i in ranked if not atoms[i].plain):
         if sum(atoms[k].name == atoms[i].name for k in chosen) < _OF_ONE_DRIVER:

@@ -1,4 +1,4 @@
-"""Whether it is worth while to look at the rows again about what was found, and which shapes to look for again."""
+"""Whether it is worth searching again about the best set, and which shapes to search again."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ others is how their form differs from the textbook."""
 # A fit is settled where the noise of the channels changed among each other by less than this (logarithm), and what it
 # leaves by such a share of the noise's square.
 _SAME_NOISE, _SAME_FIT = 0.2, 0.01
-# An effect is out of play where the sets that it takes part in are so far behind the best (log odds), and by such a
+# An effect is inactive where the sets that it takes part in are so far behind the best (log odds), and by such a
 # share of what the best explains: shapes found beside something else may be that much worse.
 _BEHIND, _SHARE = 20.0, 0.05
 
@@ -52,7 +52,7 @@ def is_converged(
 def has_new_effects(
     dictionary: Dictionary, found: Sequence[FittedSet], best: FittedSet, before: Set[str], gap: float
 ) -> bool:
-    """Whether effects joined the set since the last look that do more than mend the form of the others.
+    """Whether effects joined the set since the last search that do more than correct the form of the others.
 
     Those that fell away do not matter: shapes found beside more than there is are as good, where what was too much
     explains nothing any more.
@@ -61,7 +61,7 @@ def has_new_effects(
         dictionary: candidates.
         found: sets that were tried.
         best: the set.
-        before: names of the effects that acted in the last look.
+        before: names of the effects that acted in the last search.
         gap: squares above the noise.
     """
     old = tuple(i for i in best.members if dictionary.atoms[i].name in before)
@@ -72,7 +72,7 @@ def has_new_effects(
 
 
 def discrepancy_is_active(dictionary: Dictionary, found: Sequence[FittedSet], best: FittedSet) -> bool:
-    """Whether a catch-all does something beside a set that is not far behind the best one of the library.
+    """Whether a discrepancy term does something beside a set that is not far behind the best one of the library.
 
     Args:
         dictionary: candidates.
@@ -104,14 +104,14 @@ def most_probable_shapes(dictionary: Dictionary, found: Sequence[FittedSet]) -> 
 def known_shapes(
     dictionary: Dictionary, found: Sequence[FittedSet], best: FittedSet, sought: Set[str] | None
 ) -> dict[str, list[Atom]]:
-    """Effects whose shapes are not looked for again, by name, with the atoms whose shapes they keep: those out of play
-    with the most probable one, those in play with all that they have.
+    """Effects whose shapes are not searched again, by name, with the atoms whose shapes they keep: those inactive
+    with the most probable one, those active with all that they have.
 
     Args:
         dictionary: candidates.
         found: sets that were tried, most probable first.
-        best: the most probable one of the library, whose effects are in play.
-        sought: names whose shapes are looked for again; None = of all that are in play.
+        best: the most probable one of the library, whose effects are active.
+        sought: names whose shapes are searched again; None = of all that are active.
     """
     atoms, tried = dictionary.atoms, {f.members: f.log_posterior for f in found}
     least = best.log_posterior - _BEHIND - _SHARE * max(best.log_posterior - tried[()], 0.0)

@@ -1,4 +1,4 @@
-"""Where the fit of a set begins that was fitted with one group less: the scale of the one that was added."""
+"""Initial scale of the group that is added to a fitted set."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ccnn_torch.diagnosis.evidence.single_groups import fit_in_axes
 __all__ = ["added_scale"]
 
 _DIGITS = 1e-13
-# Sets are looked at side by side where their widths differ by less than this.
+# Sets are evaluated in one batch where their widths differ by less than this.
 _ALIKE = 24
-# Beside a set that so many atoms are added to, all columns are looked at once.
+# Beside a set that so many atoms are added to, all columns are evaluated once.
 _FEW = 5
 
 
@@ -25,8 +25,8 @@ def added_scale(dictionary: Dictionary, before: Sequence[FittedSet], more: Seque
     """log α² of each of the atoms `more` beside the set `before` it, of one member at least, `b`.
 
     The scales of a set count in units of its noise: y ~ N(0, σ² K + α² Z Zᵀ), where K = I + Σ_g (α_g² / σ²) X_g X_gᵀ is
-    as the set has it. Of Zᵀ K⁻¹ Z the diagonal is looked at only, along the principal axes of Z: near enough to begin
-    from, and far better than the scale at which the atom explains all by itself.
+    as the set has it. Of Zᵀ K⁻¹ Z the diagonal is evaluated only, along the principal axes of Z: near enough to begin
+    from, and far better than the scale at which the atom explains all alone.
     """
     turned, atoms = dictionary.turned, torch.tensor([*more])[:, None]
     own, _ = column_indices(dictionary.begins[atoms], dictionary.widths[atoms])
@@ -48,7 +48,7 @@ def added_scale(dictionary: Dictionary, before: Sequence[FittedSet], more: Seque
 def _lots(
     dictionary: Dictionary, before: Sequence[FittedSet]
 ) -> Iterator[tuple[list[int], list[FittedSet], list[int] | None]]:
-    """Rows that are looked at side by side; sets of as many members; and which of these sets each row is beside, what
+    """Rows that are evaluated in one batch; sets of as many members; and which of these sets each row is beside, what
     they leave of all columns being asked for. Or None: then each row has a set, and asks for its own columns."""
     beside: dict[tuple[int, ...], list[int]] = {}
     for row, f in enumerate(before):

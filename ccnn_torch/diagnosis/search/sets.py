@@ -1,4 +1,4 @@
-"""Fits of many sets of candidates: those of like widths side by side, each from where a smaller one ended."""
+"""Fits of many sets of candidates, batched by width, each started from a smaller one."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _starts(
     """Every set from the most probable of those that lack one of its members, and from the rivals of this one: of two
     that explain the same, the one that is there first leaves nothing to the other."""
     alone = dictionary.alone
-    # Where none of them was fitted, the one without the member that is least probable by itself is fitted now.
+    # Where none of them was fitted, the one without the member that is least probable alone is fitted now.
     orphans = {
         tuple(m for m in s if m != min(s, key=lambda i: alone[i,].log_posterior))
         for s in sets

@@ -1,4 +1,4 @@
-"""How far the gap shrinks where nothing was measured: fits to four fifths of the rows, judged on the block beside them.
+"""Share of the gap that is explained in blocks without fitted rows.
 
 Rows dealt at random have neighbours in the fit. Here the rows are sorted along the direction in which the joints vary
 most and cut in five blocks: every block is judged by a fit that saw none of it, and the two at the ends by one that has

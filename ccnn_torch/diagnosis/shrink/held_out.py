@@ -1,4 +1,4 @@
-"""How far the gap shrinks on rows that the fit has not seen, with an interval."""
+"""Share of the gap that is explained on held-out rows, with a bootstrap interval."""
 
 from __future__ import annotations
 

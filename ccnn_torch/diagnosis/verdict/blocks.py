@@ -112,7 +112,7 @@ def _effect(made: Blocks, name: str) -> dict[str, Any]:
 
 
 def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
-    """Value and standard deviation in the verdict's set, beside what mends its form; else by itself."""
+    """Value and standard deviation in the verdict's set, beside the corrections of its form; else by itself."""
     analysis = made.analysis
     atoms = analysis.dictionary.atoms
     own = made.judgement.fullest if name in made.judgement.names else made.judgement.found
@@ -139,7 +139,7 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
 
 
 def _most_probable_single(analysis: Analysis) -> dict[str, int]:
-    """Of each library name the atom that the verdict's set uses, or that is most probable by itself."""
+    """Of each library name the atom that the verdict's set uses, or that is most probable alone."""
     atoms = analysis.dictionary.atoms
     best: dict[str, int] = {}
     for found in analysis.found:

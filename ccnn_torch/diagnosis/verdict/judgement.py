@@ -1,4 +1,4 @@
-"""From the posterior over sets to a name that can be stood by: outside or not, classes, probabilities."""
+"""From the posterior over sets to the verdict: names, classes, probability, outside or not."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from ccnn_torch.effects import EXACT
 
 __all__ = ["Judgement", "judge", "without_names"]
 
-# As `FORM`, of a catch-all beside library effects, and of library effects beside a catch-all, which stands for whatever
-# was not thought of. Exact effects leave no more than the second order.
+# As `FORM`, of a discrepancy term beside library effects, and of library effects beside a discrepancy term, which
+# stands for whatever was not thought of. Exact effects leave no more than the second order.
 _FORM_DISCREPANCY, _FORM_EXACT, _BESIDE_CATCH_ALL = 0.002, 1e-4, 0.1
 # A library effect whose own part is more than this share of the gap is no form of other ones, however well these could
 # do without it.
 _CARRIES = 0.5
-# Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is stood by.
+# Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is accepted.
 _VETO, _MUCH = 0.005, 1.5
 # Or times the noise's energy, whatever the gap.
 _VETO_NOISE = 25.0
@@ -41,7 +41,7 @@ _OWN, _DOUBTED = 0.1, 0.5
 # Or that must come from other coefficients than those that mend its form, where these are so many times as large, in
 # plausible sizes.
 _MAIN, _MENDED = 0.5, 15.0
-# Odds up to which one name for another is not told apart by the data.
+# Odds up to which the data do not distinguish one name from another.
 _ODDS = math.log(20.0)
 # Log odds against the most probable set beyond which nobody looks.
 _FAR = 12.0
@@ -49,17 +49,17 @@ _FAR = 12.0
 
 @dataclass(frozen=True)
 class Judgement:
-    """What is stood by.
+    """The verdict on the names.
 
     Attributes:
         found: the set that speaks for the verdict.
-        fullest: the most probable set with the same members and with what mends their form, whose coefficients are
-            told; `found` itself where nothing mends it.
+        fullest: the most probable set with the same members and with what corrects their form, whose coefficients are
+            told; `found` itself where it has no corrections.
         names: library effects, the favourite of each class.
-        classes: for each of them the names that cannot be told from it.
+        classes: for each of them the names that cannot be distinguished from it.
         probability: that the verdict, classes taken as one, is right.
         outside: whether something is there that no library effect describes; `driver` says what it follows.
-        driver: of the catch-all, or None.
+        driver: of the discrepancy term, or None.
         marginal: probability of each candidate's name.
         leading: name sets by probability, most probable first (library names, driver or None, probability, set).
     """
@@ -127,7 +127,7 @@ def without_names(analysis: Analysis, judgement: Judgement) -> Judgement:
 
 
 def _borrowed(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]) -> frozenset[str]:
-    """Names of a set that rest on what other effects do as well, or on what should only mend their form."""
+    """Names of a set that rest on what other effects do as well, or on what should only correct their form."""
     grams, names = analysis.dictionary.grams, set()
     for i, mean in zip(found.members, found.mean, strict=True):
         atom, group = analysis.dictionary.atoms[i], analysis.dictionary.groups[i]
@@ -163,7 +163,7 @@ def _follows_need(analysis: Analysis, atom: Atom, tried: dict[tuple[int, ...], F
 def _best_without(
     analysis: Analysis, names: frozenset[str], tried: dict[tuple[int, ...], FittedSet]
 ) -> FittedSet | None:
-    """The most probable set with a catch-all and none of these names."""
+    """The most probable set with a discrepancy term and none of these names."""
     atoms = analysis.dictionary.atoms
     for found in analysis.found:
         if any(atoms[i].is_discrepancy for i in found.members) and not names & {atoms[i].name for i in found.members}:
@@ -228,7 +228,7 @@ def _smallest(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...],
 def _essential(
     analysis: Analysis, sets: Sequence[FittedSet], tried: dict[tuple[int, ...], FittedSet]
 ) -> list[FittedSet]:
-    """Each of the sets without members that only mend the form of the others."""
+    """Each of the sets without members that only correct the form of the others."""
     found = [*sets]
     going = list(range(len(found)))
     while going:
@@ -246,12 +246,12 @@ def _essential(
 
 
 def _with_less(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]) -> FittedSet:
-    """The set without the first of its members that only mend the form of the others; itself where there is none."""
+    """The set without the first of its members that only correct the form of the others; itself where there is none."""
     atoms = analysis.dictionary.atoms
     if len(found.members) < 2:
         return found
     shares = _net(analysis, found, tried)
-    # Library effects are a form of the catch-all beside them only where that carries much more than they do.
+    # Library effects are a form of the discrepancy term beside them only where that carries much more than they do.
     wild = max((share for i, (share, _) in shares.items() if atoms[i].is_discrepancy), default=0.0)
     beside = min(_BESIDE_CATCH_ALL, wild / 2)
     limits = {}
@@ -271,7 +271,7 @@ def _with_less(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...]
     ]
     if not idle:
         return found
-    # A catch-all can stand in for much of the library, so it is the first to go; else what is missed least.
+    # A discrepancy term can stand in for much of the library, so it is the first to go; else what is missed least.
     least = max(idle, key=lambda i: (atoms[i].is_discrepancy, tried[shares[i][1]].log_posterior))
     return tried[shares[least][1]]
 
@@ -291,7 +291,7 @@ def _named(analysis: Analysis, found: FittedSet) -> tuple[frozenset[str], str | 
 
 
 def _leader(analysis: Analysis, kind: str) -> str:
-    """Of drivers of one kind the one that explains most by itself."""
+    """Of drivers of one kind the one that explains most alone."""
     atoms = analysis.dictionary.atoms
     alone = (f for f in analysis.found if len(f.members) == 1)
     names = (atoms[f.members[0]].name for f in alone)
@@ -336,7 +336,7 @@ def _driver_of_remainder(analysis: Analysis) -> str | None:
 
 
 def _driver_of_single(analysis: Analysis) -> str | None:
-    """The driver that explains most by itself."""
+    """The driver that explains most alone."""
     atoms = analysis.dictionary.atoms
     alone = (f for f in analysis.found if len(f.members) == 1 and atoms[f.members[0]].is_discrepancy)
     return next((_named(analysis, f)[1] for f in alone), None)

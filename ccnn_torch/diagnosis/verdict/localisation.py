@@ -1,4 +1,4 @@
-"""Where the gap lies: shares of its energy, less the noise's, by output, joint, leg, region and covariate."""
+"""Where the gap is: shares of its energy, less the noise's, by output, joint, leg, region and covariate."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def localise(analysis: Analysis, residual: Tensor, seed: int = 0) -> tuple[dict[
         name: _bins(value[keep]) for name, value in situation.covariates.items() if float(value.max() - value.min()) > 0
     }
     covariates = {name: drawn.shares(_split(rows, member)) for name, (_, member) in edges.items()}
-    told = {
+    block = {
         "outputs": dict(zip(axes, outputs.plain, strict=True)),
         "joints": dict(zip(names, joints.plain, strict=True)),
         "legs": dict(zip(legs, joints.plain, strict=False)),
@@ -99,7 +99,7 @@ def localise(analysis: Analysis, residual: Tensor, seed: int = 0) -> tuple[dict[
         "regions": regions.interval,
         "covariates": {name: found.interval for name, found in covariates.items()},
     }
-    return told, intervals
+    return block, intervals
 
 
 def _normalised(energy: Tensor) -> Tensor:

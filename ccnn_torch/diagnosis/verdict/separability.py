@@ -1,4 +1,4 @@
-"""Why rows cannot tell two effects apart: the angle between what the two do in these rows."""
+"""Why rows do not distinguish two effects: the angle between what the two do in these rows."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def signature_angles(analysis: Analysis, judgement: Judgement) -> dict[str, dict
     def columns(members: Sequence[int]) -> Tensor:
         return torch.cat([flat[:, :0], *(flat[:, analysis.dictionary.groups[i]] for i in members)], -1)
 
-    told: dict[str, dict[str, dict[str, float]]] = {}
+    block: dict[str, dict[str, dict[str, float]]] = {}
     for i, mean in zip(found.members, found.mean, strict=True):
         like = judgement.classes.get(atoms[i].name, ())
         if not like:
@@ -42,13 +42,13 @@ def signature_angles(analysis: Analysis, judgement: Judgement) -> dict[str, dict
         beside = _span(columns([j for j in found.members if j != i]))
         own = _without(beside, columns([i]) @ mean[:, None])[:, 0]
         size = float(torch.linalg.vector_norm(own))
-        told[atoms[i].name] = {}
+        block[atoms[i].name] = {}
         for name in like:
             # Where a name stands for several atoms (shapes), the one that comes closest.
             angles = [_angle(own, _span(_without(beside, columns([j])))) for j, a in enumerate(atoms) if a.name == name]
             angle = min(angles)
-            told[atoms[i].name][name] = {"angle": angle, "separation": size * math.sin(angle)}
-    return told
+            block[atoms[i].name][name] = {"angle": angle, "separation": size * math.sin(angle)}
+    return block
 
 
 def _span(x: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""A verdict in two sentences of plain English, from the numbers of `diagnosis.json` alone."""
+"""The verdict in two sentences, from the numbers of `diagnosis.json`."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _EFFECTS = {
     "instrument": "an error of the measuring device",
     "outlier": "a few bad rows",
 }
-# Of so many effects that were tried in vain each is named.
+# Up to so many effects without support are named one by one.
 _FEW_TRIED = 3
 _DRIVERS = {"workspace": "the place in the workspace", "temperature": "the temperature", "time": "the time"}
 
@@ -166,7 +166,7 @@ def block_text(results: Block) -> str:
 
 
 def network_text(results: Block) -> str:
-    """What a network on the remainder would still gain, in one sentence; empty where nobody asked."""
+    """What a network on the remainder would still gain, in one sentence; empty where it was not asked for."""
     network = results.get("network")
     if network is None:
         return ""
@@ -185,7 +185,7 @@ def network_text(results: Block) -> str:
 
 
 def _none_of(results: Block) -> str:
-    """What was tried in vain: a few names are told, for the library has more."""
+    """Effects that were tried without support, the first few by name."""
     tried = sorted(e["name"] for e in results["effects"])
     if len(tried) > _FEW_TRIED:
         return "No effect of the library" if not results.get("not_seen") else "No effect that these records can show"
@@ -220,7 +220,7 @@ def _cause(results: Block) -> str:
 
 
 def _with_class(name: str, like: Sequence[str], signatures: Block) -> str:
-    """An effect with those that may stand in its place, and why these rows cannot tell: the angles."""
+    """An effect with those that may stand in its place, and why these rows do not distinguish them: the angles."""
     if not like:
         return effect_words(name)
     angles = [signatures[n]["angle"] for n in like if n in signatures]
@@ -230,7 +230,7 @@ def _with_class(name: str, like: Sequence[str], signatures: Block) -> str:
         size = "less than 0.1°" if widest < 0.1 else f"{'up to ' if len(angles) > 1 else ''}{widest:.1f}°"
         reason = f": on these poses their signatures are {size} apart"
     others = listed([effect_words(n) for n in like], "or")
-    return f"{effect_words(name)}, or {others} (these rows cannot tell which{reason})"
+    return f"{effect_words(name)}, or {others} (these rows do not distinguish them{reason})"
 
 
 def _removed(results: Block, joint: str) -> str:

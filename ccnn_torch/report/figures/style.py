@@ -23,7 +23,7 @@ from ccnn_torch.files.write import write_whole
 
 __all__ = ["AFTER", "BEFORE", "FLOOR", "GREY", "RASTER_ABOVE", "SERIES", "Plot", "inline_svg", "save_figure", "styled"]
 
-# Okabe and Ito's palette: told apart with every common form of colour blindness, and in grey print.
+# Okabe and Ito's palette: distinguishable with every common form of colour blindness, and in grey print.
 BEFORE = "#D55E00"
 AFTER = "#0072B2"
 FLOOR = "#6E6E6E"
