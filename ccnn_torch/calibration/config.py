@@ -20,7 +20,7 @@ from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.enn import ENNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
-from ccnn_torch.records.table import nearest
+from ccnn_torch.spelling import nearest
 
 __all__ = [
     "METHODS",

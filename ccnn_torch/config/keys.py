@@ -14,7 +14,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from ccnn_torch.files.yaml_file import read_yaml
-from ccnn_torch.records.table import nearest
+from ccnn_torch.spelling import nearest
 
 __all__ = ["config_model", "explain", "list_keys"]
 

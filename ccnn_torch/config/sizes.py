@@ -12,7 +12,7 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.parameters import match_parameters
-from ccnn_torch.records.table import nearest
+from ccnn_torch.spelling import nearest
 from ccnn_torch.units import to_si
 
 __all__ = ["ANGLE_ARM", "Size", "prior_sizes", "size", "sizes_by_name", "sizes_of_pose"]

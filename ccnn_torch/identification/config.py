@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 from ccnn_torch.config.keys import list_keys
 from ccnn_torch.config.split import HeldOutConfig
 from ccnn_torch.config.tree import Columns, Files, Names, Section, config_from_file, config_from_keys, written
-from ccnn_torch.records.table import nearest
+from ccnn_torch.spelling import nearest
 
 __all__ = [
     "IDENTIFY_METHODS",

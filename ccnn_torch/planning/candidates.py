@@ -16,7 +16,7 @@ from ccnn_torch.identification.identifiability.combinations import combinations_
 from ccnn_torch.identification.problems.problem import Problem, Progress
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.least_squares import jacobian_of
-from ccnn_torch.records.table import nearest
+from ccnn_torch.spelling import nearest
 
 __all__ = ["Candidates", "Seen", "common_coordinates", "draw_candidates", "identification_rows", "what_is_seen"]
 

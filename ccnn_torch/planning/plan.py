@@ -33,7 +33,7 @@ from ccnn_torch.planning.design import (
 from ccnn_torch.planning.gains import Gains, gains_of, gains_of_sets, recommended_count
 from ccnn_torch.planning.observability import INDICES
 from ccnn_torch.planning.other_indices import exchange_by_index
-from ccnn_torch.records.table import nearest
+from ccnn_torch.spelling import nearest
 
 __all__ = ["Choice", "Plan", "choose_poses", "plan_poses"]
 

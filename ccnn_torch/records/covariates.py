@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
-from ccnn_torch.records.table import FILE, Table, nearest
+from ccnn_torch.records.table import FILE, Table
+from ccnn_torch.spelling import nearest
 from ccnn_torch.units import parse_header, si_unit_of, to_si
 
 __all__ = ["DEFAULT_COVARIATES", "choose_covariates"]

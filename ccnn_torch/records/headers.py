@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ccnn_torch.display import is_shown, visible
 from ccnn_torch.errors import InputError
-from ccnn_torch.records.table import nearest
+from ccnn_torch.spelling import nearest
 from ccnn_torch.units import si_unit_of, split_header, to_si
 
 __all__ = ["IGNORE", "Header", "read_header"]

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.records.table import nearest
+from ccnn_torch.spelling import nearest
 from ccnn_torch.units import to_si
 
 __all__ = ["DEFAULT_BY", "KINDS", "Column", "Split", "fold_splits", "split_rows"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import io
 import json
@@ -16,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
+from ccnn_torch.spelling import nearest
 from ccnn_torch.units import LARGEST, parse_header, split_header, to_si, write_hint
 
-__all__ = ["FILE", "Table", "name_lines", "nearest", "write_table"]
+__all__ = ["FILE", "Table", "name_lines", "write_table"]
 
 FILE = "file"
 """The column that numbers the files where there are several: 0, 1, …"""
@@ -124,16 +124,6 @@ class Table:
             mapped = f'columns: {{"{near}": "{name}[{self.units[near] or si_unit or "unit"}]"}}'
             return f"'{near}' is the nearest there: rename it to '{name}' if it is meant, or write {mapped}"
         return write_hint(name, si_unit)
-
-
-def nearest(name: str, candidates: Sequence[str], cutoff: float = 0.6) -> str | None:
-    """The candidate that is most likely meant by a misspelt name, without regard to case; None if none is near.
-
-    `cutoff` is the least similarity, of difflib's 0 to 1.
-    """
-    folded = {candidate.lower(): candidate for candidate in reversed(candidates)}
-    near = difflib.get_close_matches(name.lower(), folded, 1, cutoff)
-    return folded[near[0]] if near else None
 
 
 def name_lines(

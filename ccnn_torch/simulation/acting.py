@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ccnn_torch.effects import EFFECTS, OUTLIER, Acting, Coefficient, Effect, Situation, make_effect, tried
 from ccnn_torch.errors import InputError
-from ccnn_torch.records.table import nearest
 from ccnn_torch.simulation.limits import refuse_impossible
+from ccnn_torch.spelling import nearest
 from ccnn_torch.units import to_si
 
 __all__ = ["Injected", "Wanted", "act", "read_wanted", "units_of"]

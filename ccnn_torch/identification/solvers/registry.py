@@ -10,7 +10,7 @@ from typing import Any
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress, Solver
-from ccnn_torch.records.table import nearest
+from ccnn_torch.spelling import nearest
 
 __all__ = ["SOLVERS", "get_solver"]
 

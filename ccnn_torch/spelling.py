@@ -1,0 +1,21 @@
+"""The name that a misspelt one most likely means."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+
+__all__ = ["nearest"]
+
+
+def nearest(name: str, candidates: Sequence[str], cutoff: float = 0.6) -> str | None:
+    """The candidate most similar to a misspelt name, without regard to case; None if none is similar enough.
+
+    Args:
+        name: as it was written.
+        candidates: the names that exist.
+        cutoff: least similarity, 0 to 1, of `difflib.get_close_matches`.
+    """
+    folded = {candidate.lower(): candidate for candidate in reversed(candidates)}
+    near = difflib.get_close_matches(name.lower(), folded, 1, cutoff)
+    return folded[near[0]] if near else None
