@@ -49,12 +49,15 @@ def unit_text(unit: str) -> str:
 
 
 def number_text(value: float | None, digits: int = 4) -> str:
-    """A number to so many significant digits; `–` for None. Exponents are written as 1.234e-10."""
+    """A number to so many significant digits; `–` for None. Exponents are for 1.234e-10 and 1.234e+05, not for 2990."""
     if value is None:
         return "–"
     if value == 0:
         return "0"
     if 1e-3 <= abs(value) < 1e5:
+        whole = float(f"{value:.{digits - 1}e}")
+        if abs(whole) >= 10**digits:
+            return f"{whole:.0f}"
         text = f"{value:#.{digits}g}"
         return text.rstrip(".")
     return f"{value:.{digits - 1}e}"

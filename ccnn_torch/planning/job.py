@@ -20,7 +20,7 @@ from ccnn_torch.planning.page import plan_markdown
 from ccnn_torch.records import write_table
 from ccnn_torch.report.figures.style import save_figure
 
-__all__ = ["make_plan", "write_plan"]
+__all__ = ["check_plan_file", "make_plan", "write_plan"]
 
 
 def make_plan(
@@ -65,6 +65,12 @@ def make_plan(
     return machine, plans
 
 
+def check_plan_file(path: Path) -> None:
+    """Raise `InputError` where the name of the CSV does not end in .csv."""
+    if path.suffix.lower() != ".csv":
+        raise InputError(f"--out: '{path}' must end in .csv; the page and the picture are written beside it")
+
+
 def write_plan(path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: float) -> list[Path]:
     """Write the poses as CSV, and beside it a page (.md) with its picture (.png, .svg).
 
@@ -77,8 +83,7 @@ def write_plan(path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: 
     Raises:
         InputError: the name does not end in .csv, or the folder cannot be written.
     """
-    if path.suffix.lower() != ".csv":
-        raise InputError(f"--out: '{path}' must end in .csv; the page and the picture are written beside it")
+    check_plan_file(path)
     columns = {}
     if plans[0].leg is not None:
         columns["leg[1]"] = torch.cat([torch.full((len(p.pose),), float(p.leg or 0)) for p in plans]).numpy()

@@ -1,28 +1,40 @@
-"""What a table is, and its forms: on a terminal that may be too narrow for it, and as Markdown."""
+"""The one type of table, and two of its renderers: the terminal and Markdown. HTML has it in `macros.html.jinja`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
 from ccnn_torch.display import visible
 
-__all__ = ["Table", "markdown_table", "print_table", "print_text"]
+__all__ = ["Table", "fitting_columns", "markdown_table", "print_table", "print_text"]
 
+# Characters that the first column and columns of words get where the terminal is too narrow for their longest cell.
+_LEAST_FIRST = 14
+_LEAST_WORDS = 24
 _LONGEST_NAME = 28
-# Characters of a line; no sentence of ours is as long.
+# Characters of a line; no sentence of this package is as long.
 _LONGEST = 5000
 
 
 @dataclass(frozen=True)
 class Table:
-    """Title, column headers, rows of text (one entry a column), a sentence below, and the columns that hold words.
+    """A table of text.
 
-    The first column holds words as well; all others hold numbers and are set flush right.
+    Attributes:
+        title: one line above the table.
+        columns: headers, `columns`.
+        rows: one cell for each column, `rows x columns`.
+        note: sentences below the table.
+        words: headers of the columns that hold words and are flush left. The first column is one of them, all others
+            hold numbers and are flush right.
+        details: headers of the columns that a terminal shows only where all columns fit. Files have all columns.
+        page_only: a terminal does not show the table; page and files do.
     """
 
     title: str
@@ -30,10 +42,12 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
     words: tuple[str, ...] = ()
+    details: tuple[str, ...] = ()
+    page_only: bool = False
 
 
 def markdown_table(table: Table) -> str:
-    """One table as Markdown: title, rows, and the sentence below."""
+    """A table as Markdown: title, rows, and note."""
     head, *lines = (
         "| " + " | ".join(visible(cell).replace("|", "\\|") for cell in line) + " |"
         for line in (table.columns, *table.rows)
@@ -43,59 +57,97 @@ def markdown_table(table: Table) -> str:
 
 
 def print_text(text: str, console: Console, style: str = "", wrap: bool = True) -> None:
-    """Show a sentence as it is: what looks like markup is none, and nothing in it is obeyed by the terminal.
+    """Print text without interpreting markup or control characters.
 
     Args:
-        text: what to show.
+        text: what to print.
         console: where.
-        style: rich's, of all of it.
-        wrap: break it between words at the terminal's edge; in a file or a pipe a line stays a line.
+        style: rich's style of the whole text.
+        wrap: break lines between words at the edge of a terminal; a file or a pipe gets whole lines.
     """
     console.print(_plain(text), style=style, soft_wrap=not (wrap and console.is_terminal))
 
 
 def _plain(text: str) -> Text:
-    """Text that no part of is read as markup; its line breaks are ours."""
+    """Text without markup; line breaks are kept, other control characters are shown as codes."""
     return Text("\n".join(visible(line, _LONGEST) for line in text.split("\n")))
 
 
 def print_table(table: Table, console: Console) -> None:
-    """Show a table, in parts where the terminal is too narrow; each part repeats the first column."""
-    # Measured as on a terminal without an edge: a width is else never more than there is.
-    wide = console.options.update(max_width=10_000)
-    parts: list[list[int]] = [[0]]
-    for column in range(1, len(table.columns)):
-        wider = [*parts[-1], column]
-        fits = console.measure(_shown(table, wider), options=wide).maximum <= console.width
-        if fits or len(parts[-1]) == 1:
-            parts[-1] = wider
-        else:
-            parts.append([0, column])
-    for i, part in enumerate(parts):
-        # Beside the table, not in it: a title or a note is then as wide as the terminal, not as a narrow part.
-        print_text(table.title + (", continued" if i else ""), console, "bold")
-        console.print(_shown(table, part))
-    if table.note:
-        print_text(table.note, console, "italic dim")
+    """Print a table in one piece; on a narrow terminal without the columns that do not fit, which are named below.
 
-
-def _shown(table: Table, columns: Sequence[int]) -> RichTable:
-    shown = RichTable()
-    for i in columns:
-        left = i == 0 or table.columns[i] in table.words
-        shown.add_column(
-            _plain(table.columns[i]), justify="left" if left else "right", overflow="fold", max_width=_width(table, i)
+    A table that is for the page only is not printed.
+    """
+    if table.page_only:
+        return
+    shown = fitting_columns(table, console.width)
+    grid = RichTable()
+    for i in shown:
+        words = _holds_words(table, i)
+        width = _least_width(table, i)
+        grid.add_column(
+            _plain(_header(table.columns[i])),
+            justify="left" if words else "right",
+            overflow="fold",
+            no_wrap=not words,
+            min_width=width,
+            max_width=_LONGEST_NAME if i == 0 else None if words else width,
         )
     for row in table.rows:
-        # The interval below its median: three such columns then fit into 80 characters.
-        shown.add_row(*(_plain(row[i].replace(" [", "\n[") if i else row[i]) for i in columns))
+        grid.add_row(*(_plain(_cell(row[i]) if i else row[i]) for i in shown))
+    # Printed beside the table: a title or a note of the table itself would be as narrow as the table.
+    print_text(table.title, console, "bold")
+    console.print(grid)
+    if table.note:
+        print_text(table.note, console, "italic dim")
+    if left_out := [column for i, column in enumerate(table.columns) if i not in shown]:
+        print_text(f"Columns left out on a terminal of this width: {', '.join(left_out)}.", console, "dim")
+
+
+def fitting_columns(table: Table, width: int) -> list[int]:
+    """Numbers of the columns that a terminal shows: all, else those that are not details, from the left.
+
+    Args:
+        table: the table.
+        width: characters of a line of the terminal.
+    """
+    shown = list(range(len(table.columns)))
+    if _total_width(table, shown) > width:
+        shown = [i for i in shown if table.columns[i] not in table.details]
+    while len(shown) > 2 and _total_width(table, shown) > width:
+        shown.pop()
     return shown
 
 
-def _width(table: Table, column: int) -> int:
-    """Room for what may not be broken: numbers, and words of the header; a long name is broken between words."""
-    cells = [row[column] for row in table.rows]
-    if column == 0:
-        return min(_LONGEST_NAME, max(len(cell) for cell in (table.columns[0], *cells)))
-    parts = [part for cell in cells for part in cell.replace(" [", "\n[").split("\n")]
-    return max(len(part) for part in (*table.columns[column].replace(" [", "\n[").split(), *parts))
+def _total_width(table: Table, shown: Iterable[int]) -> int:
+    # Each column has two spaces and a line; the table has one line more.
+    return 1 + sum(_least_width(table, i) + 3 for i in shown)
+
+
+def _least_width(table: Table, column: int) -> int:
+    """Characters that a column needs at least; numbers are never broken."""
+    cells = [_cell(row[column]) for row in table.rows]
+    longest = max(_width(text) for text in (_header(table.columns[column]), *cells))
+    if _holds_words(table, column):
+        return min(longest, _LEAST_WORDS if column else _LEAST_FIRST)
+    return longest
+
+
+def _holds_words(table: Table, column: int) -> bool:
+    return column == 0 or table.columns[column] in table.words
+
+
+def _cell(text: str) -> str:
+    """A cell as printed: the interval is on the line below its median."""
+    return text.replace(" [", "\n[")
+
+
+def _header(text: str) -> str:
+    """A header as printed: in two lines, broken where the longer line is shortest."""
+    words = text.split(" ")
+    breaks = (" ".join(words[:i]) + "\n" + " ".join(words[i:]) for i in range(1, len(words)))
+    return min(breaks, key=_width, default=text)
+
+
+def _width(text: str) -> int:
+    return max(map(cell_len, text.split("\n")))

@@ -151,9 +151,9 @@ def test_a_table_has_one_unit_for_each_kind(tmp_path: Path) -> None:
     path = records(tmp_path / "rows.csv", "five_bar")
     keys = {"mechanism": "five_bar", "frame": {"base": True}, "parameters": FIVE_BAR_FREE}
     identified(path, **keys).save(tmp_path / "out")
-    text = (tmp_path / "out" / "identified.md").read_text()
+    text = (tmp_path / "out" / "identified.md").read_text().partition("Held-out")[0]
     assert "base_x [mm]" in text and "l1 [mm]" in text and "µm]" not in text
-    assert "e+0" not in text.partition("Held-out")[0]
+    assert "e+0" not in text
 
 
 def test_too_few_rows_speak_of_parameters_and_not_of_a_linear_fit(tmp_path: Path) -> None:

@@ -65,8 +65,8 @@ def reach_table(results: Results) -> Table | None:
         "training rows; a search for the number of steps before it is not counted. An evaluation is one pass of the "
         "training rows through one model; seconds are one repeat's share."
     )
-    return Table("Effort to reach the same held-out error", ("method", "steps", "time [s]", "evaluations"),
-                 tuple(rows), note)  # fmt: skip
+    columns = ("method", "steps", "time [s]", "evaluations")
+    return Table("Effort to reach the same held-out error", columns, tuple(rows), note, page_only=True)
 
 
 def pose_by_method_table(results: Results) -> Table | None:

@@ -231,7 +231,9 @@ def _after_table(results: Results, paper: PaperCase | None, measure: str) -> Tab
             " Coverage: share of the held-out figures inside the domain that lie within 1.96 predictive standard "
             "deviations of the prediction."
         )
-    return Table(f"{titles[measure]} on held-out rows, after calibration", tuple(columns), tuple(rows), note.strip())
+    details = tuple(columns[1 : len(keys)]) if shared else ()
+    title = f"{titles[measure]} on held-out rows, after calibration"
+    return Table(title, tuple(columns), tuple(rows), note.strip(), details=details, page_only=not beside)
 
 
 def _scale(results: Results, key: str, measure: str) -> tuple[float, str]:
@@ -280,4 +282,5 @@ def _pose_table(results: Results) -> Table:
         columns += [f"{measure} before", f"{measure} after", f"{measure} removed [%]"]
     columns += [column for _, column, _ in extras]
     note = " ".join([*(sentence for _, _, sentence in extras), _repeats(results)]).strip()
-    return Table("Pose error on held-out rows", tuple(columns), tuple(rows), note)
+    details = ("max before", "max after", "max removed [%]", "RMS not compensable")
+    return Table("Pose error on held-out rows", tuple(columns), tuple(rows), note, details=details)

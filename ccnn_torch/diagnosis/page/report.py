@@ -137,15 +137,9 @@ def diagnosis_markdown(results: Block, about: About | None = None) -> str:
 def print_diagnosis(results: Block, console: Console, about: About | None = None, *, verdict: bool = True) -> None:
     """Show what matters of the tables, and the verdict where it was not shown before, on a terminal."""
     about = about or About()
-    effects = effect_table(results, least=_LEAST)
-    if effects is not None:
-        # Its sentence is in the verdict; on a terminal the column would break the table in two.
-        kept = [i for i, column in enumerate(effects.columns) if column != "what it is"]
-        columns, *rows = (tuple(line[i] for i in kept) for line in (effects.columns, *effects.rows))
-        effects = Table(effects.title, columns, tuple(rows), effects.note, effects.words)
     shown = (
         gap_table(results, about),
-        effects,
+        effect_table(results, least=_LEAST),
         order_table(results),
         parameter_table(results, 12),
         where_table(results, about, telling=True),

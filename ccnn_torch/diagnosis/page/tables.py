@@ -85,11 +85,12 @@ def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
         )
         for e in shown
     ]
+    alone = f"gap with it alone [{unit}]"
     columns = (
         "effect",
         "what it is",
         "probability",
-        f"gap with it alone [{unit}]",
+        alone,
         "removed [%]",
         "indistinguishable from",
     )
@@ -101,7 +102,8 @@ def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
     )
     if hidden := len(results["effects"]) - len(shown):
         note += f" Not shown: {hidden} with a probability below {least:g}."
-    return Table("Which effect?", columns, tuple(rows), note, ("what it is", "indistinguishable from"))
+    words = ("what it is", "indistinguishable from")
+    return Table("Which effect?", columns, tuple(rows), note, words, details=("what it is", alone))
 
 
 def order_table(results: Block) -> Table | None:
@@ -215,7 +217,8 @@ def record_table(results: Block) -> Table | None:
         "Size: what an effect of plausible size does to the usual of these poses in a workshop; so much of the gap it "
         "may make, and cannot be named, until the column is recorded."
     )
-    return Table("What should be recorded as well?", ("column", "would show", f"size [{unit}]"), rows, note)
+    columns = ("column", "would show", f"size [{unit}]")
+    return Table("What should be recorded as well?", columns, rows, note, ("would show",))
 
 
 def _columns_text(columns: Sequence[str]) -> str:

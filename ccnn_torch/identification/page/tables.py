@@ -165,7 +165,7 @@ def _parameter_table(results: Block) -> Table:
     several = results["machines"] > 1
     note = f"By {results['method']}." + " Medians over the machines, [5 %, 95 %]." * several
     note += f" {_interval_note(results)}"
-    return Table("Parameters", tuple(columns), tuple(rows), note)
+    return Table("Parameters", tuple(columns), tuple(rows), note, details=("nominal",))
 
 
 def _interval_note(results: Block) -> str:
@@ -178,23 +178,26 @@ def _interval_note(results: Block) -> str:
 
 
 def _method_table(results: Block) -> Table:
+    tests = [block["test"] for block in results["methods"].values()]
+    scales = {
+        name: {key: _shared_unit([test[name] for test in tests], key) for key in ("before", "after", "max_after")}
+        for name in ("position", "rotation")
+        if results["test"][name] is not None
+    }
     rows = []
     for method, block in results["methods"].items():
         cells = [method + (" (leg by leg)" if block["per_leg"] else "")]
-        for name in ("position", "rotation"):
-            test = block["test"][name]
-            if results["test"][name] is None:
-                continue
-            for key in ("before", "after", "max_after"):
-                scale, unit = display_unit(test["unit"], test[key] or 1.0)
-                cells.append(f"{_text(test, key, scale)} {unit}")
+        for name, keyed in scales.items():
+            cells += [_text(block["test"][name], key, scale) for key, (scale, _) in keyed.items()]
         cells += [str(block["machines"]), f"{100 * block['converged']:.0f} %", number_text(block["seconds"], 3)]
         rows.append(tuple(cells))
     columns = ["method"]
-    for name in ("position", "rotation"):
-        if results["test"][name] is not None:
-            columns += [f"{name} before", "after", "largest after"]
-    columns += ["machines", "converged", "seconds"]
+    details = ["machines", "converged", "time [s]"]
+    for name, keyed in scales.items():
+        words = {"before": "before", "after": "after", "max_after": "maximum after"}
+        columns += [f"{name} {words[key]} [{unit}]" for key, (_, unit) in keyed.items()]
+        details += columns[-1:]
+    columns += ["machines", "converged", "time [s]"]
     noise = results["test"]["position"] or {}
     note = "RMS distance of held-out measured poses from the predicted ones."
     if "constraint" in results:
@@ -202,7 +205,15 @@ def _method_table(results: Block) -> Table:
     if noise.get("noise") is not None:
         scale, unit = display_unit("m", noise["noise"])
         note += f" The measurement noise alone is {number_text(noise['noise'] / scale, 3)} {unit} in position."
-    return Table("Held-out pose error", tuple(columns), tuple(rows), note)
+    return Table("Held-out pose error", tuple(columns), tuple(rows), note, details=tuple(details))
+
+
+def _shared_unit(blocks: Sequence[Block | None], key: str) -> tuple[float, str]:
+    """The unit that a column shows a figure of several methods in: that of the smallest."""
+    known = [block for block in blocks if block is not None and block.get(key)]
+    if not known:
+        return 1.0, next((block["unit"] for block in blocks if block is not None), "1")
+    return display_unit(known[0]["unit"], min(block[key] for block in known))
 
 
 def _transfer_table(results: Block) -> Table | None:
@@ -215,8 +226,8 @@ def _transfer_table(results: Block) -> Table | None:
         if test is not None:
             scale, unit = display_unit(test["unit"], test["before"] or 1.0)
             keys = ("before", "after", "max_before", "max_after")
-            rows.append((name, *(f"{_text(test, key, scale)} {unit}" for key in keys)))
-    columns = ("", "nominal links", "identified links", "largest, nominal", "largest, identified")
+            rows.append((f"{name} [{unit}]", *(_text(test, key, scale) for key in keys)))
+    columns = ("error", "nominal links", "identified links", "maximum, nominal", "maximum, identified")
     note = (
         f"RMS distance of {count_text(block['rows']['test'], 'held-out pose')} of {block['records']} from the "
         f"predicted ones; frames fitted to {count_text(block['rows']['train'], 'other row')} of it, links to none."
@@ -227,56 +238,70 @@ def _transfer_table(results: Block) -> Table | None:
 def _deviation_table(results: Block) -> Table | None:
     if not results["simulated"]:
         return None
-    units = [unit for unit in ("m", "rad", "1") if unit in next(iter(results["methods"].values()))["deviations"]]
+    found = [block["deviations"] for block in results["methods"].values()]
+    scales = {
+        unit: _shared_unit([{"unit": unit, **block[unit]} for block in found], "largest")
+        for unit in ("m", "rad", "1")
+        if unit in found[0]
+    }
     rows = []
     for method, block in results["methods"].items():
         cells = [method]
-        for unit in units:
-            found = block["deviations"][unit]
-            scale, shown = display_unit(unit, found["largest"] or 1e-3)
-            cells += [f"{_text(found, key, scale)} {shown}".rstrip(" 1") for key in ("largest", "mean")]
+        for unit, (scale, _) in scales.items():
+            cells += [_text(block["deviations"][unit], key, scale) for key in ("largest", "mean")]
         bound = block["bound"]
         cells.append(number_text(bound["median"], 3) if bound else "–")
         cells.append(f"{number_text(bound['lowest'], 3)} to {number_text(bound['highest'], 3)}" if bound else "–")
         cells.append("–" if block["coverage"] is None else f"{100 * block['coverage']:.1f} %")
         rows.append(tuple(cells))
     columns = ["method"]
-    for unit in units:
+    details = ["range of σ / bound"]
+    for unit, (_, shown) in scales.items():
         kind = {"m": "lengths", "rad": "angles"}.get(unit, "gains")
-        columns += [f"{kind}: largest", "mean"]
-    columns += ["σ / bound", "over parameters", "95 % intervals hold"]
+        columns += [f"{kind}: maximum [{shown}]", f"{kind}: mean [{shown}]"]
+        details += columns[-1:]
+    columns += ["σ / bound", "range of σ / bound", "95 % intervals hold"]
     note = (
         "Deviation of identified from true parameters, median over machines. Bound: the Cramér-Rao bound of the same "
         "rows and noise; the standard deviation over the machines divided by it, median over the parameters."
     )
-    return Table("Deviation of the parameters", tuple(columns), tuple(rows), note)
+    return Table("Deviation of the parameters", tuple(columns), tuple(rows), note, details=tuple(details))
 
 
 def _compensation_table(results: Block) -> Table | None:
-    rows = []
-    for method, block in results["methods"].items():
-        for kind in ("exact", "linear"):
-            found = (block["compensation"] or {}).get(kind)
-            if not found:
-                continue
-            cells = [f"{method}, {kind}"]
-            for name in ("position", "rotation"):
-                part = found[name]
-                if part is None:
-                    cells += ["–", "–"]
-                    continue
-                scale, unit = display_unit(part["unit"], part["after"])
-                cells += [f"{_text(part, 'after', scale)} {unit}", _text(part, "removed", 0.01, 4)]
-            rows.append(tuple(cells))
-    if not rows:
+    found = {
+        f"{method}, {kind}": block["compensation"][kind]
+        for method, block in results["methods"].items()
+        for kind in ("exact", "linear")
+        if (block["compensation"] or {}).get(kind)
+    }
+    if not found:
         return None
-    columns = ("commands", "position left", "removed [%]", "rotation left", "removed [%]")
+    scales = {
+        name: _shared_unit(blocks, "after")
+        for name in ("position", "rotation")
+        if any(blocks := [block[name] for block in found.values()])
+    }
+    columns = ["commands"]
+    for name, (_, unit) in scales.items():
+        columns += [f"{name} after [{unit}]", f"{name} removed [%]"]
+    rows = [
+        (
+            label,
+            *(
+                cell
+                for name, (scale, _) in scales.items()
+                for cell in (_text(block[name], "after", scale), _text(block[name], "removed", 0.01, 4))
+            ),
+        )
+        for label, block in found.items()
+    ]
     note = (
         "RMS pose error of the simulated machines at held-out poses, commanded by the identified geometry: exact = "
         "real inverse kinematics; linear = nominal joints corrected by the identification Jacobian (Sun et al. 2018, "
         "eq. 15)."
     )
-    return Table("Compensation with the identified geometry", columns, tuple(rows), note)
+    return Table("Compensation with the identified geometry", tuple(columns), tuple(rows), note)
 
 
 def _count_table(results: Block) -> Table | None:
