@@ -18,7 +18,7 @@ from ccnn_torch.units import to_si
 __all__ = ["ANGLE_ARM", "Size", "prior_sizes", "size", "sizes_by_name", "sizes_of_pose"]
 
 ANGLE_ARM = 0.3
-"""An angle found from points this far apart [m] has their noise over it; as in `runs/machines`."""
+"""Distance of the points that orientation is measured by [m]: an angle has the noise of a length over this."""
 
 Size = float | str
 _WITH_UNIT = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?inf|nan)\s*(?P<unit>.*)", re.IGNORECASE)

@@ -11,11 +11,11 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.measured.kinematics import Kinematics
 from ccnn_torch.identification.measured.measured import Measured, Rows
-from ccnn_torch.identification.simulated.instrument import Instrument
-from ccnn_torch.identification.simulated.places import Places
-from ccnn_torch.identification.simulated.random import generator_of
 from ccnn_torch.identification.solve import pieces_of
 from ccnn_torch.planning import choose_poses
+from ccnn_torch.simulation.instrument import Instrument
+from ccnn_torch.simulation.places import Places
+from ccnn_torch.simulation.random_numbers import generator_of
 
 __all__ = ["choose_places", "plan_places"]
 

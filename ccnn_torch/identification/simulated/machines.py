@@ -15,10 +15,10 @@ from ccnn_torch.identification.config import IdentifyConfig, SimulateConfig
 from ccnn_torch.identification.measured.kinematics import make_kinematics
 from ccnn_torch.identification.measured.measured import Measured, Rows
 from ccnn_torch.identification.simulated.designs import choose_places, plan_places
-from ccnn_torch.identification.simulated.instrument import Instrument, make_instrument
-from ccnn_torch.identification.simulated.places import Places
-from ccnn_torch.identification.simulated.random import generator_of, normal_draws
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.simulation.instrument import Instrument, make_instrument
+from ccnn_torch.simulation.places import Places
+from ccnn_torch.simulation.random_numbers import generator_of, normal_draws
 
 __all__ = ["simulate"]
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ccnn_torch.config.sizes import ANGLE_ARM
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import Mechanism, PoseError
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
@@ -26,8 +27,6 @@ _BUILDERS: dict[str, Callable[[], Structure]] = {
     "arm": ArmStructure,
 }
 MACHINES = tuple(_BUILDERS)
-_LEVER = 0.3
-"""Distance of the points that orientation is measured by [m]: an angle has the noise of a length over this."""
 
 _POSES, _LOAD, _NOISE = 10, 20, 21
 
@@ -108,7 +107,7 @@ def build_machine(
         columns |= {Coordinate(f"direction{i + 1}", "1"): direction[..., i] for i in range(joints.shape[-1])}
     reached = built.reach(joints, pose)
     units = torch.tensor([coordinate.unit == "m" for coordinate in mechanism.pose])
-    sd = torch.where(units, noise, noise / _LEVER).to(torch.float64)
+    sd = torch.where(units, noise, noise / ANGLE_ARM).to(torch.float64)
     draws = draw(seeds, _NOISE, lambda g: g.standard_normal(shape))
     measured = _displaced(mechanism, reached, draws * sd)
     return RealisticMachine(mechanism, built, pose, joints, columns, reached, measured, sd)
