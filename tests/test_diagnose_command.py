@@ -204,7 +204,7 @@ def test_a_stopped_blind_check_says_how_to_go_on(cli: Cli, tmp_path: Path, monke
 def test_stopped_after_the_verdict_it_says_where_that_is(
     cli: Cli, rows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ccnn_torch.diagnosis.with_network", _stop)
+    monkeypatch.setattr("ccnn_torch.diagnosis.job.with_network", _stop)
     words = ("--records", rows, "--mechanism", "five_bar", "--effects", "backlash", "--out", tmp_path / "found")
     code, shown, told = cli("diagnose", *words)
     kept = tmp_path / "found" / "diagnosis.json"

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import load_config, make_config
 from ccnn_torch.calibration.rows.prepare import prepare
-from ccnn_torch.cli._main import app
+from ccnn_torch.cli.application import app
 from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
 from ccnn_torch.compensation.export.to_onnx import quiet_exporter, to_onnx
 from ccnn_torch.compensation.model_files.onnx_session import open_onnx

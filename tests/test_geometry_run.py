@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import make_config
 from ccnn_torch.calibration.rows.prepare import prepare
-from ccnn_torch.cli._main import app
+from ccnn_torch.cli.application import app
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry

@@ -35,7 +35,7 @@ FLOORS = [
     ["diagnosis"],
     ["run_folder", "report", "config", "testing"],
     ["simulation", "planning", "verification/promise", "identification"],
-    ["diagnosis/config", "diagnosis/page", "diagnosis/job"],
+    ["diagnosis/config", "diagnosis/page", "diagnosis/outputs", "diagnosis/job"],
     ["calibration", "sklearn", "suite", "comparison", "verification", "starter"],
     ["api", "cli", "__init__", "__main__"],
 ]

@@ -70,8 +70,6 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, 
     folder = replace(folder, facts=facts_of(config, prepared.data_hash))
     refuse_changes(folder.checkpoints, folder.facts, folder.config)
 
-    tell = partial(note, quiet=quiet)
-
     def watch(prepared: Prepared, method: str, phase: str, scaling: Scaling) -> list[Callback]:
         joints = prepared.mechanism.joints
         choosing = "cross-validating" if plan_of(config).folds > 1 else "choosing how long"
@@ -80,7 +78,7 @@ def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, 
         every = config.training.log_every
         past = partial(past_of, folder.checkpoint(method, phase))
         shown: list[Callback] = [
-            TensorBoardCallback(board, every=every, past=past, tell=tell),
+            TensorBoardCallback(board, every=every, past=past, tell=partial(note, quiet=quiet)),
             ProgressBar(label, quiet),
         ]
         if phase == "choose":

@@ -4,5 +4,5 @@ Exit codes: 0 done, 2 bad input (one sentence on stderr), 130 interrupted, 1 a b
 also ends with 1 where a promise is not kept.
 """
 
-from ccnn_torch.cli._main import app as app
-from ccnn_torch.cli._main import main as main
+from ccnn_torch.cli.application import app as app
+from ccnn_torch.cli.application import main as main

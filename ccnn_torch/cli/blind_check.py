@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ccnn_torch.cli._stopped import if_stopped
+from ccnn_torch.run_folder.interrupt import if_stopped
 
 __all__ = ["blind_check"]
 

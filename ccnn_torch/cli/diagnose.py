@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from ccnn_torch.cli._complete import complete_mechanism
-from ccnn_torch.cli._diagnosed import configured, watched
-from ccnn_torch.cli._stopped import if_stopped
-from ccnn_torch.errors import InputError
-
-if TYPE_CHECKING:
-    from ccnn_torch.diagnosis import Diagnosis
-    from ccnn_torch.diagnosis.config import DiagnoseConfig
+from ccnn_torch.cli.completion import complete_mechanism
+from ccnn_torch.cli.diagnose_options import configured
 
 __all__ = ["diagnose"]
 
@@ -61,67 +54,6 @@ def diagnose(
 
     ccnn diagnose --records measured.csv --mechanism my_simulator.py:PRESS --out runs/press
     """
-    with if_stopped("interrupted before there was a verdict; nothing was written"):
-        wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out, network)
-        if wanted.out is None:
-            raise InputError("name the folder to write with --out DIR")
-        found = _search(wanted, quiet)
-    from ccnn_torch.diagnosis.job import write_result
-    from ccnn_torch.diagnosis.page.report import print_diagnosis
-    from ccnn_torch.files.write import sweep
-    from ccnn_torch.report.screen import stdout
-    from ccnn_torch.run_folder.lock import locked
-
-    folder = Path(wanted.out)
-    try:
-        with locked(folder):
-            sweep(folder)
-            kept = write_result(folder, found)
-            stopped = f"interrupted after the verdict, which is kept in {kept}; what comes after it is not complete"
-            with if_stopped(stopped):
-                _tell(wanted, folder, found, quiet)
-    except InputError:
-        # A full disk, or another process that writes there: what was found is told, if it cannot be kept.
-        print_diagnosis(found.to_json(), stdout)
-        raise
-
-
-def _search(wanted: DiagnoseConfig, quiet: bool) -> Diagnosis:
-    """The verdict."""
     from ccnn_torch.diagnosis.job import run_diagnosis
-    from ccnn_torch.mechanisms import simulated_rows
 
-    def search(tell: Callable[[str], None]) -> Diagnosis:
-        with simulated_rows(lambda n: tell(f"{n:,} rows simulated")):
-            return run_diagnosis(wanted)
-
-    # Thousands of rows of an arm take half a minute, a slow simulator more; how much is left nobody knows.
-    return watched("looking for the effects that make the gap …", search, quiet)
-
-
-def _tell(wanted: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -> None:
-    """The verdict at once, then all that takes longer."""
-    from ccnn_torch.diagnosis import with_network
-    from ccnn_torch.diagnosis.job import write_diagnosis
-    from ccnn_torch.diagnosis.page.data import about_of, load_labels
-    from ccnn_torch.diagnosis.page.report import print_diagnosis
-    from ccnn_torch.display import short_path
-    from ccnn_torch.report.screen import say_place, stdout
-    from ccnn_torch.report.table import print_text
-
-    if not quiet:
-        print_text(found.verdict["text"], stdout, "bold")
-    if wanted.network:
-
-        def train(tell: Callable[[str], None]) -> Diagnosis:
-            return with_network(found, wanted.seed, lambda share: tell(f"{100 * share:.0f} %"))
-
-        found = watched("training a network on what the effects leave …", train, quiet)
-    records = wanted.records if isinstance(wanted.records, list) else [wanted.records]
-    rows = ", ".join(short_path(str(file)) for file in records)
-    about = {"name": folder.name, "mechanism": short_path(str(wanted.mechanism)), "records": rows}
-    path = write_diagnosis(folder, found, about, wanted.seed)
-    if quiet:
-        return
-    print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False)
-    say_place(f"Written: {path} and report.html beside it")
+    run_diagnosis(configured(overrides, records, mechanism, noise, effects, config, seed, out, network), quiet)

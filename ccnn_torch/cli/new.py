@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ccnn_torch.cli._complete import complete_mechanism
+from ccnn_torch.cli.completion import complete_mechanism
 from ccnn_torch.errors import InputError
 
 __all__ = ["new"]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ccnn_torch.cli._complete import complete_mechanism
+from ccnn_torch.cli.completion import complete_mechanism
 
 __all__ = ["plan"]
 
@@ -43,18 +43,15 @@ def plan(
 
     ccnn plan --mechanism my_machine.py:MyMachine --poses 24 --out poses.csv --config plan.yaml
     """
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
     from ccnn_torch.planning.config import load_plan_config
     from ccnn_torch.planning.job import check_plan_file, make_plan, write_plan
     from ccnn_torch.planning.page import gain_table, left_out_sentence, parameter_table, plan_sentence
-    from ccnn_torch.report.screen import say, say_place, stderr, stdout
+    from ccnn_torch.report.screen import progress_bar, say, say_place, stdout
     from ccnn_torch.report.table import print_table
 
     wanted = load_plan_config(config, [*(overrides or []), *([f"seed={seed}"] if seed is not None else [])])
     check_plan_file(out)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=stderr, disable=quiet or not stderr.is_terminal, transient=True) as bar:
+    with progress_bar(quiet, transient=True) as bar:
         task = bar.add_task("poses", total=1.0)
         machine, plans = make_plan(mechanism, poses, wanted, lambda done: bar.update(task, completed=done))
     if not quiet:

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from ccnn_torch.cli._complete import complete_mechanism
-from ccnn_torch.cli._stopped import NOTHING_WRITTEN, if_stopped
+from ccnn_torch.cli.completion import complete_mechanism
+from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
 
 __all__ = ["verify"]
 

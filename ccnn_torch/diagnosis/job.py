@@ -1,47 +1,58 @@
-"""A diagnosis from files, and what is written and shown of it."""
+"""`ccnn diagnose` and `ccnn check`: from a config to a verdict and its folder."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ccnn_torch.config.noise import noise_of_pose
-from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of
+from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of, with_network
 from ccnn_torch.diagnosis.checks.identifiable import Check, check_rows
 from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.diagnosis.from_records import naming
-from ccnn_torch.diagnosis.page.arrays import picture_arrays
-from ccnn_torch.diagnosis.page.report import write_diagnosis_report
-from ccnn_torch.diagnosis.verdict.text import noise_text
-from ccnn_torch.effects.covariates import covariate_units
+from ccnn_torch.diagnosis.outputs import write_diagnosis, write_result
+from ccnn_torch.diagnosis.page.data import about_of, load_labels
+from ccnn_torch.diagnosis.page.report import print_diagnosis
+from ccnn_torch.display import short_path
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.files.write import sweep
+from ccnn_torch.mechanisms import Mechanism, load_mechanism, simulated_rows
 from ccnn_torch.records import Records, load_records
-from ccnn_torch.report.json_files import plain, write_json
+from ccnn_torch.report.screen import say_place, stdout, with_status
+from ccnn_torch.report.table import print_text
+from ccnn_torch.run_folder.interrupt import if_stopped
+from ccnn_torch.run_folder.lock import locked
 
-__all__ = [
-    "run_check",
-    "run_diagnosis",
-    "write_check",
-    "write_diagnosis",
-    "write_result",
-]
+__all__ = ["run_check", "run_diagnosis"]
 
 
-def run_diagnosis(config: DiagnoseConfig) -> Diagnosis:
-    """Load and diagnose.
+def run_diagnosis(config: DiagnoseConfig, quiet: bool = False) -> Path:
+    """Diagnose, and write the folder of the config; the verdict is shown and kept before all that takes longer.
 
     Raises:
-        InputError: something is missing or wrong in the files or keys, or the rows carry no verdict.
+        InputError: something is missing or wrong in the files or keys, the rows carry no verdict, or the folder cannot
+            be written. A verdict that cannot be kept is printed.
     """
-    records, mechanism, effects = _loaded(config)
-    noise = _noise(config, mechanism)
-    return diagnose(records, mechanism, noise=noise, effects=effects, gravity=config.gravity, seed=config.seed)
+    if config.out is None:
+        raise InputError("name the folder to write with --out DIR")
+    with if_stopped("interrupted before there was a verdict; nothing was written"):
+        found = with_status("looking for the effects that make the gap …", lambda tell: _verdict(config, tell), quiet)
+    folder = Path(config.out)
+    try:
+        with locked(folder):
+            sweep(folder)
+            kept = write_result(folder, found)
+            with if_stopped(f"interrupted after the verdict, which is kept in {kept}; the rest is not complete"):
+                _complete(config, folder, found, quiet)
+    except InputError:
+        print_diagnosis(found.to_json(), stdout)
+        raise
+    return folder
 
 
 def run_check(config: DiagnoseConfig) -> Check:
-    """Load and look at what the records can show; raises as `run_diagnosis`."""
+    """What the records of a config can show; raises as `run_diagnosis`."""
     records, mechanism, effects = _loaded(config)
     situation = situation_of(records, mechanism, config.gravity)
     with naming(records):
@@ -49,49 +60,30 @@ def run_check(config: DiagnoseConfig) -> Check:
     return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside])
 
 
-def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
-    """Write `diagnosis.json` alone.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    path = folder / "diagnosis.json"
-    write_json(path, plain(diagnosis.to_json()))
-    return path
+def _verdict(config: DiagnoseConfig, tell: Callable[[str], None]) -> Diagnosis:
+    records, mechanism, effects = _loaded(config)
+    noise = _noise(config, mechanism)
+    with simulated_rows(lambda n: tell(f"{n:,} rows simulated")):
+        return diagnose(records, mechanism, noise=noise, effects=effects, gravity=config.gravity, seed=config.seed)
 
 
-def write_check(folder: Path, check: Check) -> Path:
-    """Write `check.json`; raises as `write_result`."""
-    path = folder / "check.json"
-    write_json(path, asdict(check))
-    return path
-
-
-def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str] | None = None, seed: int = 0) -> Path:
-    """Write `diagnosis.json`, the arrays behind its pictures, and the report.
-
-    Args:
-        folder: is made where it is not there.
-        diagnosis: what to write.
-        about: for the head of the report: `name`, `mechanism`, `records`.
-        seed: of the diagnosis.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    path = write_result(folder, diagnosis)
-    arrays, labels = picture_arrays(diagnosis, seed)
-    mechanism = diagnosis.analysis.situation.mechanism
-    units = covariate_units(mechanism) | {c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)}
-    lines = [diagnosis.lines[row] for row in diagnosis.rows_set_aside] if diagnosis.lines else []
-    told = {
-        "noise": noise_text(diagnosis.analysis.whitening.known > 0),
-        **(about or {}),
-        "units": units,
-        "lines": lines,
-    }
-    write_diagnosis_report(folder, plain(diagnosis.to_json()), arrays, labels | {"about": told})
-    return path
+def _complete(config: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -> None:
+    """The network on the remainder, the report, the tables."""
+    if not quiet:
+        print_text(found.verdict["text"], stdout, "bold")
+    if config.network:
+        found = with_status(
+            "training a network on what the effects leave …",
+            lambda tell: with_network(found, config.seed, lambda share: tell(f"{100 * share:.0f} %")),
+            quiet,
+        )
+    files = config.records if isinstance(config.records, list) else [config.records]
+    rows = ", ".join(short_path(str(file)) for file in files)
+    about = {"name": folder.name, "mechanism": short_path(str(config.mechanism)), "records": rows}
+    path = write_diagnosis(folder, found, about, config.seed)
+    if not quiet:
+        print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False)
+        say_place(f"Written: {path} and report.html beside it")
 
 
 def _noise(config: DiagnoseConfig, mechanism: Mechanism) -> dict[str, float] | None:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-
-from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as Bar
 
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.identification import Progress
@@ -14,7 +10,7 @@ from ccnn_torch.identification.config import IdentifyConfig, dump_identify_confi
 from ccnn_torch.identification.identify import Identification, identify
 from ccnn_torch.identification.outputs import RESULTS, write_outputs
 from ccnn_torch.identification.page.tables import not_settled, print_identified
-from ccnn_torch.report.screen import note, say_place, stderr, stdout
+from ccnn_torch.report.screen import note, progress_bar, say_place, stdout
 from ccnn_torch.run_folder.folder import RunFolder, kept_for
 from ccnn_torch.run_folder.resume import facts_of, refuse_changes
 
@@ -58,11 +54,13 @@ def resume_identification(path: Path, quiet: bool = False) -> Path:
 
 
 def _run(config: IdentifyConfig, path: Path, quiet: bool) -> Identification:
-    bars = _Bars(quiet)
-    try:
-        found = identify(config, path / "methods", bars.watch)
-    finally:
-        bars.stop()
+    with progress_bar(quiet) as bar:
+
+        def watch(label: str) -> Progress:
+            task = bar.add_task(label, total=1.0)
+            return lambda done: bar.update(task, completed=done)
+
+        found = identify(config, path / "methods", watch)
     if not quiet:
         # Before anything is written: what was found is not lost where the disk is full.
         print_identified(found.results, stdout)
@@ -77,28 +75,3 @@ def _run(config: IdentifyConfig, path: Path, quiet: bool) -> Identification:
             "more starts (starts=10) or fewer free parameters may help"
         )
     return found
-
-
-@dataclass
-class _Bars:
-    """A line on stderr for each method; silent off a terminal."""
-
-    quiet: bool
-
-    def __post_init__(self) -> None:
-        self._bar = Bar(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeRemainingColumn(),
-            console=stderr,
-            disable=self.quiet or not stderr.is_terminal,
-        )
-
-    def watch(self, label: str) -> Progress:
-        self._bar.start()
-        task = self._bar.add_task(label, total=1.0)
-        return lambda done: self._bar.update(task, completed=done)
-
-    def stop(self) -> None:
-        self._bar.stop()

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from ccnn_torch.report.table import print_text
 
-__all__ = ["note", "say", "say_place", "stderr", "stdout"]
+__all__ = ["note", "progress_bar", "say", "say_place", "stderr", "stdout", "with_status"]
+
+_Result = TypeVar("_Result")
 
 # Nothing that is shown is markup of rich's: a name or a path may have [brackets] in it.
 stdout = Console(markup=False, emoji=False)
@@ -17,6 +23,32 @@ def note(text: str, quiet: bool = False) -> None:
     """A line for the person at the terminal; nothing where stderr is a file or a pipe."""
     if stderr.is_terminal and not quiet:
         print_text(text, stderr, "dim")
+
+
+def progress_bar(quiet: bool, steps: bool = False, transient: bool = False) -> Progress:
+    """Bars on stderr, each with its label and the time left; silent off a terminal.
+
+    Args:
+        quiet: silent on a terminal as well.
+        steps: show `done/total` in the place of percent, and the field `note` of each bar.
+        transient: remove the bars at the end.
+    """
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn() if steps else TaskProgressColumn(),
+        TimeRemainingColumn(),
+        *([TextColumn("{task.fields[note]}", markup=False)] if steps else []),
+    )
+    return Progress(*columns, console=stderr, disable=quiet or not stderr.is_terminal, transient=transient)
+
+
+def with_status(text: str, work: Callable[[Callable[[str], None]], _Result], quiet: bool) -> _Result:
+    """Do work that has no known length; on a terminal `text` is shown, with what the work reports of its progress."""
+    if quiet or not stderr.is_terminal:
+        return work(lambda progress: None)
+    with stderr.status(text) as status:
+        return work(lambda progress: status.update(f"{text} {progress}"))
 
 
 def say(text: str) -> None:

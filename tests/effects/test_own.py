@@ -13,7 +13,7 @@ from broken_effects import Good, LaterColumn
 from typer.testing import CliRunner
 
 from ccnn_torch import diagnose, load_mechanism, load_records
-from ccnn_torch.cli._main import app
+from ccnn_torch.cli.application import app
 from ccnn_torch.diagnosis import diagnose_rows, noise_of, situation_of
 from ccnn_torch.diagnosis.checks.identifiable import check_rows
 from ccnn_torch.effects import Effect, make_effect, owned

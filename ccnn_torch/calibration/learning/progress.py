@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
 from ccnn_torch.calibration.rows.dataset import Dataset
 from ccnn_torch.learners import Learner, TrainingData
-from ccnn_torch.report.screen import stderr
+from ccnn_torch.report.screen import progress_bar
 from ccnn_torch.training import Scaling
 
 __all__ = ["HeldOut", "ProgressBar", "genome"]
@@ -27,15 +26,7 @@ class ProgressBar:
 
     def __init__(self, label: str, quiet: bool) -> None:
         self._label = label
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}", markup=False),
-            console=stderr,
-            disable=quiet or not stderr.is_terminal,
-        )
+        self._progress = progress_bar(quiet, steps=True)
 
     def on_start(self, learner: Learner, data: TrainingData, step: int) -> None:
         self._task = self._progress.add_task(self._label, total=learner.steps, completed=step, note="")

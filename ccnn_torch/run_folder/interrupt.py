@@ -1,4 +1,4 @@
-"""Ctrl-C told truly: what a command leaves behind when it is stopped depends on how far it came."""
+"""Ctrl-C: one sentence that says what an interrupted command left behind."""
 
 from __future__ import annotations
 

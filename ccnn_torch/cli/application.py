@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-from ccnn_torch.cli._stopped import Stopped
 from ccnn_torch.cli.blind_check import blind_check
 from ccnn_torch.cli.check import check
 from ccnn_torch.cli.compare import compare
@@ -26,6 +25,7 @@ from ccnn_torch.cli.suite import suite
 from ccnn_torch.cli.verify import verify
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.run_folder.interrupt import Stopped
 from ccnn_torch.version import __version__
 
 __all__ = ["main"]

@@ -1,18 +1,15 @@
-"""What `ccnn diagnose` and `ccnn check` share: their options as one config, and a sign of life."""
+"""Options of `ccnn diagnose` and `ccnn check` as one config."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ccnn_torch.diagnosis.config import DiagnoseConfig
 
-__all__ = ["configured", "watched"]
-
-_Found = TypeVar("_Found")
+__all__ = ["configured"]
 
 
 def configured(
@@ -43,13 +40,3 @@ def configured(
         "out": None if out is None else str(out),
     }
     return wanted.model_copy(update={k: v for k, v in given.items() if v is not None})
-
-
-def watched(text: str, work: Callable[[Callable[[str], None]], _Found], quiet: bool) -> _Found:
-    """Work that says how far it is, where a person is looking."""
-    from ccnn_torch.report.screen import stderr
-
-    if quiet or not stderr.is_terminal:
-        return work(lambda how_far: None)
-    with stderr.status(text) as status:
-        return work(lambda how_far: status.update(f"{text} {how_far}"))

@@ -1,0 +1,58 @@
+"""The folder of a diagnosis: `diagnosis.json`, the arrays of its figures, the report; and `check.json`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+from ccnn_torch.diagnosis.checks.identifiable import Check
+from ccnn_torch.diagnosis.page.arrays import picture_arrays
+from ccnn_torch.diagnosis.page.report import write_diagnosis_report
+from ccnn_torch.diagnosis.result import Diagnosis
+from ccnn_torch.diagnosis.verdict.text import noise_text
+from ccnn_torch.effects.covariates import covariate_units
+from ccnn_torch.report.json_files import plain, write_json
+
+__all__ = ["write_check", "write_diagnosis", "write_result"]
+
+
+def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
+    """Write `diagnosis.json` alone.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    path = folder / "diagnosis.json"
+    write_json(path, plain(diagnosis.to_json()))
+    return path
+
+
+def write_check(folder: Path, check: Check) -> Path:
+    """Write `check.json`; raises as `write_result`."""
+    path = folder / "check.json"
+    write_json(path, asdict(check))
+    return path
+
+
+def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str] | None = None, seed: int = 0) -> Path:
+    """Write `diagnosis.json`, the arrays of its figures, and the report.
+
+    Args:
+        folder: made where it does not exist.
+        diagnosis: what to write.
+        about: for the head of the report: `name`, `mechanism`, `records`.
+        seed: of the diagnosis.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    path = write_result(folder, diagnosis)
+    arrays, labels = picture_arrays(diagnosis, seed)
+    mechanism = diagnosis.analysis.situation.mechanism
+    units = covariate_units(mechanism) | {c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)}
+    lines = [diagnosis.lines[row] for row in diagnosis.rows_set_aside] if diagnosis.lines else []
+    noise = noise_text(diagnosis.analysis.whitening.known > 0)
+    labels = labels | {"about": {"noise": noise, **(about or {}), "units": units, "lines": lines}}
+    write_diagnosis_report(folder, plain(diagnosis.to_json()), arrays, labels)
+    return path
