@@ -28,7 +28,7 @@ from ccnn_torch.files.yaml_file import read_yaml
 from ccnn_torch.identification.config import load_identify_config
 from ccnn_torch.report.json_files import load_schema
 from ccnn_torch.run_folder.folder import RunFolder
-from ccnn_torch.suite.job import load_suite
+from ccnn_torch.suite.config import load_suite
 
 Cli = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parent.parent

@@ -16,7 +16,8 @@ from ccnn_torch.calibration.config import dump_config
 from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import load_schema
-from ccnn_torch.suite.job import load_suite, run_suite
+from ccnn_torch.suite.config import load_suite
+from ccnn_torch.suite.job import run_suite
 from ccnn_torch.suite.page import compare, write_suite
 from ccnn_torch.suite.tables import print_suite, suite_markdown
 

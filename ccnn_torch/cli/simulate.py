@@ -61,7 +61,8 @@ def simulate(
     from ccnn_torch.report.screen import say, say_place, stdout
     from ccnn_torch.report.table import print_table
     from ccnn_torch.simulation.config import load_simulate_config
-    from ccnn_torch.simulation.job import injected_table, simulate_records, write_simulated
+    from ccnn_torch.simulation.job import simulate_records
+    from ccnn_torch.simulation.outputs import injected_table, write_simulated
 
     with if_stopped(NOTHING_WRITTEN):
         wanted = load_simulate_config(config, overrides or [])

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.report.json_files import read_json
 
-__all__ = ["configurations", "paired_gain", "promise_block", "promised"]
+__all__ = ["configurations", "paired_gain", "promise_block", "promise_of", "promised"]
 
 # Rows whose commanded joints round to the same cell are one configuration, measured several times [SI].
 _CELL = {"m": 1e-4, "rad": 1e-3}
@@ -108,3 +111,21 @@ def _spread(values: Tensor, groups: Tensor) -> float:
     sums = torch.zeros(count, dtype=values.dtype).index_add_(0, groups, values - mean)
     variance = sums.square().sum() / len(values) ** 2 * count / (count - 1)
     return float(count * variance / mean**2)
+
+
+def promise_of(model: LoadedModel | IdentifiedGeometry) -> dict[str, Any] | None:
+    """The card's promise, or that of the identified.json beside an identified.yaml."""
+    if isinstance(model, LoadedModel):
+        metrics = model.card.get("metrics")
+        found = metrics.get("promise") if isinstance(metrics, dict) else None
+        return found if isinstance(found, dict) else None
+    path = Path(model.path).with_name("identified.json")
+    if not path.is_file():
+        return None
+    results = read_json(path)
+    promise, parameters = results.get("promise"), results.get("parameters")
+    if not isinstance(promise, dict) or not isinstance(parameters, dict):
+        return None
+    own = model.identified.describe()["parameters"]
+    same = all(math.isclose(own.get(name, math.nan), block["value"]) for name, block in parameters.items())
+    return promise if same else None

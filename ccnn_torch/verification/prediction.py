@@ -1,0 +1,136 @@
+"""New records beside what a model says of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Mechanism, PoseError, SerialArm, load_mechanism, mechanism_from_description
+from ccnn_torch.plugins import code_refused
+from ccnn_torch.pseudoerror import joint_deviations
+from ccnn_torch.records import Records
+from ccnn_torch.records.sources import read_source
+from ccnn_torch.verification.moved_frame import Motion
+
+__all__ = ["Rows", "judge", "mapped_columns", "nominal_mechanism", "predict", "pseudoerror_settings"]
+
+# As in a run: of orientation against position [m/rad], and damping of an arm's joint deviation, where no card says it.
+_ROTATION_WEIGHT, _ARM_DAMPING = 0.04, 0.01
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Records beside what a model says of them: joints and deviations `s x n`, poses `s x p` [SI]; inside `s`, bool."""
+
+    mechanism: Mechanism
+    joints: Tensor
+    pose: Tensor
+    deviation: Tensor
+    inside: Tensor
+    nominal: Tensor
+    predicted: Tensor
+
+
+def nominal_mechanism(model: LoadedModel | IdentifiedGeometry, spec: str | None, allow_code: bool) -> Mechanism:
+    """The nominal machine that the model was made for, its frames as they were fitted then."""
+    about = model.facts["mechanism"]
+    if spec is None:
+        if isinstance(model, IdentifiedGeometry):
+            return model.nominal
+        with code_refused(f"{model.path}: its mechanism", allow_code):
+            return mechanism_from_description(about, allow_code=True)
+    given = load_mechanism(spec)
+    if isinstance(given, SerialArm) and len(about["pose"]) == 3:
+        given = given.with_orientation("none")
+    for key in ("name", "joints", "pose"):
+        if about[key] != given.describe()[key]:
+            raise InputError(
+                f"--mechanism {spec}: {model.path} was made for {about['name']} ({', '.join(about['joints'])}; "
+                f"{', '.join(about['pose'])}), not for {given.name}; take the model of that machine"
+            )
+    given.set_parameters(about["parameters"])
+    return given
+
+
+def mapped_columns(model: LoadedModel | IdentifiedGeometry, records: Any) -> dict[str, str]:
+    """The map of columns that the model's run had, as far as the new rows have these headers."""
+    known = {} if isinstance(model, IdentifiedGeometry) else model.card.get("columns") or {}
+    if not known or isinstance(records, Records):
+        return {}
+    table = read_source(records)
+    there = {*table.names, *(table.header(name) for name in table.names)}
+    return {header: meaning for header, meaning in known.items() if header in there}
+
+
+def predict(model: LoadedModel | IdentifiedGeometry, machine: Mechanism, records: Records, compensated: bool) -> Rows:
+    for key in ("frame_per", "tool_per"):
+        if getattr(machine, key, ()):
+            raise InputError(
+                f"{model.path}: {machine.name} had frames per group of rows ({key}), which no model file holds; verify "
+                "the rows of one group with a model that was made from that group"
+            )
+    names = [c.name for c in records.pose_coordinates]
+    pose = records.pose[:, [names.index(c.name) for c in machine.pose]]
+    found = model(records.joints.numpy(), _covariates(model, records))
+    ideal = torch.from_numpy(np.asarray(found["ideal"]))
+    nominal = machine.forward_kinematics(records.joints, guess=pose)
+    if isinstance(model, IdentifiedGeometry):
+        real = model.identified
+        if isinstance(real, SerialArm) and len(machine.pose) == 3:
+            real = real.with_orientation("none")
+        predicted = real.forward_kinematics(records.joints, guess=pose)
+    else:
+        predicted = machine.forward_kinematics(ideal, guess=pose)
+    lost = np.flatnonzero(~(torch.isfinite(nominal) & torch.isfinite(predicted)).all(-1).numpy())
+    if len(lost):
+        raise InputError(
+            f"{records.path}: {machine.name} has no pose with the joints at {records.name_rows(lost)}; correct or "
+            "remove them, or check the units"
+        )
+    inside = torch.from_numpy(np.asarray(found["inside_domain" if compensated else "ideal_inside_domain"]))
+    return Rows(machine, records.joints, pose, ideal - records.joints, inside, nominal, predicted)
+
+
+def _covariates(model: LoadedModel | IdentifiedGeometry, records: Records) -> np.ndarray[Any, Any] | None:
+    """The model's covariates, `s x m` [SI], a constant one as well, which a run would have dropped."""
+    if not model.covariates:
+        return None
+    return np.stack([records.columns[c.name] for c in model.covariates], axis=-1)
+
+
+def pseudoerror_settings(model: LoadedModel | IdentifiedGeometry, machine: Mechanism) -> dict[str, Any]:
+    """How the joint deviations of a run were found: as the card has it."""
+    card = {} if isinstance(model, IdentifiedGeometry) else model.card
+    damping = float(card.get("damping", _ARM_DAMPING if isinstance(machine, SerialArm) else 0.0))
+    return {
+        "rotation_weight": float(card.get("rotation_weight", _ROTATION_WEIGHT)),
+        "damping": damping,
+        "max_condition": math.inf if damping > 0 else 50.0,
+    }
+
+
+def judge(
+    rows: Rows, compensated: bool, motions: list[Motion], settings: Mapping[str, Any]
+) -> tuple[PoseError, PoseError, Tensor, Tensor, Tensor]:
+    """Pose error before and after, `s`; joint deviation before and after, `s x n` [SI]; rows with one, `s`."""
+    machine = rows.mechanism
+    if compensated:
+        measured = motions[0].undone(machine, rows.pose)
+        before = machine.pose_error(rows.predicted, rows.nominal)
+        after = machine.pose_error(measured, rows.nominal)
+        found = joint_deviations(machine, rows.joints, measured, **settings)
+        return before, after, rows.deviation, found.deviation, found.usable
+    first, last = (motion.undone(machine, rows.pose) for motion in motions)
+    before = machine.pose_error(first, rows.nominal)
+    after = machine.pose_error(last, rows.predicted)
+    # Beside the frames that the model's deviation was found with, or those that suit the model best.
+    found = joint_deviations(machine, rows.joints, last, **settings)
+    return before, after, found.deviation, found.deviation - rows.deviation, found.usable
