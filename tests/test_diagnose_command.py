@@ -197,7 +197,7 @@ def test_stopped_before_the_verdict_it_says_that_nothing_was_written(
 
 def test_a_stopped_blind_check_says_how_to_go_on(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccnn_validation.blind.check.run_blind_check", _stop)
-    sentence = f"interrupted; what is done is kept in {tmp_path / 'b'}, and the same command goes on from there\n"
+    sentence = f"interrupted; finished cases are kept in {tmp_path / 'b'}, and the same command resumes from them\n"
     assert cli("blind-check", "--cases", 6, "--out", tmp_path / "b") == (130, "", sentence)
 
 

@@ -1,4 +1,4 @@
-"""Puts the commands together and turns what went wrong into one sentence and an exit code."""
+"""The application `ccnn`: register the commands; turn errors into one sentence and an exit code."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ccnn_torch.version import __version__
 
 __all__ = ["main"]
 
-# Characters of a sentence. The longest of our own, which lists all wrong keys of a config, has some hundreds.
+# Maximum characters of a message. The longest of this package, which lists wrong keys, has some hundreds.
 _LONGEST = 2000
 
 app = typer.Typer(
@@ -78,18 +78,18 @@ for _command in (
 
 def main() -> None:
     """Entry point of the console script."""
-    # Before torch is loaded. With threads that spin while they wait, a run beside another one took tens of times as
-    # long on two cores; alone no clear difference was seen.
+    # Set before torch is loaded. With busy-waiting threads, two runs at once on two cores took tens of times as long;
+    # a single run showed no clear difference.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
-        # 130 comes back where a person pressed Ctrl-C and the command had no sentence of its own for that.
+        # 130: Ctrl-C in a command that has no message of its own for it.
         code = app(standalone_mode=False) or 0
     except (InputError, MethodFailedError) as problem:
         code = _say(str(problem))
     except typer.TyperException as problem:
-        code = _say(f"{problem.format_message()} (ccnn --help, or ccnn COMMAND --help, tells what there is)")
+        code = _say(f"{problem.format_message()} (see ccnn --help or ccnn COMMAND --help)")
     except OSError as problem:
-        # What has no better sentence of its own: a screen that is a full disk, a folder that went away meanwhile.
+        # Errors without a message of their own: stdout on a full disk, a folder that was deleted meanwhile.
         code = _say(f"{problem.filename or 'the output'}: {problem.strerror or problem}")
     except Stopped as stopped:
         _say(str(stopped))
@@ -102,6 +102,6 @@ def main() -> None:
 
 
 def _say(sentence: str) -> int:
-    """One line on stderr, whatever the file said that it quotes."""
+    """Print one line on stderr, with control characters escaped; return the exit code of bad input."""
     typer.echo(visible(" ".join(sentence.split()), _LONGEST), err=True)
     return 2

@@ -1,4 +1,4 @@
-"""`ccnn blind-check`: how often the diagnosis is right on machines whose cause it is never told."""
+"""`ccnn blind-check`: how often the diagnosis is right on simulated machines of undisclosed cause."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ __all__ = ["blind_check"]
 
 
 def blind_check(
-    cases: Annotated[int, typer.Option(help="How many machines.")],
+    cases: Annotated[int, typer.Option(help="Number of machines.")],
     out: Annotated[Path, typer.Option(help="Folder to write.")],
-    seed: Annotated[int, typer.Option(help="Of the machines, their poses and noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the machines, their poses and noise.")] = 0,
     mechanism: Annotated[
-        str | None, typer.Option(help="Names with commas; when not given all but mujoco_five_bar.")
+        str | None, typer.Option(help="Names, separated by commas; by default all but mujoco_five_bar.")
     ] = None,
     kinds: Annotated[
-        str, typer.Option(help="Of single, pair, none, outside, with commas.")
+        str, typer.Option(help="Any of single, pair, none, outside, separated by commas.")
     ] = "single,pair,none,outside",
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no tables.")] = False,
 ) -> None:
-    """Diagnose machines whose cause is sealed, then open the seal and count how often the diagnosis was right.
+    """Diagnose simulated machines of undisclosed cause, then count how often the diagnosis was right.
 
-    The machines are generated in a process of their own, by formulas that are not those of the effects library: one
-    cause, two, none, or something that the library does not have, with a gap of 3, 10 and 30 times the noise. After
-    that every single cause is diagnosed once more by a library that lacks it. The folder holds blind.json, blind.csv
-    and blind.md: right answers by cause, strength and machine, the confusion table, false alarms, how reliable the
-    probabilities are, and how often the intervals of the shrink hold the truth, each with a 95 % interval. A second
-    call goes on where the first was stopped. Mechanisms: five_bar, tripod, machine_tool, stewart, delta, delta_linear,
-    arm, and mujoco_five_bar (a simulator of others, pip install 'ccnn-torch[mujoco]').
+    A separate process simulates the machines, by formulas that are not those of the effects library. They have one
+    cause, two, none, or one that the library lacks, with a gap of 3, 10 and 30 times the noise. Then every single cause
+    is diagnosed again by a library without it. The folder holds blind.json, blind.csv and blind.md: right answers by
+    cause, strength and machine, the confusion table, false alarms, the calibration of the probabilities, and the
+    coverage of the intervals of the error reduction. Each figure has a 95 % interval. A second call resumes an
+    interrupted one. Mechanisms: five_bar, tripod, machine_tool, stewart, delta, delta_linear, arm, and mujoco_five_bar
+    (an independent simulator, pip install 'ccnn-torch[mujoco]').
 
     Examples:
 
@@ -45,7 +45,7 @@ def blind_check(
 
     from ccnn_torch.diagnosis import diagnose
 
-    with if_stopped(f"interrupted; what is done is kept in {out}, and the same command goes on from there"):
+    with if_stopped(f"interrupted; finished cases are kept in {out}, and the same command resumes from them"):
         run_blind_check(
             cases,
             out,

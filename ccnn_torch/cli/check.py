@@ -1,4 +1,4 @@
-"""`ccnn check`: what records can show, before any verdict."""
+"""`ccnn check`: which effects records can identify, before a diagnosis."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def check(
         str | None,
         typer.Option(help="A mechanism's name, file, or path/to/file.py:Name.", autocompletion=complete_mechanism),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to write check.json to; nothing when left out.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to write check.json to; nothing by default.")] = None,
     noise: Annotated[
         str | None,
         typer.Option(
@@ -29,13 +29,13 @@ def check(
         ),
     ] = None,
     effects: Annotated[
-        str | None, typer.Option(help="Candidates, a,b,…; all for the whole library, as when left out.")
+        str | None, typer.Option(help="Candidates, a,b,…; all = the whole library, which is the default.")
     ] = None,
     config: Annotated[Path | None, typer.Option(help="A YAML file with keys as for ccnn diagnose.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Nothing but the exit code.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing; set the exit code alone.")] = False,
 ) -> None:
-    """Tell what records can show: rows, noise, covariates, effects that cannot be seen, pairs that look alike.
+    """Report which effects records can identify: rows, noise, covariates, unidentifiable effects, confusable pairs.
 
     Examples:
 
@@ -51,7 +51,7 @@ def check(
 
     with if_stopped(NOTHING_WRITTEN):
         wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)
-        found = with_status("looking at what the rows can show …", lambda tell: run_check(wanted), quiet)
+        found = with_status("checking what the rows can identify …", lambda _: run_check(wanted), quiet)
     if not quiet:
         for line in check_text(found):
             say(line)

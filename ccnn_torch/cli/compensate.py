@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 __all__ = ["compensate"]
 
-# How near to the wanted pose the joints must bring the nominal machine [m, rad].
+# Largest pose error of the nominal machine at the joints found [m, rad].
 _CLOSE = 1e-8
-# Starts tried at once where the row before leads to no joints.
+# Initial guesses solved at once where that of the previous row does not converge.
 _STARTS = 64
 
 
@@ -44,20 +44,19 @@ def compensate(
     allow_code: Annotated[
         bool, typer.Option("--allow-code", help="Run the Python file that the model names as its mechanism.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
 ) -> None:
-    """Correct joints so that the machine reaches what was meant; or, from commands, tell what it reaches.
+    """Correct joints so that the machine reaches the intended pose; or, with --back, convert commands to ideal joints.
 
     OUT.csv repeats the columns of IN.csv and adds command_q1[unit]…, deviation_q1[unit]… and inside_domain[1] (0 =
-    outside the model's domain, where the correction fades into its safe value). With --back it adds ideal_q1[unit]…
+    outside the model's domain, where the correction tends to its safe value). With --back it adds ideal_q1[unit]…
     and inside_domain[1]; the commands are the columns command_q1… where IN.csv has them, else q1…. With --pose a
-    serial arm takes the branch of guess_q1[unit]… where given, else that of the row before. With --sd it also adds
-    deviation_sd_q1[unit]…: what the machine does beyond the command, measured anew, is within 1.96 of it in about 95 of
-    100 places inside the domain. With identified.yaml, which ccnn identify writes, the commands are those of the real
-    kinematics.
+    serial arm takes the branch of guess_q1[unit]… where given, else that of the previous row. With --sd it also adds
+    deviation_sd_q1[unit]…: inside the domain, about 95 % of new measurements are within 1.96 times it of the predicted
+    deviation. With identified.yaml, which ccnn identify writes, the commands are those of the identified kinematics.
 
-    Every row is held to what the model's card promises. Where the model breaks it (a number that is not finite, a
-    deviation above the limit), the row has command = joints and inside_domain = 0, and the exit code is 2.
+    Every row is checked against the limits in the model's card. Where the model violates them (a number that is not
+    finite, a deviation above the limit), the row has command = joints and inside_domain = 0, and the exit code is 2.
 
     Examples:
 
@@ -76,7 +75,9 @@ def compensate(
     if pose and back:
         raise InputError("--pose and --back exclude each other: --pose takes wanted poses, --back takes commands")
     if sd and back:
-        raise InputError("--sd and --back exclude each other: --sd tells how sure a command is, --back takes commands")
+        raise InputError(
+            "--sd and --back exclude each other: --sd gives the standard deviation of a command, --back takes commands"
+        )
     for file, what in ((input, "IN.csv"), (model, "the model")):
         if os.path.realpath(output) == os.path.realpath(file):
             raise InputError(f"{output}: OUT.csv is {what} itself, which would be overwritten; name another file")
@@ -95,7 +96,7 @@ def compensate(
         joints, units = _joints(loaded, table, back)
     covariates = stack_columns(table, loaded.covariates) if loaded.covariates else None
     with warnings.catch_warnings():
-        # Told at the end, with the line of the table.
+        # Reported at the end, with the line of the table.
         warnings.simplefilter("ignore", FallbackWarning)
         found = loaded(joints, covariates)
     if back:
@@ -114,19 +115,19 @@ def compensate(
     kept = {table.header(name): table.raw(name) for name in table.names if name not in names}
     write_table(output, kept | added)
     if not quiet:
-        _tell(output, inside, trained=bool(loaded.covariates) or "deviation_sd" in found)
+        _report(output, inside, trained=bool(loaded.covariates) or "deviation_sd" in found)
         if mechanism is not None and _chooses_branch(loaded, mechanism, table):
             say(
-                "An arm takes a pose on several branches (elbow, wrist): these are the joints nearest to those of the "
-                "row before, and may be on another branch than meant; give "
+                "An arm reaches a pose on several branches (elbow, wrist): these are the joints nearest to those of "
+                "the previous row, and may be on another branch than intended; give "
                 f"{_guess_headers(loaded)} near the joints wanted."
             )
     bad = np.flatnonzero(found["fallback"])
     if len(bad):
         raise InputError(
             f"{output}: in {len(bad)} of {len(joints)} rows, the first from {name_lines(table.lines, bad[:1])} of "
-            f"{input}, {model} breaks what its card promises (finite numbers, |deviation| within the limit); they were "
-            "written without any correction and with inside_domain = 0: do not use this model"
+            f"{input}, {model} violates the limits in its card (finite numbers, |deviation| within the limit); they "
+            "were written without any correction and with inside_domain = 0: do not use this model"
         )
 
 
@@ -153,7 +154,7 @@ def _joints(loaded: Model, table: Table, back: bool) -> tuple[Array, dict[str, s
 
 
 def _refuse_other_machine(loaded: Model, table: Table) -> None:
-    """A file with more joints than the model's is that of another machine; fewer are missed by name anyway."""
+    """Raise `InputError` for a file with more joints than the model; a missing one is reported when it is read."""
     known = {c.name for c in loaded.joints}
     other = [name for name in table.names if name[:1] == "q" and name[1:].isdigit() and name not in known]
     if other:
@@ -201,7 +202,7 @@ def _joints_of_poses(loaded: Model, mechanism: Mechanism, table: Table) -> Array
 
 
 def _chooses_branch(loaded: Model, mechanism: Mechanism, table: Table) -> bool:
-    """Whether joints of poses were found without a word on their branch, where there are several."""
+    """Whether joints of poses were found without a given branch, where there are several."""
     return bool(mechanism.orientations) and not any(f"guess_{c.name}" in table for c in loaded.joints)
 
 
@@ -211,9 +212,9 @@ def _guess_headers(loaded: Model) -> str:
 
 
 def _follow(mechanism: Mechanism, poses: Tensor, guess: Tensor) -> Tensor:
-    """Joints of poses one after the other, each on the branch of those of the row before, the first on the guess's.
+    """Joints of successive poses, each on the branch of the previous row, the first on that of the guess.
 
-    Where no such branch is found, the joints nearest to those of the row before are taken, out of many starts.
+    Where that branch has no solution, take the one nearest to the previous row, out of many initial guesses.
     """
     import torch
 
@@ -249,7 +250,7 @@ def _named(what: str, loaded: Model, values: Array, units: dict[str, str]) -> di
     }
 
 
-def _tell(output: Path, inside: NDArray[Any], trained: bool) -> None:
+def _report(output: Path, inside: NDArray[Any], trained: bool) -> None:
     from ccnn_torch.report.screen import say
 
     outside = len(inside) - int(inside.sum())

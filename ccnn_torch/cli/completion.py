@@ -1,10 +1,10 @@
-"""Words that a shell completes: cheap ones, without torch."""
+"""Shell completion, without importing torch."""
 
 from __future__ import annotations
 
 __all__ = ["complete_mechanism"]
 
-# The registry's names; a test holds this list to it, so that completion need not load torch.
+# The registry's names, so that completion need not load torch; a test compares the two.
 MECHANISMS = (
     "tripod",
     "machine_tool",
@@ -17,5 +17,5 @@ MECHANISMS = (
 
 
 def complete_mechanism(incomplete: str) -> list[str]:
-    """Built-in mechanisms that begin so."""
+    """Built-in mechanisms whose names begin with `incomplete`."""
     return [name for name in MECHANISMS if name.startswith(incomplete)]

@@ -1,4 +1,4 @@
-"""`ccnn diagnose`: which effect makes the gap between model and machine."""
+"""`ccnn diagnose`: which physical effects explain the error of a model."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ def diagnose(
         ),
     ] = None,
     effects: Annotated[
-        str | None, typer.Option(help="Candidates, a,b,…; all for the whole library, as when left out.")
+        str | None, typer.Option(help="Candidates, a,b,…; all = the whole library, which is the default.")
     ] = None,
     config: Annotated[Path | None, typer.Option(help="A YAML file with keys as below.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
     network: Annotated[
-        bool | None, typer.Option(help="What a network would still gain; the same as network=….")
+        bool | None, typer.Option(help="Estimate the further gain by a network; the same as network=….")
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No verdict, no table.")] = False,
 ) -> None:
-    """Name the physical effect that makes the gap between a model and measurements, and how far the gap shrinks.
+    """Find the physical effect that explains the error of a model, and how much of the error it removes.
 
-    The verdict comes first; then a network is trained on what the effects leave, to say what it would still gain
-    (seconds; --no-network leaves that out). The folder gets diagnosis.json, report.html and next_measurements.csv, the
-    rows that would tell most. Keys: records, columns, mechanism, out, mechanism_keys, covariates, noise, effects,
-    gravity, network, seed.
+    The diagnosis comes first; then a network is trained on the residual of the effects, to estimate its further gain
+    (seconds; --no-network omits that). The folder gets diagnosis.json, report.html and next_measurements.csv, the most
+    informative poses to measure next. Keys: records, columns, mechanism, out, mechanism_keys, covariates, noise,
+    effects, gravity, network, seed.
 
     Examples:
 

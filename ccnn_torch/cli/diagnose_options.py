@@ -23,13 +23,13 @@ def configured(
     out: Path | None = None,
     network: bool | None = None,
 ) -> DiagnoseConfig:
-    """The config file with what the command line says over it."""
+    """The config file, overridden by the options of the command line."""
     from ccnn_torch.config.noise import read_noise
     from ccnn_torch.config.overrides import listed_files
     from ccnn_torch.diagnosis.config import load_diagnose_config
 
-    told = [] if noise is None else [f"noise={json.dumps(read_noise(noise))}"]
-    wanted = load_diagnose_config(config, [*(overrides or []), *told])
+    noise_key = [] if noise is None else [f"noise={json.dumps(read_noise(noise))}"]
+    wanted = load_diagnose_config(config, [*(overrides or []), *noise_key])
     names = None if effects is None else [e.strip() for e in effects.split(",") if e.strip()]
     given = {
         "records": None if records is None else listed_files(str(records), Path()),

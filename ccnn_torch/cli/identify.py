@@ -15,13 +15,13 @@ __all__ = ["identify"]
 def identify(
     config: Annotated[Path | None, typer.Argument(help="A YAML config, e.g. experiments/five_bar.yaml.")] = None,
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
-    resume: Annotated[Path | None, typer.Option(help="Go on with the identification in this folder.")] = None,
+    resume: Annotated[Path | None, typer.Option(help="Resume the identification in this folder.")] = None,
     out: Annotated[str | None, typer.Option(help="Folder to write; the same as out=….")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
-    keys: Annotated[bool, typer.Option("--keys", help="List every key with its default, and do nothing.")] = False,
+    keys: Annotated[bool, typer.Option("--keys", help="List every key with its default, and exit.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no tables.")] = False,
 ) -> None:
-    """Identify a machine's geometry: parameters with intervals, what the poses cannot tell, held-out pose error.
+    """Identify a machine's geometry: parameters with intervals, unidentifiable parameters, held-out pose error.
 
     The folder gets identified.json, .csv, .md, plots and report.html, and the machine itself: identified.yaml, which
     every command takes as a mechanism and ccnn compensate as a model; of a serial arm also identified.urdf and
@@ -50,7 +50,7 @@ def identify(
         return
     if resume is not None:
         if config is not None or overrides or out is not None or seed is not None:
-            raise InputError("--resume goes on as it was; it takes the folder and nothing beside it")
+            raise InputError("--resume takes the folder alone, without a config, overrides or other options")
         resume_identification(resume, quiet=quiet)
         return
     if config is None:

@@ -21,15 +21,15 @@ def new(
         str | None, typer.Option(help="A mechanism's name or file.", autocompletion=complete_mechanism)
     ] = None,
     units: Annotated[
-        str | None, typer.Option(metavar="LENGTH,ANGLE", help="Of columns without a unit, e.g. mm,deg.")
+        str | None, typer.Option(metavar="LENGTH,ANGLE", help="Units of columns without one, e.g. mm,deg.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write over CONFIG.yaml where it is there.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing, and ask nothing.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing CONFIG.yaml.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing, and ask nothing.")] = False,
 ) -> None:
-    """Look at a table of measurements and write a config for ccnn run, with comments on what was guessed.
+    """Write a config for ccnn run from a table of measurements, with comments on what was guessed.
 
     Joints may be called q1, J1, A1, joint_1, axis1 …; the position X, Y, Z; the orientation rx, ry, rz, qw to qz, A, B,
-    C (KUKA) or W, P, R (Fanuc). What cannot be guessed is asked for on a terminal, else it is said.
+    C (KUKA) or W, P, R (Fanuc). What cannot be guessed is asked for on a terminal; elsewhere a message names it.
 
     Examples:
 
@@ -38,7 +38,7 @@ def new(
     ccnn new measured.csv --mechanism my_arm.yaml --units mm,deg --out robot.yaml
     """
     if out.exists() and not force:
-        raise InputError(f"{out} is there already; name another file, or give --force to write over it")
+        raise InputError(f"{out} is there already; name another file, or give --force to overwrite it")
     from ccnn_torch.files.write import write_whole
     from ccnn_torch.starter.job import starter_config
 
@@ -47,7 +47,7 @@ def new(
     write_whole(out, text.encode())
     if quiet:
         return
-    typer.echo(f"{out} is written. Look it through, then:")
+    typer.echo(f"{out} is written. Check it, then:")
     typer.echo(f"ccnn run {out}" if ready else f"ccnn run {out} mechanism=FILL_IN")
 
 

@@ -20,16 +20,16 @@ def plan(
         ),
     ],
     poses: Annotated[int, typer.Option(help="How many poses to plan (per_leg: for each leg).")],
-    out: Annotated[Path, typer.Option(help="CSV to write; a page .md and a picture .png, .svg are put beside it.")],
+    out: Annotated[Path, typer.Option(help="CSV to write; a page .md and a picture .png, .svg are written beside it.")],
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
     config: Annotated[Path | None, typer.Option(help="A YAML file with keys as below.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no tables.")] = False,
 ) -> None:
-    """Choose the poses that show a machine's geometric parameters best, and tell how many are worth measuring.
+    """Choose the poses that best identify a machine's geometric parameters, and recommend how many to measure.
 
     OUT.csv has a row for each pose: the joints to command, q1[unit]…, and the pose at which they bring the nominal
-    machine, in the order of their worth. The page beside it tells what each further pose would give. Keys:
+    machine, the most informative ones first. The page beside it gives the gain of each further pose. Keys:
     mechanism_keys, parameters.free, .fixed, .tied, .prior, residual, noise, joint_noise, index, candidates, limits,
     max_condition, rotation_weight, per_leg, repeat, least_gain, margin, seed. Sizes are in SI, or texts with a unit.
 
@@ -55,12 +55,12 @@ def plan(
         task = bar.add_task("poses", total=1.0)
         machine, plans = make_plan(mechanism, poses, wanted, lambda done: bar.update(task, completed=done))
     if not quiet:
-        # Before anything is written: minutes of work are not lost where the disk is full.
+        # Before anything is written, so that the result is not lost if the disk is full.
         for part in plans:
             print_table(parameter_table(part), stdout)
             print_table(gain_table(part, short=True), stdout)
-            if said := left_out_sentence(part):
-                say(said)
+            if sentence := left_out_sentence(part):
+                say(sentence)
             say(plan_sentence(part, wanted.least_gain))
     files = write_plan(out, machine, plans, wanted.least_gain)
     if not quiet:

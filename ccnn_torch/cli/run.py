@@ -15,7 +15,7 @@ __all__ = ["run"]
 def run(
     config: Annotated[Path | None, typer.Argument(help="A YAML config, for example experiments/tripod.yaml.")] = None,
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
-    resume: Annotated[Path | None, typer.Option(help="Go on with the run in this folder.")] = None,
+    resume: Annotated[Path | None, typer.Option(help="Resume the run in this folder.")] = None,
     out: Annotated[str | None, typer.Option(help="Folder to write; the same as out=….")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no tables.")] = False,
@@ -39,7 +39,7 @@ def run(
 
     if resume is not None:
         if config is not None or overrides or out is not None or seed is not None:
-            raise InputError("--resume goes on with a run as it was; it takes the run's folder and nothing beside it")
+            raise InputError("--resume takes the run's folder alone, without a config, overrides or other options")
         resume_run(resume, quiet=quiet)
         return
     if config is None:

@@ -1,4 +1,4 @@
-"""`ccnn sign`: a signature beside a model that is passed on, and the keys for it."""
+"""`ccnn sign`: sign a model file, and make the keys for it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def sign(
     model: Annotated[Path | None, typer.Argument(help="A .safetensors or .onnx file, or identified.yaml.")] = None,
     key: Annotated[Path | None, typer.Option("--key", metavar="PRIVATE.pem", help="Private Ed25519 key.")] = None,
     new_key: Annotated[str | None, typer.Option("--new-key", metavar="NAME", help="Make a pair of keys.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
 ) -> None:
-    """Sign a model and its card by Ed25519: MODEL.sig tells whoever has the public key that neither was changed.
+    """Sign a model and its card with Ed25519: by MODEL.sig and the public key others verify that neither was changed.
 
-    With --new-key it writes NAME.private.pem, which is yours alone, and NAME.public.pem, which you give to those who
-    use your models; they run ccnn compensate MODEL … --public-key NAME.public.pem. A signature is of one file and the
-    card as they are: sign again after a model was written again. It needs pip install 'ccnn-torch[sign]'.
+    With --new-key it writes NAME.private.pem, which you keep secret, and NAME.public.pem, which you give to the users
+    of your models; they run ccnn compensate MODEL … --public-key NAME.public.pem. A signature covers one file and its
+    card: sign again whenever the model is rewritten. It needs pip install 'ccnn-torch[sign]'.
 
     Examples:
 
@@ -36,9 +36,9 @@ def sign(
 
     if new_key is not None:
         private, public = new_key_pair(new_key)
-        said = f"{private}: keep it to yourself. {public}: give it to those who use your models."
+        message = f"{private}: keep it secret. {public}: give it to the users of your models."
     else:
         assert model is not None and key is not None
-        said = f"{sign_model(model, key)}: written; pass it on with {model.name} and its card."
+        message = f"{sign_model(model, key)}: written; pass it on with {model.name} and its card."
     if not quiet:
-        typer.echo(said)
+        typer.echo(message)

@@ -20,7 +20,7 @@ def simulate(
             help="A mechanism's name, a geometry file, or path/to/file.py:Name.", autocompletion=complete_mechanism
         ),
     ],
-    rows: Annotated[int, typer.Option(help="How many rows.")],
+    rows: Annotated[int, typer.Option(help="Number of rows.")],
     noise: Annotated[
         str, typer.Option(help="Standard deviation of the pose: 1e-5 (SI), 10um, x=1e-5,y=20um or m=10um,rad=30urad.")
     ],
@@ -30,10 +30,10 @@ def simulate(
     ] = None,
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value, over the config.")] = None,
     config: Annotated[Path | None, typer.Option(help="A YAML file with keys as below.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Do not tell what was injected.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Do not print what was injected.")] = False,
 ) -> None:
-    """Simulate the records of a machine that is not as its model says, and tell what was injected.
+    """Simulate the records of a machine that differs from its model by given effects, and print what was injected.
 
     OUT.csv has the commanded joints, the measured pose and the conditions (time, temperature, loads, directions of
     approach; speeds along moves). Effects: geometry, joint_offset, joint_gain, transmission, backlash, friction,
@@ -73,5 +73,5 @@ def simulate(
     if made.injected:
         print_table(injected_table(made), stdout)
     else:
-        say("Nothing was injected: the machine is as its model says.")
+        say("Nothing was injected: the machine equals its model.")
     say_place(f"Written: {out}")

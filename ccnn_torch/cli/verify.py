@@ -20,7 +20,8 @@ def verify(
     mechanism: Annotated[
         str | None,
         typer.Option(
-            help="The machine's name or file, where it is not where the model says.", autocompletion=complete_mechanism
+            help="The machine's name or file; by default the model's.",
+            autocompletion=complete_mechanism,
         ),
     ] = None,
     compensated: Annotated[
@@ -30,14 +31,14 @@ def verify(
         bool, typer.Option("--refit-frames", help="The measuring device was moved since the model was made.")
     ] = False,
     allow_code: Annotated[
-        bool, typer.Option("--allow-code", help="Run the Python file that the model names, of a machine of your own.")
+        bool, typer.Option("--allow-code", help="Run the Python file that the model names as its mechanism.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
 ) -> None:
-    """Judge a model on new measurements: does it keep what its held-out rows promised?
+    """Test a model on new measurements, against the error promised by its held-out rows.
 
-    Without --compensated the rows are of the machine as it is: joints commanded, pose measured. With --compensated
-    the joints are those wanted, the machine was commanded by the model, and the pose should be the nominal one.
+    Without --compensated the rows are of the uncompensated machine: joints commanded, pose measured. With --compensated
+    the joints are the ideal ones, the machine was commanded by the model, and the pose should be the nominal one.
 
     Exit code 0: the promise is kept; 1: the RMS of position or rotation is above its limit at 95 %; 2: bad input.
 

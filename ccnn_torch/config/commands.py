@@ -1,4 +1,4 @@
-"""What the config of each command may hold: by section for people, as JSON Schema for editors."""
+"""The config keys of each command: as a list by section, and as JSON Schema for editors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the keys `records`, `columns` and `split` to rows, and to which of them are held out."""
+"""The rows given by the keys `records` and `columns`, and those that `split` holds out."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from ccnn_torch.records.splits import Column, Split, split_rows
 __all__ = ["Given", "given_records", "held_out_notes", "name_given", "rows_of_test_file", "split_by", "with_test_file"]
 
 Given = Source | Records
-"""Records as Python has them: a DataFrame, several, or loaded ones; they stand in place of the config's file."""
+"""Records given in Python in place of the config's file: a DataFrame, several, or loaded records."""
 
 
 def given_records(records: Any) -> Given | None:
-    """What was given in place of a file's name; None where it is the name of a file, or of several."""
+    """Records given in Python; None if they are the name of a file, or of several."""
     each = records if isinstance(records, list | tuple) else [records]
     return None if records is None or all(isinstance(one, str | Path) for one in each) else records
 
 
 def name_given(given: Given) -> str:
-    """What a config says of records that were given in Python."""
+    """The value of the key `records` in the config for records given in Python."""
     return given.path if isinstance(given, Records) else "DataFrame"
 
 
@@ -79,7 +79,7 @@ def rows_of_test_file(split: HeldOutConfig, parts: Sequence[tuple[str, int]]) ->
 
 
 def held_out_notes(split: HeldOutConfig, rows: int) -> list[str]:
-    """What was held out where it was not drawn. rows: how many."""
+    """A note on the held-out rows if they were not drawn at random. rows: their number."""
     if split.test_file is not None:
         return [f"Held out: all {rows} rows of {Path(split.test_file).name}."]
     if split.kind == "column" and split.by and split.test_values:

@@ -1,4 +1,4 @@
-"""What keys a config may have, and one sentence for all that is wrong in one."""
+"""The keys that a config may have, and one message for all its wrong keys."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ccnn_torch.spelling import nearest
 
 __all__ = ["config_model", "explain", "list_keys"]
 
-# Wrong keys that one sentence names.
+# Maximum number of wrong keys in one message.
 _FEW = 8
 
 # The model of each command's config, by name: they are loaded when asked for, as each of them imports this module.
@@ -34,7 +34,7 @@ _OPTION = {"plan": " --config", "diagnose": " --config"}
 
 
 def config_model(command: str) -> type[BaseModel]:
-    """The model that a command's config is checked by."""
+    """The pydantic model of a command's config."""
     module, _, name = _COMMANDS[command].partition(":")
     model: type[BaseModel] = getattr(import_module(module), name)
     return model
@@ -87,7 +87,7 @@ def explain(error: ValidationError, model: type[BaseModel], file: str, given: Ma
     """One line for all errors, each with its key, what is wrong and what would be right.
 
     Args:
-        error: what pydantic found.
+        error: of pydantic.
         model: the model that was validated.
         file: the config's name.
         given: key -> override, for keys that were set on the command line.
@@ -103,21 +103,21 @@ def explain(error: ValidationError, model: type[BaseModel], file: str, given: Ma
     other = _other_command(file, model)
     if other:
         return f"{file}: this looks like {other}"
-    said: list[str] = []
+    listed: list[str] = []
     for part in parts:
         head, _, keys_there = part.partition("; the keys ")
-        said.append(head if keys_there and any(part.endswith(keys_there) for part in said) else part)
-    return f"{file}: " + "; ".join(said[:_FEW]) + (f"; and {len(said) - _FEW} more" if len(said) > _FEW else "")
+        listed.append(head if keys_there and any(part.endswith(keys_there) for part in listed) else part)
+    return f"{file}: " + "; ".join(listed[:_FEW]) + (f"; and {len(listed) - _FEW} more" if len(listed) > _FEW else "")
 
 
 def _other_command(file: str, model: type[BaseModel]) -> str:
-    """What a file of other keys is: a mechanism, or a config of another command that knows them all; else empty."""
+    """Name what a file with other keys is: a mechanism, or another command's config; empty if neither."""
     if not Path(file).is_file():
         return ""
     there = set(read_yaml(Path(file)))
     if there >= {"convention", "alpha"}:
         return f"the file of an arm, no config; write mechanism={file}"
-    # A single strange key is a slip of the pen rather than another command's file.
+    # A single unknown key is more likely a typing error than another command's file.
     if len(there) < 2 or there <= set(model.model_fields):
         return ""
     names = (name for name in _COMMANDS if there <= set(config_model(name).model_fields))

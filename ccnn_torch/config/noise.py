@@ -1,4 +1,4 @@
-"""Noise of the pose as people write it: one size, or sizes by coordinate or unit, in SI or with a unit."""
+"""Noise of the pose as the user gives it: one size, or sizes by coordinate or unit, in SI or with a unit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Noise = Size | dict[str, Size]
 
 
 def read_noise(text: str) -> Noise:
-    """What stands after `--noise`: `1e-5`, `10um`, or `x=1e-5,y=20um` or `m=10um,rad=30urad`.
+    """Parse the argument of `--noise`: `1e-5`, `10um`, or `x=1e-5,y=20um` or `m=10um,rad=30urad`.
 
     Raises:
         InputError: it is none of these.
@@ -37,9 +37,9 @@ def read_noise(text: str) -> Noise:
 
 
 def noise_of_pose(given: Noise, coordinates: Sequence[Coordinate], key: str = "noise") -> dict[str, float]:
-    """Standard deviation [SI] of the pose coordinates that something is said of.
+    """Standard deviation [SI] of the pose coordinates for which it is given.
 
-    A number without a unit is that of lengths in metres and of angles in radians alike; names may be patterns, or a
+    A number without a unit applies to lengths in metres and to angles in radians; names may be patterns, or a
     unit for all that have it.
 
     Raises:

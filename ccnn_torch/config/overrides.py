@@ -13,13 +13,13 @@ from ccnn_torch.files.yaml_file import check_values, parse_yaml
 
 __all__ = ["apply_overrides", "listed_files", "relate_paths", "resolve_paths"]
 
-# Keys whose value is text however it looks: a path may hold a colon, a name may be 2024.
+# Keys whose value is always text: a path may hold a colon, a name may be 2024.
 _TEXT = ("name", "out", "records", "transfer", "mechanism")
 
-# What a file stands behind in `effects`.
+# Prefix of a file in `effects`.
 _FROM = "from:"
 
-# A share that stands in quotes is no file.
+# A share in quotes is not a file.
 _NUMBER = re.compile(r"[+-]?\d*\.?\d*(e[+-]?\d+)?", re.IGNORECASE)
 
 _PLUGINS = ("methods", "auto.methods", "effects")
@@ -64,7 +64,7 @@ def resolve_paths(tree: dict[str, Any], folder: Path) -> None:
 
 
 def relate_paths(tree: dict[str, Any], folder: Path) -> None:
-    """Make the paths in a tree relative to `folder`, in place: a folder that is moved with its data is still right."""
+    """Make the paths in a tree relative to `folder`, in place: so that a folder can be moved with its data."""
     start = os.path.realpath(folder)
 
     def related(path: str) -> str:

@@ -18,7 +18,7 @@ from ccnn_torch.units import to_si
 __all__ = ["ANGLE_ARM", "Size", "prior_sizes", "size", "sizes_by_name", "sizes_of_pose"]
 
 ANGLE_ARM = 0.3
-"""Distance of the points that orientation is measured by [m]: an angle has the noise of a length over this."""
+"""Distance of the points that determine orientation [m]: the noise of an angle is that of a length over this."""
 
 Size = float | str
 _WITH_UNIT = re.compile(r"(?P<number>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?inf|nan)\s*(?P<unit>.*)", re.IGNORECASE)
@@ -55,7 +55,7 @@ def prior_sizes(given: Mapping[str, Size], geometry: Sequence[Parameter], key: s
     for pattern, value in given.items():
         fits = match_parameters(geometry, [pattern], key.partition(".")[2])
         kinds = list(dict.fromkeys(units[p.name] for p in geometry if p.name in fits))
-        # Every kind that it fits is asked, so that none is passed over that the unit does not suit.
+        # Converted for every unit that the pattern matches, so that no mismatch is missed.
         found[pattern] = max(size(value, unit, f"{key}.{pattern}") for unit in kinds)
     return found
 

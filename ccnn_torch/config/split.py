@@ -1,4 +1,4 @@
-"""The keys that say which rows are held out, of a run and of an identification alike."""
+"""The keys that select the held-out rows of a run or an identification."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class HeldOutConfig(Section):
 
     @property
     def test_file(self) -> str | None:
-        """The file whose rows are held out; None where it is a share or a column that tells."""
+        """The file whose rows are held out; None if a share or a column selects the rows."""
         return self.test if isinstance(self.test, str) else None
 
     @model_validator(mode="after")
@@ -78,6 +78,6 @@ class HeldOutConfig(Section):
 
 
 class SplitConfig(HeldOutConfig):
-    """Which rows are held out, and which choose the model."""
+    """Which rows are held out, and which are for validation."""
 
     validation: float = Field(default=0.2, ge=0, lt=1, description="share of the rest that chooses the model")

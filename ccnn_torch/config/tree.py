@@ -1,4 +1,4 @@
-"""What the configs of runs, identifications, plans and suites share: from a tree of keys to one that is checked."""
+"""Common parts of all configs: read a tree of keys, apply overrides, validate, write."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Config = TypeVar("Config", bound=BaseModel)
 
 
 def _listed(value: Any) -> Any:
-    """A single name, or several with commas as a shell would have them, as a list."""
+    """A name, or several separated by commas, as a list."""
     return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
 
 
@@ -56,11 +56,11 @@ Columns = Annotated[
         '{A1: "q1[deg]", X: "x[mm]", Note: ignore}',
     ),
 ]
-"""What the headers of records mean."""
+"""Headers of records -> names and units."""
 
 
 class Section(BaseModel):
-    """Keys that are all known, with values that do not change and are finite."""
+    """A section of a config: unknown keys are refused, values are finite and immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -74,7 +74,7 @@ def config_from_file(model: type[Config], path: str | Path, overrides: Iterable[
     path = Path(path)
     tree = read_yaml(path)
     tree.setdefault("name", path.stem)
-    # As the system goes up from a folder that is a link, and as `written` counts.
+    # Links are resolved, as the system does for `..` and as `written` does.
     resolve_paths(tree, Path(os.path.realpath(path.parent)))
     given = apply_overrides(tree, overrides, Path.cwd())
     return validated(model, tree, str(path), given)
@@ -109,7 +109,7 @@ def validated(model: type[Config], tree: Mapping[str, Any], source: str, given: 
     """A config from a tree of keys whose paths are absolute.
 
     Args:
-        model: what it is to be.
+        model: class of the config.
         tree: keys and sections.
         source: the config's name, which opens the sentence of an error.
         given: key -> override, for keys that were set on the command line.
@@ -128,8 +128,7 @@ def written(config: BaseModel, folder: Path | None) -> str:
 
     Args:
         config: what to write.
-        folder: where the file will stand; paths are written relative to it, so that both can be moved. Absolute when
-            None.
+        folder: of the file; paths are written relative to it, so that both can be moved. Absolute when None.
     """
     tree = config.model_dump(mode="json")
     if folder is not None:

@@ -302,7 +302,7 @@ def test_the_command_line_writes_safe_rows_and_says_so(copied: Path, tmp_path: P
     for options, what in (((), "command"), (("--sd",), "command"), (("--back",), "ideal")):
         code, _, err = cli("compensate", path, program, out, *options)
         assert code == 2 and len(err.splitlines()) == 1
-        assert "in 2 of 4 rows, the first from line 3 (row 2)" in err and "breaks what its card promises" in err
+        assert "in 2 of 4 rows, the first from line 3 (row 2)" in err and "violates the limits in its card" in err
         table = read_table(out)
         found = np.stack([table.column(f"{what}_q{k}") for k in (1, 2, 3)], -1)
         expected = joints + (1e-5 if what == "ideal" else -1e-5) * np.array([[1.0], [0.0], [0.0], [1.0]])

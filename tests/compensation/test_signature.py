@@ -38,7 +38,7 @@ def test_from_a_new_key_to_a_checked_command(copied: Path, tmp_path: Path, cli: 
     joints = tripod_joints(4).numpy()
     write_table(tmp_path / "in.csv", {f"q{k + 1}[m]": joints[:, k] for k in range(3)})
     code, out, err = cli("sign", "--new-key", "ours")
-    assert (code, err) == (0, "") and "ours.private.pem: keep it to yourself" in out
+    assert (code, err) == (0, "") and "ours.private.pem: keep it secret" in out
     assert stat.S_IMODE((tmp_path / "ours.private.pem").stat().st_mode) == 0o600
     for form in ("safetensors", "onnx"):
         model = copied / f"model.{form}"
