@@ -97,7 +97,7 @@ def test_a_run_on_a_full_disk_says_so_and_goes_on_when_there_is_room(cli: Cli, t
     # Not even the first checkpoint fits.
     with full_disk(6000):
         code, _, told = cli(*words, f"out={tmp_path / 'a'}")
-    assert code == 2 and f"ccnn run --resume {tmp_path / 'a'} goes on" in told and len(told.splitlines()) == 1
+    assert code == 2 and f"ccnn run --resume {tmp_path / 'a'} resumes" in told and len(told.splitlines()) == 1
     assert [p.name for p in (tmp_path / "a").rglob("*") if p.is_file()] == ["config.yaml"]
     # The training fits, what comes after it does not: the figures are shown, and the checkpoint is kept.
     out = tmp_path / "b"
@@ -171,7 +171,7 @@ def test_a_kill_before_the_first_file_stood_is_no_dead_end(tmp_path: Path) -> No
     path.mkdir()
     (path / ".lock").write_text("1")
     (path / ".ccnn-0123.part").write_text("seed: ")
-    with pytest.raises(InputError, match="give the command that began it again"), RunFolder.existing(path):
+    with pytest.raises(InputError, match="repeat the command that started it"), RunFolder.existing(path):
         raise AssertionError
     with RunFolder.fresh(str(path), "name") as folder:
         folder.write("config.yaml", "seed: 0\n")

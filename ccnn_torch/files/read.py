@@ -1,4 +1,4 @@
-"""The one way in which this package reads text files that others made: regular files of a bounded size, in UTF-8."""
+"""Read files from outside: regular files of a bounded size, text in UTF-8."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from ccnn_torch.errors import InputError
 __all__ = ["CONFIG_LIMIT", "parse_json", "read_bytes", "read_text"]
 
 CONFIG_LIMIT = 1_000_000
-"""Largest config or geometry file in bytes. They have some kB, and a parser must not be busy with one for minutes."""
+"""Largest config or geometry file in bytes. Usual ones have some kB; the limit bounds the time of the parser."""
 
 _DEEPEST = 100
 
 
 def read_bytes(path: str | Path, largest: int, remedy: str = "give the path of a file") -> bytes:
-    """The content of a file. What is no file is not opened: a pipe without a writer would be waited for without end.
+    """The content of a regular file. Pipes and devices are not opened: reading a pipe without a writer never ends.
 
     Args:
         path: the file.
         largest: bytes beyond which it is refused.
-        remedy: what to give instead, the end of the sentence where there is no such file.
+        remedy: what to give instead, the end of the error message.
 
     Raises:
         InputError: there is no such file, it is a folder, pipe or device, it cannot be read, or it is too large.
@@ -46,7 +46,7 @@ def read_bytes(path: str | Path, largest: int, remedy: str = "give the path of a
 
 
 def read_text(path: str | Path, largest: int, remedy: str = "give the path of a file") -> str:
-    """As `read_bytes`, decoded; a byte-order mark is passed over, and every line ends in a line feed.
+    """As `read_bytes`, decoded; a byte-order mark is removed, and every line ends in a line feed.
 
     Raises:
         InputError: as `read_bytes`, or it is not UTF-8.
@@ -60,13 +60,13 @@ def read_text(path: str | Path, largest: int, remedy: str = "give the path of a 
 
 
 def parse_json(text: str, where: str) -> Any:
-    """The value of a JSON text; `where` opens the sentence of an error.
+    """The value of a JSON text; `where` begins the error message.
 
     Raises:
         InputError: it is no JSON, holds NaN or infinity, names a key twice, or is nested more than 100 deep.
     """
     depth = deepest = 0
-    # Brackets in texts count as well, which no file of ours has in such numbers.
+    # Brackets in strings count as well; no file of this package has that many.
     for character in text:
         depth += (character in "[{") - (character in "]}")
         deepest = max(deepest, depth)
@@ -86,7 +86,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
-        raise ValueError(f"the key '{next(name for name in names if names.count(name) > 1)}' stands twice")
+        raise ValueError(f"the key '{next(name for name in names if names.count(name) > 1)}' occurs twice")
     return found
 
 

@@ -1,4 +1,4 @@
-"""The one way in which this package writes files: whole or not at all."""
+"""Write files atomically."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def write_whole(path: str | Path, content: bytes | str) -> None:
     """Write a file through a temporary one beside it; a reader sees the old content or the new, never a part.
 
     Its folder is made where it is not there; text is written as UTF-8. A link stays a link, a file keeps its rights,
-    and what is no file at all, like /dev/stdout in a pipe, is written to directly.
+    and a pipe or device, such as /dev/stdout, is written to directly.
 
     Raises:
         WriteError: it cannot be written (disk full, no permission, a folder of that name …); an old file is as it was.
     """
     path = Path(path)
     data = content.encode() if isinstance(content, str) else content
-    with _told(path):
+    with _as_write_error(path):
         kind = _kind(path)
         if kind is not None and stat.S_ISDIR(kind):
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -40,7 +40,7 @@ def write_whole(path: str | Path, content: bytes | str) -> None:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
         target = Path(os.path.realpath(path))
         target.parent.mkdir(parents=True, exist_ok=True)
-        # Its name does not grow with the file's, which may be as long as a name can be.
+        # A name of fixed length: that of the file may already have the maximum length.
         temporary = target.with_name(f"{_PREFIX}{uuid4().hex}{_SUFFIX}")
         try:
             with temporary.open("xb") as stream:
@@ -55,7 +55,7 @@ def write_whole(path: str | Path, content: bytes | str) -> None:
 
 
 def make_folder(path: str | Path) -> None:
-    """Make a folder and those above it, where they are not there.
+    """Make a folder and its parents, if missing.
 
     Raises:
         WriteError: it cannot be made.
@@ -67,13 +67,13 @@ def make_folder(path: str | Path) -> None:
 
 
 def sweep(folder: Path, below: bool = True) -> None:
-    """Remove what a killed process left half written in a folder, and below; nobody else may be writing there."""
+    """Remove the temporary files of a killed process in a folder and below; no other process may be writing there."""
     for leftover in (folder.rglob if below else folder.glob)(f"{_PREFIX}*{_SUFFIX}"):
         leftover.unlink(missing_ok=True)
 
 
 def _kind(path: Path) -> int | None:
-    """The mode of what stands there; None where nothing does."""
+    """The file mode of a path; None if it does not exist."""
     try:
         return path.stat().st_mode
     except FileNotFoundError:
@@ -81,8 +81,8 @@ def _kind(path: Path) -> int | None:
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _as_write_error(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as reason:
-        raise WriteError(f"{path}: cannot be written ({reason.strerror}); what stood there is as it was") from None
+        raise WriteError(f"{path}: cannot be written ({reason.strerror}); the old content is unchanged") from None

@@ -1,7 +1,7 @@
-"""YAML 1.2, so that 1e-4 is a number, `no` a word and a key that stands twice an error.
+"""YAML 1.2, so that 1e-4 is a number, `no` a word and a repeated key an error.
 
-Only its plain part is read: maps, lists and values. Aliases (`*a`, of an anchor `&a`) can refer to themselves or unfold
-to more than any memory holds, and tags (`!!set`) make what no key takes; files for this package need neither.
+Only its plain part is read: maps, lists and values. Aliases (`*a`, of an anchor `&a`) can be recursive or expand beyond
+all memory, and tags (`!!set`) make types that no key takes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """The value that a YAML text stands for; `where` opens the sentence of an error.
+    """The value of a YAML text; `where` begins the error message.
 
     Raises:
         InputError: it is no YAML, or more than its plain part.
@@ -85,7 +85,7 @@ def check_values(tree: Any, where: str) -> None:
     if isinstance(tree, dict):
         strange = [key for key in tree if not isinstance(key, (str, int, float))]
         if strange:
-            raise InputError(f"{where}: {strange[0]!r} stands where a key must be; write `key: value`, the key a word")
+            raise InputError(f"{where}: {strange[0]!r} cannot be a key; write `key: value`, the key a word")
     if isinstance(tree, (dict, list)):
         for value in [*tree, *tree.values()] if isinstance(tree, dict) else tree:
             check_values(value, where)
@@ -94,7 +94,7 @@ def check_values(tree: Any, where: str) -> None:
 def dump_yaml(tree: dict[str, Any]) -> str:
     """YAML text in block style, keys in the order given; `parse_yaml` gives the same tree back."""
     text = _dumped(tree, unicode=True)
-    # The emitter takes NEL for a line break and the parser does not; escaped, both take it for what it is.
+    # The emitter treats NEL as a line break and the parser does not; escaped, both read the same text.
     return _dumped(tree, unicode=False) if "\x85" in text else text
 
 
@@ -103,7 +103,7 @@ def _dumped(tree: dict[str, Any], unicode: bool) -> str:
     yaml.default_flow_style = False
     yaml.allow_unicode = unicode
     setattr(yaml, "sort_base_mapping_type_on_output", False)  # noqa: B010 - ruamel declares its type as None
-    # A list that stands twice is written twice: aliases are not read.
+    # A repeated list is written out twice: aliases are not read.
     yaml.representer.ignore_aliases = lambda _: True
     buffer = io.StringIO()
     yaml.dump(tree, buffer)

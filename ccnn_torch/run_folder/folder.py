@@ -1,4 +1,4 @@
-"""The run folder: where each file of a run stands, and who may write there."""
+"""The run folder: the paths of its files, and its lock."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ __all__ = ["RunFolder", "kept_for"]
 
 @contextmanager
 def kept_for(command: str) -> Iterator[None]:
-    """Where a file cannot be written, say by which command the work goes on once it can."""
+    """If a file cannot be written, add to the error the command that resumes the work."""
     try:
         yield
     except WriteError as problem:
-        raise WriteError(f"{problem}; what was computed is kept, and {command} goes on from there") from None
+        raise WriteError(f"{problem}; what was computed is kept, and {command} resumes from it") from None
 
 
 @dataclass(frozen=True)
@@ -39,17 +39,16 @@ class RunFolder:
     @classmethod
     @contextmanager
     def fresh(cls, out: str | None, name: str, resume: str = "ccnn run --resume") -> Iterator[RunFolder]:
-        """Make the folder `out`, or `runs/NAME-STAMP`, and hold it; `resume` is the command that goes on in a folder.
+        """Make the folder `out`, or `runs/NAME-STAMP`, and lock it; `resume` is the command that resumes a run.
 
-        A folder in which a run was killed before its first file stood is as good as an empty one, and one that stays
-        empty is removed.
+        A folder in which a run was killed before it wrote a file counts as empty. A folder that stays empty is removed.
 
         Raises:
             InputError: the folder holds files already, is in use, or cannot be made.
         """
         path = Path(out) if out else Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
         taken = InputError(
-            f"{path} holds files already; give another folder with out=…, or go on with that run: {resume} {path}"
+            f"{path} holds files already; give another folder with out=…, or resume that run: {resume} {path}"
         )
         if path.exists() and not path.is_dir():
             raise taken
@@ -67,15 +66,15 @@ class RunFolder:
     @classmethod
     @contextmanager
     def existing(cls, path: Path, command: str = "ccnn run") -> Iterator[RunFolder]:
-        """Hold a folder to resume; `command` is the one that made it.
+        """Lock a folder to resume; `command` is the one that made it.
 
         Raises:
             InputError: there is no run in it, or it is in use.
         """
         if not (path / "config.yaml").is_file():
             raise InputError(
-                f"{path} has no config.yaml, so there is nothing to resume; name a folder made by {command}, or, where "
-                "it was stopped before its first file stood, give the command that began it again"
+                f"{path} has no config.yaml, so there is nothing to resume; name a folder made by {command}, or, if "
+                "it was stopped before it wrote a file, repeat the command that started it"
             )
         with locked(path):
             sweep(path)
@@ -91,7 +90,7 @@ class RunFolder:
 
     @property
     def auto(self) -> Path:
-        """What `methods=auto` has decided so far."""
+        """The choices of `methods=auto` so far."""
         return self.path / "auto.json"
 
     @property

@@ -1,4 +1,4 @@
-"""Ctrl-C: one sentence that says what an interrupted command left behind."""
+"""Ctrl-C: one sentence on what an interrupted command left behind."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ NOTHING_WRITTEN = "interrupted; nothing was written"
 
 
 class Stopped(Exception):
-    """A person pressed Ctrl-C; its text is the sentence that they are told."""
+    """Ctrl-C was pressed; its text is the message to print."""
 
 
 @contextmanager

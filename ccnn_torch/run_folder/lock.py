@@ -21,17 +21,17 @@ __all__ = ["LOCK", "locked"]
 
 LOCK = ".lock"
 
-# Far behind the number of the process, which others must be able to read while the byte is locked (Windows).
+# Offset of the locked byte, far beyond the process number, which others must be able to read (Windows).
 _BYTE = 1 << 30
-# What a lock that somebody else holds is told by.
+# Error numbers of a lock that another process holds.
 _HELD = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
-# Some network drives have no locks; a run there is as it was before there were any.
+# Some network drives have no locks; a run there is not locked.
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder, which is made where it is not there.
+    """Lock a folder, which is made if missing.
 
     Raises:
         InputError: another process holds it.
@@ -42,7 +42,7 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        # The name goes before the lock does: who opens the file from now on finds another one.
+        # The file is removed before it is unlocked: a process that opens it from now on makes a new one.
         if sys.platform != "win32":
             (folder / LOCK).unlink(missing_ok=True)
         os.close(held)
@@ -64,7 +64,7 @@ def _taken(folder: Path) -> int:
                     os.write(held, str(os.getpid()).encode())
                 return held
         except FileNotFoundError:
-            pass  # Let go by another process between opening and locking.
+            pass  # Released by another process between opening and locking.
         except OSError as reason:
             if reason.errno in _HELD:
                 number = os.read(held, 20).decode(errors="replace").strip()

@@ -1,4 +1,4 @@
-"""What work in a folder was begun with: its checkpoints hold it, and whoever goes on is held to it."""
+"""The config and data that a run was started with, kept in its checkpoints; it can be resumed with these alone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ccnn_torch.version import __version__
 
 __all__ = ["facts_of", "refuse_changes"]
 
-# The folder may have been moved, and what is written at the end changes no figure.
+# Keys that may differ: the folder may have been moved, and files written at the end change no result.
 _FREE = ("out", "save_models", "save_report")
 _MOST = 3
 
@@ -38,19 +38,18 @@ def refuse_changes(checkpoints: Iterable[Path], facts: Mapping[str, Any], config
         if made.get("version") != facts["version"]:
             raise InputError(
                 f"{path}: was made by ccnn_torch {made.get('version', 'of an unknown version')}, this is "
-                f"{facts['version']}; go on with that version, or start anew in another folder"
+                f"{facts['version']}; resume with that version, or start anew in another folder"
             )
         changed = list(_changed(facts["config"], made.get("config", {}), ""))
         if changed:
             more = f" and {len(changed) - _MOST} more keys differ" if len(changed) > _MOST else ""
             raise InputError(
-                f"{config}: {', '.join(changed[:_MOST])}{more}; put it back as it was to go on, or start anew in "
-                "another folder"
+                f"{config}: {', '.join(changed[:_MOST])}{more}; restore it to resume, or start anew in another folder"
             )
         if "data" in facts and made.get("data") != facts["data"]:
             raise InputError(
-                f"{path}: is of other data than the config's; the records were changed: put them back as they were "
-                "to go on, or start anew in another folder"
+                f"{path}: is of other data than the config's; the records were changed: restore them to resume, or "
+                "start anew in another folder"
             )
 
 
@@ -64,7 +63,7 @@ def _changed(now: Any, then: Any, key: str) -> Iterator[str]:
 
 
 def _place_free(value: Any) -> Any:
-    """A file by its name alone: it may have been moved with the folder, and what it holds has a hash of its own."""
+    """A file by its name alone: it may have been moved with the folder, and its content has a hash of its own."""
     if isinstance(value, dict):
         return {key: _place_free(one) for key, one in value.items()}
     if isinstance(value, list):
