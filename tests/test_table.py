@@ -73,7 +73,7 @@ def test_dialects(tmp_path: Path, text: str) -> None:
         ("q1[rad],x[mm]\n", ("no row",)),
         ("1.0,2.0\n1,2\n", ("line 1 must be the header", "numbers alone")),
         ("[rad],x[mm]\n1,2\n", ("'[rad]' has a unit but no name",)),
-        ("q1[rad],x[mm],q1[rad]\n1,2,3\n", ("column 'q1' stands twice",)),
+        ("q1[rad],x[mm],q1[rad]\n1,2,3\n", ("column 'q1' occurs twice",)),
         ("q1[rad],x[mm]\n1,2\n1,2,3\n", ("line 3 (row 2)", "3 cells", "2 columns")),
         ("q1[rad],x[mm]\n1,2\n\n1\n", ("line 4 (row 2)", "1 cells")),
         ("q1[rad],x[mm]\n1,5,2,5\n", ("line 2 (row 1)", "4 cells", "decimal comma")),
@@ -132,7 +132,7 @@ def test_unreadable_files(tmp_path: Path) -> None:
 
 
 def test_write_refuses_what_could_not_be_read_back(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="column 'x' would stand twice"):
+    with pytest.raises(InputError, match="column 'x' would occur twice"):
         write_table(tmp_path / "t.csv", {"x[mm]": [1.0], "x[m]": [1.0]})
     with pytest.raises(InputError, match="one length"):
         write_table(tmp_path / "t.csv", {"x[mm]": [1.0], "y[mm]": [1.0, 2.0]})

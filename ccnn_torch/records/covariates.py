@@ -17,7 +17,7 @@ from ccnn_torch.units import parse_header, si_unit_of, to_si
 __all__ = ["DEFAULT_COVARIATES", "choose_covariates"]
 
 # A cell so many times farther from the column's median than every other one leaves nothing of the others to learn.
-_GIANT = 1e3
+_EXTREME = 1e3
 # A column that varies by less than this share is constant but for how its numbers were written.
 _SAME = 1e-14
 
@@ -40,7 +40,7 @@ def choose_covariates(
 
     Raises:
         InputError: a wanted column is missing, is a joint or a pose column, or a column has the wrong dimension; one
-            cell dwarfs all others of its column.
+            cell is an extreme outlier of its column.
     """
     taken = {coordinate.name for coordinate in joints} | set(pose)
     free = [name for name in table.names if name not in taken]
@@ -54,12 +54,12 @@ def choose_covariates(
     for name in chosen:
         coordinate = Coordinate(name, _si_unit(name, table, pose))
         values = table.column(name, coordinate.unit)
-        _refuse_lone_giant(values, name, table)
+        _refuse_extreme_cell(values, name, table)
         if np.ptp(values) <= _SAME * max(np.abs(values).max(), 1.0):
             notes.append(f"covariate '{name}' is constant ({table.raw(name)[0]:g} {table.units[name]}) and was dropped")
         else:
             covariates.append(coordinate)
-    # The column that numbers several files is ours, and nobody asked for it.
+    # The column that numbers several files was added by this package.
     ignored = [name for name in free if name not in chosen and not (table.parts and name == FILE)]
     if ignored:
         notes.append(f"ignored columns: {', '.join(ignored)}; name them in covariates to use them as inputs")
@@ -70,14 +70,14 @@ def choose_covariates(
     return tuple(covariates), notes
 
 
-def _refuse_lone_giant(values: NDArray[np.float64], name: str, table: Table) -> None:
-    """Refuse a column of which one cell decides alone: scaled to it, all others are the same."""
+def _refuse_extreme_cell(values: NDArray[np.float64], name: str, table: Table) -> None:
+    """Refuse a column with one extreme outlier: scaled to it, all other cells are nearly equal."""
     if len(values) < 3:
         return
     away = np.abs(values - np.median(values))
     order = np.argsort(away)
     first, second = away[order[-1]], away[order[-2]]
-    if first > _GIANT * second > 0:
+    if first > _EXTREME * second > 0:
         row = int(order[-1])
         raise InputError(
             f"{table.path}: column '{name}' has {table.cell(name, row)} at "

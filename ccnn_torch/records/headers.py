@@ -1,4 +1,4 @@
-"""The header of a table: names and units as they stand in a file, or as a map of columns says."""
+"""The header of a table: names and units as in the file, or as given by a map of columns."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ __all__ = ["IGNORE", "Header", "read_header"]
 # Characters of a name.
 _LONGEST = 100
 IGNORE = "ignore"
-"""What a map of columns says of a column that is to be left out."""
+"""The entry in a map of columns for a column to leave out."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """Names and units of the columns that are kept, and where they stand.
+    """Names, units and positions of the columns that are kept.
 
     Attributes:
         units: unit of each column, by name, in the file's order; empty where it has none.
@@ -37,13 +37,13 @@ def read_header(cells: Sequence[str], file: str, columns: Mapping[str, str] | No
     """Read a header.
 
     Args:
-        cells: as they stand in the file; a cell without text gets the name ``column 3`` or the like.
+        cells: as in the file; a cell without text gets the name ``column 3`` or the like.
         file: the file, for the error.
         columns: header as in the file (or its name alone) -> ``name[unit]``, or ``ignore``. The unit may be left out
             where the file has it.
 
     Raises:
-        InputError: there is no header, a name stands twice, or the map names no column of the file, lacks a unit or
+        InputError: there is no header, a name is repeated, or the map names no column of the file, lacks a unit or
             contradicts the file's.
     """
     if all(_is_number(cell) for cell in cells):
@@ -70,7 +70,7 @@ def read_header(cells: Sequence[str], file: str, columns: Mapping[str, str] | No
                     f"{file}: '{first[name]}' and '{cell.strip()}' would both be the column '{name}'; write "
                     f'columns: {{"{cell.strip()}": {IGNORE}}} for the one that is not meant'
                 )
-            raise InputError(f"{file}: column '{name}' stands twice in the header; remove or rename one of them")
+            raise InputError(f"{file}: column '{name}' occurs twice in the header; remove or rename one of them")
         units[name] = unit
         first[name] = cell.strip()
         kept.append(k)
@@ -78,7 +78,7 @@ def read_header(cells: Sequence[str], file: str, columns: Mapping[str, str] | No
 
 
 def _check_name(name: str, number: int, file: str) -> None:
-    """Refuse what cannot stand on a screen, or would be a formula in the spreadsheet that opens what we write."""
+    """Refuse names that are too long, have control characters, or are formulas to a spreadsheet."""
     wrong = ""
     if len(name) > _LONGEST:
         wrong = f"has {len(name)} characters; is line 1 the header?"
@@ -93,7 +93,7 @@ def _check_name(name: str, number: int, file: str) -> None:
 
 
 def _targets(cells: Sequence[str], file: str, columns: Mapping[str, str]) -> dict[int, str]:
-    """Number of a column -> what the map says of it."""
+    """Number of a column -> its entry in the map."""
     whole = [cell.strip() for cell in cells]
     pairs = [split_header(cell) for cell in cells]
     names = [name for name, _ in pairs]

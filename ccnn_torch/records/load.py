@@ -101,7 +101,7 @@ class Records:
         return self.pose[:, [k for k, coordinate in enumerate(self.pose_coordinates) if coordinate.unit == "m"]]
 
     def name_rows(self, rows: Sequence[int] | NDArray[np.int64]) -> str:
-        """Rows (0-based) as a person finds them in the file, e.g. "line 17 (row 16)"."""
+        """Rows (0-based) by their lines in the file, e.g. "line 17 (row 16)"."""
         return name_lines(self.lines, rows, parts=self.parts)
 
 
@@ -122,15 +122,15 @@ def load_records(
     ([] = none). A constant covariate is dropped with a note. A column that is not used needs no unit.
 
     Args:
-        source: a CSV file or an .xlsx workbook; several of them, whose rows stand one file after the other and whose
+        source: a CSV file or an .xlsx workbook; several of them, whose rows are concatenated and whose
             column `file` numbers them; a pandas DataFrame with headers as in a file; or records that are loaded
             already, which stay as they are.
-        learns: whether a learner is trained on the rows: fewer than a linear fit of the inputs needs, twice, are then
-            refused. How many an identification needs, its number of parameters tells.
+        learns: whether a learner is trained on the rows: fewer than twice the unknowns of a linear fit are then
+            refused. An identification checks their number by its parameters.
         columns: header in the file -> ``name[unit]``, or ``ignore``.
 
     Raises:
-        InputError: a column is missing, stands twice, or has no unit or one of a wrong dimension; a cell is not a
+        InputError: a column is missing, is repeated, or has no unit or one of a wrong dimension; a cell is not a
             finite number; values in rad look like degrees; columns look like an orientation that is not read; files
             differ in their columns; too few rows; no input varies.
     """
@@ -141,7 +141,7 @@ def load_records(
     joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
     pose, coordinates, orientation, read = read_pose(table, mechanism)
     used = {joint.name for joint in mechanism.joints} | set(read)
-    # Of an arm, no other form of the pose may be an input either: no command can know it.
+    # No other form of an arm's pose may be an input either: it is unknown when a command is given.
     measured = dict.fromkeys(read, "") | {coordinate.name: coordinate.unit for coordinate in coordinates}
     chosen, notes = choose_covariates(table, mechanism.joints, measured, covariates)
     unused = [name for name in table.names if name not in used | {c.name for c in chosen}]
@@ -155,7 +155,11 @@ def load_records(
             f"{table.path}: no input varies: {', '.join(still)} are constant and there is no covariate that changes; "
             "record configurations that differ"
         )
-    notes = [*(f"joint '{name}' is constant and tells the learner nothing" for name in still), *notes, *table.notes]
+    notes = [
+        *(f"joint '{name}' is constant and carries no information" for name in still),
+        *notes,
+        *table.notes,
+    ]
     alike = unused_joints(table, mechanism.joints, unused)
     if alike:
         notes.append(

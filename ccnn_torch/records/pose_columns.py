@@ -59,7 +59,7 @@ _JOINT = re.compile(r"(?:q|j|a|e|joint|axis|axe|achse|theta)0*(\d+)")
 
 
 class HasCoordinates(Protocol):
-    """What records need to know of a mechanism."""
+    """Attributes of a mechanism that records need."""
 
     @property
     def name(self) -> str: ...
@@ -109,7 +109,7 @@ def read_pose(
     where = stack_columns(table, position)
     if form == "none":
         return where, position, form, read
-    # Only here: few files give anything but rotation vectors, and the import takes long.
+    # Imported here: few files need it, and the import takes long.
     from scipy.spatial.transform import Rotation
 
     if form == "quaternion":
@@ -132,12 +132,12 @@ def check_joints(table: Table, joints: Sequence[Coordinate]) -> None:
     if missing and all(k + 1 in alike for k, joint in enumerate(joints) if joint in missing):
         pairs = {alike[k + 1]: joint for k, joint in enumerate(joints) if joint in missing}
         usual = {"rad": "deg", "m": "mm"}
-        told = (
+        entries = (
             f'"{table.header(n)}": "{j.name}[{table.units[n] or usual.get(j.unit, j.unit)}]"' for n, j in pairs.items()
         )
         raise InputError(
             f"{table.path}: there is no column '{missing[0].name}'; these look like joints: {_quoted(pairs)}; write "
-            f"columns: {{{', '.join(told)}}} if they are meant, or rename them"
+            f"columns: {{{', '.join(entries)}}} if they are meant, or rename them"
         )
 
 
@@ -164,7 +164,7 @@ def refuse_lost_orientation(table: Table, mechanism: HasCoordinates, unused: Ite
     ignored = ", ".join(f'"{table.header(name)}": ignore' for name in found)
     raise InputError(
         f"{table.path}: columns {', '.join(found)} look like an orientation and would not be used; {say}, or "
-        f"columns: {{{ignored}}} to go by positions alone"
+        f"columns: {{{ignored}}} to use positions alone"
     )
 
 

@@ -1,4 +1,4 @@
-"""Tables as people have them: CSV of every dialect and code page, Excel workbooks, pandas frames."""
+"""Read tables: CSV of every dialect and code page, Excel workbooks, pandas frames."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["Frame", "read_frame", "read_table"]
 
 # Bytes; a million rows of twenty columns. Read, it takes some ten times that in memory.
 _LARGEST_FILE = 500_000_000
-# What a damaged workbook makes openpyxl, zipfile and the XML parser raise.
+# Exceptions of openpyxl, zipfile and the XML parser on a damaged workbook.
 _DAMAGED = (
     *(BadZipFile, EOFError, KeyError, IndexError, ValueError, TypeError, AttributeError, SyntaxError, zlib.error),
     *(RuntimeError, OverflowError),
@@ -33,12 +33,12 @@ _DAMAGED = (
 _WORKBOOKS = (".xlsx", ".xlsm")
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 _DOT_NUMBER = re.compile(r"[+-]?\d*\.\d*([eE][+-]?\d+)?")
-# A row of a spreadsheet, whose line says where a person finds it.
+# A row of a spreadsheet.
 _Cells = Sequence[object]
 
 
 class Frame(Protocol):
-    """What a pandas DataFrame has, and is known by."""
+    """The attributes by which a pandas DataFrame is recognised."""
 
     @property
     def columns(self) -> Iterable[Any]: ...
@@ -49,15 +49,15 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Ta
     """Read a CSV file, or the first sheet of an .xlsx workbook that has a header, with headers ``name[unit]``.
 
     CSV: the separator is a comma, a semicolon or a tab, as the header has it; with the latter two a decimal comma is
-    understood. The text is UTF-8, UTF-16 with a byte-order mark, or else Windows code page 1252, which a note then
-    tells. Blank lines and lines of separators alone (left by spreadsheets) are passed over.
+    understood. The text is UTF-8, UTF-16 with a byte-order mark, or else Windows code page 1252, which is then
+    noted. Blank lines and lines of separators alone (left by spreadsheets) are skipped.
 
     Args:
         path: the file.
         columns: header in the file -> ``name[unit]`` or ``ignore``.
 
     Raises:
-        InputError: the file cannot be read or is empty, a header stands twice, `columns` does not fit it, or a row has
+        InputError: the file cannot be read or is empty, a header is repeated, `columns` does not fit it, or a row has
             another number of cells than the header.
     """
     file = str(path)
@@ -199,7 +199,7 @@ def _read_text(file: str) -> tuple[str, list[str]]:
 
 
 def _has_decimal_commas(rows: Sequence[str], separator: str) -> bool:
-    """Whether commas stand for decimal points: there are some, and no cell is a number with a point."""
+    """Whether commas are decimal separators: there are some, and no cell is a number with a point."""
     if not any("," in row for row in rows):
         return False
     return not any(_DOT_NUMBER.fullmatch(cell.strip(' "')) for row in rows for cell in row.split(separator))
@@ -208,7 +208,7 @@ def _has_decimal_commas(rows: Sequence[str], separator: str) -> bool:
 def _read_cells(
     rows: Iterable[_Cells], header: Header, file: str, lines: NDArray[np.int64], separator: str = ""
 ) -> tuple[NDArray[np.float64], dict[tuple[int, int], str]]:
-    """Numbers cell by cell, and what stands in the cells that are none."""
+    """The cells as numbers, and the text of cells that are none."""
     values = np.full((len(lines), header.width), np.nan)
     bad: dict[tuple[int, int], str] = {}
     for row, cells in enumerate(rows):

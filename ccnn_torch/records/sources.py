@@ -1,4 +1,4 @@
-"""One table from what is given as records: a file, several files, or a pandas frame."""
+"""One table from records in a file, in several files, or in a pandas frame."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ Source = str | Path | Frame | Sequence[str | Path | Frame]
 
 
 def is_frame(source: object) -> bool:
-    """Whether this is a pandas DataFrame or what looks like one."""
+    """Whether this is a pandas DataFrame, or has the same attributes."""
     return hasattr(source, "columns") and hasattr(source, "to_numpy")
 
 
 def read_source(source: Source, columns: Mapping[str, str] | None = None) -> Table:
-    """Read records, whatever they are in.
+    """Read records from any supported source.
 
     Args:
-        source: a file, several files with the same columns, or a pandas DataFrame. Rows of several files stand one file
-            after the other, and a column `file` (0, 1, …) numbers them, unless they have one of that name.
+        source: a file, several files with the same columns, or a pandas DataFrame. Rows of several files are
+            concatenated, and a column `file` (0, 1, …) numbers them, unless they have one of that name.
         columns: header in the file -> ``name[unit]`` or ``ignore``; for each of several files.
 
     Raises:
@@ -62,7 +62,7 @@ def _joined(tables: Sequence[Table]) -> Table:
     }
     units, notes = dict(first.units), [note for table in tables for note in table.notes]
     if FILE in units:
-        notes.append(f"the files have a column '{FILE}' of their own, which was kept; another one numbers no files")
+        notes.append(f"the files have a column '{FILE}' of their own, which was kept; no other numbers the files")
     else:
         units[FILE] = "1"
         number = np.repeat(np.arange(len(tables), dtype=np.float64), [len(table) for table in tables])

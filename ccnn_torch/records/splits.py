@@ -2,7 +2,7 @@
 
 Four kinds, each a function of the rows and one seed:
 
-* ``random``: single rows at random. Rows of one target pose may stand on both sides, which flatters the figures.
+* ``random``: single rows at random. Rows of one target pose may be in both parts, which makes the figures optimistic.
 * ``group``: whole groups at random. `by` is a column or ``position:5mm``, the default: rows whose measured positions
   round to the same cell of 5 mm share a target pose and form a group. Several entries, or a pattern such as ``goal_*``,
   make a group of the rows that are alike in all. A column that is named counts alone: where many groups visit the same
@@ -57,7 +57,7 @@ class Split:
 
     Attributes:
         groups: number of each row's group, `rows` int64; those of a block split ascend along its direction. None =
-            every row stands for itself.
+            every row is a group of its own.
     """
 
     train: Tensor
@@ -81,7 +81,7 @@ def split_rows(
     Of `k` rows (or groups) the first ``int((1 - test) * k)`` of ``numpy.random.default_rng(seed).permutation(k)`` are
     not test rows; of these `k'` the first ``int((1 - validation) * k')`` are for training, the others for validation.
     Groups are numbered as `numpy.unique` sorts their keys. A block split takes the same shares, of rows, along the
-    sorted groups; a group that stands across a border goes to the far side.
+    sorted groups; a group across a border belongs to the far side.
 
     Args:
         positions: `rows x d` [m]; d may be 0 where `by` names columns.
@@ -92,7 +92,7 @@ def split_rows(
             bool (``random`` and ``group``).
         validation: share of the rest, from 0.
         seed: seed of the draw; a block split draws nothing.
-        test_values: values of the column `by` whose rows are held out (``column``), as they stand in `columns`.
+        test_values: values of the column `by` whose rows are held out (``column``), as in `columns`.
 
     Raises:
         InputError: an unknown kind or column, a share out of range, a value that does not occur, or too few rows or
@@ -130,8 +130,8 @@ def fold_splits(split: Split, kind: str, folds: int, seed: int) -> list[Split]:
     """Cross-validation within the rows that are not test rows: every one is a validation row once.
 
     Whole groups are dealt to the folds in a random order; for ``block`` the folds are neighbouring blocks of about
-    equally many rows along the split's direction. Random folds there would choose what interpolates best, and would
-    call an error small that the held-out block, where the model extrapolates, does not keep.
+    equally many rows along the split's direction. Random folds would select the model that interpolates best, and would
+    underestimate its error on the held-out block, where it extrapolates.
 
     Args:
         folds: at least 2.
@@ -192,7 +192,7 @@ def _having(
     """Which rows have one of some values in a column, `rows`."""
     names = [by] if isinstance(by, str) else list(by or [])
     if len(names) != 1:
-        raise InputError("split.by: split.kind=column goes by one column; write e.g. split.by=set")
+        raise InputError("split.by: split.kind=column takes one column; write e.g. split.by=set")
     column = _column(names[0], columns)
     held = np.zeros(len(column), dtype=bool)
     there = ", ".join(f"{value:g}" for value in np.unique(column)[:_FEW])
@@ -238,7 +238,7 @@ def _block(positions: NDArray[np.float64], groups: _Integers, test: float, valid
 
 
 def _first(share: float, count: int) -> int:
-    """Whole number of items in a share, as `int(share * count)`, but 0.8 of 125 is 100 whatever the rounding."""
+    """Whole number of items in a share: `int(share * count)` without rounding errors, so that 0.8 of 125 is 100."""
     return int(share * count + 1e-9)
 
 

@@ -26,7 +26,7 @@ FILE = "file"
 
 @dataclass(frozen=True)
 class Table:
-    """A table as it stands in the file: nothing is converted or judged until a column is asked for.
+    """A table as in the file; a column is converted and checked when it is read.
 
     Attributes:
         path: the file, as given; several with commas between them.
@@ -35,7 +35,7 @@ class Table:
         lines: line of each row in the file, `rows`, int64 (the header is line 1).
         bad_cells: (row, column) -> text of the cells that are empty or no number.
         parts: where rows are from, in order: file and number of its rows; empty for a single file.
-        notes: what a person should know of how the file was read, one sentence each.
+        notes: remarks on how the file was read, one sentence each.
     """
 
     path: str
@@ -69,7 +69,7 @@ class Table:
         return f"{name}[{self.units[name]}]" if self.units[name] else name
 
     def name_rows(self, rows: Sequence[int] | NDArray[np.int64]) -> str:
-        """Rows (0-based) as a person finds them: "line 17 (row 16)", with the file where there are several."""
+        """Rows (0-based) by their lines in the file: "line 17 (row 16)", with the file where there are several."""
         return name_lines(self.lines, rows, parts=self.parts)
 
     def raw(self, name: str) -> NDArray[np.float64]:
@@ -86,7 +86,7 @@ class Table:
 
         Args:
             name: the column.
-            si_unit: the SI unit it must be in, or None for whatever it is; without a unit it is then as written.
+            si_unit: the SI unit it must be in, or None for any; without a unit it is then as written.
 
         Raises:
             InputError: the column is missing (with the nearest name), has no, a wrong or an unknown unit, or a cell
@@ -132,7 +132,7 @@ def name_lines(
     most: int = 5,
     parts: Sequence[tuple[str, int]] = (),
 ) -> str:
-    """Name rows (given 0-based) for a person, at most `most` of them: "line 17 (row 16)".
+    """Text that names rows (given 0-based) by their lines, at most `most` of them: "line 17 (row 16)".
 
     The line is that of the file, whose first line is the header; the row counts the rows below it from 1. With `parts`
     (files and the numbers of their rows) the file is named and the row counts in it: "line 17 (row 16) of day2.csv".
@@ -165,7 +165,7 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
     names = [split_header(header)[0] for header in columns]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise InputError(f"{path}: column '{twice[0]}' would stand twice in the header")
+        raise InputError(f"{path}: column '{twice[0]}' would occur twice in the header")
     arrays = [np.asarray(values, dtype=np.float64) for values in columns.values()]
     if len({array.shape for array in arrays}) != 1 or arrays[0].ndim != 1:
         raise InputError(f"{path}: the columns to write must be one-dimensional and of one length")

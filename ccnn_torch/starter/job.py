@@ -1,4 +1,4 @@
-"""`ccnn new`: a first config for a stranger's records, with what was guessed said beside it."""
+"""`ccnn new`: a first config for records, with comments on what was guessed."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def starter_config(
 
     Args:
         records: the file.
-        out: where the config will stand; paths in it are relative to its folder.
+        out: path of the config; paths in it are relative to its folder.
         mechanism: name or file; guessed where one built-in mechanism has just these columns.
         units: such as `mm,deg`, for columns without a unit.
-        ask: puts a question to a person; None where there is nobody to ask.
+        ask: asks the user a question; None without a terminal.
 
     Raises:
-        InputError: the file cannot be read, has no joints or no pose, or columns lack units and nobody can be asked.
+        InputError: the file cannot be read, has no joints or no pose, or columns lack units and `ask` is None.
     """
     table = read_source(records)
     found = recognise(table)
@@ -79,8 +79,8 @@ def _machine(
         if len(fitting) == 1:
             given, why = fitting[0], "the built-in one with just these joints and this pose"
         elif ask is not None:
-            told = f" (these fit: {', '.join(fitting)})" if fitting else ""
-            given = ask(f"Mechanism: a name, or a file of the arm's geometry (.yaml, .urdf){told}").strip() or None
+            choices = f" (these fit: {', '.join(fitting)})" if fitting else ""
+            given = ask(f"Mechanism: a name, or a file of the arm's geometry (.yaml, .urdf){choices}").strip() or None
     if given is None:
         return None, None, ", ".join(suitable_mechanisms(found, table))
     machine = load_mechanism(given)
@@ -130,21 +130,21 @@ def _mechanism_lines(name: str | None, why: str, out: Path) -> list[str]:
     fitting = f" ({why} would fit)" if why else ""
     return [
         f"# FILL IN the machine{fitting}: a built-in name, or an arm's geometry as a DH file (.yaml) or URDF;",
-        "# docs/how_to/mechanisms.md shows both. `ccnn run` says so until it is there.",
+        "# docs/how_to/mechanisms.md shows both. `ccnn run` refuses this config until it is given.",
         "# mechanism: my_arm.yaml",
     ]
 
 
 def _column_lines(columns: dict[str, str], found: Recognised, table: Table) -> list[str]:
-    """The map of columns, less those that have our name and a unit; a covariate without unit is left out."""
+    """The map of columns, without those that need no entry; a covariate without unit is left out."""
     needed = {table.header(name): target for name, target in columns.items() if table.header(name) != target}
     bare = [name for name in found.unknown if is_covariate(name) and not table.units[name]]
-    told = [f"# Orientation: {text}." for name, text in _ORIENTATION.items() if name in found.pose]
+    lines = [f"# Orientation: {text}." for name, text in _ORIENTATION.items() if name in found.pose]
     if not needed and not bare:
-        return told
+        return lines
     entries = [f"  {_quoted(header)}: {json.dumps(target, ensure_ascii=False)}" for header, target in needed.items()]
     entries += [f'  {_quoted(n)}: ignore   # no unit: write "{n}[unit]" to have it as an input' for n in bare]
-    return [*told, "columns:", *entries]
+    return [*lines, "columns:", *entries]
 
 
 def _other_lines(found: Recognised, table: Table) -> list[str]:

@@ -1,4 +1,4 @@
-"""What the headers of a stranger's table most likely mean: joints, pose, and in which units."""
+"""Guess joints, pose and units from the headers of a table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Recognised", "recognise", "suitable_mechanisms", "unit_pair"]
 
 _JOINT = re.compile(r"(q|j|a|joint|axis|achse|theta)0*(\d+)")
 _POSITION = {"x", "y", "z"}
-# Names as people have them -> ours; together, because a single letter may be anything.
+# Usual names -> names of this package; only as a complete set, because a single letter is ambiguous.
 _TURNS = (
     (("rx", "ry", "rz"), ("rx", "ry", "rz")),
     (("qw", "qx", "qy", "qz"), ("qw", "qx", "qy", "qz")),
@@ -28,7 +28,7 @@ _TURNS = (
     (("a", "b", "c"), EULER_ANGLES["kuka"][0]),
     (("w", "p", "r"), EULER_ANGLES["fanuc"][0]),
 )
-# The two whose number of joints and frames no header tells.
+# Mechanisms whose number of joints or frames does not follow from headers.
 _OPEN = ("serial", "framed")
 
 
@@ -60,7 +60,7 @@ class Recognised:
 
 
 def recognise(table: Table) -> Recognised:
-    """Find joints (q1, J1, A1, joint_1, axis1, …) and pose columns by their names, whatever their case."""
+    """Find joints (q1, J1, A1, joint_1, axis1, …) and pose columns by their names, ignoring case."""
     folded = {name: re.sub(r"[\s_.\-]", "", name).lower() for name in table.names}
     families: dict[str, dict[int, str]] = {}
     for name, plain in folded.items():
@@ -109,7 +109,7 @@ def unit_pair(text: str) -> dict[str, str]:
 
 
 def is_covariate(name: str, patterns: Sequence[str] = DEFAULT_COVARIATES) -> bool:
-    """Whether a run takes a column of this name as an input by itself."""
+    """Whether a run takes a column of this name as an input by default."""
     from fnmatch import fnmatchcase
 
     return any(fnmatchcase(name, pattern) for pattern in patterns)
@@ -135,7 +135,7 @@ def choose_split(positions: np.ndarray[tuple[int, int], np.dtype[np.float64]] | 
 
 
 def _repeats(rows: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> bool:
-    """Whether a fifth of the rows or more stands where another one does, at 10 places or more."""
+    """Whether at least a fifth of the rows repeats the position of another one, at 10 positions or more."""
     distinct = len(np.unique(rows, axis=0))
     return 10 <= distinct <= 0.8 * len(rows)
 

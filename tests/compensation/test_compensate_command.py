@@ -214,7 +214,7 @@ def test_a_file_that_is_no_model_and_an_output_that_would_overwrite(folder: Path
         ("q1[m],q2[m],q3[m],q4[m]", r"column 'q4' is no joint of this model, which was made for tripod \(q1\[m\]"),
         ("q1[rad],q2[m],q3[m]", "must be a length"),
         ("q1,q2[m],q3[m]", "has no unit"),
-        ("q1[m],q2[m],q3[m],q3[m]", "stands twice"),
+        ("q1[m],q2[m],q3[m],q3[m]", "occurs twice"),
     ],
 )
 def test_wrong_tables(folder: Path, tmp_path: Path, header: str, sentence: str) -> None:
