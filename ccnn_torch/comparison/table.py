@@ -103,7 +103,7 @@ def write_runs(path: Path, runs: Mapping[str, Results]) -> None:
 def _marks(runs: Mapping[str, Results]) -> dict[str, str]:
     """A letter for each set of test rows: data, seed and repeats, split, and how many rows are in each part.
 
-    The figures before compensation stand for the split, which `results.json` does not name: they are those of the test
+    The figures before compensation identify the split, which `results.json` does not name: they are those of the test
     rows alone.
     """
     keys: dict[tuple[Any, ...], str] = {}
@@ -116,7 +116,7 @@ def _marks(runs: Mapping[str, Results]) -> dict[str, str]:
 
 
 def _number_key(before: Mapping[str, Any]) -> str:
-    """Figures as a text that is equal where they are to 9 digits: what was summed in another order is the same."""
+    """Figures as text with 9 digits, so that sums in another order compare equal."""
     return " ".join(
         f"{joint} {quantity} {number_text(spread['median'], 9)}"
         for joint, block in before.items()

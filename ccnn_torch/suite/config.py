@@ -23,7 +23,7 @@ __all__ = ["Suite", "SuiteFile", "load_suite"]
 # Keys of the suite itself, where they come from the command line.
 _OWN = ("name", "out")
 
-# Both take longer than many a case, and what a suite is for is the comparison.
+# Both take longer than many cases; a suite is for the comparison.
 _DEFAULTS = {"save_models": False, "save_report": False}
 
 

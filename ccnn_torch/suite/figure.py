@@ -12,7 +12,7 @@ from ccnn_torch.report.figures.style import FLOOR, GREY, SERIES, Plot, styled
 
 __all__ = ["suite_plot"]
 
-# One row's methods stand a little apart, so that intervals do not lie on each other.
+# The methods of a row are offset, so that their intervals do not overlap.
 _SPREAD = 0.62
 
 

@@ -71,7 +71,7 @@ def _run_cases(suite: Suite, quiet: bool) -> Path:
 
 
 def _finish(config: RunConfig, quiet: bool) -> RunFolder:
-    """The finished run of a case: kept as it is, gone on with, or started."""
+    """The finished run of a case: kept, resumed, or started."""
     assert config.out is not None
     folder = RunFolder(Path(config.out))
     if folder.config.is_file():
@@ -96,7 +96,7 @@ def _check_folder(config: RunConfig) -> None:
 
 def _comparable(config: RunConfig) -> dict[str, Any]:
     tree = config.model_dump(mode="json")
-    # The folder may have been moved, and the screen decides nothing.
+    # The folder may have been moved, and screen output changes no result.
     return {key: value for key, value in tree.items() if key != "out"}
 
 

@@ -47,7 +47,7 @@ def compare(
     Args:
         name: of the suite.
         results: content of `results.json` of every case that was run, by name.
-        about: what to tell of each case, by name.
+        about: description of each case, by name.
         failed: sentence of each case that has no results.
     """
     failed = dict(failed)

@@ -13,7 +13,7 @@ from ccnn_torch.report.table import Table, markdown_table, print_table, print_te
 
 __all__ = ["case_line", "print_suite", "suite_markdown", "suite_tables"]
 
-# The learner that the framework is about: its standing has a column of its own where it was run.
+# The learner whose rank is shown in each case, if it was run.
 _WATCHED = "ccnn"
 
 
@@ -95,7 +95,7 @@ def _case_text(case: Mapping[str, Any]) -> str:
 
 
 def _standing(case: Mapping[str, Any]) -> str:
-    """The best method, and where it is another one how the watched one stands beside it."""
+    """The best method and, if it is another one, the comparison of the watched method with it."""
     block = case["methods"].get(_WATCHED)
     if block is None or block["best"]:
         return str(case["best"])
@@ -121,7 +121,7 @@ def _methods_table(comparison: Mapping[str, Any]) -> Table:
 
 def _failures(comparison: Mapping[str, Any]) -> list[str]:
     texts = [f"case '{name}' failed: {sentence}" for name, sentence in comparison["failed"].items()]
-    # A learner that is not there fails alike in every case: said once.
+    # A learner that is not installed fails alike in every case: reported once.
     where: dict[tuple[str, str], list[str]] = {}
     for case in comparison["cases"]:
         for method, sentence in case["failed_methods"].items():

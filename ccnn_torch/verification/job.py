@@ -1,4 +1,4 @@
-"""Judge a model on new rows against what it promised."""
+"""Verify a model on new rows against its promised error."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ccnn_torch.verification.tables import verify_text
 
 __all__ = ["verify_model"]
 
-# A moved measuring frame is suspected where setting it right takes at least half of what is left.
+# A moved measuring frame is suspected if correcting it halves the remaining RMS error at least.
 _SUSPECT = 0.5
 
 
@@ -44,7 +44,7 @@ def verify_model(
     Without `compensated` the joints are commands and the pose is what the uncompensated machine reached: before = its
     distance from the nominal machine's pose, after = from the pose that the model predicts, as `pose` of a run's
     results. With `compensated` the joints are the ideal ones that went through the compensator and the pose should be
-    the nominal one: after = its distance from that, before = what the model says the machine would have missed by.
+    the nominal one: after = its distance from that, before = the pose error without compensation, by the model.
 
     Args:
         records: what `load_records` takes. Headers that the model's records had and its run mapped are mapped alike.
@@ -118,7 +118,7 @@ def _kept(blocks: Mapping[str, dict[str, Any] | None], before: PoseError, after:
 
 
 def _moved(rows: Rows, results: Mapping[str, Any], compensated: bool) -> list[str]:
-    """A sentence where a moved measuring frame explains most of what is left."""
+    """A sentence if a moved measuring frame explains at least half of the remaining error."""
     if results["kept"] or not Motion.fits(rows.mechanism) or results["configurations"] < 4:
         return []
     at = rows.nominal if compensated else rows.predicted

@@ -14,7 +14,7 @@ from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 __all__ = ["Motion", "fit_motion"]
 
-# Of orientation against position [m/rad], as frames of arms are fitted.
+# Weight of orientation against position [m/rad], as in fits of an arm's frames.
 _ROTATION_WEIGHT = 0.3
 _NEEDED = 4
 

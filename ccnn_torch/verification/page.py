@@ -18,7 +18,7 @@ __all__ = ["write_verify_report"]
 
 def write_verify_report(folder: Path, results: Mapping[str, Any], arrays: RunArrays) -> list[Path]:
     """Write `verify.html` and `verify.json` into a folder, which is made."""
-    # Loads matplotlib, which only a report waits for.
+    # Imported here: it loads matplotlib.
     from ccnn_torch.report.figures.errors import joint_error_plot, pose_error_plot
     from ccnn_torch.report.figures.style import inline_svg, save_figure
     from ccnn_torch.verification.figure import pose_rows_plot, predicted_plot

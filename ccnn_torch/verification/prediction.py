@@ -1,4 +1,4 @@
-"""New records beside what a model says of them."""
+"""New records and the predictions of a model for them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from ccnn_torch.verification.moved_frame import Motion
 
 __all__ = ["Rows", "judge", "mapped_columns", "nominal_mechanism", "predict", "pseudoerror_settings"]
 
-# As in a run: of orientation against position [m/rad], and damping of an arm's joint deviation, where no card says it.
+# As in a run, if no card gives it: weight of orientation [m/rad], and damping of an arm's joint deviation.
 _ROTATION_WEIGHT, _ARM_DAMPING = 0.04, 0.01
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Records beside what a model says of them: joints and deviations `s x n`, poses `s x p` [SI]; inside `s`, bool."""
+    """Records and predictions of a model: joints and deviations `s x n`, poses `s x p` [SI]; inside `s`, bool."""
 
     mechanism: Mechanism
     joints: Tensor

@@ -33,7 +33,7 @@ def configurations(joints: Tensor, coordinates: Sequence[Coordinate]) -> Tensor:
 
 
 def promise_block(before: PoseError, after: PoseError, groups: Tensor) -> dict[str, Any] | None:
-    """What stands in a model's card under `metrics`, `promise`; None with fewer than two configurations.
+    """The entry `metrics`, `promise` of a model's card; None with fewer than two configurations.
 
     Args:
         before, after: pose error of the held-out rows, `s`.
@@ -83,7 +83,7 @@ def promised(promise: Mapping[str, Any], kind: str, count: int) -> dict[str, flo
     block = promise.get(kind)
     if block is None:
         return None
-    # Only here: a command that promises nothing need not wait for it.
+    # Imported here: few commands need it.
     from scipy.stats import f
 
     freedom = [2 * n / block["spread"] for n in (count, promise["configurations"])]
