@@ -16,7 +16,7 @@
 | `mask_0`, `mask_1` … | out x in, bool | connections of the network, layer by layer |
 | `weight_0`, `weight_1` … | out x (in + 1) | 1; last column = bias |
 
-Rows stand in the order of the records. `history-METHOD.safetensors` holds the training curves: `step` (t, int64), and
+Rows are in the order of the records. `history-METHOD.safetensors` holds the training curves: `step` (t, int64), and
 every metric as t x r or t x r x k; among them `seconds` (one repeat's share of the time inside the learner, the one
 array that differs from run to run) and, where the learner counts them, `evaluations`.
 """

@@ -51,7 +51,7 @@ def tidy_rows(results: Mapping[str, Any]) -> Iterator[Row]:
         for joint, spread in (block.get("sd") or {}).items():
             yield row(method, "test", "sd", joint, units[joint], spread)
         for name, left in (block.get("pose") or {}).items():
-            # The best method's stands below, beside what there was before.
+            # That of the best method is written below, with the error before compensation.
             if left and method != results.get("best_method"):
                 for measure in ("rms", "max"):
                     yield row(method, "test", f"{name}_{measure}", "", left["unit"], left[measure])

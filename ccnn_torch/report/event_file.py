@@ -16,11 +16,10 @@ _numbers = itertools.count()
 
 
 class EventFile:
-    """One event file, written by the thread that has the numbers.
+    """One event file, written by the calling thread.
 
-    torch's own `SummaryWriter` writes in a thread, whose traceback nobody can catch when the disk is full. Here the
-    file ends with the last record that fitted, `failed` says why, and what comes after it is dropped: curves are there
-    to be looked at, and no run ends for their sake.
+    torch's own `SummaryWriter` writes in a thread of its own, whose exception on a full disk cannot be caught. Here the
+    file ends with the last whole record, `failed` gives the reason, and later records are dropped: the run continues.
     """
 
     def __init__(self, folder: Path, purge_step: int | None = None) -> None:
@@ -28,7 +27,7 @@ class EventFile:
 
         Args:
             folder: made where it is not there.
-            purge_step: tells TensorBoard to forget what older files of this folder hold from this step on.
+            purge_step: TensorBoard ignores the records of older files of this folder from this step on.
         """
         # TensorBoard takes a second to import, which only runs that write curves should pay.
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
@@ -64,7 +63,7 @@ class EventFile:
         self._add(None, step=step, summary=self._summary.text(tag, text))
 
     def flush(self) -> None:
-        """Put what was added into the file, so that TensorBoard sees it."""
+        """Write the added records to the file, so that TensorBoard sees them."""
         content = memoryview(self._pending.getvalue())
         self._pending.seek(0)
         self._pending.truncate()
@@ -73,7 +72,7 @@ class EventFile:
         whole = self._file.tell()
         try:
             while content:
-                # A disk that is filling up takes a part.
+                # A disk that fills up may accept a part.
                 content = content[self._file.write(content) or 0 :]
         except OSError as reason:
             self.failed = reason.strerror

@@ -69,5 +69,5 @@ def render(template: str, **values: Any) -> str:
 
 
 def trusted(figures: Sequence[InlineFigure]) -> list[InlineFigure]:
-    """Figures whose SVG stands on the page as it is: it is our own, everything else on a page is escaped."""
+    """Figures whose SVG is not escaped, since this package made it; everything else on a page is."""
     return [figure._replace(svg=Markup(figure.svg)) for figure in figures]

@@ -1,4 +1,4 @@
-"""JSON files that outsiders rely on: written whole or not at all, never with NaN, and each with a JSON Schema."""
+"""JSON result files: written atomically, without NaN, and each with a JSON Schema."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LARGEST = 500_000_000
 
 
 def plain(value: Any) -> Any:
-    """The same value out of JSON's own types: arrays and tensors become lists, what is not finite becomes None.
+    """The same value in JSON's types: arrays and tensors become lists, numbers that are not finite become None.
 
     Raises:
         TypeError: a value that JSON has no form for.

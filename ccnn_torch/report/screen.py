@@ -1,4 +1,4 @@
-"""The two consoles: results on stdout, progress and notes on stderr, the latter only where a person is looking."""
+"""The two consoles: results on stdout, progress and notes on stderr if it is a terminal."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ __all__ = ["note", "progress_bar", "say", "say_place", "stderr", "stdout", "with
 
 _Result = TypeVar("_Result")
 
-# Nothing that is shown is markup of rich's: a name or a path may have [brackets] in it.
+# Without rich's markup: a name or a path may have [brackets] in it.
 stdout = Console(markup=False, emoji=False)
 stderr = Console(stderr=True, markup=False, emoji=False)
 
 
 def note(text: str, quiet: bool = False) -> None:
-    """A line for the person at the terminal; nothing where stderr is a file or a pipe."""
+    """Print a line on stderr if it is a terminal."""
     if stderr.is_terminal and not quiet:
         print_text(text, stderr, "dim")
 
@@ -30,7 +30,7 @@ def progress_bar(quiet: bool, steps: bool = False, transient: bool = False) -> P
 
     Args:
         quiet: silent on a terminal as well.
-        steps: show `done/total` in the place of percent, and the field `note` of each bar.
+        steps: show `done/total` instead of percent, and the field `note` of each bar.
         transient: remove the bars at the end.
     """
     columns = (
@@ -44,7 +44,7 @@ def progress_bar(quiet: bool, steps: bool = False, transient: bool = False) -> P
 
 
 def with_status(text: str, work: Callable[[Callable[[str], None]], _Result], quiet: bool) -> _Result:
-    """Do work that has no known length; on a terminal `text` is shown, with what the work reports of its progress."""
+    """Do work of unknown length; a terminal shows `text` and the progress that the work reports."""
     if quiet or not stderr.is_terminal:
         return work(lambda progress: None)
     with stderr.status(text) as status:
@@ -52,10 +52,10 @@ def with_status(text: str, work: Callable[[Callable[[str], None]], _Result], qui
 
 
 def say(text: str) -> None:
-    """A result in words on stdout, broken between words where a terminal is narrow."""
+    """Print a result on stdout, wrapped between words at the width of the terminal."""
     print_text(text, stdout)
 
 
 def say_place(text: str) -> None:
-    """A line on stdout with a path, which stays in one piece to be copied."""
+    """Print a line with a path on stdout, without wrapping."""
     print_text(text, stdout, wrap=False)

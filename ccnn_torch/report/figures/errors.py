@@ -87,14 +87,14 @@ def pose_error_plot(arrays: RunArrays) -> Plot:
     if arrays.rotation_before is not None and arrays.rotation_after is not None:
         pairs.append(("rotation error", "rad", arrays.rotation_before, arrays.rotation_after))
     figure = Figure(figsize=(4.6 * len(pairs) + (1.2 if len(pairs) == 1 else 0), 3.5), layout="constrained")
-    told = []
+    medians = []
     for axes, (title, unit, before, after) in zip(figure.subplots(1, len(pairs), squeeze=False)[0], pairs, strict=True):
-        told.append(_draw_distribution(axes, title, unit, before[arrays.test], after[arrays.test]))
+        medians.append(_draw_distribution(axes, title, unit, before[arrays.test], after[arrays.test]))
     return Plot(
         "pose_error",
         figure,
         f"Share of the {count_text(int(arrays.test.sum()), 'held-out row')} whose pose error is at most the value on "
-        f"the axis: {' and '.join(told)}.",
+        f"the axis: {' and '.join(medians)}.",
     )
 
 

@@ -67,7 +67,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Plot:
-    """A picture: its file name without ending, the figure, and one sentence that says what is seen."""
+    """A picture: its file name without ending, the figure, and its caption."""
 
     name: str
     figure: Figure
@@ -75,7 +75,7 @@ class Plot:
 
 
 def styled(function: Callable[P, T]) -> Callable[P, T]:
-    """Run a function under the house style."""
+    """Run a function with the plot style of this package."""
 
     @wraps(function)
     def inner(*args: P.args, **kwargs: P.kwargs) -> T:

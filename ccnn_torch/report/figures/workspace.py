@@ -42,9 +42,9 @@ def workspace_plot(arrays: RunArrays) -> Plot | None:
     shapes = [height_of(place, arrays.axes, plane) for plane in planes]
     figure = Figure(figsize=(9.2, sum(3.6 * shape + 0.85 for shape in shapes)), layout="constrained")
     grid = figure.subplots(len(planes), 2, squeeze=False, height_ratios=shapes)
-    told = draw_pairs(figure, grid, arrays.axes, planes, place, before, after)
+    rms_text = draw_pairs(figure, grid, arrays.axes, planes, place, before, after)
     return Plot(
-        "workspace", figure, f"Position error over the workspace {where}, before and after on one scale: {told}."
+        "workspace", figure, f"Position error over the workspace {where}, before and after on one scale: {rms_text}."
     )
 
 
@@ -72,8 +72,8 @@ def overview_plot(arrays: RunArrays, joint: int | None = None) -> Plot:
     left.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, handletextpad=0.3, columnspacing=1.2)
     caption = f"Error of joint {arrays.joints[joint].name} before and after compensation"
     if planes:
-        told = draw_pairs(figure, grid[:, 1:], arrays.axes, planes, place, before, after)
-        caption += f" (left), and position error over the workspace {where}: {told}"
+        rms_text = draw_pairs(figure, grid[:, 1:], arrays.axes, planes, place, before, after)
+        caption += f" (left), and position error over the workspace {where}: {rms_text}"
     return Plot("overview", figure, caption + ".")
 
 
@@ -113,7 +113,7 @@ def draw_pairs(
     quantity: str = "position error",
     si_unit: str = "m",
 ) -> str:
-    """Fill a grid of `planes` lines and two columns, add the colour bar; returns what is to be seen, in words."""
+    """Fill a grid of `planes` lines and two columns, add the colour bar; returns the RMS values as text."""
     scale, unit = display_unit(si_unit, float(np.median(before)))
     norm = _norm(before / scale, after / scale)
     drawn: Any = None
