@@ -56,7 +56,7 @@ def test_strength_one_is_a_fraction_of_a_millimetre_and_strength_scales(name: st
 def test_a_cause_alone_is_its_part_of_the_mixed_machine() -> None:
     alone, mixed = (machine("tripod", cause).built.causes for cause in ("geometry", "mixed"))
     assert torch.allclose(mixed.geometry, 0.5 * alone.geometry)
-    assert not alone.play.any() and not alone.growth.any() and bool(mixed.play.any())
+    assert not alone.backlash.any() and not alone.growth.any() and bool(mixed.backlash.any())
 
 
 @pytest.mark.parametrize("name", ["tripod", "machine_tool"])
@@ -117,7 +117,7 @@ def test_legs_and_screws_are_in_equilibrium_under_weight_and_load(name: str) -> 
     by_pose, by_drive = torch.func.grad(energy, argnums=(0, 1))(pose, drives)
     # Newtons: the weight alone is 245 N or more.
     assert float(by_pose.abs().max()) < 1e-4
-    assert torch.allclose(built.given_way(-by_drive), drives - found.joints, atol=1e-12)
+    assert torch.allclose(built.deflection(-by_drive), drives - found.joints, atol=1e-12)
     assert float((drives - found.joints).abs().max()) > 1e-5
 
 
@@ -135,7 +135,7 @@ def test_the_arms_gears_hold_its_weight_and_load() -> None:
         return (GRAVITY * height - (built.load[..., :3] * tip).sum(-1)).sum()
 
     torque = -torch.func.grad(potential)(drives)
-    assert torch.allclose(built.given_way(torque), drives - found.joints, atol=1e-13)
+    assert torch.allclose(built.deflection(torque), drives - found.joints, atol=1e-13)
     assert float(torque[..., 1].abs().max()) > 20.0
 
 
@@ -165,10 +165,10 @@ def test_play_lies_against_the_motion_unless_the_load_is_larger() -> None:
     found = machine("arm", "backlash")
     there, back = (replace(found.built, direction=torch.full_like(found.joints, sign)) for sign in (1.0, -1.0))
     gap = back.drives(found.joints, found.pose) - there.drives(found.joints, found.pose)
-    assert bool((gap >= 0).all()) and bool((gap <= 2 * found.built.causes.play + 1e-15).all())
+    assert bool((gap >= 0).all()) and bool((gap <= 2 * found.built.causes.backlash + 1e-15).all())
     # The first axis stands upright, so that its weight does not choose; the second carries the arm.
-    assert float((gap / (2 * found.built.causes.play))[..., 0].min()) > 0.5
-    assert float((gap / (2 * found.built.causes.play))[..., 1].min()) < 0.5
+    assert float((gap / (2 * found.built.causes.backlash))[..., 0].min()) > 0.5
+    assert float((gap / (2 * found.built.causes.backlash))[..., 1].min()) < 0.5
 
 
 def test_a_body_follows_a_step_of_its_surroundings_exponentially() -> None:

@@ -22,7 +22,7 @@ _FORM = re.compile(r"(?P<name>.+?\.py:[^:]+|[^:]+)(?::(?P<rest>.*))?")
 _VALUE = re.compile(r"(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\s\d].*)?")
 SIZE = "size"
 _DRAWN = (0.5, 1.5)
-# A factor beyond this is no machine.
+# Largest plausible factor.
 _LARGEST = 1000.0
 
 
@@ -35,7 +35,7 @@ class Wanted:
 
     @property
     def outlier(self) -> bool:
-        """Whether it stands for bad rows."""
+        """Whether it is the effect of bad rows."""
         return self.name == OUTLIER
 
 
@@ -55,7 +55,7 @@ class Injected:
 
 
 def read_wanted(text: str) -> Wanted:
-    """Take `NAME`, `NAME:parameter=value,…` or `file.py:Name:parameter=value,…` apart.
+    """Parse `NAME`, `NAME:parameter=value,…` or `file.py:Name:parameter=value,…`.
 
     Raises:
         InputError: it is not of that form.
@@ -77,7 +77,7 @@ def act(wanted: Wanted, situation: Situation, generator: torch.Generator) -> Act
 
     Raises:
         InputError: no such effect, one that these rows cannot show, a parameter that it does not have, a value that no
-            machine has, or a user's own effect that breaks what `Effect` says.
+            machine has, or a user's own effect that violates `Effect`.
     """
     if wanted.name not in EFFECTS and nearest(wanted.name, [OUTLIER], 0.8):
         raise InputError(f"effects: '{wanted.name}' is no effect; did you mean '{OUTLIER}'?")

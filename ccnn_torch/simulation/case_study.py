@@ -50,7 +50,7 @@ class Simulation(Protocol):
 
 @dataclass(frozen=True)
 class CaseSimulation:
-    """A case study of paper 000: its noise is the machine's own."""
+    """A case study of paper 000: its noise is scatter of the machine itself."""
 
     case: CaseStudy
     noise: Tensor
@@ -74,7 +74,7 @@ class CaseSimulation:
 
 @dataclass(frozen=True)
 class RealisticSimulation:
-    """A machine as built: it repeats itself, and the noise is the measurement's."""
+    """A machine as built: it repeats exactly, and the noise is that of the measurement."""
 
     machine: RealisticMachine
     noise: Tensor
@@ -93,7 +93,7 @@ class RealisticSimulation:
 def simulate_realistic(
     machine: RealisticMachine, deviations: Callable[[Tensor], Tensor], measured: Tensor
 ) -> RealisticSimulation:
-    """Push the noise of the measurement into the joints by the pseudoerror itself.
+    """Propagate the noise of the measurement to the joints by the pseudoerror.
 
     Args:
         machine: the rows.
@@ -101,6 +101,6 @@ def simulate_realistic(
         measured: those of the measured poses, `r x s x n` [SI].
     """
     true = deviations(machine.reached)
-    # One freedom of the pose after the other: the noise is far below the curvature of the kinematics.
+    # One degree of freedom of the pose at a time: the noise is far below the curvature of the kinematics.
     parts = [(deviations(machine.shifted(i)) - true).square() for i in range(len(machine.sd))]
     return RealisticSimulation(machine, measured - true, torch.stack(parts).sum(0))

@@ -1,8 +1,8 @@
 """The two case studies of paper 000 (section IV): mechanism, poses and the joint errors that are given there.
 
-In the papers' simulations the deviation is given and the ideal joints play the commanded ones: row t of a case is the
-machine standing at pose t and reaching FK(q + error(t)). The constants that the paper leaves out (L, r, the pose grid,
-the platform of case two) are ours and stand here.
+In the papers' simulations the deviation is given and the ideal joints are the commanded ones: in row t of a case the
+ideal pose is pose t, and the machine reaches FK(q + error(t)). The constants that the paper omits (L, r, the pose grid,
+the platform of case two) are chosen here.
 """
 
 from __future__ import annotations

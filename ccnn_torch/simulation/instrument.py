@@ -19,7 +19,7 @@ __all__ = ["Instrument", "PointsView", "make_instrument"]
 
 @dataclass(frozen=True)
 class Instrument:
-    """What is seen of a machine.
+    """What is measured of a machine.
 
     Attributes:
         view: the mechanism with what is measured as its pose, `o` coordinates.
@@ -60,7 +60,7 @@ class PointsView(Mechanism):
 
     def __init__(self, mechanism: Mechanism, points: Tensor) -> None:
         """points: in the platform's frame, `3 x 3` [m]."""
-        # Not a submodule's task: the view only lends the mechanism other pose coordinates.
+        # In a tuple, so that the mechanism is not registered as a submodule.
         self._inner: Any = (mechanism,)
         self._turn = _triad(points)
         self._points = points

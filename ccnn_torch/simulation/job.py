@@ -32,7 +32,7 @@ class Simulated:
         joints: commanded, `s x n` [SI].
         pose: measured, `s x p` [SI].
         covariates: by name, `s` each [SI].
-        injected: what is wrong with the machine.
+        injected: the effects that act on the machine.
         outliers: numbers of the bad rows, from 0.
         gap: root of the mean square of the position's error by all effects, without noise and bad rows [m].
     """
@@ -58,12 +58,12 @@ def simulate_records(
 
     Args:
         mechanism: a name, a file, or a mechanism.
-        effects: each `NAME` or `NAME:parameter=value,…`; none = a machine that is as its model says.
-        rows: how many.
+        effects: each `NAME` or `NAME:parameter=value,…`; none = a machine that equals its model.
+        rows: their number.
         noise: standard deviation of each measured coordinate, in SI or with a unit (`10um`), one for all, or by name or
             unit (others 0).
         config: defaults when None.
-        seed: of everything that is drawn.
+        seed: of all random numbers.
 
     Raises:
         InputError: an unknown effect, parameter or coordinate, an effect that these rows cannot show, values that no
@@ -116,7 +116,7 @@ def _injected(situation: Situation, acting: Acting, nominal: Tensor) -> Injected
     shown = {name: value for name, value in values.items() if value}
     there = list(values.values())
     for shape, value in zip(effect.shapes(situation), acting.shape.tolist(), strict=True):
-        # Of a coefficient that is 0 it changes nothing.
+        # A shape whose coefficients are all 0 has no influence.
         if any(there[k] for k in (range(len(there)) if shape.columns is None else shape.columns)):
             shown[shape.name] = value
     gap = _rms(reached(situation, [acting]) - nominal)

@@ -19,10 +19,10 @@ def bad_rows(
     """Gross errors of a share of the rows.
 
     Returns:
-        Numbers of the rows, ascending; what is added to their frames, `rows x c` [m, rad]; and the parameters.
+        Numbers of the rows, ascending; the displacements of their frames, `rows x c` [m, rad]; and the parameters.
 
     Raises:
-        InputError: a parameter that is not there or has no sense.
+        InputError: a parameter that does not exist or is out of range.
     """
     values = {}
     for name, text in wanted.values.items():

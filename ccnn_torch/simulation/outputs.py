@@ -1,4 +1,4 @@
-"""What is written and shown of simulated records."""
+"""File and table of simulated records."""
 
 from __future__ import annotations
 

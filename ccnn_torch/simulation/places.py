@@ -99,7 +99,7 @@ class Places:
         return usable
 
     def even(self, count: int) -> Tensor:
-        """Places of low discrepancy, `count x .`: a Halton sequence in the box, without what is out of reach."""
+        """Places of low discrepancy, `count x .`: a Halton sequence in the box, without unreachable places."""
         # Only here: scipy.stats takes half a second to load.
         from scipy.stats import qmc
 

@@ -12,7 +12,7 @@ __all__ = ["generator_of", "normal_draws"]
 
 
 def generator_of(*seeds: int) -> torch.Generator:
-    """A generator of its own for each tuple of seeds; numpy's mixing keeps neighbours apart."""
+    """A generator of its own for each tuple of seeds; numpy's hashing makes neighbouring seeds independent."""
     state = np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state >> np.uint64(1)))
 

@@ -68,7 +68,7 @@ class ArmStructure:
         stiffness = torch.tensor([6e5, 6e5, 4e5, 1e5, 1e5, 1e5], dtype=torch.float64)
         self.drive_compliance = 1 / stiffness
         self.drive_growth = torch.zeros(6, dtype=torch.float64)
-        self.play = torch.full((6,), 2e-4, dtype=torch.float64)
+        self.backlash = torch.full((6,), 2e-4, dtype=torch.float64)
         self.wave = torch.tensor([8e-5, 8e-5, 1e-4, 1.5e-4, 1.5e-4, 1.5e-4], dtype=torch.float64)
         self.screw = torch.zeros(6, dtype=torch.bool)
         self.load = torch.tensor([40.0, 40.0, 40.0, 0.0, 0.0, 0.0], dtype=torch.float64)
@@ -78,7 +78,7 @@ class ArmStructure:
         self.travel = torch.stack([joints.amin(0), joints.amax(0)], dim=-1)
         torque = self.forces(joints, self.parameters, pose, torch.zeros(6, dtype=torch.float64))[0]
         rms = torque.square().mean(0).sqrt()
-        # An axis along gravity carries nothing of it, but friction and play have a scale there too.
+        # An axis along gravity carries nothing of it, but friction and backlash have a scale there too.
         self.drive_force = rms.clamp_min(0.1 * float(rms.max()))
 
     def draw(self, count: int, generator: np.random.Generator) -> tuple[Tensor, Tensor]:
@@ -127,5 +127,5 @@ class ArmStructure:
         return torque, torque.new_zeros(*torque.shape[:-1], 0)
 
     def stretched(self, parameters: Tensor, members: Tensor) -> Tensor:
-        """See `Structure`; links are stiff beside gears."""
+        """See `Structure`; links are stiff relative to gears."""
         return parameters

@@ -17,7 +17,7 @@ _ROUNDS = 6
 _STIFFENING = 0.5
 """A drive starts softer by this share and has its stiffness above its typical force: preload, wind-up."""
 _EDGE = 0.5
-"""Width of the change from one flank of the play to the other, in units of the typical force."""
+"""Width of the change from one flank of the backlash to the other, in units of the typical force."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class BuiltMachine:
     def equilibrium(self, command: Tensor, guess: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Where drives, parameters and pose settle under weight and load.
 
-        The force on a drive depends on the pose and the pose on how far the drive gives way: a fixed point, each round
+        The force on a drive depends on the pose and the pose on the drive's deflection: a fixed point, each iteration
         of which solves the closure and takes the forces by the transposed Jacobian.
 
         Returns:
@@ -61,7 +61,7 @@ class BuiltMachine:
         for _ in range(_ROUNDS):
             pose = self.structure.reach(drives, shape, pose)
             force, members = self.structure.forces(drives, shape, pose, self.load)
-            drives = still + self.given_way(force)
+            drives = still + self.deflection(force)
             shape = self.structure.stretched(parameters, members * self.causes.member_compliance)
         return drives, shape, self.structure.reach(drives, shape, pose)
 
@@ -71,27 +71,27 @@ class BuiltMachine:
         return self.structure.parameters + self.causes.geometry + grown
 
     def drives(self, command: Tensor, guess: Tensor) -> Tensor:
-        """Where the drives stand before they give way: periodic error, growth of the screws, play; `r x s x n`."""
+        """Drive positions without deflection: periodic error, thermal growth of the screws, backlash; `r x s x n`."""
         causes = self.causes
         angle = command[..., None] * causes.frequency[:, None] + causes.phase[:, None]
         wave = (causes.amplitude[:, None] * torch.sin(angle)).sum(-1)
         # A screw is held at the low end of its travel.
         grown = causes.drive_growth * self.climate.drives * (command - self.structure.travel[:, 0])
-        return command + wave + grown + self._play(command, guess)
+        return command + wave + grown + self._backlash(command, guess)
 
-    def _play(self, command: Tensor, guess: Tensor) -> Tensor:
-        """Half the play towards the flank that friction and load choose between them, `r x s x n`.
+    def _backlash(self, command: Tensor, guess: Tensor) -> Tensor:
+        """Half the backlash, towards the flank that friction and load determine, `r x s x n`.
 
-        Friction holds the output behind the motion, the load presses it its own way; where the two are about equal it
+        Friction keeps the output behind the motion, the load pushes it in its own direction; where the two balance it
         floats between the flanks.
         """
-        if not bool(self.causes.play.any()):
+        if not bool(self.causes.backlash.any()):
             return torch.zeros_like(command)
         force, _ = self.structure.forces(command, self.structure.parameters, guess, self.load)
         push = force / self.structure.drive_force - self.causes.friction * self.direction
-        return self.causes.play * torch.tanh(push / _EDGE)
+        return self.causes.backlash * torch.tanh(push / _EDGE)
 
-    def given_way(self, force: Tensor) -> Tensor:
+    def deflection(self, force: Tensor) -> Tensor:
         """Displacement of the drives under their forces, `r x s x n` [joint's unit]."""
         typical = self.structure.drive_force
         return self.causes.drive_compliance * (force + _STIFFENING * typical * torch.tanh(force / typical))

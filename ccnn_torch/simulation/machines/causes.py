@@ -1,7 +1,7 @@
-"""What makes a machine miss: geometry, compliance, transmission, heat and play, drawn for each repeat by its seed.
+"""Causes of pose error: geometry, compliance, transmission, heat and backlash, drawn for each repeat by its seed.
 
-A value of strength 1 gives pose errors of about 0.05 to 0.3 mm. Everything is drawn also where its strength is 0, so
-that a machine under one cause is the same machine whatever else acts on it.
+A value of strength 1 gives pose errors of about 0.05 to 0.3 mm. Every cause is drawn even if its strength is 0, so
+that the cause of a machine does not depend on which others act.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Climate:
 
 @dataclass(frozen=True)
 class Causes:
-    """What is wrong with each repeat's machine; a cause that does not act is all zeros.
+    """Errors of each repeat's machine; a cause that does not act is all zeros.
 
     Attributes:
         geometry: errors of the parameters, `r x 1 x k` [SI].
@@ -70,7 +70,7 @@ class Causes:
             [rad]; h harmonics.
         growth: of each parameter, as in `Structure`, `r x k x 3` [SI/K].
         drive_growth: of the drives' travel, `r x 1 x n` [1/K].
-        play: half the play of each drive, `r x 1 x n` [joint's unit].
+        backlash: half the backlash of each drive, `r x 1 x n` [joint's unit].
         friction: force by which friction holds a drive against its flank, in units of its typical force, `r x 1 x n`.
     """
 
@@ -82,7 +82,7 @@ class Causes:
     phase: Tensor
     growth: Tensor
     drive_growth: Tensor
-    play: Tensor
+    backlash: Tensor
     friction: Tensor
 
 
@@ -90,7 +90,7 @@ def draw_causes(structure: Structure, cause: str, strength: float, seeds: list[i
     """The machine of each repeat.
 
     Args:
-        structure: whose parameters are off.
+        structure: its nominal parameters and tolerances.
         cause: one of `CAUSES`; `mixed` has all, each at half the strength.
         strength: 1 = 0.05 to 0.3 mm of pose error.
         seeds: one a repeat.
@@ -105,7 +105,7 @@ def draw_causes(structure: Structure, cause: str, strength: float, seeds: list[i
     amplitude, frequency, phase = _waves(structure, seeds)
     uneven = draw(seeds, _GROWTH, lambda g: np.concatenate([g.uniform(0.5, 1.5, (k, 2)), g.normal(size=(k, 1))], -1))
     screws = draw(seeds, _SCREW_GROWTH, lambda g: g.uniform(0.5, 1.5, (1, n)))
-    play = draw(seeds, _BACKLASH, lambda g: g.uniform(0.5, 1.5, (2, 1, n)))
+    backlash = draw(seeds, _BACKLASH, lambda g: g.uniform(0.5, 1.5, (2, 1, n)))
     return Causes(
         geometry=normal * structure.tolerances * factor("geometry"),
         drive_compliance=give[..., :n] * structure.drive_compliance,
@@ -115,14 +115,14 @@ def draw_causes(structure: Structure, cause: str, strength: float, seeds: list[i
         phase=phase,
         growth=uneven * structure.growth * factor("thermal"),
         drive_growth=screws * structure.drive_growth * factor("thermal"),
-        play=play[:, 0] * structure.play / 2 * factor("backlash"),
-        friction=play[:, 1],
+        backlash=backlash[:, 0] * structure.backlash / 2 * factor("backlash"),
+        friction=backlash[:, 1],
     )
 
 
 def _waves(structure: Structure, seeds: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     """Two harmonics a drive: 3 to 6 and twice as many periods over a screw's travel, 1 to 4 and twice as many per turn
-    of a gear (whole numbers: it comes back to itself)."""
+    of a gear (whole numbers, so that it is periodic)."""
     n = len(structure.wave)
     size = draw(seeds, _WAVE_SIZE, lambda g: g.uniform(0.6, 1.4, (n, 2)))
     rest = draw(seeds, _WAVE_PLACE, lambda g: g.uniform(0.0, 1.0, (n, 3)))
@@ -137,7 +137,7 @@ def _waves(structure: Structure, seeds: list[int]) -> tuple[Tensor, Tensor, Tens
 
 def draw_climate(seeds: list[int], rows: int, drives: int) -> Climate:
     """A working day: the hall drifts by a few kelvin, the structure follows hours or half an hour behind, drives warm
-    up by their own work. Rows stand evenly in it, `rows` of them."""
+    up by their own work. The `rows` rows are evenly spaced in time."""
     grid = np.arange(0.0, SESSION + _GRID, _GRID)
     time = np.linspace(0.0, SESSION, rows)
 

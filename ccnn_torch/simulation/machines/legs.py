@@ -1,8 +1,8 @@
 """Three legs of fixed length on straight guideways, every leg with its own geometry: tripod and machine tool as built.
 
-The closure of leg i is |p + R a_i - f_i - (ρ_i - ρ°) u_i| = l_i: platform joint a_i, foot f_i, direction u_i of the
-guideway, length l_i. The constraints that take the platform's other freedoms away (parallelograms, a passive leg) are
-ideal here: their errors would move the platform in directions that the pose does not have.
+The closure of leg i is |p + R a_i - f_i - (ρ_i - ρ°) u_i| = l_i: platform joint a_i, base joint f_i, direction u_i of
+the guideway, length l_i. The constraints that remove the platform's other degrees of freedom (parallelograms, a passive
+leg) are ideal here: their errors would move the platform in directions that the pose does not have.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from ccnn_torch.simulation.machines.structure import ANGLE_TOLERANCE, EXPANSION,
 
 __all__ = ["LegStructure", "machine_tool_structure", "tripod_structure"]
 
-# Parameters of a leg: foot, platform joint, length, and two small angles by which the guideway is off.
+# Parameters of a leg: base joint, platform joint, length, and two small angles by which the guideway is off.
 _PER_LEG = 9
 _BENDING = 1.5e-5
 """Turn of a guideway per kelvin between surroundings and frame [rad/K]."""
 
 
 class LegStructure:
-    """See `Structure`. Parameters `k` = 27, leg by leg: foot x, y, z, joint x, y, z, length [m], two angles [rad]."""
+    """See `Structure`. Parameters of each leg, `k` = 27: base joint, platform joint, length [m], two angles [rad]."""
 
     def __init__(
         self,
         mechanism: Mechanism,
-        feet: Tensor,
+        base_joints: Tensor,
         joints: Tensor,
         directions: Tensor,
         length: float,
@@ -46,7 +46,8 @@ class LegStructure:
 
         Args:
             mechanism: nominal machine, pose of three coordinates.
-            feet, joints, directions: of the guideways in the base, of the legs on the platform, `3 x 3` [m], [1].
+            base_joints, joints, directions: of the guideways in the base, of the legs on the platform, `3 x 3` [m],
+                [1].
             length: of the legs [m].
             mass: of the platform with its half of the legs [kg].
             centre: of that mass in the platform [m].
@@ -61,11 +62,11 @@ class LegStructure:
         self.across = torch.stack([first, torch.linalg.cross(directions, first)], dim=-2)
         angles = torch.zeros(3, 2, dtype=torch.float64)
         lengths = torch.full((3, 1), length, dtype=torch.float64)
-        self.parameters = torch.cat([feet, joints, lengths, angles], dim=-1).flatten()
+        self.parameters = torch.cat([base_joints, joints, lengths, angles], dim=-1).flatten()
         row = torch.tensor([LENGTH_TOLERANCE] * 7 + [ANGLE_TOLERANCE] * 2, dtype=torch.float64)
         self.tolerances = row.repeat(3)
         self.growth = torch.zeros(3, _PER_LEG, 3, dtype=torch.float64)
-        self.growth[:, 0:3, 0] = EXPANSION * feet
+        self.growth[:, 0:3, 0] = EXPANSION * base_joints
         self.growth[:, 3:6, 1] = EXPANSION * joints
         self.growth[:, 6, 1] = EXPANSION * length
         self.growth[:, 7:9, 2] = _BENDING
@@ -74,7 +75,7 @@ class LegStructure:
         self.leg_compliance = 1 / leg_stiffness
         self.drive_compliance = torch.full((3,), 1 / drive_stiffness, dtype=torch.float64)
         self.drive_growth = torch.full((3,), EXPANSION, dtype=torch.float64)
-        self.play = torch.full((3,), 1.5e-4, dtype=torch.float64)
+        self.backlash = torch.full((3,), 1.5e-4, dtype=torch.float64)
         self.wave = torch.full((3,), 6e-5, dtype=torch.float64)
         self.screw = torch.ones(3, dtype=torch.bool)
         self.load = torch.tensor(load, dtype=torch.float64)
@@ -97,7 +98,7 @@ class LegStructure:
         return gap
 
     def reach(self, drives: Tensor, parameters: Tensor, guess: Tensor) -> Tensor:
-        """See `Structure`; damped Newton from the guess. A row without a solution comes back as NaN."""
+        """See `Structure`; damped Newton from the guess. A row without a solution is NaN."""
         lead = torch.broadcast_shapes(drives.shape[:-1], parameters.shape[:-1])  # type: ignore[no-untyped-call]
         found = levenberg_marquardt(self.closure, guess.expand(*lead, -1), self._slope, (drives, parameters))
         return torch.where((found.cost <= 1e-24)[..., None], found.value, torch.nan)
@@ -155,7 +156,7 @@ def tripod_structure() -> LegStructure:
     out = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
     return LegStructure(
         mechanism,
-        feet=torch.zeros(3, 3, dtype=torch.float64),
+        base_joints=torch.zeros(3, 3, dtype=torch.float64),
         joints=radius * out,
         directions=out,
         length=length,
@@ -176,7 +177,7 @@ def machine_tool_structure() -> LegStructure:
     rise = torch.full_like(alpha, math.sin(gamma))
     return LegStructure(
         mechanism,
-        feet=stack_last(l_b * alpha.cos(), l_b * alpha.sin(), torch.zeros_like(alpha)),
+        base_joints=stack_last(l_b * alpha.cos(), l_b * alpha.sin(), torch.zeros_like(alpha)),
         joints=stack_last(l_e * beta.cos(), l_e * beta.sin(), torch.full_like(beta, z_0)),
         directions=stack_last(-slide * alpha.cos(), -slide * alpha.sin(), rise),
         length=length,

@@ -42,7 +42,7 @@ class RealisticMachine:
         columns: what is recorded beside joints and pose, by coordinate, `r x s` each [SI].
         reached: true poses under these commands, `r x s x p` [SI].
         measured: with the noise of the measurement, `r x s x p` [SI].
-        sd: standard deviation of that noise in each freedom of the pose, `p` [SI].
+        sd: standard deviation of that noise in each degree of freedom of the pose, `p` [SI].
     """
 
     mechanism: Mechanism
@@ -65,7 +65,7 @@ class RealisticMachine:
         return self.mechanism.pose_error(self.built.reach(command, self.pose), self.pose)
 
     def shifted(self, freedom: int) -> Tensor:
-        """True poses, each off by one standard deviation of the noise in one freedom, `r x s x p` [SI]."""
+        """True poses displaced by one standard deviation of the noise in one degree of freedom, `r x s x p` [SI]."""
         step = torch.zeros_like(self.sd)
         step[freedom] = self.sd[freedom]
         return _displaced(self.mechanism, self.reached, step)

@@ -1,4 +1,4 @@
-"""What the simulation needs of a machine's structure: geometry with all its tolerances, statics, and thermal growth."""
+"""Structure of a machine: geometry with all its tolerances, statics, and thermal growth."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Structure(Protocol):
         drive_compliance: displacement of a drive per force on it at strength 1, `n` [joint's unit per N or N·m].
         drive_growth: share by which a drive's travel grows per kelvin, 0 for revolute joints, `n` [1/K].
         drive_force: typical force on a drive, `n` [N or N·m].
-        play: of a drive at strength 1, typical, `n` [joint's unit].
+        backlash: of a drive at strength 1, typical, `n` [joint's unit].
         wave: amplitude of a drive's periodic error at strength 1, typical, `n` [joint's unit].
         screw: whether a drive is a screw, with a travel, rather than a gear, with turns, `n` bool.
         travel: lowest and highest joint in the workspace, `n x 2` [SI].
@@ -45,7 +45,7 @@ class Structure(Protocol):
     drive_compliance: Tensor
     drive_growth: Tensor
     drive_force: Tensor
-    play: Tensor
+    backlash: Tensor
     wave: Tensor
     screw: Tensor
     travel: Tensor
