@@ -22,7 +22,7 @@ __all__ = ["Candidates", "Seen", "common_coordinates", "draw_candidates", "ident
 
 Limits = Mapping[str, tuple[float, float]]
 
-# Candidates drawn and looked at in one call.
+# Candidates drawn and evaluated in one call.
 _AT_ONCE = 20_000
 # Configurations after which progress is shown.
 _TOLD = 4000
@@ -30,7 +30,7 @@ _TOLD = 4000
 _MACHINES = 8
 # Configurations whose forward kinematics are tried on these machines in one call.
 _TRIED = 500
-# Draws after which a mechanism with hardly any candidate is given up.
+# Draws after which the search ends for a mechanism with hardly any candidate.
 _DRAWS = 200
 # Singular values below this share of the largest are no information but rounding.
 _UNSEEN = 1e-9
@@ -38,7 +38,7 @@ _UNSEEN = 1e-9
 
 @dataclass(frozen=True)
 class Candidates:
-    """Configurations to choose from: joints `M x n` and poses `M x p` [SI]; `drawn`: how many were looked at."""
+    """Configurations to choose from: joints `M x n` and poses `M x p` [SI]; `drawn`: how many were drawn."""
 
     joints: Tensor
     pose: Tensor
@@ -80,8 +80,8 @@ def draw_candidates(
     there = drawn = 0
     shown = 0.0
 
-    def tell(share: float) -> None:
-        """Of the draw at hand: as much of it is kept as of those before, for all that is known."""
+    def report(share: float) -> None:
+        """Progress within this draw, if as large a share of it is kept as of those before."""
         nonlocal shown
         kept = there / drawn if there else 1.0
         shown = max(shown, min(1.0, (there + share * kept * min(count, _AT_ONCE)) / count))
@@ -93,12 +93,12 @@ def draw_candidates(
         values = torch.cat([joints, pose], dim=-1)
         good = (torch.isfinite(values) & (values >= bounds[:, 0]) & (values <= bounds[:, 1])).all(-1)
         joints, pose = joints[good], pose[good]
-        # By parts, so that whoever waits sees something move.
+        # In parts, so that progress is shown.
         parts = torch.split(torch.arange(len(joints)), _TOLD)
         condition = torch.empty(len(joints), dtype=torch.float64)
         for number, part in enumerate(parts):
             condition[part] = mechanism.condition_number(joints[part], rotation_weight, guess=pose[part])
-            tell(0.5 * (number + 1) / len(parts))
+            report(0.5 * (number + 1) / len(parts))
         order = condition.argsort(descending=True)
         order = order[condition[order] <= max_condition]
         if others is not None:
@@ -106,7 +106,7 @@ def draw_candidates(
         kept = order.sort().values
         found.append((joints[kept], pose[kept]))
         there, drawn = there + len(kept), drawn + min(count, _AT_ONCE)
-        tell(0.0)
+        report(0.0)
         if there >= count:
             joints, pose = (torch.cat(part)[:count] for part in zip(*found, strict=True))
             return Candidates(joints, pose, drawn)
@@ -127,7 +127,7 @@ def _draw(mechanism: Mechanism, count: int, generator: torch.Generator) -> tuple
 
 
 def _others(mechanism: Mechanism, uncertainty: Tensor | None) -> Tensor | None:
-    """Parameters of machines that are off, `m x 1 x K`."""
+    """Parameters of machines with errors, `m x 1 x K`."""
     if uncertainty is None or mechanism.orientations:
         return None
     draw = torch.rand(_MACHINES, 1, len(uncertainty), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -137,8 +137,8 @@ def _others(mechanism: Mechanism, uncertainty: Tensor | None) -> Tensor | None:
 def _in_reach(mechanism: Mechanism, joints: Tensor, pose: Tensor, order: Tensor, others: Tensor) -> Tensor:
     """Which of the configurations in `order` (worst conditioned first) all the other machines reach, too.
 
-    That a machine has joints for the pose is asked everywhere. That the commanded joints close its loops, too, is asked
-    where it may fail, near singularities of the second kind: from the worst conditioned on, until none fails any more.
+    Whether a machine has joints for the pose is checked everywhere. Whether the commanded joints close its loops is
+    checked near singularities of the second kind only: from the worst conditioned on, until none fails any more.
     """
     order = order[mechanism.reachable(pose[order], others).all(0)]
     kept = []
@@ -167,7 +167,7 @@ def _bounds(mechanism: Mechanism, limits: Limits) -> Tensor:
 
 
 def identification_rows(problem: Problem, progress: Progress | None = None) -> Tensor:
-    """What each row of a problem shows: derivatives of its residual at the start, `s x c x k` [1] (first machine).
+    """Identification rows of a problem: derivatives of its residual at the start, `s x c x k` [1] (first machine).
 
     The residual is in units of its noise and each parameter in its plausible error, so that the rows are numbers.
     """
@@ -188,8 +188,8 @@ def _at(problem: Problem, data: tuple[Tensor, ...]) -> Callable[[Tensor], Tensor
 
 
 class Seen(NamedTuple):
-    """What candidates can tell: numbers of parameters that they tell when the others are held, ascending `k'`, int64;
-    and what is known of the others' combinations, in words."""
+    """The parameters that candidates determine when the others are fixed, by number, ascending `k'`, int64; and the
+    combinations that are not determined, in words."""
 
     kept: Tensor
     left_out: tuple[str, ...]
@@ -198,8 +198,8 @@ class Seen(NamedTuple):
 def what_is_seen(rows: Tensor, prior: Tensor, parameters: Sequence[Parameter], scale: Tensor) -> Seen:
     """Parameters enough to span all that the candidates show, and the combinations that show in none of them.
 
-    Which of the parameters of such a combination is held does not matter to a plan: the determinants of all designs
-    then change by one and the same factor. Those that show best are kept (QR with column pivoting).
+    Which parameter of such a combination is fixed does not matter to a plan: the determinants of all designs then
+    change by the same factor. Those that show best are kept (QR with column pivoting).
 
     Args:
         rows: `M x c x k` [1].
@@ -226,7 +226,7 @@ def what_is_seen(rows: Tensor, prior: Tensor, parameters: Sequence[Parameter], s
 def _factor(rows: Tensor, prior: Tensor) -> Tensor:
     """Triangular R `k x k` with RᵀR the mean information of a candidate and the prior's; `common_coordinates`."""
     flat = rows.flatten(0, 1) / len(rows) ** 0.5
-    # By parts, so that no second copy of all rows is needed.
+    # In parts, so that no second copy of all rows is needed.
     parts = [torch.linalg.qr(part).R for part in torch.split(flat, _AT_ONCE)]
     factor: Tensor = torch.linalg.qr(torch.cat([*parts, torch.diag(prior)])).R
     return factor

@@ -3,7 +3,7 @@
 Sun and Hollerbach ("Active robot calibration algorithm", 2008) add and exchange poses one by one and update the
 determinant and the inverse instead of computing them anew; here a pose has c rows, so that an update is of rank c, and
 the effect of every candidate is known at once. The exchange is that of Cook and Nachtsheim (1980): each chosen pose in
-turn gives way to the best of all candidates, until none can be bettered.
+turn is exchanged for the best of all candidates, until no exchange improves the design.
 
 With information A, V = A⁻¹ and rows J_i of candidate i, W_ij = J_i V J_jᵀ (c x c):
 adding i multiplies det A by det(I + W_ii); exchanging j for i multiplies it by
@@ -26,7 +26,7 @@ __all__ = ["Design", "add_best", "exchange", "make_design", "order_by_worth", "r
 _GAIN = 1e-9
 # Information that the first poses start from where there is no prior, as a share of that of an average pose.
 _RIDGE = 1e-6
-# Sweeps of exchanges; a handful is the rule.
+# Maximum sweeps of exchanges; usually a few are enough.
 _SWEEPS = 50
 
 
@@ -74,7 +74,7 @@ def make_design(rows: Tensor, prior: Tensor | None = None, repeat: bool = False)
 
     Args:
         rows: identification rows of the candidates, `M x c x k` [1].
-        prior: information that is there already, `k x k`; a trace of it in every direction when None.
+        prior: information that is there already, `k x k`; very little in every direction when None.
         repeat: whether a candidate may be chosen more than once.
     """
     across = rows.permute(1, 2, 0).contiguous()
@@ -97,27 +97,27 @@ def add_best(design: Design) -> float:
     return float(gain[best])
 
 
-def exchange(design: Design, tell: Progress | None = None) -> bool:
-    """Exchange chosen poses for better ones until none can be bettered; returns whether it came so far."""
+def exchange(design: Design, progress: Progress | None = None) -> bool:
+    """Exchange chosen poses for better ones; returns whether no further exchange improves the design."""
     for sweep in range(_SWEEPS):
         design.refresh()
         changed = False
         for place in range(len(design.chosen)):
             changed |= _exchange_one(design, place)
-        if tell is not None:
-            tell((sweep + 1) / (sweep + 2))
+        if progress is not None:
+            progress((sweep + 1) / (sweep + 2))
         if not changed:
             return True
     return False
 
 
 def _exchange_one(design: Design, place: int) -> bool:
-    """Give the pose at `place` up for the best candidate, if that gains anything."""
+    """Exchange the pose at `place` for the best candidate, if that is a gain."""
     old = design.chosen[place]
     factor = small_cholesky(design.spread + _unit(design.spread))
     added = _allowed(design, log_determinant(factor))
     # An exchange gains at most what the addition does: only candidates that add more than the best exchange found so
-    # far need to be looked at.
+    # far need to be evaluated.
     first = added.argmax()[None]
     least = max(float(_exchange_gain(design, old, first, factor, added)), _GAIN)
     worth = torch.nonzero(added > least)[:, 0]
@@ -152,20 +152,20 @@ def _exchange_gain(design: Design, old: int, new: Tensor, factor: Tensor, added:
 
 
 def removal_loss(design: Design) -> Tensor:
-    """What giving up each chosen pose takes from the determinant's logarithm, `N`; inf where it is needed."""
+    """Loss of the determinant's logarithm when each chosen pose is removed, `N`; inf if it is needed."""
     own = design.spread[..., design.chosen]
     return -log_determinant(small_cholesky(_unit(own) - own))
 
 
 def order_by_worth(rows: Tensor, prior: Tensor) -> tuple[list[int], int]:
-    """Order poses so that the first ones alone are good, too: the one missed least comes last, and so on.
+    """Order poses so that the first ones alone are good, too: the least informative one comes last, and so on.
 
     Args:
         rows: of the chosen poses, `N x c x k` [1].
         prior: `k x k`; may be 0.
 
     Returns:
-        The order, and how many of the first are needed before every direction is seen.
+        The order, and how many of the first are needed before every direction is observable.
     """
     across = rows.permute(1, 2, 0).contiguous()
     k = across.shape[1]

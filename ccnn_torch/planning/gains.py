@@ -12,13 +12,13 @@ from ccnn_torch.planning.observability import Observability, observability
 
 __all__ = ["Gains", "gains_of", "recommended_count"]
 
-# So many poses in a row must give little before the search for more ends: single gains jump.
+# Successive poses of small gain before the search for more ends: single gains scatter.
 _WINDOW = 3
 
 
 @dataclass(frozen=True)
 class Gains:
-    """What the first so many poses of a plan show; `t` counts.
+    """Figures of the first n poses of a plan, for `t` values of n.
 
     Attributes:
         count: number of poses, `t`, int64.
@@ -45,7 +45,7 @@ def gains_of(rows: Tensor, first: int, scale: Tensor, prior_sd: Tensor) -> Gains
 
     Args:
         rows: of the poses in order, `N x c x k` [1], in plausible errors.
-        first: the least number of poses that see every direction.
+        first: the least number of poses that make every direction observable.
         scale: plausible errors, `k` [SI].
         prior_sd: standard deviations of the prior, `k` [SI], inf where there is none.
     """

@@ -30,12 +30,12 @@ def make_plan(
 
     Args:
         mechanism: a name, a file, or a mechanism.
-        poses: how many; with `per_leg` for each leg.
+        poses: their number; with `per_leg` for each leg.
         config: defaults when None.
         progress: called with the share that is done.
 
     Raises:
-        InputError: as `load_mechanism` and `plan_poses`; a size that is none, or of something unknown.
+        InputError: as `load_mechanism` and `plan_poses`; a size that is invalid, or of an unknown name.
     """
     config = config or PlanConfig()
     if poses < 1:
@@ -75,7 +75,7 @@ def write_plan(path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: 
     """Write the poses as CSV, and beside it a page (.md) with its picture (.png, .svg).
 
     The CSV has a row for each pose: `leg[1]` where each leg has its own, the joints to command, and the pose at which
-    they bring the nominal machine; rows stand in the order of their worth.
+    they bring the nominal machine; the most informative rows come first.
 
     Returns:
         The files.

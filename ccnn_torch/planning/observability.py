@@ -18,8 +18,8 @@ INDICES = ("O1", "O2", "O3", "O4", "O5")
 class Observability:
     """Indices of an identification matrix with singular values σ1 ≥ … ≥ σk; each `...`, larger is better.
 
-    They are 0 where a direction cannot be seen. O1 with any divisor prefers the same poses, whatever the parameters'
-    units are; the others depend on the units. Sun and Hollerbach (2008) compare all five.
+    They are 0 where a direction is unobservable. The ranking of poses by O1, with any divisor, does not depend on the
+    parameters' units; that by the others does. Sun and Hollerbach (2008) compare all five.
 
     Attributes:
         o1: (σ1 ⋯ σk)^(1/k) / √poses (Borm and Menq 1991).

@@ -18,23 +18,23 @@ _GAIN = 1e-7
 
 
 def exchange_by_index(
-    rows: Tensor, chosen: list[int], prior: Tensor, index: str, repeat: bool = False, tell: Progress | None = None
+    rows: Tensor, chosen: list[int], prior: Tensor, index: str, repeat: bool = False, progress: Progress | None = None
 ) -> tuple[list[int], bool]:
-    """Better a design by exchanging its poses one after the other until the index gains no more.
+    """Improve a design by exchanging its poses one by one, until the index grows no more.
 
-    These indices know no cheap update: the derivative of the index by the information says which candidates are worth
-    the eigenvalues of the information with them.
+    These indices have no cheap update: the derivative of the index by the information selects the candidates for which
+    the index is computed in full.
 
     Args:
         rows: of the candidates, `M x c x k` [1], in the units that the index is meant in.
-        chosen: a design that sees every direction, for example the one of largest O1.
+        chosen: a design in which every direction is observable, for example the one of largest O1.
         prior: information without any pose, `k x k`.
         index: `O2` … `O5`.
         repeat: whether a candidate may be chosen more than once.
-        tell: called with the share that is done.
+        progress: called with the share that is done.
 
     Returns:
-        The design, and whether no exchange betters it.
+        The design, and whether no exchange improves it.
     """
     chosen = list(chosen)
     information = prior + _information(rows[chosen]).sum(0)
@@ -55,8 +55,8 @@ def exchange_by_index(
             free[chosen[place]] = repeat
             information = prior + _information(rows[chosen]).sum(0)
             changed = True
-        if tell is not None:
-            tell((sweep + 1) / (sweep + 2))
+        if progress is not None:
+            progress((sweep + 1) / (sweep + 2))
         if not changed:
             return chosen, True
     return chosen, False

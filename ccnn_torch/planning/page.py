@@ -12,7 +12,7 @@ __all__ = ["gain_table", "left_out_sentence", "parameter_table", "plan_markdown"
 
 
 def plan_sentence(plan: Plan, least_gain: float) -> str:
-    """What a plan gives against random poses, and how many poses are recommended."""
+    """The gain of a plan over random poses, and the recommended number of poses."""
     count = len(plan.pose)
     subject = f"leg {plan.leg}" if plan.leg is not None else count_text(len(plan.parameters), "parameter")
     against = plan.o1 / plan.choice.random_o1 if plan.choice.random_o1 > 0 else float("inf")
@@ -22,14 +22,14 @@ def plan_sentence(plan: Plan, least_gain: float) -> str:
     percent = f"{100 * least_gain:g} %"
     recommended = plan.choice.recommended
     if recommended is None:
-        return f"{text}. Even the last pose looked at still gives more than {percent}: plan more."
+        return f"{text}. Even the last pose evaluated still gives more than {percent}: plan more."
     if recommended > count:
         return f"{text}. Up to {recommended} poses each further one still gives more than {percent}."
     return f"{text}. After {recommended} poses a further one gives less than {percent}."
 
 
 def left_out_sentence(plan: Plan) -> str:
-    """What no pose determines, and that the plan is for the rest; empty where every parameter shows."""
+    """The combinations that no pose determines; empty if every parameter is determined."""
     if not plan.choice.left_out:
         return ""
     subject = f"Of leg {plan.leg} no" if plan.leg is not None else "No"
@@ -40,7 +40,7 @@ def left_out_sentence(plan: Plan) -> str:
 
 
 def gain_table(plan: Plan, short: bool = False) -> Table:
-    """What the first so many poses show, and how much the last of them gave.
+    """Figures of the first n poses, and the gain of the last of them.
 
     Args:
         plan: one plan.
@@ -99,14 +99,14 @@ def plan_markdown(mechanism: str, plans: Sequence[Plan], least_gain: float, pict
         plans: one, or one a leg.
         least_gain: what a further pose must give, a share.
         picture: file name of the picture beside the page.
-        caption: what is seen there.
+        caption: of the picture.
     """
     first = plans[0]
     parts = [
         f"# Poses to measure: {mechanism}",
         f"Chosen from {first.candidates} configurations ({first.drawn} drawn; the others are outside the limits or too "
-        f"near to a singularity) so that {first.index} is largest. The rows stand in the order of their worth: the "
-        "first ones alone are good, too.",
+        f"near to a singularity) so that {first.index} is largest. The most informative rows come first: these "
+        "alone are good, too.",
         *(plan_sentence(plan, least_gain) for plan in plans),
         *filter(None, map(left_out_sentence, plans)),
         f"![{caption}]({picture})\n\n{caption}",

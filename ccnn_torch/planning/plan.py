@@ -37,7 +37,7 @@ from ccnn_torch.spelling import nearest
 
 __all__ = ["Choice", "Plan", "choose_poses", "plan_poses"]
 
-# Draws of random poses that a plan is held against; odd, for the median.
+# Draws of random poses that a plan is compared with; odd, for the median.
 _RANDOM = 101
 # Candidates shown in pictures.
 _AROUND = 2000
@@ -55,11 +55,11 @@ class Choice:
         recommended: the number of poses after which a further one gives little; None where even the last gives more.
         bound: share of the best possible det^(1/k) of the information that is reached at least; None for an index other
             than O1 and where there is a prior.
-        settled: whether no exchange of a pose betters the index.
+        settled: whether no exchange of a pose improves the index.
         random_o1: O1 of as many candidates drawn at random, the median of 101 draws.
         random_sd: standard deviation of each parameter with them, likewise, `k` [SI].
         kept: numbers of the parameters that are planned for, `k` of the problem's; all where every one shows.
-        left_out: what no candidate shows, in words: of each group of parameters the combinations that are seen.
+        left_out: groups of parameters that no candidate determines alone, with the combinations that are determined.
     """
 
     chosen: Tensor
@@ -75,15 +75,15 @@ class Choice:
 
 @dataclass(frozen=True)
 class Plan:
-    """Poses to measure, in the order of their worth.
+    """Poses to measure, the most informative ones first.
 
     Attributes:
         leg: whose parameters they are for; None for all.
-        parameters: what the poses are planned for, `k`: without those that are held since no pose determines them.
+        parameters: the parameters to identify, `k`, without those that are fixed because no pose determines them.
         scale: their plausible errors, `k` [SI].
         joints: commands for the machine, `N x n` [SI].
         pose: where they bring the nominal machine, `N x p` [SI].
-        index: what was made largest.
+        index: the index that was maximised.
         choice: the choice and its figures.
         candidates: how many configurations there were to choose from.
         drawn: how many were drawn to find them.
@@ -123,9 +123,9 @@ def choose_poses(
 ) -> Choice:
     """Choose rows of a problem (its first machine) so that an observability index of the parameters is largest.
 
-    Any problem will do, so poses are planned for constraints as well as for measured poses. Where a combination of
-    parameters shows in no candidate one of them is held, and the plan is for the others (`Choice.kept`): all that the
-    rows can tell. Figures have those `k` parameters.
+    Any problem can be given, so that poses are planned for constraints as well as for measured poses. If no candidate
+    determines a combination of parameters, one of them is fixed, and the plan is for the others (`Choice.kept`).
+    Figures have those `k` parameters.
 
     Args:
         problem: a row for every candidate.
@@ -141,8 +141,8 @@ def choose_poses(
     if index not in INDICES:
         near = nearest(index, INDICES)
         raise InputError(f"index: must be one of {', '.join(INDICES)}, not '{index}'" + (f"; {near}?" if near else ""))
-    tell = progress or (lambda _: None)
-    rows = identification_rows(problem, _share(tell, 0.0, 0.15))
+    report = progress or (lambda _: None)
+    rows = identification_rows(problem, _share(report, 0.0, 0.15))
     held = torch.where(torch.isfinite(problem.prior_sd), problem.scale / problem.prior_sd, 0.0)
     seen = what_is_seen(rows, held, problem.parameters, problem.scale)
     rows, held = rows[..., seen.kept], held[seen.kept]
@@ -155,14 +155,14 @@ def choose_poses(
     design_share = 0.4 if index != "O1" else 0.8
     for step in range(count):
         add_best(design)
-        tell(0.15 + 0.05 * (step + 1) / count)
+        report(0.15 + 0.05 * (step + 1) / count)
     design.prior = prior
-    settled = exchange(design, _share(tell, 0.2, design_share))
+    settled = exchange(design, _share(report, 0.2, design_share))
     bound = None if bool((held > 0).any()) or index != "O1" else tightest_bound(design)
     chosen = design.chosen
     if index != "O1":
         known_already = torch.diag(held.square())
-        chosen, settled = exchange_by_index(rows, chosen, known_already, index, repeat, _share(tell, 0.6, 0.4))
+        chosen, settled = exchange_by_index(rows, chosen, known_already, index, repeat, _share(report, 0.6, 0.4))
     order, first = order_by_worth(rows[chosen] @ turn, prior)
     chosen = [chosen[place] for place in order]
 
@@ -174,7 +174,7 @@ def choose_poses(
     for _ in range(min(max(6, count // 2), len(rows) - count if not repeat else count)):
         add_best(design)
     gains = gains_of(rows[design.chosen], first, scale, prior_sd)
-    tell(1.0)
+    report(1.0)
     recommended = recommended_count(gains, least_gain)
     random_o1, random_sd = _random(rows, count, scale, prior_sd)
     return Choice(
@@ -209,7 +209,7 @@ def plan_poses(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[Plan]:
-    """Active calibration: the poses that show a mechanism's parameters best.
+    """Active calibration: the poses that best identify a mechanism's parameters.
 
     Args:
         mechanism: with its nominal parameters.
@@ -233,7 +233,7 @@ def plan_poses(
     Raises:
         InputError: as `draw_candidates`, `choose_poses` and `inverse_problem`.
     """
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     selection = select_parameters(mechanism.geometry, choice, mechanism.nominal)
     found = draw_candidates(
         mechanism,
@@ -243,7 +243,7 @@ def plan_poses(
         max_condition=max_condition,
         rotation_weight=rotation_weight,
         uncertainty=margin * selection.scale @ selection.spread,
-        progress=_share(tell, 0.0, 0.4),
+        progress=_share(report, 0.0, 0.4),
     )
     if pose_noise is None and joint_noise is None:
         pose_noise = [_NOISE.get(c.unit, 1e-5) for c in mechanism.pose]
@@ -257,7 +257,7 @@ def plan_poses(
             index=index,
             repeat=repeat,
             least_gain=least_gain,
-            progress=_share(tell, 0.4 + 0.6 * number / len(parts), 0.6 / len(parts)),
+            progress=_share(report, 0.4 + 0.6 * number / len(parts), 0.6 / len(parts)),
         )
         joints, pose = found.joints[chosen.chosen], found.pose[chosen.chosen]
         leg = part.channels[0].leg if per_leg else None
@@ -269,8 +269,8 @@ def plan_poses(
     return plans
 
 
-def _share(tell: Progress, begin: float, width: float) -> Progress:
-    return lambda done: tell(begin + width * done)
+def _share(report: Progress, begin: float, width: float) -> Progress:
+    return lambda done: report(begin + width * done)
 
 
 def _problem(

@@ -1,4 +1,4 @@
-"""Cholesky factors of a great many small matrices, one number of all of them side by side.
+"""Cholesky factors of a great many small matrices, stored entry by entry.
 
 `torch.linalg` takes matrices one by one; here a factor of up to 6 x 6 for each of 1e5 candidates is a few dozen vector
 operations.
