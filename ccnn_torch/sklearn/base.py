@@ -1,4 +1,4 @@
-"""What the estimators share: checks of the data, scaling, training by the one trainer, prediction."""
+"""Base class of the estimators: checks of the data, scaling, training, prediction."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _Floats = NDArray[np.float64]
 
 
 class _Choice(NamedTuple):
-    """What rows held out of a first training tell.
+    """Results on rows held out of a first training.
 
     Attributes:
         steps: of lowest error on them, `1` int64.
@@ -42,7 +42,7 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     """A learner as a scikit-learn regressor; a subclass names the learner and has its settings as parameters.
 
     Rows that are alike in X and y are one row of their summed weights, and rows are sorted before training. So a
-    weight of 2 is exactly the same as a row that stands twice, the order of rows changes nothing, and no copy of a
+    weight of 2 is exactly the same as a repeated row, the order of rows changes nothing, and no copy of a
     training row is ever held out for validation.
     """
 
@@ -125,7 +125,7 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     def _choose(
         self, inputs: _Floats, targets: _Floats, weights: _Floats, seed: int, generator: np.random.RandomState
     ) -> _Choice | None:
-        """Hold rows out of a first training; None where that is not asked for."""
+        """Hold rows out of a first training; None without early stopping."""
         return None
 
     def _sd(self, features: Tensor) -> Tensor:
@@ -135,10 +135,10 @@ class LearnerRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         return variance.sqrt() * self.scaling_.deviation
 
     def _sd_scale(self, choice: _Choice) -> _Floats:
-        """What makes intervals of the model as wide as held-out residuals are.
+        """Factor that makes intervals of the model as wide as held-out residuals.
 
-        These are set against the standard deviation of the model that is kept, not of the one that left them: how sure
-        the two are can differ by half, while their errors hardly differ.
+        The residuals are divided by the standard deviation of the final model, not of the first one: the standard
+        deviations of the two can differ by half, while their errors hardly differ.
         """
         sd = self._sd(self.scaling_.features(_tensor(choice.inputs)))
         return sd_scale(choice.residuals[None], sd[None], torch.ones(1, len(sd), dtype=sd.dtype))[0].numpy()

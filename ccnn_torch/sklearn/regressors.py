@@ -183,7 +183,7 @@ class ENNRegressor(SteppedRegressor):
         bias: whether nodes have a bias.
         periodic: inputs that are angles in rad, by index or by name, to be fed as sine and cosine.
         early_stopping: hold rows out, find the step of the lowest error on them and how wide intervals must be to cover
-            them, then train on all rows for so long; nothing else holds noise back here.
+            them, then train on all rows for so long; there is no other regularisation.
         validation_fraction: share of the rows that are then held out.
         n_iter_no_change: steps without improvement after which that search ends; None = go to the end.
         random_state: seed, or a RandomState to draw it from; None = draw it from NumPy's global generator.
@@ -244,7 +244,7 @@ class GRNNRegressor(LearnerRegressor):
     Args:
         iterations: steps of the search at most; it ends earlier once its moves are small.
         candidates: bandwidth vectors judged in one step.
-        narrowest, widest: range of bandwidths that the first step looks at; inputs are scaled to -1 .. 1.
+        narrowest, widest: range of bandwidths that the first step searches; inputs are scaled to -1 .. 1.
         queries: rows that leave-one-out judges, drawn where there are more.
         references: rows that they are predicted from, drawn where there are more.
         periodic: inputs that are angles in rad, by index or by name, to be fed as sine and cosine.
@@ -256,7 +256,7 @@ class GRNNRegressor(LearnerRegressor):
         sd_scale_: 1 for every output.
         n_iter_: steps of the search.
         loss_curve_: mean squared standardised error on the training rows after each of them.
-        converged_: whether the search ended by itself.
+        converged_: whether the search met its own criterion.
         n_features_in_, feature_names_in_: as in scikit-learn.
     """
 

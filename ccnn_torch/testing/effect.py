@@ -23,7 +23,7 @@ _ROWS = 8
 # Differences of `reached` over this share of a plausible size, and how well they fit what is to be linear [1].
 _SHARE, _SLOPE_TOLERANCE = 1e-3, 1e-4
 _SAME, _ABSENT = 1e-9, 1e-12
-# Differences of nearly singular configurations say nothing about the derivative.
+# Near singular configurations, differences do not approximate the derivative.
 _REGULAR = 200.0
 
 
@@ -31,9 +31,9 @@ def check_effect(effect: str | Callable[[], Effect], mechanism: Mechanism | str 
     """Check names and units, absence at 0, first order against `reached`, batch shapes, and that all is finite.
 
     Args:
-        effect: a name, `path/to/file.py:Name`, or what makes it.
+        effect: a name, `path/to/file.py:Name`, or a factory.
         mechanism: a mechanism on which the effect has all that it needs, or its name.
-        seed: of the rows that are tried.
+        seed: of the test rows.
 
     Raises:
         AssertionError: one sentence that says what is wrong; with the line where the effect's code raised.
@@ -50,7 +50,7 @@ def check_effect(effect: str | Callable[[], Effect], mechanism: Mechanism | str 
 
 
 def _made(effect: str | Callable[[], Effect]) -> OwnEffect:
-    """With every call checked, the library's own effects as well."""
+    """The effect with every call checked, also if it is one of the library."""
     made = make_effect(effect) if isinstance(effect, str) else owned(effect())
     return made if isinstance(made, OwnEffect) else OwnEffect(made, label_of(made))
 
@@ -91,7 +91,7 @@ def _shape(effect: Effect, situation: Situation) -> Tensor:
 
 
 def _check_needs(effect: Effect, situation: Situation) -> None:
-    """`missing` tells the truth: without complaint the effect works with the columns there are."""
+    """`missing` is right: if it returns no text, the effect works with the given columns."""
     if effect.missing(situation.mechanism, []):
         return
     alone = replace(situation, covariates={})
@@ -107,7 +107,7 @@ def _check_needs(effect: Effect, situation: Situation) -> None:
 
 
 def _check_basis(effect: Effect, situation: Situation) -> None:
-    """The same again, and finite also where the nominal machine has no pose."""
+    """The basis is repeatable, and finite also where the nominal machine has no pose."""
     found = effect.coefficients(situation)
     shape = _shape(effect, situation)
     basis = effect.basis(situation, shape)

@@ -18,7 +18,7 @@ __all__ = ["check_learner"]
 
 
 def check_learner(factory: Callable[[], Learner], rows: int = 40) -> None:
-    """Train fresh learners on small synthetic data, as one repeat and as three, and check every promise of `Learner`.
+    """Train fresh learners on small synthetic data, as one repeat and as three, and check the contract of `Learner`.
 
     Give a factory with small budgets: the learner is trained to its end about ten times.
 
@@ -27,7 +27,7 @@ def check_learner(factory: Callable[[], Learner], rows: int = 40) -> None:
         rows: training rows of each repeat.
 
     Raises:
-        AssertionError: a promise is broken, in one sentence.
+        AssertionError: one sentence on what violates the contract.
     """
     for repeats in (1, 3):
         data = _data(repeats, rows)

@@ -19,7 +19,7 @@ _BATCHES: tuple[tuple[int, ...], ...] = ((), (2,), (2, 3))
 _CLOSES = 1e-8
 _STEP = 1e-5
 _SLOPE_TOLERANCE = 2e-5
-# Differences of nearly singular configurations say nothing about the derivative.
+# Near singular configurations, differences do not approximate the derivative.
 _REGULAR = 200.0
 
 
@@ -31,11 +31,11 @@ _RowFunction = Callable[[Tensor], Tensor]
 def check_mechanism(mechanism: Mechanism, seed: int = 0) -> None:
     """Check names and units, the branch of a numeric inverse, IK∘FK, derivatives, batch shapes, hooks, the description.
 
-    Numeric inverse kinematics are held against a walk from home in small steps, which must end on the same branch.
+    Numeric inverse kinematics are compared with a path from home in small steps, which must end on the same branch.
 
     Args:
         mechanism: any `Mechanism`, at its nominal parameters.
-        seed: of the configurations that are tried.
+        seed: of the test configurations.
 
     Raises:
         AssertionError: one sentence that says what is wrong.
@@ -96,13 +96,13 @@ def _check_round_trip(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
     near = joints + 1e-3
     back = m.solve_inverse(pose, guess=near)
     gap = _pose_gap(m, pose, m.forward_kinematics(back, guess=pose))
-    _require(gap <= _CLOSES, m, f"forward_kinematics(solve_inverse(pose)) misses the pose by {gap:.2g}")
+    _require(gap <= _CLOSES, m, f"forward_kinematics(solve_inverse(pose)) has a pose error of {gap:.2g}")
     closed = float(m.closure(pose, back).abs().max())
     _require(closed <= _CLOSES, m, f"closure(pose, solve_inverse(pose)) is {closed:.2g}, expected 0")
     if len(m.joints) <= len(m.pose):
         off = float(m.wrap(back - joints).abs().max())
         _require(
-            off <= _CLOSES * _REGULAR, m, f"solve_inverse(forward_kinematics(joints)) misses the joints by {off:.2g}"
+            off <= _CLOSES * _REGULAR, m, f"solve_inverse(forward_kinematics(joints)) has a joint error of {off:.2g}"
         )
     off_closure = float(m.closure(pose, near).abs().max())
     _require(off_closure > _CLOSES, m, "closure is 0 for joints that do not belong to the pose")
@@ -111,7 +111,7 @@ def _check_round_trip(m: Mechanism, joints: Tensor, pose: Tensor) -> None:
 def _calls(m: Mechanism) -> dict[str, _Call]:
     """Functions of joints, pose and parameters, by name.
 
-    The forward map is looked at through `frame`: a rotation vector jumps at half a turn, the frame does not.
+    The forward map is compared by `frame`: a rotation vector jumps at half a turn, the frame does not.
     """
 
     def placed(q: Tensor, x: Tensor, k: Tensor | None) -> Tensor:

@@ -65,7 +65,7 @@ class _LosesParameters(Tripod):
     [
         (_WrongJacobian, "jacobian is off by"),
         (_WrongParameterJacobian, "parameter_jacobian is off by .* for parameter offset1"),
-        (_WrongForward, "misses the pose by"),
+        (_WrongForward, "has a pose error of"),
         (_NotBatched, "solve_inverse of batch shape"),
         (_IgnoresParameters, "of parameters"),
         (_CutsGradient, "not differentiable in its parameters"),
