@@ -70,12 +70,12 @@ def verify(
     refit_frames: bool = False,
     allow_code: bool = False,
 ) -> dict[str, Any]:
-    """Judge a model on rows that it has never seen, against what its held-out rows promised; nothing is written.
+    """Test a model on new rows, against the error promised by its held-out rows; nothing is written.
 
     Args:
         model: a .safetensors or .onnx file, or identified.yaml.
         records: new rows, as `load_records` takes them.
-        mechanism: name or file, where the machine's file is not where the model says.
+        mechanism: name or file; the one that the model names when None.
         compensated: the machine was commanded by the model while it was measured; the joints are then those wanted.
         refit_frames: the measuring device was moved since the model was made.
         allow_code: run the Python file that the model names for a user's own mechanism.

@@ -24,7 +24,7 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Condition(Coordinate):
-    """A covariate that a simulator takes, with the SI value that it has where the records do not tell.
+    """A covariate that a simulator takes, with its SI value for records without that column.
 
     Attributes:
         usual: that value.
@@ -44,10 +44,10 @@ class Parameter:
         unit: SI unit.
         nominal: nominal value [SI].
         leg: number of the leg that it belongs to, and no other; joint i drives leg i. None = common to all.
-        scale: plausible error of a machine as built [SI], one standard deviation; None = `plausible_error` goes by the
+        scale: plausible error of a machine as built [SI], one standard deviation; None = `plausible_error` of its
             unit.
-        low, high: values that it cannot pass [SI]; a simulator is never asked beyond them. None = no bound.
-        cause: what a diagnosis calls the cause when it is wrong; parameters of one cause go wrong together. None =
+        low, high: bounds [SI]; a simulator is never called beyond them. None = no bound.
+        cause: name of its error in a diagnosis; the parameters of one cause are one candidate. None =
             ``geometry``, the lengths and angles of the machine as built.
     """
 

@@ -1,4 +1,4 @@
-"""SI numbers as people read them: the unit that gives 1 to 999, four digits; and text that may be shown at all."""
+"""Display SI numbers in the unit that gives 1 to 999, with four digits; and escape text from outside."""
 
 from __future__ import annotations
 
@@ -69,10 +69,10 @@ def count_text(count: int, word: str) -> str:
 
 
 def visible(text: str, longest: int = 200) -> str:
-    """Text from outside as it may stand on a screen or a page: what a terminal would obey is shown as its code.
+    """Escape text from outside for a screen or a page: control characters are shown as codes.
 
     Control characters, marks that turn the direction of writing, and halves of pairs become \\x1b or \\u202e; of a text
-    that is too long the middle is left out, since a sentence has the place at its begin and the remedy at its end.
+    that is too long the middle is left out, since a message begins with the place and ends with the remedy.
     """
     if len(text) > longest:
         text = f"{text[: longest * 2 // 3]} … {text[len(text) - longest // 3 :]}"
@@ -80,7 +80,7 @@ def visible(text: str, longest: int = 200) -> str:
 
 
 def is_shown(character: str) -> bool:
-    """Whether a character is one that a person sees, or a space."""
+    """Whether a character is visible, or a space."""
     return character.isprintable() or unicodedata.category(character) == "Zs"
 
 

@@ -12,11 +12,11 @@ class InputError(CcnnError):
 
 
 class RowsError(InputError):
-    """Rows that cannot be looked at as a whole: too few, or out of reach. Where they are from a file, it is named."""
+    """Too few rows, or rows out of reach. If they are from a file, it is named."""
 
 
 class WriteError(InputError):
-    """A file or folder cannot be written: the disk is full, a right is missing. What stood there is as it was."""
+    """A file or folder cannot be written: the disk is full, or permission is missing. An old file is unchanged."""
 
 
 class ModelFileError(InputError):
@@ -24,12 +24,12 @@ class ModelFileError(InputError):
 
 
 class MethodFailedError(CcnnError):
-    """A learner could not be trained on this data; a run notes the sentence in its results and goes on. Or the first
+    """A learner could not be trained on this data; a run notes the sentence in its results and continues. Or the first
     method of an identification did not converge: its files are there, and the command exits with 2."""
 
 
 class FallbackWarning(UserWarning):
-    """A model file gave a command that breaks what its card promises; the joints are commanded as they are there."""
+    """A model file gave a command outside the limits in its card; the joints are then commanded without correction."""
 
 
 class OutsideDomainWarning(UserWarning):

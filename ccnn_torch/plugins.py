@@ -21,10 +21,10 @@ from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 
 __all__ = ["class_hint", "code_refused", "failure", "file_that_names", "is_plugin", "load_plugin"]
 
-# Lines of this package, of Python and of what is installed tell a user nothing about the own file.
+# Lines of this package, of Python and of installed packages are not reported: they are not the user's.
 _OTHERS = (f"{Path(__file__).parent}{os.sep}", f"{sysconfig.get_path('stdlib')}{os.sep}", "<")
 
-# What is being read, while it may name no code.
+# The source being read, while it may name no code.
 _SOURCE: ContextVar[str | None] = ContextVar("source", default=None)
 
 
@@ -52,7 +52,7 @@ def code_refused(source: str, allow_code: bool = False) -> Iterator[None]:
 
 
 def file_that_names() -> str | None:
-    """What is being read where it may name no code, as given to `code_refused`; None elsewhere."""
+    """The source being read, as given to `code_refused`, while it may name no code; None elsewhere."""
     return _SOURCE.get()
 
 
@@ -68,7 +68,7 @@ def class_hint(file: str) -> str:
         return f"{file} is no valid Python: it has a NUL, or is nested too deeply"
     names = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
     for node in tree.body:
-        # NAME = Simulator(…) and what makes one.
+        # NAME = Simulator(…), or a function that makes one.
         if (
             isinstance(node, ast.Assign)
             and isinstance(node.value, ast.Call)
@@ -92,8 +92,8 @@ def failure(error: BaseException, label: str) -> str:
         file = Path(users[-1].filename)
         own = file.resolve() == Path(label.rpartition(":")[0]).resolve()
         where = f" at line {users[-1].lineno}{'' if own else f' of {file}'}"
-    said = (str(error).strip().splitlines() or [""])[0]
-    return f"fails{where}: {type(error).__name__}{': ' if said else ''}{said}"
+    text = (str(error).strip().splitlines() or [""])[0]
+    return f"fails{where}: {type(error).__name__}{': ' if text else ''}{text}"
 
 
 def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
@@ -114,7 +114,7 @@ def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
     path = Path(file)
     if not path.is_file():
         raise InputError(f"{spec}: there is no file {file}")
-    # A name of its own, so that two users' files of the same name, or one called torch.py, do not meet.
+    # A name of its own, so that two users' files of the same name, or one called torch.py, do not collide.
     unique = f"_ccnn_torch_user_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}"
     module_spec = importlib.util.spec_from_file_location(unique, path)
     if module_spec is None or module_spec.loader is None:
@@ -129,7 +129,7 @@ def load_plugin(spec: str, also: tuple[type, ...] = ()) -> Any:
         raise InputError(f"{spec}: {file} imports something that is not installed: {error}") from error
     except CcnnError:
         raise
-    # What a user's code raises nobody knows beforehand.
+    # A user's code may raise any exception.
     except (Exception, SystemExit) as error:
         raise InputError(f"{spec}: {file} {failure(error, spec)}") from error
     found = getattr(module, name, None)

@@ -43,13 +43,13 @@ class Pseudoerror:
             "condition": "the arm is near a singularity, where a small pose error needs a large joint deviation",
             "deviation": "the joint deviation is larger than max_deviation",
         }
-        said = []
+        found = []
         for reason, flagged in self.reasons.items():
             rows = torch.nonzero(flagged.reshape(-1, flagged.shape[-1]).any(0)).squeeze(-1)
             if len(rows):
                 named = ", ".join(str(int(i) + 1) for i in rows[:max_named]) + (", …" if len(rows) > max_named else "")
-                said.append(f"{len(rows)} rows are not trained on: {sentences[reason]} (rows {named})")
-        return said
+                found.append(f"{len(rows)} rows are not trained on: {sentences[reason]} (rows {named})")
+        return found
 
 
 def joint_deviations(
@@ -136,7 +136,7 @@ def pose_energy(mechanism: Mechanism, measured: Tensor, reference: Tensor, rotat
     """Energy of a pose error, E = E_xyz + η E_rot (eq. 5), with the geodesic angle as E_rot.
 
     Args:
-        mechanism: says how a pose is a frame.
+        mechanism: converts a pose to a frame.
         measured, reference: `... x p` [SI].
         rotation_weight: η [m/rad].
 

@@ -21,7 +21,7 @@ __all__ = ["LARGEST", "from_si", "parse_header", "si_unit_of", "split_header", "
 
 LARGEST = 1e12
 """No number of a record or a geometry file is larger in SI: it is 7 times the Earth's distance from the Sun in m, a
-stiffness or a pressure beyond steel's, and its square still adds up without loss of what stands beside it."""
+stiffness or a pressure beyond steel's, and sums of its square still keep the smaller terms."""
 
 # What a measured quantity is usually written in, for the remedy in an error, and what it is called.
 _EXAMPLES = {
@@ -76,7 +76,7 @@ def split_header(header: str) -> tuple[str, str]:
     """Name and unit of a column header; the unit is empty where the header has none.
 
     Beside ``name[unit]`` this takes ``name (unit)`` where the parentheses hold a unit that is known; anything else is a
-    name as it stands.
+    name without unit.
     """
     match = _HEADER.fullmatch(header)
     if match is not None:
@@ -91,7 +91,7 @@ def parse_header(header: str, file: str, si_unit: str | None = None) -> tuple[st
     """Split a column header ``name[unit]`` into name and unit (as written; ``1`` = no unit).
 
     Args:
-        header: the header as it stands in the file.
+        header: the header as in the file.
         file: the file, for the error.
         si_unit: what the column should be in, where known; sharpens the remedy in the error.
 
@@ -155,10 +155,10 @@ def to_si(
     Args:
         values: any shape, in `unit`.
         unit: as written in a header, e.g. ``mm``, ``deg``, ``degC``, ``1``.
-        si_unit: the SI unit that is wanted, or None for whatever `unit` leads to.
+        si_unit: the SI unit that is wanted, or None for that of `unit`.
         where: opens the sentence of an error, e.g. ``records.csv: column 'q1'``.
         name: the column's name, for the remedy.
-        hint: the remedy itself where the values stand in no column.
+        hint: the remedy for values that are not from a column.
 
     Raises:
         InputError: unknown unit, or one of another dimension (an angle and a plain number differ).
