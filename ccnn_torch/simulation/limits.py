@@ -29,7 +29,7 @@ def refuse_impossible(name: str, effect: Effect, situation: Situation, values: M
     """
     for c in effect.coefficients(situation):
         value = values.get(c.name, 0.0)
-        given, usual = f"--effect {name}: {c.name} = {_shown(value, c.unit)}", _shown(c.scale, c.unit)
+        given, usual = f"--effect {name}: {c.name} = {_text(value, c.unit)}", _text(c.scale, c.unit)
         if c.positive and value < 0:
             raise InputError(f"{given} is below 0, which physics does not allow; plausible is about {usual}")
         if abs(value) > _ABSURD * c.scale:
@@ -37,8 +37,8 @@ def refuse_impossible(name: str, effect: Effect, situation: Situation, values: M
     for s in effect.shapes(situation):
         if s.grid[0] >= 0 > values.get(s.name, 0.0):
             raise InputError(
-                f"--effect {name}: {s.name} = {_shown(values[s.name], s.unit)} is below 0; on these rows a diagnosis "
-                f"searches from {s.grid[0]:g} to {_shown(s.grid[-1], s.unit)}"
+                f"--effect {name}: {s.name} = {_text(values[s.name], s.unit)} is below 0; on these rows a diagnosis "
+                f"searches from {s.grid[0]:g} to {_text(s.grid[-1], s.unit)}"
             )
 
 
@@ -61,7 +61,7 @@ def refuse_beyond_bounds(situation: Situation, acting: Sequence[Acting]) -> None
             names = [one.effect.name for one, change in zip(changing, changes, strict=True) if change[:, k].any()]
             there = least if low else most
             raise InputError(
-                f"--effect {names[0]}: {parameter.name} would be {_shown(there, parameter.unit)}, and the mechanism has "
+                f"--effect {names[0]}: {parameter.name} would be {_text(there, parameter.unit)}, and the mechanism has "
                 f"it {_range(parameter, 0.0)}; give a difference to its nominal {parameter.nominal:g} "
                 f"{_range(parameter, parameter.nominal)}"
             )
@@ -74,5 +74,5 @@ def _range(parameter: Parameter, zero: float) -> str:
     return f"from {low} up" if high is None else f"up to {high}"
 
 
-def _shown(value: float, unit: str) -> str:
+def _text(value: float, unit: str) -> str:
     return f"{value:g} {unit}".removesuffix(" 1")
