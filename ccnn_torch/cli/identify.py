@@ -50,7 +50,7 @@ def identify(
         return
     if resume is not None:
         if config is not None or overrides or out is not None or seed is not None:
-            raise InputError("--resume takes the folder alone, without a config, overrides or other options")
+            raise InputError("--resume takes the folder alone, without CONFIG, overrides, --out and --seed")
         resume_identification(resume, quiet=quiet)
         return
     if config is None:

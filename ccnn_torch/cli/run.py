@@ -39,7 +39,7 @@ def run(
 
     if resume is not None:
         if config is not None or overrides or out is not None or seed is not None:
-            raise InputError("--resume takes the run's folder alone, without a config, overrides or other options")
+            raise InputError("--resume takes the run's folder alone, without CONFIG, overrides, --out and --seed")
         resume_run(resume, quiet=quiet)
         return
     if config is None:
