@@ -110,7 +110,7 @@ def test_the_simulator_of_others_has_nothing_outside_the_library() -> None:
         (0, MACHINES, tuple(KINDS), "at least 1 case"),
         (3, ("crane",), tuple(KINDS), "'crane' is not there; known: five_bar"),
         (3, MACHINES, ("many",), "known: single, pair"),
-        (3, ("arm", "arm"), tuple(KINDS), "stand twice"),
+        (3, ("arm", "arm"), tuple(KINDS), "are repeated"),
     ],
 )
 def test_bad_plans_are_one_sentence(count: int, machines: tuple[str, ...], kinds: tuple[str, ...], said: str) -> None:

@@ -1,1 +1,1 @@
-"""The blind check: machines whose cause is sealed from the diagnosis, and the judge that opens them afterwards."""
+"""The blind check: simulated machines whose cause the diagnosis does not know, and the comparison with the truth."""

@@ -38,7 +38,7 @@ _HOME = (0.2, -1.4, 1.9, -2.07, -1.57, 0.0)
 _LOW = (-0.75, -0.35, 0.1, -0.4, -0.4, -1.0)
 _HIGH = (-0.35, 0.35, 0.55, 0.4, 0.4, 1.0)
 _LARGEST_CONDITION = 40.0
-# Length that is worth a radian in the condition number of a pose [m].
+# Length equivalent to a radian in the condition number of a pose [m].
 _LEVER = 0.3
 
 

@@ -25,12 +25,12 @@ _DRIVES = {
     "delta_linear": ("offset",),
     "arm": ("base_", "tool_", "theta"),
 }
-"""How parameters begin that belong to the drives or to where the machine stands: their errors are other causes."""
+"""Prefixes of parameters of the drives and of the base frame: their errors are other causes."""
 _EXPANSION = 1.2e-5
 
 
 def geometry(machine: BlindMachine, at: Conditions, generator: Generator) -> Deviation:
-    """A body that was made and put together with errors: in all dimensions, or in those of one leg."""
+    """Errors of manufacture and assembly: in all dimensions, or in those of one leg."""
     parts = machine.mechanism.geometry
     of_body = np.array([not p.name.startswith(_DRIVES[machine.mechanism.name]) for p in parts])
     size = np.array([plausible_error(p) for p in parts]) * of_body * generator.standard_normal(len(parts))
@@ -42,7 +42,7 @@ def geometry(machine: BlindMachine, at: Conditions, generator: Generator) -> Dev
 
 
 def thermal(machine: BlindMachine, at: Conditions, generator: Generator) -> Deviation:
-    """Bodies that warm up in two stages, skin and core, each leg a little more or less than the others."""
+    """Bodies that warm up in two stages, skin and core, each leg by a slightly different factor."""
     skin, core = generator.uniform(0.05, 0.4) * 3600, generator.uniform(0.6, 2.0) * 3600
     share = generator.uniform(0.3, 0.9)
     body = share * lagged(at.hall, skin) + (1 - share) * lagged(at.hall, core)
@@ -57,12 +57,12 @@ def thermal(machine: BlindMachine, at: Conditions, generator: Generator) -> Devi
 
 
 def frame(machine: BlindMachine, at: Conditions, generator: Generator) -> Deviation:
-    """A measuring device that does not stand where it was thought to stand."""
+    """A constant error of the pose of the measuring device."""
     return replace(_none(machine, at), base=_twist(generator))
 
 
 def tool(machine: BlindMachine, at: Conditions, generator: Generator) -> Deviation:
-    """A target that does not sit where it was thought to sit."""
+    """A constant error of the pose of the target."""
     return replace(_none(machine, at), tool=_twist(generator))
 
 

@@ -18,19 +18,19 @@ __all__ = ["CAUSES_STREAM", "CONDITIONS_STREAM", "NOISE_STREAM", "BlindCase", "d
 CONDITIONS_STREAM, CAUSES_STREAM, NOISE_STREAM = 1, 2, 3
 """Streams of random numbers of a case."""
 _BAD = (0.02, 0.05)
-"""Share of bad rows; each is off by 20 to 200 times the noise."""
+"""Share of bad rows; each has an error of 20 to 200 times the noise."""
 
 
 @dataclass(frozen=True)
 class BlindCase:
-    """A case with everything about it; what the diagnoser is given is `joints`, `measured`, `columns`, `sd` if told.
+    """A case and its truth; the diagnosis gets `joints`, `measured`, `columns`, and `sd` if the plan discloses it.
 
     Attributes:
         true: pose without noise, `s x p` [SI].
         sd: standard deviation of the noise of each pose coordinate, `p` [SI].
         drivers: of each cause, as a verdict may name them where it says that no effect fits; () where it has none of
             its own.
-        bad: rows that are off, 0-based.
+        bad: gross outliers, 0-based.
     """
 
     plan: CasePlan

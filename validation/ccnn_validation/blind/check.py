@@ -1,4 +1,4 @@
-"""`ccnn blind-check`: sealed machines, their diagnoses, and the figures once the seal is open; resumable."""
+"""`ccnn blind-check`: machines with sealed truth, their diagnoses, and the figures after opening; resumable."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ def run_blind_check(
 ) -> Path:
     """Generate, seal, diagnose, open, diagnose without the effect that was there, and count.
 
-    A second call with the same arguments goes on where the first was stopped; nothing finished is done again.
+    A second call with the same arguments resumes an interrupted one; finished steps are kept.
 
     Args:
-        cases: how many.
+        cases: their number.
         out: folder.
         diagnose: the diagnosis to check.
         seed: of the cases.
@@ -112,7 +112,7 @@ def _checked(folder: BlindFolder, settings: dict[str, Any], diagnose: Diagnoser,
 
 
 def _settle(folder: BlindFolder, settings: dict[str, Any]) -> None:
-    """Write what was asked for, or hold it to what the folder was begun with."""
+    """Write the settings; in an existing folder, check that they are equal."""
     if folder.settings.is_file():
         there = read_json(folder.settings)
         other = sorted(key for key in settings if there.get(key) != settings[key])
@@ -126,7 +126,7 @@ def _settle(folder: BlindFolder, settings: dict[str, Any]) -> None:
 
 
 def _generator(what: str, folder: BlindFolder) -> None:
-    """The other side, in a process of its own."""
+    """Run the generating side in a process of its own."""
     command = [sys.executable, "-m", "ccnn_validation.blind.generator", what, str(folder.path)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode == 2:
@@ -143,7 +143,7 @@ def _diagnose_all(
     without: Mapping[int, Sequence[str]] | None,
     quiet: bool,
 ) -> None:
-    """Diagnose what is not diagnosed yet."""
+    """Diagnose the cases without a diagnosis."""
     machines: dict[str, Mechanism] = {}
     withheld = without is not None
     left = [case for case in told if not folder.diagnosis(case["number"], withheld).is_file()]

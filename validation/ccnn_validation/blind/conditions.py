@@ -76,7 +76,7 @@ class Conditions:
 
 
 def draw_conditions(machine: BlindMachine, rows: int, moving: bool, generator: np.random.Generator) -> Conditions:
-    """Draw what a day's measurement of so many rows looks like.
+    """Draw the conditions of one day's measurement.
 
     Args:
         rows: `s`.
@@ -89,7 +89,7 @@ def draw_conditions(machine: BlindMachine, rows: int, moving: bool, generator: n
     time = np.cumsum(pause) - pause[0]
     time *= _SESSION * generator.uniform(0.4, 1.0) / time[-1]
     levels = generator.normal(size=(rows, len(machine.load)))
-    # Half the machines are loaded by weights that are hung on or not, half by whatever the process asks.
+    # Half the machines are loaded by a weight that is attached or not, half by random process forces.
     if generator.random() < 0.5:
         levels = generator.integers(-1, 2, levels.shape) * generator.uniform(1.0, 1.5, (1, levels.shape[1]))
     load = torch.as_tensor(levels) * machine.load
@@ -100,7 +100,7 @@ def draw_conditions(machine: BlindMachine, rows: int, moving: bool, generator: n
         acceleration = torch.as_tensor(generator.normal(size=(rows, n))) * span
         direction = torch.sign(speed)
     else:
-        # Half come straight from the pose before; half approach every pose from a side of their choice.
+        # Half come straight from the previous pose; half approach every pose from a side of their choice.
         direction = torch.sign(torch.diff(joints, dim=0, prepend=machine.travel.mean(-1)[None]))
         if generator.random() < 0.5:
             direction = torch.as_tensor(generator.choice([-1.0, 1.0], (rows, n)))

@@ -1,4 +1,4 @@
-"""What is wrong with a blind machine at unit size, and the poses that it then reaches in its true kinematics."""
+"""Errors of a blind machine at unit size, and the poses that it then reaches in its true kinematics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Deviation", "measured_pose", "stack", "weighted"]
 
 @dataclass(frozen=True)
 class Deviation:
-    """One cause at unit size; what it leaves alone is 0. Leading dims `...` stand for cases and causes.
+    """One cause at unit size; what it does not change is 0. Leading dims `...` stand for cases and causes.
 
     Attributes:
         joints: change of the joints, `... x s x n` [SI].
@@ -36,7 +36,7 @@ class Deviation:
 
     @staticmethod
     def none(machine: BlindMachine, rows: int) -> Deviation:
-        """A machine as it should be."""
+        """A machine without error."""
         n, k = len(machine.mechanism.joints), len(machine.mechanism.geometry)
         shapes = ((rows, n), (rows, k), (6,), (6,), (3, 3), (rows, 6))
         return Deviation(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes))
@@ -63,7 +63,7 @@ def measured_pose(machine: BlindMachine, joints: Tensor, pose: Tensor, wrong: De
         machine: the nominal one.
         joints: commanded, `r x s x n` [SI].
         pose: nominal, `r x s x p` [SI]: where the search for the true one starts.
-        wrong: what is wrong, in its true size, leading dim `r`.
+        wrong: the errors in their true size, leading dim `r`.
 
     Returns:
         `r x s x p` [SI].

@@ -1,4 +1,4 @@
-"""What the effects library could say of a sealed case at best: how much of the true gap each name leaves.
+"""The best explanation of a sealed case by the effects library: how much of the true gap each name leaves.
 
 This is the judge's side. It sees the true poses, without noise, and fits the library's effects to them in the true
 kinematics; the blind machines themselves do not know the library.
@@ -27,11 +27,11 @@ AS_WELL = 6.0
 _SHARE = 0.1
 """Of the gap's squares, at most, that an explanation may leave: columns under an angle of cosine 0.95."""
 _FREE = 1e3
-"""Prior scale of the coefficients in units of what is plausible: it keeps the fit regular and else asks nothing."""
+"""Prior scale of the coefficients in units of what is plausible: it only keeps the fit regular."""
 _STEPS = 3
 _FAR = 3.0
-"""Rows in which the joints move the platform so many times as far as usual tell nothing by first-order columns: they
-are left out, whatever the answer."""
+"""Rows in which the joints move the platform so many times as far as usual are not described by first-order columns:
+they are left out."""
 _SWEEPS, _REFINEMENTS = 3, 3
 _CHUNK = 16
 
@@ -75,7 +75,7 @@ class Judge:
 
     @property
     def numbers(self) -> int:
-        """How many were measured: rows times pose coordinates."""
+        """Number of measured values: rows times pose coordinates."""
         return int(self._regular.sum()) * self._case.true.shape[-1]
 
     @cached_property
@@ -91,7 +91,7 @@ class Judge:
         return self._known[key]
 
     def as_well(self, names: Sequence[str], than: Sequence[str]) -> bool:
-        """Whether these rows cannot tell the names from others: they leave as little, to within the noise.
+        """Whether these rows cannot distinguish the names from others: the residuals are equal to within the noise.
 
         An explanation with fewer coefficients may leave more: as much as the others' freedom costs (Schwarz 1978), but
         never more than a tenth of the gap.

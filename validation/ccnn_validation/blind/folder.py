@@ -1,10 +1,10 @@
 """Files of a blind check, and what each side may read.
 
-`settings.json` tells which cases; `machines/NAME.yaml` are the nominal machines, `cases/NNNN.csv` the records and
+`settings.json` defines the cases; `machines/NAME.yaml` are the nominal machines, `cases/NNNN.csv` the records and
 `cases.json` what goes with them: all that the diagnosing side reads. `seal.json` binds the generating side to the truth
 before the first diagnosis. `diagnoses/NNNN.json` are the answers, `truth.json` is what was sealed, `withheld/NNNN.json`
-the answers of a library without the effect that was there, `judged.json` all of it held together; then `blind.json`,
-`blind.csv`, `blind.md`.
+the answers of a library without the effect that was there, `judged.json` the comparison of answers and truth; then
+`blind.json`, `blind.csv`, `blind.md`.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ class BlindFolder:
 
     @property
     def settings(self) -> Path:
-        """What was asked for."""
+        """The settings of the check."""
         return self.path / "settings.json"
 
     @property
     def public(self) -> Path:
-        """What is told of every case."""
+        """What the diagnosing side may read of every case."""
         return self.path / "cases.json"
 
     @property

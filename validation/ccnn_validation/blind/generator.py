@@ -1,8 +1,8 @@
 """The generating side of a blind check, run as a process of its own: `python -m … write FOLDER`, `… open FOLDER`,
 `… judge FOLDER`.
 
-It alone knows what is wrong with the machines. `write` leaves records and digests; `open`, once every diagnosis is on
-disk, writes the truth; `judge` holds all answers to it.
+It alone knows the causes. `write` leaves records and digests; `open`, once every diagnosis is on
+disk, writes the truth; `judge` compares all answers with it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _AT_ONCE = 60
 
 
 def write_cases(folder: BlindFolder) -> None:
-    """Write records, machines and what is told of them, and the seal last."""
+    """Write records, machines and their public description, and the seal last."""
     settings = read_json(folder.settings)
     seals: dict[str, dict[str, str]] = {}
     told: list[dict[str, Any]] = []
@@ -57,7 +57,7 @@ def write_cases(folder: BlindFolder) -> None:
 
 
 def open_cases(folder: BlindFolder) -> None:
-    """Draw the truth again, hold it to the seal, and write it.
+    """Draw the truth again, compare it with the seal, and write it.
 
     Raises:
         InputError: a diagnosis is missing, or the truth or a file is not the one that was sealed.

@@ -20,7 +20,7 @@ __all__ = ["JOINT_CAUSES", "normalised", "of_joints", "some_of"]
 
 Generator = np.random.Generator
 _BALANCED = 0.6
-"""Share of machines whose weight does not press on the drives' friction."""
+"""Share of machines whose weight does not add to the drives' friction."""
 
 
 def of_joints(machine: BlindMachine, change: Tensor) -> Deviation:
@@ -39,7 +39,7 @@ def some_of(count: int, generator: Generator) -> Tensor:
 
 
 def normalised(force: Tensor) -> Tensor:
-    """By the RMS over the rows and over all drives, `s x n`: a drive that carries nothing stays at nothing."""
+    """Divided by the RMS over the rows and over all drives, `s x n`: a drive without load stays at 0."""
     return force / force.square().mean().sqrt().clamp_min(1e-12)
 
 
@@ -55,7 +55,7 @@ def joint_offset(machine: BlindMachine, at: Conditions, generator: Generator) ->
 
 
 def joint_gain(machine: BlindMachine, at: Conditions, generator: Generator) -> Deviation:
-    """A pitch that is off, a little more at the ends of the travel."""
+    """An error of the pitch, slightly larger at the ends of the travel."""
     u = _place(machine, at.joints)
     uneven = torch.as_tensor(generator.uniform(-0.02, 0.02, u.shape[-1]))
     return of_joints(machine, some_of(u.shape[-1], generator) * (u + uneven * u**3))
@@ -75,16 +75,16 @@ def transmission(machine: BlindMachine, at: Conditions, generator: Generator) ->
 
 
 def backlash(machine: BlindMachine, at: Conditions, generator: Generator) -> Deviation:
-    """Play: the output trails behind the motion, and where the load pushes the other way it leaves that flank."""
+    """Backlash: the output trails behind the motion, and leaves that flank where the load pushes the other way."""
     n = at.joints.shape[-1]
     push = normalised(at.torque + at.weight) * generator.uniform(0.0, 0.6) - at.direction * generator.uniform(1.0, 2.0)
     return of_joints(machine, some_of(n, generator).abs() * torch.tanh(push / generator.uniform(0.3, 0.7)))
 
 
 def friction(machine: BlindMachine, at: Conditions, generator: Generator) -> Deviation:
-    """Wind-up behind the motion by a friction that grows with what the drive carries, a little less than in proportion.
+    """Wind-up behind the motion by a friction that grows with the drive's load, a little less than in proportion.
 
-    Most axes are balanced, so that the load alone presses; in others it adds to the weight.
+    Most axes are balanced, so that the load alone acts; in others it adds to the weight.
     """
     balanced = generator.random() < _BALANCED
     carried = normalised(at.torque if balanced else at.torque + at.weight).abs()

@@ -1,8 +1,8 @@
-"""Whether an answer is right, by the truth and by what these rows can show.
+"""Whether an answer is right, by the truth and by what these rows can identify.
 
 An answer is *right* where its names explain the true gap as well as the true causes do, with no more names, to within
-the noise (`Judge.as_well`): then the data cannot tell it from the truth, whether it is the truth, one of its class, or
-one name for a pair. What lies outside the library is right where the answer says so and names the driver.
+the noise (`Judge.as_well`): then the data cannot distinguish it from the truth, whether it is the truth, one of its
+class, or one name for a pair. What lies outside the library is right where the answer says so and names the driver.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _answer(case: BlindCase, judge: Judge, causes: Sequence[str], answer: Mappin
 
 
 def _found(cause: str, named: Sequence[str], causes: Sequence[str], judge: Judge) -> bool:
-    """Whether a true cause is named, or one that these rows cannot tell from it in its place."""
+    """Whether a true cause is named, or one that these rows cannot distinguish from it."""
     if cause in named or (named and judge.as_well(named, causes)):
         return True
     others = [c for c in causes if c != cause]

@@ -1,4 +1,4 @@
-"""The nominal machines of blind cases: what the diagnoser is given, what moves them, and what they carry."""
+"""The nominal machines of blind cases: their kinematics, drives and loads."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ccnn_validation.blind.arm import draw_arm_poses, link_weight_torque, mass_o
 __all__ = ["MACHINES", "BlindMachine", "blind_machine"]
 
 _TURN = 6.0
-"""Rotation of the platform that is worth a metre when the condition of a pose is judged, rad/m: a lever of 1/6 m."""
+"""Rotation of the platform equivalent to a metre in the condition number of a pose, rad/m: a lever of 1/6 m."""
 _CONDITION = 15.0
 _GRAVITY = 9.80665
 
 
 @dataclass(frozen=True)
 class BlindMachine:
-    """A nominal machine with what a simulation needs to know besides its kinematics.
+    """A nominal machine with the properties that a simulation needs besides its kinematics.
 
     Attributes:
         mechanism: the nominal one; its parameters are those that geometry errors may have.
@@ -34,7 +34,7 @@ class BlindMachine:
         weight: of what the drives carry: the platform, or the links of an arm [N].
         screw: whether the drives are screws with a travel, rather than gears with turns.
         orientation: whether position and all three rotations are measured.
-        own_weight: torque that the arm's own links ask of its drives, `... x n` from joints; None for a platform.
+        own_weight: torque of the arm's own links on its drives, `... x n` from joints; None for a platform.
     """
 
     mechanism: Mechanism
@@ -58,7 +58,7 @@ class BlindMachine:
         return forward
 
     def weight_torque(self, pose: Tensor, joints: Tensor) -> Tensor:
-        """What the machine's own weight asks of each drive, `... x n` [N or N·m]."""
+        """Force or torque of the machine's own weight on each drive, `... x n` [N or N·m]."""
         if self.own_weight is not None:
             return self.own_weight(joints)
         names = [c.name for c in self.mechanism.pose]
@@ -130,7 +130,7 @@ _MAKERS: dict[str, Callable[[], BlindMachine]] = {
     "mujoco_five_bar": lambda: _platform(FiveBar(), 50.0, 30.0, 6.0),
 }
 MACHINES = tuple(name for name in _MAKERS if name != "mujoco_five_bar")
-"""Those with causes of our own."""
+"""Those with the causes of this package."""
 
 
 def blind_machine(name: str) -> BlindMachine:

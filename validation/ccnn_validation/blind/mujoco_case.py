@@ -31,9 +31,9 @@ _TOLERANCE, _ZERO = 2e-4, 3e-4
 
 
 def mujoco_case(plan: CasePlan, seed: int) -> BlindCase:
-    """Simulate and measure one case. The gap is what it is; the noise is set so that it has the strength asked for.
+    """Simulate and measure one case. The noise is scaled so that the gap has the planned strength.
 
-    Without compliance no load is hung on: servos are never rigid.
+    Without compliance there is no load: servos are never rigid.
     """
     machine = blind_machine(plan.machine)
     at = draw_conditions(machine, plan.rows, False, np.random.default_rng([seed, plan.number, CONDITIONS_STREAM]))

@@ -1,6 +1,6 @@
 """The five-bar in MuJoCo: bodies, servos, a loop held closed by a constraint, payload and dry friction (Todorov 2012).
 
-A simulator that nobody here wrote, as a source of blind cases: nothing in it knows of effects. A pose is read half a
+An independent simulator as a source of blind cases: it has no notion of effects. A pose is read half a
 second after the command has stopped, as one does at a machine: its dry friction creeps.
 """
 
@@ -32,7 +32,7 @@ _STUCK = f"solreffriction={_STIFF[0]} solimpfriction={_STIFF[1]}"
 
 @dataclass(frozen=True)
 class Servo:
-    """What is real about the machine.
+    """The dynamics of the machine.
 
     Attributes:
         stiffness: of both servos [N·m/rad].
@@ -53,17 +53,17 @@ class Servo:
 def settled(
     servo: Servo, parameters: Tensor, command: Tensor, direction: Tensor, load: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Where the machine stands half a second after it was commanded somewhere.
+    """Where the machine is half a second after a command.
 
     Args:
-        servo: what is real about it.
+        servo: its dynamics.
         parameters: of `FiveBar`, as built, `12` [SI].
         command: crank angles commanded, `s x 2` [rad].
         direction: from which side they are approached, `s x 2` [1]; 0 = from above.
         load: force on the tool, `s x 2` [N].
 
     Returns:
-        Position of the tool, `s x 2` [m], and the angles at which the cranks then stand, `s x 2` [rad].
+        Position of the tool, `s x 2` [m], and the angles of the cranks there, `s x 2` [rad].
 
     Raises:
         InputError: MuJoCo is not installed.

@@ -1,4 +1,4 @@
-"""Causes that no effects library knows, each with what drives it: the honest answer to them is "outside"."""
+"""Causes that the effects library lacks, each with what drives it: the right answer to them is "outside"."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def outside_cause(
 
 
 def _dent(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple[Deviation, tuple[str, ...]]:
-    """A joint whose track is dented in one place; elsewhere all is well."""
+    """A joint whose track has a dent in one place."""
     i = int(generator.integers(at.joints.shape[-1]))
     low, high = machine.travel[i].tolist()
     middle = low + (high - low) * generator.uniform(0.3, 0.7)
@@ -76,7 +76,7 @@ def _clamp(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple
 
 
 def _snap(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple[Deviation, tuple[str, ...]]:
-    """Metal of two kinds that jumps over at one temperature."""
+    """A bimetal that snaps at one temperature."""
     temperature = at.temperature.numpy()
     turning = np.quantile(temperature, generator.uniform(0.35, 0.65))
     width = np.std(temperature) * generator.uniform(0.05, 0.2)
@@ -84,7 +84,7 @@ def _snap(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple[
 
 
 def _twitch(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple[Deviation, tuple[str, ...]]:
-    """The approach of one joint that leaves another one displaced, the more the further out that one stands."""
+    """The approach of one joint that leaves another one displaced, the more the further out that one is."""
     i, j = generator.permutation(at.joints.shape[-1])[:2]
     low, high = machine.travel[j].tolist()
     change = torch.zeros_like(at.joints)
@@ -102,7 +102,7 @@ def _hum(machine: BlindMachine, at: Conditions, generator: Generator) -> tuple[D
 
 
 def _moved(machine: BlindMachine, at: Conditions, course: Tensor, generator: Generator) -> Deviation:
-    """The whole platform moved along one way by a course over the rows, `s`: alike wherever it stands.
+    """The whole platform moved along one way by a course over the rows, `s`: equally at every pose.
 
     Without what is the same in all rows: that would be a device or a target elsewhere, which a library knows.
     """

@@ -21,7 +21,7 @@ STRENGTHS = (3.0, 10.0, 30.0)
 """RMS of the gap over rows and pose coordinates, each in units of its noise."""
 SIMULATORS = (*MACHINES, "mujoco_five_bar")
 CAUSES = (*BODY_CAUSES, *JOINT_CAUSES, "outlier")
-"""What can be wrong with a machine, by the names that a verdict may give."""
+"""Causes of a machine's error, by the names that a verdict may give."""
 MUJOCO_CAUSES = ("joint_offset", "compliance", "gravity", "friction", "geometry")
 _ROWS, _ROWS_SHARE = (40, 100, 200, 400), (0.15, 0.2, 0.45, 0.2)
 _WEAKEST = 0.3
@@ -43,11 +43,11 @@ class CasePlan:
         shares: size of each cause in units of the first.
         strength: of the gap; 0 for none and for bad rows.
         rows: how many.
-        noise: standard deviation of a measured position [m]; of the simulator that we did not write it follows from
+        noise: standard deviation of a measured position [m]; of the independent simulator it follows from
             the gap and the strength.
-        noise_told: whether the diagnoser is given it.
+        noise_told: whether the diagnosis gets it.
         moving: whether poses are read in motion.
-        disturbance: what else is there: "" or "heavy tails", "bad rows", "uneven noise".
+        disturbance: of the rows: "" or "heavy tails", "bad rows", "uneven noise".
     """
 
     number: int
@@ -70,7 +70,7 @@ def plan_cases(count: int, seed: int, machines: Sequence[str], kinds: Sequence[s
         InputError: a machine or kind that is not there, no case at all, or none that these machines can have.
     """
     _check(count, machines, kinds)
-    # Nothing outside the library is built into the simulator of others.
+    # The independent simulator has no causes outside the library.
     able = {kind: [m for m in machines if kind != "outside" or m != "mujoco_five_bar"] for kind in kinds}
     kinds = [kind for kind in kinds if able[kind]]
     if not kinds:
@@ -122,7 +122,7 @@ class _Deck:
 
     def __init__(self, kind: str, machines: Sequence[str], generator: np.random.Generator) -> None:
         self._kind, self._g = kind, generator
-        # The simulator that we did not write has no causes of ours that lie outside the library.
+        # The independent simulator has no causes outside the library.
         self._machines = [m for m in machines if m != "mujoco_five_bar" or kind != "outside"] or list(machines)
         self._left: dict[str, list[str]] = {}
 
@@ -161,4 +161,4 @@ def _check(count: int, machines: Sequence[str], kinds: Sequence[str]) -> None:
         if strange or not given:
             raise InputError(f"{option}: '{', '.join(strange)}' is not there; known: {', '.join(known)}")
         if len(set(given)) < len(given):
-            raise InputError(f"{option}: names stand twice in {', '.join(given)}")
+            raise InputError(f"{option}: names are repeated in {', '.join(given)}")

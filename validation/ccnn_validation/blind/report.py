@@ -1,6 +1,6 @@
-"""Figures of a blind check: how often a diagnosis names what was wrong, and knows when it does not know.
+"""Figures of a blind check: how often a diagnosis is right, and how reliable its probabilities are.
 
-Every share stands with its 95 % interval (Clopper and Pearson 1934).
+Every share has its 95 % interval (Clopper and Pearson 1934).
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def _by_cause(kinds: Mapping[str, Sequence[Case]]) -> dict[str, Block]:
     return found
 
 
-def _said(case: Case) -> str:
+def _verdict(case: Case) -> str:
     """A verdict in a word."""
     answer = case["answer"]
     if "failed" in answer:
@@ -183,7 +183,7 @@ def _confusion(kinds: Mapping[str, Sequence[Case]]) -> dict[str, dict[str, int]]
                 case["causes"][0] if kind == "single" else "none" if kind == "none" else f"outside: {case['causes'][0]}"
             )
             row = table.setdefault(true, {})
-            row[_said(case)] = row.get(_said(case), 0) + 1
+            row[_verdict(case)] = row.get(_verdict(case), 0) + 1
     return {k: dict(sorted(row.items(), key=lambda item: -item[1])) for k, row in sorted(table.items())}
 
 

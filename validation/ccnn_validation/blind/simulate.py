@@ -30,7 +30,7 @@ from ccnn_validation.blind.plan import CasePlan
 __all__ = ["LEVER", "simulate"]
 
 LEVER = 0.3
-"""Distance of the points that orientation is measured by [m]: an angle has the noise of a length over this."""
+"""Distance of the points that determine orientation [m]: the noise of an angle is that of a length over this."""
 _ROUNDS, _ROUGH = 5, 2
 
 
@@ -103,7 +103,7 @@ def _sizes(
 ) -> Tensor:
     """Factors of the causes, `r x e`: each alone as strong as `alone` asks (`r x e`), then all as `together` (`r`).
 
-    Strength is nearly proportional to the factor: a few rounds of the rule of three bring it there.
+    Strength is nearly proportional to the factor: a few proportional corrections reach it.
     """
     size = (alone > 0) * 1e-5
     for cause in range(alone.shape[1]):

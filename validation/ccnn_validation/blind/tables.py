@@ -49,7 +49,7 @@ def print_blind(found: Mapping[str, Any], console: Console) -> None:
 
 
 def case_line(machine: str, answer: Mapping[str, Any], withheld: bool) -> str:
-    """One line while a check runs; what is right is not known yet."""
+    """One line while a check runs; the truth is not known yet."""
     if "failed" in answer:
         return f"{machine}: {answer['failed']}"
     verdict = answer["verdict"]

@@ -4,7 +4,7 @@ The truth is on no disk while the cases are diagnosed. It is drawn from the seed
 again when the seal is opened; in between there are only digests. A digest covers the noise-free poses bit by bit, so
 that it cannot be tried against a list of likely truths. Opening checks that every diagnosis is there, and that truth
 and records are those that were sealed. The diagnosing side gets the records, the nominal machine, and the noise where
-it is told; it could only cheat by running the generator itself.
+it is disclosed; it could only cheat by running the generator itself.
 """
 
 from __future__ import annotations
