@@ -161,7 +161,7 @@ def _quoted(header: str) -> str:
 
 
 def _plain(line: str) -> str:
-    """A comment on one line, whatever headers it names."""
+    """A comment on one line, with blanks for characters that are not printable."""
     return "".join(mark if mark.isprintable() else " " for mark in line)
 
 

@@ -90,15 +90,15 @@ def _checked(folder: BlindFolder, settings: dict[str, Any], diagnose: Diagnoser,
     if not folder.seal.is_file():
         note(f"generating {settings['cases']} sealed cases in a process of their own", quiet)
         _generator("write", folder)
-    told = read_json(folder.public)["cases"]
-    _diagnose_all(folder, told, diagnose, None, quiet)
+    public_cases = read_json(folder.public)["cases"]
+    _diagnose_all(folder, public_cases, diagnose, None, quiet)
     if not folder.truth.is_file():
         note("opening the seal", quiet)
         _generator("open", folder)
     truth = read_json(folder.truth)["cases"]
     absent = {c["number"]: c["causes"][0] for c in truth if c["kind"] == "single" and c["causes"][0] in EFFECTS}
     without = {number: [name for name in EFFECTS if name != cause] for number, cause in absent.items()}
-    _diagnose_all(folder, [t for t in told if t["number"] in absent], diagnose, without, quiet)
+    _diagnose_all(folder, [t for t in public_cases if t["number"] in absent], diagnose, without, quiet)
     if not folder.judged.is_file():
         note("judging", quiet)
         _generator("judge", folder)
@@ -138,7 +138,7 @@ def _generator(what: str, folder: BlindFolder) -> None:
 
 def _diagnose_all(
     folder: BlindFolder,
-    told: Sequence[Mapping[str, Any]],
+    public_cases: Sequence[Mapping[str, Any]],
     diagnose: Diagnoser,
     without: Mapping[int, Sequence[str]] | None,
     quiet: bool,
@@ -146,7 +146,7 @@ def _diagnose_all(
     """Diagnose the cases without a diagnosis."""
     machines: dict[str, Mechanism] = {}
     withheld = without is not None
-    left = [case for case in told if not folder.diagnosis(case["number"], withheld).is_file()]
+    left = [case for case in public_cases if not folder.diagnosis(case["number"], withheld).is_file()]
     for position, case in enumerate(left, 1):
         number, name = case["number"], case["machine"]
         if name not in machines:

@@ -38,7 +38,7 @@ def write_cases(folder: BlindFolder) -> None:
     """Write records, machines and their public description, and the seal last."""
     settings = read_json(folder.settings)
     seals: dict[str, dict[str, str]] = {}
-    told: list[dict[str, Any]] = []
+    public_cases: list[dict[str, Any]] = []
     make_folder(folder.records(0).parent)
     for case in _cases(settings):
         number = case.plan.number
@@ -51,8 +51,8 @@ def write_cases(folder: BlindFolder) -> None:
         seals[str(number)] = {"truth": digest(truth_of(case)), "records": file_digest(path)}
         names = [c.name for c in case.machine.mechanism.pose]
         noise = dict(zip(names, case.sd.tolist(), strict=True)) if case.plan.noise_told else None
-        told.append({"number": number, "machine": case.plan.machine, "noise": noise})
-    write_json(folder.public, {"cases": told})
+        public_cases.append({"number": number, "machine": case.plan.machine, "noise": noise})
+    write_json(folder.public, {"cases": public_cases})
     write_json(folder.seal, {"cases": seals})
 
 

@@ -55,7 +55,7 @@ def _answer(case: BlindCase, judge: Judge, causes: Sequence[str], answer: Mappin
     names, outside = list(verdict["effects"]), bool(verdict["outside_library"])
     kind = case.plan.kind
     exact = set(names) == set(case.plan.causes) and not outside
-    told = {
+    common = {
         "effects": names,
         "probability": verdict["probability"],
         "outside": outside,
@@ -67,18 +67,18 @@ def _answer(case: BlindCase, judge: Judge, causes: Sequence[str], answer: Mappin
     }
     if kind == "none":
         right = not names and not outside
-        return {**told, "exact": right, "right": right, "found": 0, "shrink": None}
+        return {**common, "exact": right, "right": right, "found": 0, "shrink": None}
     if kind == "outside":
         right = outside and verdict["driver"] in case.drivers[0]
         bare = right and not set(names) - {_OUTLIER}
-        return {**told, "exact": bare, "right": right, "found": int(outside), "shrink": None}
+        return {**common, "exact": bare, "right": right, "found": int(outside), "shrink": None}
     if case.plan.causes == (_OUTLIER,):
-        return {**told, "exact": exact, "right": exact, "found": int(_OUTLIER in names), "shrink": None}
+        return {**common, "exact": exact, "right": exact, "found": int(_OUTLIER in names), "shrink": None}
     named = [n for n in names if n != _OUTLIER]
     bearable = not outside or judge.explained(causes).left > _CLEAR * judge.numbers
     explains = bool(named) and len(named) <= len(causes) and judge.as_well(named, causes)
     return {
-        **told,
+        **common,
         "exact": exact or (set(named) == set(causes) and bearable),
         "right": explains and bearable,
         "named": explains,

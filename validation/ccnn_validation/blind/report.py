@@ -42,8 +42,8 @@ DEFINITIONS = {
 
 def share(hits: Iterable[bool]) -> Block:
     """How many of how many, the share, and its 95 % interval; the share is None of none."""
-    told = list(hits)
-    count, of = sum(map(bool, told)), len(told)
+    outcomes = list(hits)
+    count, of = sum(map(bool, outcomes)), len(outcomes)
     if not of:
         return {"count": 0, "of": 0, "share": None, "low": None, "high": None}
     interval = binomtest(count, of).proportion_ci(0.95, method="exact")
@@ -189,10 +189,10 @@ def _confusion(kinds: Mapping[str, Sequence[Case]]) -> dict[str, dict[str, int]]
 
 def _reliability(cases: Sequence[Case]) -> list[Block]:
     """Claimed probability against how often it was right, by bins of the claim."""
-    told = [(_probability(c), _is(c, "right")) for c in cases if "failed" not in c["answer"]]
+    claims = [(_probability(c), _is(c, "right")) for c in cases if "failed" not in c["answer"]]
     bins = []
     for low, high in pairwise(_EDGES):
-        inside = [(p, r) for p, r in told if low <= p and (p < high or high == _EDGES[-1])]
+        inside = [(p, r) for p, r in claims if low <= p and (p < high or high == _EDGES[-1])]
         mean = sum(p for p, _ in inside) / len(inside) if inside else None
         bins.append({"from": low, "to": high, "claimed": mean, "right": share(r for _, r in inside)})
     return bins

@@ -86,9 +86,9 @@ def _causes(found: Mapping[str, Any]) -> Table:
 def _confusion(found: Mapping[str, Any]) -> Table:
     rows = []
     for true, said in found["confusion"].items():
-        told = [f"{name} {count}" for name, count in said.items()]
+        entries = [f"{name} {count}" for name, count in said.items()]
         rest = sum(list(said.values())[_MOST:])
-        rows.append((true, ", ".join(told[:_MOST] + ([f"others {rest}"] if rest else []))))
+        rows.append((true, ", ".join(entries[:_MOST] + ([f"others {rest}"] if rest else []))))
     return Table("What was said of what", ("truth", "verdicts and how often"), tuple(rows))
 
 
@@ -116,17 +116,17 @@ def _seconds(found: Mapping[str, Any]) -> Table:
 
 
 def _sentences(found: Mapping[str, Any]) -> list[str]:
-    told = []
+    sentences = []
     if found["failed"]:
         first = found["failed"][0]
-        told.append(
+        sentences.append(
             f"{count_text(len(found['failed']), 'case')} had no answer, the first of them case {first['number']}: "
             f"{first['sentence']}"
         )
     seconds = found["seconds"]
     if seconds:
-        told.append(
+        sentences.append(
             f"A diagnosis took {number_text(seconds[len(seconds) // 2], 3)} s (median), "
             f"{number_text(seconds[-1], 3)} s at most."
         )
-    return told
+    return sentences
