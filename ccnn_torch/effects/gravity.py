@@ -54,7 +54,7 @@ class Gravity:
                 parts.append(("tool", unit, size))
             elif turning:
                 parts += [(f"crank {wave}", "rad", size * _LEVER) for wave in ("cos", "sin")]
-            # No crank weighs many times as much as the platform; a tool may.
+            # No input link weighs many times as much as the platform; a tool may.
             found += [
                 Coefficient(
                     f"{joint.name} {part}", u, _SECONDARY * v, joint=joint.name, secondary=True, mends=part != "tool"

@@ -24,7 +24,7 @@ _HARMONICS = tuple(
 )
 # Harmonics of a turn; those of a harmonic drive's ball cage and teeth lie near the hundredth.
 _MOST_PER_TURN = 130
-# Periods over the travel of a sliding joint; fewer than the first cannot be told from a bend.
+# Periods over the travel of a sliding joint; fewer than the first are indistinguishable from a bend.
 _PERIODS = (1.5, 40.0)
 # Of a period over the travel between neighbours of the grid; a wave is lost from a whole one on.
 _PERIOD_STEP = 1 / 3

@@ -139,7 +139,7 @@ def levenberg_marquardt(
         trial = here + step
         trial_r, trial_slope = evaluate(trial, active)
         trial_cost = trial_r.square().sum(-1) / 2
-        # A rise within rounding counts as no rise: at the minimum the cost cannot be told apart from its neighbours.
+        # A rise within rounding counts as no rise: at the minimum neighbouring costs are equal to rounding.
         better = trial_cost <= cost[active] * (1 + 4 * _EPS)
         size = torch.linalg.vector_norm(step, dim=-1)
         done = size <= tolerance * (1 + torch.linalg.vector_norm(here, dim=-1))

@@ -186,7 +186,7 @@ def confusable_table(results: Block) -> Table | None:
         "On these rows the second can leave nearly the same trace as the first, so the numbers cannot say which it is. "
         "Angle: between what the first does to these rows and all that the second can do, 0 = the same, 90 = unlike; "
         "difference: what the second cannot copy over all rows together, in units of the noise: below about 3 it is "
-        "hidden. Told apart by: the first of the next measurements that does."
+        "hidden. Separated by: the first of the next measurements that does."
     )
     columns = ("pair", "probability", "angle [°]", "difference / noise [1]", "separated by")
     return Table("Which effects do these rows not distinguish?", columns, tuple(rows), note, ("separated by",))

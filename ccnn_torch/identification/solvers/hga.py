@@ -119,8 +119,8 @@ def polish(objective: Objective, points: Tensor, tell: Progress) -> tuple[Tensor
     """Sequential quadratic programming from each machine's point, without bounds.
 
     SciPy's SLSQP begins with the identity for the Hessian and learns the rest by updates, of which parameters that are
-    hardly told apart need thousands. So each round is in coordinates in which the Gauss-Newton Hessian at its start is
-    the identity, and rounds follow until one gains nothing that counts.
+    hardly distinguishable need thousands. So each round is in coordinates in which the Gauss-Newton Hessian at its
+    start is the identity, and rounds follow until one gains nothing that counts.
 
     Args:
         objective: what is minimised.
