@@ -33,4 +33,4 @@ class FallbackWarning(UserWarning):
 
 
 class OutsideDomainWarning(UserWarning):
-    """A command lies outside the domain that a compensator was trained on; the safe correction is used there."""
+    """A command is outside the domain that a compensator was trained on; the safe correction is used there."""

@@ -193,7 +193,7 @@ def test_all_errors_at_once_each_with_the_nearest_key(tmp_path: Path) -> None:
         ("methods=cnn", ("no method 'cnn'; did you mean 'ccnn'?",)),
         ("methods=transformer", ("no method 'transformer'; known are ccnn, bp_lm",)),
         ("methods=[ccnn, ccnn]", ("'ccnn' is given twice",)),
-        ("methods=[all, ccnn]", ("'all' stands alone",)),
+        ("methods=[all, ccnn]", ("'all' cannot be combined",)),
         ("device=gpu", ("device: must be cpu, cuda, cuda:N or mps, not gpu",)),
         ("covariates=3", ("covariates: must be a list, not 3",)),
         ("compensation.limit=-1", ("compensation.limit", "greater than 0")),

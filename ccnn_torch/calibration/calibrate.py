@@ -116,7 +116,7 @@ class Calibration:
             The share of what was learned that the compensator applies, 1 unless all of it was too steep.
 
         Raises:
-            MethodFailedError: the model cannot be exported; the sentence says why.
+            MethodFailedError: the model cannot be exported; the sentence gives the reason.
         """
         method = method or self.method
         repeat = self.repeat(method)
@@ -139,7 +139,7 @@ class Calibration:
         return compensator.share
 
     def _promise(self, method: str, compensator: Compensator) -> dict[str, Any] | None:
-        """What the held-out rows promise for new ones, with the compensator as it stands in the file.
+        """What the held-out rows promise for new ones, with the compensator as it is in the file.
 
         With frames per group of rows the card has no frames to judge new rows by, and of a simulated machine the
         commanded one is judged: both by the figures of the results.
@@ -210,7 +210,7 @@ def calibrate(
 def makers(config: RunConfig, default: str = "ccnn") -> dict[str, Callable[[], Learner] | None]:
     """What makes the learner of each method, by the name that results and files have for it.
 
-    A user's `path/to/file.py:Name` is called `Name` there. None stands for a learner that `methods=all` or `auto`
+    A user's `path/to/file.py:Name` is called `Name` there. None marks a learner that `methods=all` or `auto`
     asks for and this version does not have.
 
     Args:

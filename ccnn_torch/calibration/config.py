@@ -248,7 +248,7 @@ class RunConfig(_Part):
     def _known(cls, methods: list[str] | None) -> list[str] | None:
         for method in _checked(methods or [], (*METHODS, "all", "auto")):
             if method in ("all", "auto") and len(methods or []) > 1:
-                raise ValueError(f"'{method}' stands alone; remove the other names or '{method}'")
+                raise ValueError(f"'{method}' cannot be combined with other names; remove them or '{method}'")
         return methods
 
     @field_validator("effects")

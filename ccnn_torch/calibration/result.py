@@ -138,7 +138,7 @@ def _notes(plan: Plan) -> list[str]:
 def _certainty(
     outcome: Outcome, dataset: Dataset, test: Rows, inside: Tensor, joints: tuple[Coordinate, ...]
 ) -> dict[str, Any]:
-    """How wide the predictive sd is, and how often what was measured lies within its 95 % interval."""
+    """How wide the predictive sd is, and how often what was measured is within its 95 % interval."""
     sd = outcome.fitted.sd(test.take(dataset.inputs))
     residuals = test.take(dataset.deviation) - test.take(outcome.deviation)
     there = (test.weights > 0).unsqueeze(-1)

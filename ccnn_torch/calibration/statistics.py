@@ -1,6 +1,6 @@
 """The blocks of `results.json`: error measures per joint, noise floor, pose error, each with its spread over repeats.
 
-Every number stands in SI (m, rad and their squares). A spread is `{"median", "low", "high", "values"}`: the median and
+Every number is in SI (m, rad and their squares). A spread is `{"median", "low", "high", "values"}`: the median and
 the 5 % and 95 % quantiles over the repeats, and one value a repeat in the order of the seeds. A value that is not
 finite is written as null and left out of the median and the quantiles, so that a reader sees which repeat failed.
 """
@@ -277,7 +277,7 @@ def _rms_and_max(errors: NDArray[np.float64], weights: ArrayLike | None) -> Bloc
 def _rows(
     values: NDArray[np.float64], weights: ArrayLike | None, joints: Sequence[Coordinate]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Values `r x s x n` and weights `r x s`, checked; values of rows of weight 0 are 0, whatever stood there."""
+    """Values `r x s x n` and weights `r x s`, checked; values of rows of weight 0 become 0."""
     if values.ndim == 2:
         values = values[None]
     if values.ndim != 3 or values.shape[-1] != len(joints):

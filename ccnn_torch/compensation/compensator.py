@@ -77,7 +77,7 @@ class Compensator(nn.Module):
     domain r fades into `safe`; γ stays where the geometry `extrapolates` (an arm's links are what they are everywhere)
     and fades to 0 with r where it does not (a polynomial).
 
-    How far a newly measured δ may be from this one is told by `sd`: inside the domain by the network's own `variance`
+    `sd` says how far a newly measured δ may be from this one: inside the domain by the network's own `variance`
     and `sd_scale`, outside by how the training deviations scatter about `safe`, between the two by the guard's weight.
 
     Attributes:
@@ -92,7 +92,7 @@ class Compensator(nn.Module):
         lipschitz: bound of |∂δ/∂q| with joints in units of their limits (maximum row sum), 1.
         iterations: smallest k with lipschitzᵏ · max|δ| below 1e-12 of the limit.
         share: of what the network learned beside its mean that is applied [1]; below 1 where all of it was too steep.
-            It is in the scaling already, and a model file does not tell it.
+            The scaling has it already, and a model file does not store it.
         geometry: commanded joints `... x n` -> γ `... x n` [SI], bounded for finite joints; None without one.
         effects: commanded joints and covariates -> ε `... x n` [SI]; None without one.
     """
@@ -173,7 +173,7 @@ class Compensator(nn.Module):
         return Solution(command, last.value, last.inside, joints + first.value, first.inside, self._sd(last))
 
     def guarded(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As `solve`, told by deviations and weights instead of joints, which single precision cannot hold.
+        """As `solve`, for deviations and weights instead of joints, which single precision cannot hold.
 
         Returns:
             δ at the command `... x n` [SI], its weight `... x 1` [1] (1 inside the domain); δ and weight were the
@@ -209,7 +209,7 @@ class Compensator(nn.Module):
                 warned = True
                 warnings.warn(
                     "a command is outside the domain that the compensator was trained on, where it falls back to the "
-                    "mean training deviation; this is said once",
+                    "mean training deviation; this warning is given once",
                     OutsideDomainWarning,
                     stacklevel=2,
                 )

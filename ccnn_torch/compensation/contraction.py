@@ -54,7 +54,7 @@ def steepest(
         inputs: training inputs, `s x (n + m)` [SI].
         domain: fitted to them.
         limit: `n` [SI].
-        count: inputs that are looked at; of points between and around them there are six times as many.
+        count: inputs that are compared; of points between and around them there are six times as many.
         at_once: points that one pass takes; a geometry's many small operations take hardly longer for more of them.
     """
     n = len(limit)

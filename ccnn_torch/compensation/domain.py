@@ -98,7 +98,7 @@ class Domain(nn.Module):
             reach: how far a correction moves each input, `d` [SI]: the limits of the joints, 0 for covariates. Where
                 it is not small against the half range, the transition is made wider, so that the command stays
                 solvable.
-            margin: how far the boxes stand beyond the training inputs, as a share of their half range.
+            margin: how far the boxes extend beyond the training inputs, as a share of their half range.
             transition: width of the transition beyond the margin, as a share of the half range.
 
         Raises:

@@ -30,11 +30,11 @@ class Promise:
 
     Attributes:
         limit: of |deviation|, `n` [SI]; infinity without one.
-        sd: standard deviation where the deviation is taken as 0, `n` [SI]; None for a model that tells none.
-        centre, low, high: what stands for an input that is no number, and for an infinite one, `d` [SI].
+        sd: standard deviation where the deviation is taken as 0, `n` [SI]; None for a model without one.
+        centre, low, high: replacements of an input that is no number, and for an infinite one, `d` [SI].
         half_range: unit of the rows of `directions`, `d` [SI].
         directions: `k x d` [1], with `least` and `most`, `k` [1]: inside the domain, directions · (x - centre) /
-            half_range is between the two; no rows where the domain is told by the model alone.
+            half_range is between the two; no rows where the model alone defines the domain.
     """
 
     limit: Array
@@ -70,7 +70,7 @@ class Promise:
 
     @classmethod
     def without_card(cls, home: Array) -> Promise:
-        """Of identified geometry, which has no limit and tells its domain itself; home: `n` [SI]."""
+        """Of identified geometry, which has no limit and defines its domain itself; home: `n` [SI]."""
         n = len(home)
         nothing = np.zeros(0)
         return cls(np.full(n, np.inf), None, home, home, home, np.ones(n), np.zeros((0, n)), nothing, nothing)
@@ -109,8 +109,8 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
 
     A row falls back where an output is missing, of another shape or kind, or not finite, where |deviation| or
     |ideal - joints| is above the limit, or where command + deviation is not the joints. It then has command = ideal =
-    joints and deviation 0, outside the domain. A row is inside only where the card's domain says so, too. Joints that
-    are no number count as the middle of the domain, infinite ones as its edge.
+    joints and deviation 0, outside the domain. A row is inside only where it is also inside the card's domain. Joints
+    that are no number count as the middle of the domain, infinite ones as its edge.
 
     Args:
         found: outputs by name; others than these are left out.

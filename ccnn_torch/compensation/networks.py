@@ -11,7 +11,7 @@ from ccnn_torch.errors import InputError, ModelFileError
 
 __all__ = ["DescribedNetwork", "UncertainNetwork", "describe_network", "network_from_description", "register_network"]
 
-# Kind -> the class, or where it stands; imported when a file asks for it.
+# Kind -> the class, or its module; imported when a file needs it.
 _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "constant": "ccnn_torch.learners.constant:ConstantNetwork",
     "grnn": "ccnn_torch.learners.grnn_network:GRNNNetwork",
@@ -27,11 +27,11 @@ class DescribedNetwork(Protocol):
     """What a learner's network offers so that a model file can hold it; a class that is an `nn.Module` as well."""
 
     def describe(self) -> dict[str, Any]:
-        """JSON with the key `kind` and whatever `from_description` needs; the tensors are stored beside it."""
+        """JSON with the key `kind` and everything that `from_description` needs; the tensors are stored beside it."""
 
     @classmethod
     def from_description(cls, description: dict[str, Any]) -> nn.Module:
-        """A network of the described shape, whatever its values: its `state_dict` is loaded afterwards."""
+        """A network of the described shape, with any values: its `state_dict` is loaded afterwards."""
 
 
 @runtime_checkable

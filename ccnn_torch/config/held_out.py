@@ -57,7 +57,7 @@ def split_by(
     validation: float,
     held: Tensor | None = None,
 ) -> Split:
-    """Split rows as a config says.
+    """Split rows by a config.
 
     Args:
         positions: `rows x d` [m].

@@ -24,7 +24,7 @@ _WRONG_NOISE = (
 
 
 def _deviation(value: Any) -> Any:
-    """Noise as it stands in a config: None, a size above 0, or sizes above 0 by name."""
+    """Noise as in a config: None, a size above 0, or sizes above 0 by name."""
     sizes = list(value.values()) if isinstance(value, dict) else [value]
     try:
         fine = value is None or (sizes and all(0 < size(one, None, "noise") < math.inf for one in sizes))
@@ -36,7 +36,7 @@ def _deviation(value: Any) -> Any:
 
 
 class DiagnoseConfig(Section):
-    """What `ccnn diagnose` and `ccnn check` may be told."""
+    """Options of `ccnn diagnose` and `ccnn check`."""
 
     records: Files | None = Field(
         default=None,

@@ -52,7 +52,7 @@ _FEWEST_ROWS = 20
 UNSHOWN = "rows in which it shows: in these it changes no pose"
 # Names below this probability are accepted only where rows not used for fitting show what they take away.
 _LIKELY = 0.8
-# Times the noise from which a row is bad and not unlucky: by itself; and where more than so many rows in a hundred, one
+# Times the noise from which a row is bad and not unlucky: alone; and where more than so many rows in a hundred, one
 # at least, are beyond the second, since the tail of a t distribution with three degrees comes that far now and then.
 _GROSS, _GROSS_TOGETHER, _SHARE_TOGETHER = 60.0, 15.0, 0.01
 
@@ -192,7 +192,7 @@ def _notes(
         )
     if judgement.outside and not proposed:
         notes.append(
-            "no measurement is proposed: no effect says what would be measured of what lies outside of the library"
+            "no measurement is proposed: no effect says what would be measured of a cause outside of the library"
         )
     if not judgement.names and not judgement.outside and analysis.whitening.known == 0 and missing:
         columns = ", ".join(column for entry in missing for column in entry["columns"])

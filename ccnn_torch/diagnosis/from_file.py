@@ -106,7 +106,7 @@ class Verdict:
 
 
 def one_row_at_a_time(situation: Situation) -> Situation:
-    """The same rows as if each stood alone: without their times."""
+    """The same rows as if each were isolated: without their times."""
     covariates = {name: value for name, value in situation.covariates.items() if name != "time"}
     return Situation(
         situation.mechanism, situation.joints, covariates, situation.gravity, situation.parameters, situation.guess

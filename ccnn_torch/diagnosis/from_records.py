@@ -72,7 +72,7 @@ def diagnose(
 
 
 def _unread(records: Records, situation: Situation) -> list[str]:
-    """A note of columns that no effect goes by: one of them may bear another name than it should."""
+    """A note of columns that no effect uses: one of them may be misnamed."""
     mechanism = situation.mechanism
     known = [*DEFAULT_COVARIATES, *situation.covariates, *(condition.name for condition in mechanism.takes)]
     known += [*mechanism.frame_per, *mechanism.tool_per] if isinstance(mechanism, SerialArm) else []

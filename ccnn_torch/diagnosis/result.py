@@ -29,8 +29,8 @@ class Diagnosis:
         by_block: gap and shrink where rows are held out in blocks, along the direction in which the joints vary most;
             None where the verdict names nothing.
         network: what a network on the remainder would still gain; None where it was not asked for.
-        verdict: what is stood by.
-        next_measurements: rows that would tell the leading explanations apart.
+        verdict: the conclusion and its certainty.
+        next_measurements: rows that would distinguish the leading explanations.
         missing_covariates: columns that would bring more effects into sight, most promising first.
         not_seen: effects that these records cannot show, with what is missing for each.
         rows_set_aside: rows (0-based) that no fit saw: outliers, near-singular ones, rows outside the reach.

@@ -25,10 +25,10 @@ _EDGES = ((" softer", 2 * _SOFT), (" harder", 0.5 * _SOFT))
 class Backlash:
     """Δq_i = b_i / 2 tanh((w_i / h - s_i) / e) / tanh(1 / e): s the direction of approach, w the push on the joint.
 
-    A joint rests on the flank that drove it, half the play b behind the motor's middle, unless weight and load push it
-    onto the other flank whichever way it came; friction holds it there up to the push h. The machine's weight and h are
-    shapes, h for all joints alike; without a push that reaches h this is -b s / 2. Secondary: the same with an edge
-    twice and half as soft as e = 0.3, less the part with e, so that b stays the play.
+    A joint rests on the flank that drove it, half the backlash b behind the motor's middle, unless weight and load push
+    it onto the other flank whichever way it came; friction holds it there up to the push h. The machine's weight and h
+    are shapes, h for all joints alike; without a push that reaches h this is -b s / 2. Secondary: the same with an edge
+    twice and half as soft as e = 0.3, less the part with e, so that b stays the backlash.
     """
 
     name = "backlash"
@@ -85,5 +85,5 @@ class Backlash:
 
 
 def _rest(left: Tensor, soft: float) -> Tensor:
-    """Where a joint rests within its play, ±1/2 where nothing pushes it off its flank."""
+    """Where a joint rests within its backlash, ±1/2 where nothing pushes it off its flank."""
     return torch.tanh(left / soft) / (2 * math.tanh(1 / soft))

@@ -104,7 +104,7 @@ def twist_columns(situation: Situation, arm: Tensor, axes: Tensor) -> Tensor:
 
 
 def shown_columns(situation: Situation, columns: Callable[[Situation], Tensor]) -> list[int]:
-    """Numbers of the columns that change what is measured anywhere in the workspace, whatever the rows are.
+    """Numbers of the columns that change what is measured anywhere in the workspace, for any rows.
 
     Args:
         situation: whose mechanism counts.

@@ -49,6 +49,6 @@ class Coupling:
         n = situation.joints.shape[-1]
         others = ~torch.eye(n, dtype=torch.bool)
         eye = torch.eye(n, dtype=situation.joints.dtype, device=situation.joints.device)
-        # moved joint, pair (i, j): 1 where the moved joint is i, times where joint j stands.
+        # moved joint, pair (i, j): 1 where the moved joint is i, times the position of joint j.
         moved = eye[:, :, None] * situation.from_middle[..., None, None, :]
         return torch.cat([moved[..., others], eye.expand(*moved.shape[:-2], n)], -1)

@@ -14,7 +14,7 @@ from ccnn_torch.mechanisms import Mechanism
 __all__ = ["SHIFT", "covariate_units", "draw_covariates"]
 
 SHIFT = 8 * 3600.0
-"""Rows stand evenly over a shift [s]."""
+"""Rows are spread evenly over a shift [s]."""
 # Standard deviations of the load along a coordinate [N], [N·m].
 _LOAD = {"m": 60.0, "rad": 6.0}
 

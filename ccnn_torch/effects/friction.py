@@ -18,7 +18,7 @@ __all__ = ["Friction"]
 
 # A joint's friction is some tenths of what it carries, its constant part like that of a tenth of the platform's weight.
 _SHARE = 0.3
-# Small: what does not depend on the load is play, and takes its name unless the rest of friction is there.
+# Small: the part that does not depend on the load is backlash, and is called so unless the rest of friction is there.
 _CONSTANT = {"m": 6e-6, "rad": 1e-5}
 
 
@@ -28,7 +28,7 @@ class Friction:
     Coulomb's friction is in proportion to what presses the surfaces together; a drive of compliance C and friction
     coefficient μ stops C μ |τ| short. The weight is that of a platform of 100 N: of another one d is as much larger.
     Secondary: load and weight together, |τ_load + τ_weight|, where they pull apart, the weight a shape; and the part e
-    that does not depend on them, which by itself is what play does.
+    that does not depend on them, which alone is what backlash does.
     """
 
     name = "friction"

@@ -34,7 +34,7 @@ class Geometry:
         """One a parameter."""
         mechanism = situation.mechanism
         chosen = caused_by(mechanism, self.name)
-        # The parameters of an arm's link i stand behind its joint i.
+        # The parameters of an arm's link i come after its joint i.
         links = len(chosen) // len(mechanism.joints) if isinstance(mechanism, SerialArm) else 0
         return tuple(
             Coefficient(

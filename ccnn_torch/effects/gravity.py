@@ -29,7 +29,7 @@ class Gravity:
     the measured point of the platform. c is compliance times weight: a sag for each metre of lever (turning joints), or
     along a joint that carries all (sliding ones). Secondary: a joint that stiffens, d τ|τ| / 0.3 m (or / 1); what
     another mass distribution does: for an arm a weight at the tool; for a turning drive of another machine its crank,
-    whose weight asks in proportion to cos q and sin q, and for a platform that turns the moment of its weight about
+    whose weight acts in proportion to cos q and sin q, and for a platform that turns the moment of its weight about
     the measured point, in its own axes, on drives of plausible compliance.
     """
 

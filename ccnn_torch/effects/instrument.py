@@ -29,7 +29,7 @@ _COEFFICIENTS = (
 class Instrument:
     """Δposition = S (position - middle of the workspace) + z, S symmetric: no rigid motion but by what is secondary.
 
-    The diagonal of S are errors of scale, beside it stands half the angle by which two axes are not square. Secondary:
+    The diagonal of S are errors of scale, beside it is half the angle by which two axes are not square. Secondary:
     lean, the other half, a turn, since the device aligns one of the two axes with the machine and not their bisector;
     z, since its own zero is not the middle of the workspace; and a scale of the measured angles where the machine's
     angles are measured as such (not by the frames of an arm).

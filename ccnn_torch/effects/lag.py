@@ -54,7 +54,7 @@ def lagged(time: Tensor, value: Tensor, lag: Tensor) -> Tensor:
 def velocity(time: Tensor, joints: Tensor) -> Tensor:
     """Velocities by differences of the neighbouring rows in time, `... x s x n` [joint's unit per s].
 
-    Rows more than a second from either neighbour do not stand on a trajectory: their velocity is 0.
+    Rows more than a second from either neighbour are not part of a trajectory: their velocity is 0.
 
     Args:
         time: `... x s` [s], in any order.

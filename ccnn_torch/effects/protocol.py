@@ -26,14 +26,14 @@ class Coefficient:
         scale: plausible size in a machine as built [unit], one standard deviation.
         joint: name of the joint that it belongs to alone, or None.
         leg: number of the leg that it belongs to alone, or None.
-        secondary: whether it stands for what the textbook form leaves out (a stiffening spring, a second harmonic); a
+        secondary: whether it describes what the textbook form leaves out (a stiffening spring, a second harmonic); a
             simulation leaves it 0 unless given.
-        borrowed: whether by itself it is what another effect does (a constant part): it does not speak for this
+        borrowed: whether alone it is what another effect does (a constant part): it is no evidence for this
             one.
-        doubtful: whether something else may do the same as time goes by (a mount that follows the temperature, which
+        doubtful: whether something else may do the same over time (a mount that follows the temperature, which
             rises from morning to noon): it speaks for this effect where the gap follows what the effect needs.
         mends: whether it is but a correction of the form of the others, and cannot be many times as large as they are.
-        positive: whether physics allows it no negative value (play, compliance); for drawing it in a simulation.
+        positive: whether physics allows it no negative value (backlash, compliance); for drawing it in a simulation.
     """
 
     name: str

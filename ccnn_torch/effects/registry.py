@@ -74,7 +74,7 @@ def make_effect(name: str, mechanism: Mechanism | None = None) -> Effect:
             effect = make()
         except CcnnError:
             raise
-        except (Exception, SystemExit) as error:  # whatever a user's code may raise
+        except (Exception, SystemExit) as error:  # a user's code may raise anything
             raise InputError(f"{name}: making it without arguments {failure(error, name)}") from error
         return owned(effect, name)
     if Path(name).suffix == ".py":

@@ -105,7 +105,7 @@ class Situation:
     def samples(self) -> Situation:
         """The nominal machine at configurations all over its own workspace, without covariates.
 
-        What an effect takes from here (a middle, a range) means the same whatever rows it is looked at on.
+        What an effect takes from here (a middle, a range) does not depend on the rows it is evaluated on.
         """
         joints = self.mechanism.sample_joints(_SAMPLES, torch.Generator().manual_seed(0))
         return Situation(self.mechanism, joints[torch.isfinite(joints).all(-1)], {}, self.gravity)
@@ -210,7 +210,7 @@ class Situation:
     def push(self, weight: Tensor, rows: Tensor | None = None) -> Tensor:
         """How hard weight and load push each joint along its coordinate, `... x s x n` [1].
 
-        In units of what `PLATFORM_WEIGHT` typically asks of the joints of the same unit in the workspace.
+        In units of what `PLATFORM_WEIGHT` typically requires of the joints of the same unit in the workspace.
 
         Args:
             weight: of the machine, `...` [N].

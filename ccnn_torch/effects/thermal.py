@@ -40,7 +40,7 @@ class Thermal:
     sees: growth of all and of the sliding drives by 1 - exp(-t / 2000 s).
 
     Lengths are parameters and drives are joints. Both move the measured frame, to first order by the mechanism's
-    derivatives, so the effect is one on the pose: no joint has to stand in for a length (near a singularity of an arm
+    derivatives, so the effect is one on the pose: no joint has to replace a length (near a singularity of an arm
     that would take a large one), and growth of 1e-4 leaves 1e-8 to the second order.
     """
 

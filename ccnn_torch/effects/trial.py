@@ -20,14 +20,14 @@ __all__ = ["refuse_one_name", "tried"]
 
 
 def tried(effect: Effect, situation: Situation) -> str:
-    """What the rows lack for an effect, as `Effect.missing` says it; a user's own is tried on them where that is ''.
+    """What the rows lack for an effect, as `Effect.missing` states it; a user's own is tried on them where that is ''.
 
     Args:
         effect: as `make_effect` or `owned` gives it; the library's are not tried.
         situation: `... x s` rows.
 
     Raises:
-        InputError: one sentence with file and method where the effect breaks what `Effect` says.
+        InputError: one sentence with file and method where the effect breaks the contract of `Effect`.
     """
     if isinstance(effect, OwnEffect):
         wrong = _wrong_name(effect, situation)
@@ -42,7 +42,7 @@ def tried(effect: Effect, situation: Situation) -> str:
 
 
 def refuse_one_name(effects: Sequence[Effect]) -> None:
-    """Raise InputError where two candidates are called the same: a verdict could not tell them apart."""
+    """Raise InputError where two candidates are called the same: a verdict could not distinguish them."""
     names = [e.name for e in effects]
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is None:

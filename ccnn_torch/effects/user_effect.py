@@ -24,7 +24,7 @@ _Part = TypeVar("_Part", Coefficient, Shape)
 class OwnEffect:
     """An effect that is not the library's, as the rest of the package calls it.
 
-    What its code raises, and what it returns in another form than `Effect` says, becomes an InputError.
+    What its code raises, and what it returns in another form than `Effect` defines, becomes an InputError.
     """
 
     name: str
@@ -42,12 +42,12 @@ class OwnEffect:
         """As `Effect.missing`.
 
         Raises:
-            InputError: it fails, or says nothing in words.
+            InputError: it fails, or returns something other than a sentence.
         """
         said = self._asked("missing", mechanism, covariates)
         if not isinstance(said, str):
             raise InputError(
-                f"{self.label}: missing() returned {_a(said)}, expected a sentence that says which column to add, or ''"
+                f"{self.label}: missing() returned {_a(said)}, expected a sentence that names the column to add, or ''"
             )
         return said
 
@@ -88,7 +88,7 @@ class OwnEffect:
             return getattr(self.own, verb)(*given)
         except CcnnError:
             raise
-        except (Exception, SystemExit) as error:  # whatever a user's code may raise
+        except (Exception, SystemExit) as error:  # a user's code may raise anything
             raise InputError(f"{self.label}: {verb}() {failure(error, self.label)}{_hint(error, given[0])}") from error
 
     def _listed(self, verb: str, kind: type[_Part], situation: Situation) -> tuple[_Part, ...]:
@@ -127,7 +127,7 @@ class OwnEffect:
             return "joints", situation.joints.shape[-1]
         if self.kind == "parameters":
             return "parameters", len(mechanism.geometry)
-        # Not by the situation's Jacobian, which may be slow, or recorded as something that the effect looks at.
+        # Not by the situation's Jacobian, which may be slow, or recorded as something that the effect reads.
         return "pose channels", 3 if mechanism.frame(mechanism.home_pose)[1] is None else 6
 
     def _not_finite(self, situation: Situation, shape: Tensor, found: Tensor) -> str:
@@ -175,7 +175,7 @@ def owned(effect: object, label: str | None = None) -> Effect:
 
 
 def of_library(effect: object) -> bool:
-    """Whether an effect's class comes with this package, by whose tests it is held to `Effect`."""
+    """Whether an effect's class comes with this package, whose tests check it against `Effect`."""
     return type(effect).__module__.startswith(f"{__package__}.")
 
 

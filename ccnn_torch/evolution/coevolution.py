@@ -135,7 +135,7 @@ def keep_refined(state: Coevolution, refined: Sequence[Genome], scores: Tensor) 
     """Write refined networks into the elite where they are fitter than the best joined network.
 
     Args:
-        refined: parts of complete networks, `r x 1 x ...`; what stands where there is no connection is dropped.
+        refined: parts of complete networks, `r x 1 x ...`; weights without a connection are dropped.
         scores: their fitness, `r`.
     """
     return _keep_best(state, [Genome(g.mask, torch.where(active(g), g.weight, 0.0)) for g in refined], scores)

@@ -1,6 +1,6 @@
 """The paper's layered encoding: a bit string for the structure, a shorter real string for the weights (III-C).
 
-Bits stand in row order (row = node of the later layer). The weight string holds the weight of every 1, in the same
+Bits are in row order (row = node of the later layer). The weight string holds the weight of every 1, in the same
 order; where the network has biases, a node's bias follows the weights of its row.
 """
 

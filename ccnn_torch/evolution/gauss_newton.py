@@ -160,7 +160,7 @@ def _backward(
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Derivative of `seed` times the output with respect to each layer's sums, `b x s x c x out`, and what flows in.
 
-    Where there are periodic nodes, one more pair stands at the end: the derivative with respect to the frequencies,
+    Where there are periodic nodes, one more pair is at the end: the derivative with respect to the frequencies,
     beside an inflow of 1.
     """
     weights = network.split(torch.where(network.active, flat, 0))

@@ -18,10 +18,10 @@ from torch import Tensor
 
 __all__ = ["Harmonics", "fit_harmonics", "harmonic_count"]
 
-# Rows that a harmonic of one joint needs, and each turning joint at least: with fewer the harmonics follow whatever
-# else there is, which the network then does not see. On simulated six-joint arms with compliance or play, 140 rows, the
-# error was 1.5 to 1.8 times as large with them, with everything at once and 280 rows 1.5 times; on a UR10 with 350 rows
-# half as large.
+# Rows that a harmonic of one joint needs, and each turning joint at least: with fewer the harmonics follow everything
+# else there is, which the network then does not see. On simulated six-joint arms with compliance or backlash, 140 rows,
+# the error was 1.5 to 1.8 times as large with them, with everything at once and 280 rows 1.5 times; on a UR10 with 350
+# rows half as large.
 _ROWS_EACH, _ROWS_A_JOINT = 8, 50
 _ITERATIONS = 30
 _VAGUE = 1e-6
@@ -71,7 +71,7 @@ class Harmonics:
 
 
 def harmonic_count(most: int, rows: int, joints: int) -> int:
-    """Harmonics of each of so many turning joints that so many rows can tell, `most` at most; 0 with too few rows."""
+    """Harmonics of each turning joint that so many rows can determine, at most `most`; 0 with too few rows."""
     return min(most, rows // _ROWS_EACH) if rows >= _ROWS_A_JOINT * joints else 0
 
 
@@ -90,7 +90,7 @@ def fit_harmonics(
         inputs: `r x s x i` [1], the angles last.
         step: their size, `r x a` [rad].
         targets: `r x s x o` [1].
-        rows: row weights, `r x s`; 0 leaves a row out, whatever its value.
+        rows: row weights, `r x s`; 0 leaves a row out, even with NaN.
         owners: the output that is the deviation of each turning joint, `a`.
         metric: channels in which errors are judged, `r x s x c x o`, as in refinement; None = the outputs.
         count: harmonics of a joint.
@@ -126,7 +126,7 @@ def _fit(
     basis = _basis(step, angles, count).flatten(-2)
     spread = (metric @ owner.mT).repeat_interleave(2 * count, -1)
     wanted = (metric @ targets.unsqueeze(-1)).squeeze(-1)
-    # The means of the outputs are fitted as well, so that no harmonic stands in for them; they are not kept.
+    # The means of the outputs are fitted as well, so that no harmonic replaces them; they are not kept.
     grams, moments = [], []
     for channel in range(wanted.shape[-1]):
         design = torch.cat([spread[:, channel] * basis, metric[:, channel]], -1)

@@ -18,7 +18,7 @@ def fed_nodes(masks: Sequence[Tensor]) -> list[Tensor]:
     """Hidden nodes that some network input reaches; biases do not count as inputs.
 
     The others are forced to output 0 (sigmoid(0) is not 0, and a node fed by its bias alone is a constant that belongs
-    into the next bias). A node without outputs needs no forcing: nobody reads it.
+    into the next bias). A node without outputs needs no forcing: it is not read.
 
     Args:
         masks: one a layer, `... x out x in`, bool.
@@ -41,7 +41,7 @@ def alive_nodes(masks: Sequence[Tensor]) -> list[Tensor]:
     """
     alive = fed_nodes(masks)
     for layer in range(len(alive) - 1, -1, -1):
-        # Behind the nodes of the last hidden layer, the output's connections to periodic nodes may stand.
+        # Behind the nodes of the last hidden layer, the output's connections to periodic nodes may follow.
         after = masks[layer + 1][..., : masks[layer].shape[-2]]
         if layer + 1 < len(alive):
             after = after & alive[layer + 1].unsqueeze(-1)
@@ -97,7 +97,7 @@ def _affine(signal: Tensor, weight: Tensor) -> Tensor:
 
 
 def average(masks: Sequence[Tensor], weights: Sequence[Tensor], slots: int = 0) -> tuple[list[Tensor], list[Tensor]]:
-    """The mean of several networks of one shape as one masked network: their hidden nodes stand side by side.
+    """The mean of several networks of one shape as one masked network: their hidden nodes are concatenated.
 
     Args:
         masks, weights: one a layer, `... x m x out x in` and `... x m x out x (in or in + 1)`, m = networks.

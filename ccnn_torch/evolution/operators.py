@@ -36,7 +36,7 @@ def swap_genes(kind: str, draws: Tensor, genes: int) -> Tensor:
     Args:
         kind: ``"point"``: cut the row-order string at as many points as there are draws (one draw: single-point), at
             places 1 .. genes - 1; segments are exchanged alternately, and two cuts at one place cancel.
-            ``"uniform"``: each gene by itself with probability 1/2.
+            ``"uniform"``: each gene independently with probability 1/2.
         draws: uniform numbers, `... x cuts` or `... x genes`.
         genes: length of the string.
 

@@ -76,7 +76,7 @@ def refine(
         weights: per layer `... x out x in + 1`, the last column a bias, always on; or all `... x out x in`.
         inputs: `... x s x i`, about in [-1, 1].
         targets: `... x s x o`, of about unit deviation.
-        row_weights: `... x s`; 0 leaves a row out, whatever its value.
+        row_weights: `... x s`; 0 leaves a row out, even with NaN.
         settings: defaults where None.
         row_metric: `... x s x c x o`: the residual of a row is this matrix times (output - target), so that errors
             are judged in other channels than the outputs' own, as the pose error that joint deviations cause.

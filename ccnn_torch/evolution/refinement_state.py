@@ -165,7 +165,7 @@ class Refined:
 
 
 def part_of_problem(problem: RefinementProblem, index: Tensor) -> RefinementProblem:
-    """The problem of some of the networks, numbered as they stand in the batch; they lead in one dimension."""
+    """The problem of some of the networks, numbered as in the batch; they lead in one dimension."""
     if len(index) == len(problem.rows):
         return problem
     network = problem.network

@@ -13,7 +13,7 @@ _RIVAL, _RIVAL_OUTPUTS = (12, 12), 3
 
 @dataclass(frozen=True)
 class CCNNSettings:
-    """Settings of the CCNN. Defaults are for users; figures of paper 000 (section IV-A) stand beside them.
+    """Settings of the CCNN. Defaults are for users; figures of paper 000 (section IV-A) are given beside them.
 
     Attributes:
         hidden: nodes of each hidden layer; null = one layer of 8 nodes for each output, at least 24. The paper has two
@@ -40,7 +40,7 @@ class CCNNSettings:
             1 holds a sigmoid network back (test error 1.10 to 1.12 of the noise), 1.5 to 3 are alike (1.03 to 1.06).
         density: share of connections that exist at the start. No difference on the paper's cases; refined networks
             predict better with a third to a half of the connections than with all, on a UR10 and on simulated
-            machines (0.35 and 0.5 were compared there; 0.4 lies between).
+            machines (0.35 and 0.5 were compared there; 0.4 is between).
         bias: whether nodes have a bias, an input that is always on; the paper's strings have none.
         epsilon: added to the error in eq. 11, on standardised outputs.
         nonuniform_exponent: b of eq. 13 (paper: usually 2).

@@ -56,7 +56,7 @@ def readout_spread(
         masks, weights: one a layer, `... x m x out x in` and `... x m x out x (in or in + 1)`; m = 1 for one network.
         inputs: `... x s x i` [1].
         targets: `... x s x o` [1].
-        rows: row weights, `... x s`; rows of weight 0 are left out, whatever its value.
+        rows: row weights, `... x s`; rows of weight 0 are left out, even with NaN.
         waves: periodic nodes, `... x m x k`.
     """
     there = (rows > 0).unsqueeze(-1)

@@ -207,7 +207,7 @@ class IdentifyConfig(Section):
     )
     bootstrap: int = Field(default=0, ge=0, description="resampled fits beside the formula's intervals; 0 = none")
     paper: Literal["001", "004"] | None = Field(
-        default=None, description="paper whose printed figures stand beside ours in the tables"
+        default=None, description="paper whose printed figures are listed beside ours in the tables"
     )
     save_report: bool = Field(default=True, description="draw plots/ and write report.html")
 

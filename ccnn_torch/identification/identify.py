@@ -128,7 +128,7 @@ def identify(
         return Identification(config, *identify_by_constraint(config, progress, given), given=given)
     mechanism, measured = prepare(config, given)
     elsewhere = read_elsewhere(config, mechanism)
-    for method in config.methods:  # what cannot be solved is said before anything takes minutes
+    for method in config.methods:  # refuse what cannot be solved before anything takes minutes
         solver_of(method, config)
         pieces_of(measured, config, is_apart(method, config), torch.arange(1))
     facts = facts_of(config, _fingerprint(measured))

@@ -40,7 +40,7 @@ class Known:
     """What is known of the free parameters at a geometry.
 
     Attributes:
-        sd: `r x k` [SI]; inf where the rows cannot tell the parameter.
+        sd: `r x k` [SI]; inf where the rows do not determine the parameter.
         combinations: those that cannot be identified, in words, of the first machine.
         correlation: `k x k` of the first machine, NaN where nothing is known.
         singular_values: of the scaled Jacobian, by leg or for all, of the first machine.
@@ -271,7 +271,7 @@ def parameter_blocks(
     for column, parameter in enumerate(measured.mechanism.geometry):
         name = parameter.name
         i = place.get(name)
-        # Where the search did not end at a minimum the linearised problem says nothing of the truth.
+        # Where the search did not end at a minimum the linearised problem is not informative.
         identifiable = i is not None and bool(settled.any()) and bool(torch.isfinite(known.sd[settled, i]).all())
         values: dict[str, Tensor | None] = {"value": outcome.values[:, column]}
         values["sd"] = known.sd[settled, i] if i is not None and identifiable else None

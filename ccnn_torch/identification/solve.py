@@ -52,7 +52,7 @@ _ROUNDS = 2
 
 @dataclass(frozen=True)
 class Piece:
-    """A problem that is solved by itself: the whole, or one leg's; `leg` is None for the whole."""
+    """A problem that is solved on its own: the whole, or one leg's; `leg` is None for the whole."""
 
     problem: Problem
     leg: int | None = None

@@ -71,9 +71,10 @@ class BPLMSettings:
 class BPLM:
     """Levenberg-Marquardt with Bayesian regularisation (`evolution.refinement`); a step is an iteration of all starts.
 
-    The Jacobian is in closed form (`evolution._gauss_newton`), which is faster than `torch.func` and held to it by a
-    test. Starts are those of Nguyen and Widrow (IJCNN 1990), put to the logistic sigmoid: directions and places of the
-    nodes drawn from the seed, slopes such that the nodes share out the range of the inputs; output weights are small.
+    The Jacobian is in closed form (`evolution._gauss_newton`), which is faster than `torch.func` and compared with it
+    by a test. Starts are those of Nguyen and Widrow (IJCNN 1990), put to the logistic sigmoid: directions and places of
+    the nodes drawn from the seed, slopes such that the nodes share out the range of the inputs; output weights are
+    small.
 
     The model is the network of highest evidence so far, of whichever start and iteration. On case one (seeds 1000 to
     1009) the average of ten networks was as good (0.648 and 0.646 of the constant's error), and it would have ten times

@@ -33,7 +33,7 @@ class CCNN:
     training error for held-out error, so that training fitness could not choose. Refinement judges errors in the
     channels of `data.metric`, evolution (eq. 11) always in the outputs.
 
-    Where the data tell which output is the deviation of a turning joint itself, the harmonics of its gear are fitted
+    Where the data show which output is the deviation of a turning joint itself, the harmonics of its gear are fitted
     first (with refinement only), and everything else learns what they leave.
 
     Metrics of a step: `fitness_best`, `fitness_mean` (over all individuals), `error_train` (mean square of the model,

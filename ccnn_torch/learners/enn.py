@@ -87,7 +87,7 @@ class ENN:
     """The CCNN's genomes, operators and fitness (eq. 11) without its cooperation; a step is one generation.
 
     An individual is a whole network: its layers have the same parents, and one number is its fitness. The model is the
-    fittest network so far. Nothing is refined and nothing regularised, so that whatever a network is fitter by counts,
+    fittest network so far. Nothing is refined and nothing regularised, so that every difference in fitness counts,
     noise included.
 
     Metrics of a step: `fitness_best`, `fitness_mean`, `error_train`, `evaluations` (networks so far), each `r`;

@@ -28,7 +28,7 @@ __all__ = ["GPSettings", "GaussianProcess"]
 # Numbers in one matrix worked on at a time: what fits into the processor's cache is several times faster than one
 # batch of everything.
 _CHUNK = 1 << 18
-# Steps between two looks at whether the likelihood still rises.
+# Steps between two checks of whether the likelihood still rises.
 _LOOK = 10
 # Rprop's step sizes never leave these bounds [nats of a hyperparameter's logarithm].
 _STEP_SIZES = (1e-4, 1.0)
@@ -153,7 +153,7 @@ class GaussianProcess:
         self._stepping = True
 
     def _order(self, data: TrainingData) -> Tensor:
-        """Which rows to use, `r x n`: all as they stand where they are few, else drawn by the seeds, padding last."""
+        """Which rows to use, `r x n`: all in their order where they are few, else drawn by the seeds, padding last."""
         s, device = data.inputs.shape[1], data.inputs.device
         if s <= min(self.settings.hyperparameter_rows, self.settings.variance_rows):
             return torch.arange(s, device=device).expand(len(data.seeds), -1)
@@ -161,7 +161,7 @@ class GaussianProcess:
         return torch.where(data.weights > 0, keys, 2.0).argsort(dim=1, stable=True)[:, : self.settings.max_rows]
 
     def step(self) -> dict[str, Tensor]:
-        """One marginal likelihood of every output whose search goes on, and one step of Rprop."""
+        """One marginal likelihood of every output whose search has not ended, and one step of Rprop."""
         from ccnn_torch.learners.gp_evidence import log_evidence
 
         state = self._state
@@ -239,7 +239,7 @@ class GaussianProcess:
         return self._network(repeat, self._final_dual(), self._spread())
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Hyperparameters where the search stands, with Rprop's memory, and those of the model: `r x o x k`."""
+        """Hyperparameters at this point of the search, with Rprop's memory, and those of the model: `r x o x k`."""
         return {name: value.detach().clone() for name, value in self._state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -266,7 +266,7 @@ class GaussianProcess:
         self._factors: Tensor | None = None
 
     def _chunks(self, going: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Indices of repeats and outputs whose search goes on, a few at a time."""
+        """Indices of repeats and outputs whose search has not ended, a few at a time."""
         size = max(1, _CHUNK // self._few**2)
         for part in torch.split(torch.nonzero(going), size):
             yield part[:, 0], part[:, 1]
@@ -312,7 +312,7 @@ class GaussianProcess:
         """Inverse Cholesky factors of the rows that variances condition on, `r x o x v x v`."""
         if self._factors is None:
             rows = min(self.settings.variance_rows, self._rows.shape[1])
-            # Rows that do not exist tell nothing.
+            # Rows that do not exist carry no information.
             there = self._weights[:, :rows] > 0
             self._factors = self._over_outputs(rows, lambda repeat, _, matrix: spread_factor(matrix) * there[repeat])
         return self._factors

@@ -142,7 +142,7 @@ class GPNetwork(nn.Module):
         return (self.output_scale - explained).clamp_min(0.0) + self.noise
 
     def _correlation(self, features: Tensor, points: Tensor, own: Tensor) -> Tensor:
-        """With the rows that `points` and `own` tell of, `... x o x n`."""
+        """With the rows of `points` and `own`, `... x o x n`."""
         across = (features @ points).reshape(*features.shape[:-1], *own.shape)
         square = ((features * features) @ self.inverse_squares).unsqueeze(-1)
         return _correlation(self.kernel, square + own - 2 * across)

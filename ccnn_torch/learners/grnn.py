@@ -37,7 +37,7 @@ class GRNNSettings:
             leave-one-out, to be used at all. The lowest of many errors is low by luck too: with nothing to learn in 100
             rows, 0 costs 2 % of the variance and 1.5 a tenth of that, while on case one the gain is 3.5 to 6.
         queries: rows that leave-one-out judges, drawn once by seed where there are more. Bandwidth vectors are
-            compared on the same rows, so that 500 tell them apart as well as all would.
+            compared on the same rows, so that 500 distinguish them as well as all would.
         references: rows that they are predicted from, drawn likewise; the bandwidths are then narrowed by
             (references / rows) ** (1 / (4 + inputs)) for the use of all rows, the rate at which the best ones shrink.
 
@@ -96,9 +96,9 @@ class GRNN:
     a step: each bandwidth up, down, and switched off or on; and random moves of several at once. Everything is exact
     up to `references` rows, and computed in blocks of a few megabytes beyond.
 
-    Variance: kernel-weighted mean of the squared leave-one-out residuals, which a few rows alone cannot tell and which
-    is therefore drawn towards their overall mean; times (1 + sum of squared shares) for the error of the mean itself;
-    plus the variance that the inputs explain where no row is near.
+    Variance: kernel-weighted mean of the squared leave-one-out residuals, which a few rows alone do not determine and
+    which is therefore drawn towards their overall mean; times (1 + sum of squared shares) for the error of the mean
+    itself; plus the variance that the inputs explain where no row is near.
 
     Metrics of a step: `error_train` (on the judged rows alone beyond `references`), `error_leave_one_out` (in the
     channels of the metric, the lowest so far), `evaluations` (leave-one-out errors so far), each `r`.
@@ -209,7 +209,7 @@ class GRNN:
         return max(self.settings.candidates, 3 * self._inverse.shape[-1])
 
     def _draw_rows(self, rows: TrainingData) -> _Judged:
-        """Rows in an order drawn by seed, padded ones last, as many as are looked at."""
+        """Rows in an order drawn by seed, padded ones last, as many as are used."""
         count = rows.weights.shape[1]
         keys = uniform(self._seeds, _ROWS, 0, (count,)) + (rows.weights == 0)
         order = keys.argsort(-1)[:, : self.settings.references]
@@ -235,7 +235,7 @@ class GRNN:
         draws = uniform(self._seeds, _MOVES, int(self._step), (2, count, width))
         log_range = math.log(settings.widest / settings.narrowest)
         fresh = torch.exp(log_range * draws[:, 0]) / settings.widest
-        # Each input by itself: narrower, wider, off; where it is off: three fresh bandwidths.
+        # Each input alone: narrower, wider, off; where it is off: three fresh bandwidths.
         alone = torch.eye(width, dtype=torch.bool, device=best.device)
         factor = torch.stack([self._move, 1 / self._move, torch.zeros_like(self._move)], -1)
         scale = torch.where(alone, factor[:, :, None, None], 1.0).flatten(1, 2)
@@ -292,7 +292,7 @@ class GRNN:
         return inverse / ((kept / whole) ** (1 / (4 + inputs.to(kept.dtype)))).unsqueeze(-1)
 
     def _residuals(self, repeat: int) -> KernelVariance:
-        """What the leave-one-out residuals of one repeat tell about the noise."""
+        """What the leave-one-out residuals of one repeat show of the noise."""
         judged = self._judged
         count = judged.queries
         there = judged.weights[repeat] > 0

@@ -23,7 +23,7 @@ class TrainingData:
         metric: in which channels the error of a row is judged, `r x s x c x o`: this matrix times (output - target),
             such as the pose error that joint deviations cause. None = the outputs themselves. Learners may leave it
             aside.
-        angles: how many of the features, the last ones, are scaled angles that stand among the others by their sines
+        angles: how many of the features, the last ones, are scaled angles given by their sines
             and cosines; 0 unless the learner's `reads_angles` asks for them.
         angle_step: size of these features, `r x angles` [rad]; None = not known.
         angle_outputs: the output that is the deviation of each of these joints itself; () = not known.

@@ -133,7 +133,7 @@ class Structure:
         best = self._best()
         evidence = self.evidence[best]
         rows = self.rows.weights[best].sum(-1) * self.rows.targets.shape[-1]
-        # A member that fell short stands back for a copy of the best one: every repeat has as many networks.
+        # A member that fell short is replaced by a copy of the best one: every repeat has as many networks.
         short = evidence < evidence[:, :1] - _SHORT * rows
         model = choose(self.evidence > -torch.inf, self.refined, self._evolved())
         voters = torch.where(short, best[:, :1], best)

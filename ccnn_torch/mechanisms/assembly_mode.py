@@ -12,7 +12,8 @@ from ccnn_torch.mechanisms.mechanism import Mechanism
 __all__ = ["find_jump", "is_numeric", "jump_sentence", "settle_home"]
 
 _POSES, _STEPS = 256, 8
-# A walk whose joints change by more than this in a step, or that differs by less from the direct answer, tells nothing.
+# A walk whose joints change by more than this in a step, or that differs by less from the direct answer, is not
+# conclusive.
 _LARGEST_STEP, _APART = 1.0, 0.1
 
 
@@ -32,7 +33,7 @@ def is_numeric(mechanism: Mechanism) -> bool:
 def settle_home(mechanism: Mechanism) -> None:
     """Put `home_joints` exactly where `home_pose` is, by Newton from where they are; changed in place.
 
-    From a guess that is only near, a search for another pose first has to come back to the branch, and may miss it.
+    From a guess that is only near, a search for another pose first has to return to the branch, and may miss it.
     Where there is no solution near, they stay.
     """
     if is_numeric(mechanism):

@@ -32,7 +32,7 @@ class Mechanism(nn.Module):
 
     Everything is float64 and SI, broadcasts over leading dims, parameters included (`r x 1 x k` parameters and `s x n`
     joints give `r x s x p` poses), and is differentiable in joints, pose and parameters. A row without a solution
-    comes back as NaN: ask `reachable` first.
+    is returned as NaN: ask `reachable` first.
 
     Attributes:
         name: name in configs and model cards.
@@ -42,7 +42,7 @@ class Mechanism(nn.Module):
         nominal: nominal parameters, `k` [SI], buffer.
         low, high: box of poses that `sample_workspace` draws from, `p` [SI], buffers.
         home_pose, home_joints: a configuration on the nominal branch, `p` and `n` [SI], buffers; where Newton starts.
-        closed_form: which direction is a closed form of sums, products, roots, sines and cosines, so that it can stand
+        closed_form: which direction is a closed form of sums, products, roots, sines and cosines, so that it can be
             in an exported graph: ``forward``, ``inverse``, or None.
         inverse_kinematics: child module around `solve_inverse`, the place for forward hooks.
         takes: covariates that the nominal machine itself depends on: a simulator's; () for all others.
@@ -148,7 +148,7 @@ class Mechanism(nn.Module):
         The default reads x, y, z and rx, ry, rz (a rotation vector) by name; what is not there is 0.
 
         Raises:
-            InputError: the pose has another angle: a mechanism with one overrides this and says how it turns.
+            InputError: the pose has another angle: a mechanism with one overrides this and defines how it turns.
         """
         return frame_from_coordinates(pose, self.pose, self.name)
 
@@ -252,7 +252,7 @@ class Mechanism(nn.Module):
         return self
 
     def lacking(self, conditions: Sequence[str]) -> list[Condition]:
-        """Covariates that it depends on and that neither these names nor `under` have told it."""
+        """Covariates that it depends on and that neither these names nor `under` supply."""
         return []
 
     def condition_number(
@@ -281,7 +281,7 @@ class Mechanism(nn.Module):
         is (second kind: the platform can move with the joints held) the largest goes to infinity (Gosselin and Angeles
         1990). The measure is their ratio, the reciprocal condition number of J with its rotation rows times
         `rotation_weight` [m/rad]. Unlike determinants of the two matrices it does not depend on how F is written.
-        Which kind is near, `singular_values` tells.
+        `singular_values` tells which kind is near.
         """
         return 1 / self.condition_number(joints, rotation_weight, parameters, guess)
 

@@ -54,7 +54,7 @@ def carry_derivative(x: Tensor, slope: Tensor, residual: Tensor) -> Tensor:
     Args:
         x: `... x k`, the root.
         slope: `... x c x k`, dF/dx there; no gradient is taken through it.
-        residual: `... x c`, F at the frozen root, differentiable in whatever F depends on besides.
+        residual: `... x c`, F at the frozen root, differentiable in everything else that F depends on.
 
     Returns:
         `... x k`, equal to x bit by bit.

@@ -30,7 +30,7 @@ def pose_error(measured: Frame, reference: Frame) -> PoseError:
     """Euclidean distance (eq. 6) and geodesic angle of two frames.
 
     Eq. 7 of the paper takes the arccos of a sum of three products, which is undefined for small errors; the geodesic
-    angle is what it stands for.
+    angle is the one that it represents.
     """
     position = torch.linalg.vector_norm(measured[0] - reference[0], dim=-1)
     if measured[1] is None or reference[1] is None:

@@ -18,7 +18,7 @@ __all__ = ["checked_plugin"]
 
 # A root is settled to about 1e-12; a user's own closed form may close a little worse [m, rad].
 _CLOSES = 1e-6
-_ADVICE = "ccnn_torch.testing.check_mechanism says more"
+_ADVICE = "ccnn_torch.testing.check_mechanism reports more"
 
 
 def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
@@ -49,7 +49,7 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
             wrong = _wrong_kinematics(mechanism) or jump_sentence(mechanism)
     except CcnnError:
         raise
-    except (Exception, SystemExit) as error:  # whatever a user's code may raise
+    except (Exception, SystemExit) as error:  # a user's code may raise anything
         said = str(error).strip().splitlines() or [""]
         raise InputError(f"{spec}{_line(spec, error)}: {type(error).__name__}: {said[0]}") from error
     if wrong:

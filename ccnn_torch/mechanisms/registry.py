@@ -33,7 +33,7 @@ def _framed(
     mechanism: str | Mapping[str, Any], base: bool = True, tool: bool = False, rotation_weight: float = 0.04
 ) -> Framed:
     """A mechanism by name, file or description, seen from a measuring frame."""
-    # Whether code may run is for whoever reads the file that this stands in to say.
+    # The reader of the file that contains this decides whether code may run.
     if isinstance(mechanism, str):
         inner = load_mechanism(mechanism)
     else:
@@ -132,7 +132,7 @@ def mechanism_of_file(
 
 
 def _made(spec: str, keys: Any, parameters: Callable[[Mechanism], Any], source: str) -> Mechanism:
-    """The mechanism that a file tells of, whatever else than what we write stands there."""
+    """The mechanism that a file describes, whatever else the file contains."""
     try:
         mechanism = load_mechanism(spec, **keys)
         mechanism.set_parameters(parameters(mechanism))

@@ -9,7 +9,7 @@ __all__ = ["expand_leading", "leading_shape", "stack_last"]
 
 
 def leading_shape(*tensors: Tensor) -> torch.Size:
-    """Common leading dims of tensors `... x d`, whatever their last dims."""
+    """Common leading dims of tensors `... x d` with any last dims."""
     shape: torch.Size = torch.broadcast_shapes(*(t.shape[:-1] for t in tensors))  # type: ignore[no-untyped-call]
     return shape
 

@@ -43,7 +43,7 @@ def residual_scale(length: Tensor, used: Tensor, channels: int, parameters: int)
 
 
 def inlying(length: Tensor, used: Tensor, channels: int, parameters: int) -> Tensor:
-    """Rows that are no gross outliers, `… x s` bool; all of them where too few rows could tell.
+    """Rows that are no gross outliers, `… x s` bool; all of them where there are too few rows to decide.
 
     Args:
         length, used, channels, parameters: as for `residual_scale`.

@@ -125,6 +125,6 @@ def rotation_vector_rate(vector: Tensor) -> Tensor:
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
-    """The same angle in [-pi, pi], any shape [rad]; an angle already there comes back bit by bit."""
+    """The same angle in [-pi, pi], any shape [rad]; an angle already there is returned bit by bit."""
     turns = torch.round(angle / (2 * torch.pi))
     return torch.where(turns == 0, angle, angle - turns * 2 * torch.pi)

@@ -26,7 +26,7 @@ __all__ = ["check_plan_file", "make_plan", "write_plan"]
 def make_plan(
     mechanism: str | Mechanism, poses: int, config: PlanConfig | None = None, progress: Progress | None = None
 ) -> tuple[Mechanism, list[Plan]]:
-    """Plan poses as a config says.
+    """Plan poses by a config.
 
     Args:
         mechanism: a name, a file, or a mechanism.

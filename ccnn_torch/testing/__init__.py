@@ -1,4 +1,4 @@
-"""Conformance checks for plug-ins: each raises AssertionError with a sentence that says what is wrong."""
+"""Conformance checks for plug-ins: each raises AssertionError with a sentence that names the mistake."""
 
 from ccnn_torch.testing.effect import check_effect as check_effect
 from ccnn_torch.testing.learner import check_learner as check_learner

@@ -36,7 +36,7 @@ def check_effect(effect: str | Callable[[], Effect], mechanism: Mechanism | str 
         seed: of the test rows.
 
     Raises:
-        AssertionError: one sentence that says what is wrong; with the line where the effect's code raised.
+        AssertionError: one sentence with the mistake; with the line where the effect's code raised.
     """
     before = (torch.random.get_rng_state(), random.getstate())
     try:

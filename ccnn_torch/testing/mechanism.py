@@ -38,7 +38,7 @@ def check_mechanism(mechanism: Mechanism, seed: int = 0) -> None:
         seed: of the test configurations.
 
     Raises:
-        AssertionError: one sentence that says what is wrong.
+        AssertionError: one sentence that names the mistake.
     """
     _check_names(mechanism)
     jump = jump_sentence(mechanism, seed)

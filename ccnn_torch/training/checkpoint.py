@@ -67,5 +67,5 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _seal(tensors: dict[str, Tensor], about: dict[str, Any]) -> str:
-    """SHA-256 over the tensors and what is said of them."""
+    """SHA-256 over the tensors and their metadata."""
     return hashlib.sha256((tensor_digest(tensors) + json.dumps(about, sort_keys=True)).encode()).hexdigest()

@@ -15,7 +15,7 @@ class Scaling(nn.Module):
     """Input and output scaling of `r` repeats (or of none: every buffer then lacks the leading dimension).
 
     A linear input x becomes (x - centre) / half_range; a periodic one (a revolute joint that turns far) becomes the
-    two features sin x and cos x, so that a full turn is no jump. Features stand in the order: linear inputs, then the
+    two features sin x and cos x, so that a full turn is no jump. Features have the order: linear inputs, then the
     sines, then the cosines of the periodic ones, and then, for a learner that reads angles, the periodic ones scaled as
     the linear ones are.
 

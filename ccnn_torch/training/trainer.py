@@ -32,8 +32,8 @@ class Training:
         history: metrics by name, `steps x r [x k]`.
         seconds: time spent inside the learner.
         clock: the same after each step, `steps` [s].
-        converged: what the learner says of itself after its last step, before the chosen state is taken, `r` bool; a
-            training that was ended before the learner's own end counts as converged. None = it does not say.
+        converged: what the learner reports after its last step, before the chosen state is taken, `r` bool; a
+            training that was ended before the learner's own end counts as converged. None = it does not report it.
         ended: false where the budget ended it before the learner, `stop_at` or `patience` did.
     """
 
@@ -174,7 +174,7 @@ class _Run:
             error = error.view(-1, self.folds).mean(1).repeat_interleave(self.folds)
             improved = error < self.best_validation
             if self.patience is not None:
-                # A repeat that would have stopped by itself takes nothing more, whatever runs beside it.
+                # A repeat that would have stopped alone takes no more steps, whatever runs beside it.
                 improved &= self.step - self.best_step <= self.patience
             self.best_validation = torch.where(improved, error, self.best_validation)
         if improved is not None and bool(improved.any()):
@@ -188,7 +188,7 @@ class _Run:
 
     def finish(self) -> Training:
         if self.stop_at is not None and bool((self.stop_at > self.step).any()):
-            # The learner ended by itself before it came so far: its last state is the nearest one.
+            # The learner ended before that step: its last state is the nearest one.
             self._keep(self.stop_at > self.step)
         ended, converged = self.done, getattr(self.learner, "converged", None)
         if converged is not None:
@@ -276,7 +276,7 @@ def _told(learner: Learner, when: str) -> Iterator[None]:
     try:
         yield
     except torch.linalg.LinAlgError as problem:  # type: ignore[attr-defined]
-        # Its first line says what; the others are for those who call the routine.
+        # Its first line is the reason; the others are for callers of the routine.
         sentence = str(problem).splitlines()[0].removeprefix("linalg.")
         raise MethodFailedError(f"{learner.name} met a matrix that cannot be factorised {when} ({sentence})") from None
 

@@ -339,9 +339,9 @@ def test_a_master_of_weights_that_overflow_falls_back_in_calls_and_in_the_hook(c
     assert torch.equal(hooked, tripod.inverse_kinematics(tripod.home_pose))
 
 
-def test_a_master_whose_limits_are_not_those_it_tells_of(copied: Path) -> None:
+def test_a_master_whose_limits_are_not_those_of_its_metadata(copied: Path) -> None:
     path = forge_master(copied, facts_of(copied), lambda t: t.update(limit=t["limit"] * 1e6))
-    with pytest.raises(ModelFileError, match="other limits than it tells of"):
+    with pytest.raises(ModelFileError, match="its limits are not those of its metadata"):
         load_model(path)
 
 

@@ -164,7 +164,7 @@ def test_a_terminal_shows_only_regimes_that_tell_something() -> None:
     results["where_ci95"]["covariates"]["load_z"] = [[0.1, 0.6], [0.4, 0.9]]
     told = where_table(results, about, telling=True)
     assert told is not None and not any("load_z" in row[0] for row in told.rows)
-    assert told.note.endswith("Not shown: load_z, over which the gap is even as far as these rows tell.")
+    assert told.note.endswith("Not shown: load_z, over which these rows show no difference in the gap.")
 
 
 def test_next_measurements_as_table_and_as_records_for_the_machine(folder: Path) -> None:

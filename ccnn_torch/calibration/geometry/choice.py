@@ -23,7 +23,7 @@ from ccnn_torch.records.splits import Split, fold_splits
 __all__ = ["GeometryChoice", "choose_geometry"]
 
 _FOLDS = 5
-# Rows that the comparison looks at: enough to see what helps, few enough to take seconds.
+# Rows that the comparison uses: enough to see what helps, few enough to take seconds.
 _MOST_ROWS = 600
 # The learner that is compared, and its settings: hyperparameters from few rows and steps, since there is a GP a fold.
 _LEARNER = "gp"
@@ -59,9 +59,9 @@ def choose_geometry(
     """Compare identified geometry alone, nominal geometry with a learner, and identified geometry with a learner.
 
     By the held-out pose errors of cross-validation in the training rows of one repeat, at most 600 of them; frames,
-    parameters and learner are fitted anew in each fold. The learner is a Gaussian process, whatever is trained later.
-    A simpler one of the three, in this order, is kept unless a later one is better by more than a standard error of the
-    folds' differences.
+    parameters and learner are fitted anew in each fold. The learner is a Gaussian process, for every method that is
+    trained later. A simpler one of the three, in this order, is kept unless a later one is better by more than a
+    standard error of the folds' differences.
 
     Args:
         split, kind: of the repeat; `kind` says how folds are made.
@@ -123,7 +123,7 @@ def _errors(
         "nominal + learner": learned(fitted.parameters),
         "identified + learner": learned(fitted.geometry),
     }
-    # A gross outlier says nothing of any of them, and would decide alone.
+    # A gross outlier is no evidence for any of them, and would decide alone.
     length = rows["identified"].sqrt().nan_to_num(math.inf)
     held = held * inlying(length, held > 0, 3, 0)
     return {name: (values.nan_to_num(0.0) * held).sum(-1) / held.sum(-1) for name, values in rows.items()}

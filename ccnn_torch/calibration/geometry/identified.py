@@ -70,7 +70,7 @@ class Fitted:
         Args:
             joints: commanded, `s x n` [SI].
             total: deviations of the nominal machine, `[r x] s x n` [SI].
-            splits: one a repeat; the rows that are not held out tell how far a correction goes.
+            splits: one a repeat; the rows that are not held out bound the correction.
             margin: of the compensator's domain.
         """
         assert self.geometry is not None
@@ -86,7 +86,7 @@ def fit_machine(mechanism: Mechanism, records: Records, splits: list[Split], ide
     """Fit frames that are unknown, and the geometry where it is asked for or costs nothing (a serial arm).
 
     Args:
-        splits: one a repeat; only rows that are not held out are looked at.
+        splits: one a repeat; only rows that are not held out are used.
         identify: whether the geometry is to be a part of the compensator.
 
     Raises:

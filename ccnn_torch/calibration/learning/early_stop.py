@@ -62,13 +62,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Choice:
-    """What the held-out rows of the choosing phase said; every tensor leads with the repeats.
+    """Result on the held-out rows of the choosing phase; every tensor leads with the repeats.
 
     Attributes:
         best_step: steps after which the mean error over the folds was lowest, `r` int64.
         errors: mean squared standardised error on the held-out rows then, `r x folds`.
         sd_scale: by `sd_scale` from all held-out rows, `r x n`.
-        converged: what the learner said at its end, over all folds, `r` bool; None = it does not say.
+        converged: the learner's own report at its end, over all folds, `r` bool; None = it does not report it.
         evaluations: of all folds together, `r`; None = the learner does not count.
         step, seconds: steps done, and time spent inside the learner.
         ended: false where the budget ended it.

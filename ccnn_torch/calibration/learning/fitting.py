@@ -32,7 +32,7 @@ class Fitted:
 
     Attributes:
         data: the training rows that the learner was fitted to.
-        training, choice: the fit on all training rows, and what held-out rows said before it (None = none were).
+        training, choice: the fit on all training rows, and the result on held-out rows before it (None = none were).
         score: what repeats and methods are compared by, lower is better, `r`: the mean squared standardised error on
             the held-out rows, or where none were held out on the training rows.
         sd_scale: what the learner's predictive sd is multiplied by so that its intervals cover what they claim, by the
@@ -70,9 +70,9 @@ class Fitted:
 
     @property
     def converged(self) -> Tensor | None:
-        """Whether the learner met its own criterion by its last step, `r` bool; None = it does not say.
+        """Whether the learner met its own criterion by its last step, `r` bool; None = it does not report it.
 
-        Where rows were held out this is of the training before the refit, since the refit ends where they said.
+        Where rows were held out this is of the training before the refit, since the refit ends where they decided.
         """
         found = self.training.converged if self.choice is None else self.choice.converged
         return None if found is None else found.cpu()
@@ -116,7 +116,7 @@ def refit(
     folder: RunFolder | None,
     watch: WatchPhase,
 ) -> Fitted:
-    """The second phase of `fit_method`: train on all training rows, for as long as the choice says."""
+    """The second phase of `fit_method`: train on all training rows, for as many steps as were chosen."""
     learner = make()
     data, scaling = dataset.scaled("fit", False, learner)
     data = moved(data, plan.device)

@@ -29,7 +29,7 @@ _SIMPLEST = "constant"
 
 @dataclass
 class Comparison:
-    """What cross-validation said of each method, and which one that makes the choice.
+    """Result of cross-validation for each method, and the method it chooses.
 
     A method that the budget ended between two steps is compared with what it has: its best step so far is what its
     refit would take, so the comparison is fair to the model that the user would get. One that did not get to its first

@@ -43,7 +43,7 @@ def comparison_table(results: Results) -> Table | None:
 
 
 def reach_table(results: Results) -> Table | None:
-    """Seconds and evaluations to the same held-out error; None where the run has no curves to tell."""
+    """Seconds and evaluations to the same held-out error; None where the run has no curves."""
     reach = results.get("reach")
     if not reach:
         return None

@@ -1,13 +1,13 @@
 """The tables of paper 000 (Zhang and Gao, IEEE Trans. Ind. Electron. 59(10), 2012), as printed, beside our results.
 
-Slips in the print, kept here as they stand:
+Misprints, kept here as printed:
 
 * Table I: with the errors of eq. 17 the rows of ρ1 and ρ3 are swapped (the formulas give means of -0.950e-4, 0.919e-4
   and 1.489e-4 m for ρ1, ρ2, ρ3).
 * Table II: the last column of ENN does not follow from its joints (their mean mse is 1.778e-10 m²).
 * Table III: its spread does not follow from the printed deviations of eq. 19 (2e-5, 5e-4, 2.5e-5 m) but from about
   4e-6, 2.1e-5 and 3.6e-6 m; that is our variant `tabulated`.
-* Table IV: the row GRNN repeats for u2 the digits of ρ2 in Table II, and CCNN lies below the noise floor of the printed
+* Table IV: the row GRNN repeats for u2 the digits of ρ2 in Table II, and CCNN is below the noise floor of the printed
   deviations.
 """
 
@@ -117,7 +117,7 @@ _MACHINE_TOOL = PaperCase(
         }
     ),
     remark=(
-        "The noise that the paper prints in eq. 19 contradicts its Table III, and its Table IV lies below the floor of "
+        "The noise that the paper prints in eq. 19 contradicts its Table III, and its Table IV is below the floor of "
         "that noise; only the variant `tabulated` can be compared with its figures. GRNN's u2 repeats digits of "
         "Table II."
     ),

@@ -1,7 +1,7 @@
 """The tables of a run, from `results.json` alone: for the screen, for `results.md`, and for the HTML report.
 
 They follow the paper: before calibration as Tables I and III, after it as Tables II and IV, and where the run is one of
-the paper's cases its printed figures stand beside ours. All numbers are medians over the repeats with [5 %, 95 %].
+the paper's cases its printed figures are listed beside ours. All numbers are medians over the repeats with [5 %, 95 %].
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def write_tables(folder: Path, results: Results) -> None:
 
 
 def cautions(results: Results) -> list[str]:
-    """What a person must know before they use the model: `worse_text` and `failures`."""
+    """What a user must know before using the model: `worse_text` and `failures`."""
     worse = worse_text(results)
     return [*([worse] if worse else []), *failures(results)]
 

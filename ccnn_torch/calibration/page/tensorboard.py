@@ -30,14 +30,14 @@ class TensorBoardCallback:
     `density/subpopulation_1`) and, when there are several repeats, that of the first one under `repeat_0/…`: a median
     curve hides how a single run moves, thirty curves hide everything.
 
-    Errors (`heldout_mse_…` and `error_…`) stand there twice more, so that methods whose steps are different things can
+    Errors (`heldout_mse_…` and `error_…`) are written twice more, so that methods whose steps are different things can
     be compared on one axis: `by_evaluations/NAME` with the evaluations so far in place of the step, and `by_time/NAME`
     with the milliseconds inside the learner (all repeats together). Every event carries the time inside the learner as
     its wall time, so that TensorBoard's relative axis means the same.
 
-    The writer opens at the first step it is given and purges what stood at or after that step, so that a run resumed
-    from a checkpoint shows no step twice. That takes points of the other two axes along, whose numbers are not steps;
-    they are written again from `past`.
+    The writer opens at the first step it is given and purges what was written at or after that step, so that a run
+    resumed from a checkpoint shows no step twice. That takes points of the other two axes along, whose numbers are not
+    steps; they are written again from `past`.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class TensorBoardCallback:
         genome = getattr(learner, "genome", None)
         self._origin = time.time()
         if step == 0:
-            # Nothing lies before a fresh start, whatever an older file holds.
+            # A fresh start has no earlier steps, whatever an older file holds.
             self._past = None
         if self._masks is None and genome is not None:
             self._masks = lambda: [mask.cpu().numpy() for mask in genome(0)[0]]
@@ -148,7 +148,7 @@ def _median(value: Tensor | float) -> float:
 
 
 def _seconds(metrics: Mapping[str, Tensor]) -> float | None:
-    """Time inside the learner so far, the same for all repeats; None where nobody measured it."""
+    """Time inside the learner so far, the same for all repeats; None where it was not measured."""
     return float(metrics["seconds"].max()) if "seconds" in metrics else None
 
 

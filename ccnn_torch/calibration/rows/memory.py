@@ -18,7 +18,7 @@ def memory_of_run(config: RunConfig, rows: int, joints: int) -> int:
     """About what a run takes at its peak, in bytes; the methods come one after the other.
 
     Args:
-        config: says repeats, methods and their sizes.
+        config: with repeats, methods and their sizes.
         rows: of the data.
         joints: of the mechanism.
     """
@@ -50,7 +50,7 @@ def check_memory(config: RunConfig, rows: int, joints: int) -> list[str]:
 
 
 def free_memory() -> int | None:
-    """Bytes that a new process could have; None where the system does not tell."""
+    """Bytes that a new process could have; None where the system does not report it."""
     try:
         with open("/proc/meminfo", encoding="ascii") as about:
             lines = dict(line.split(":", 1) for line in about)
@@ -58,7 +58,7 @@ def free_memory() -> int | None:
     except (OSError, KeyError, ValueError):
         pass
     try:
-        # All of it: what is free is not told everywhere.
+        # All of it: not every system reports what is free.
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):
         return None

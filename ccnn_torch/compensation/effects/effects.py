@@ -144,7 +144,7 @@ class PhysicalEffects(nn.Module):
         return found.reshape(joints.shape)
 
     def describe(self) -> dict[str, Any]:
-        """Everything `from_description` needs; the tensors stand beside it."""
+        """Everything `from_description` needs; the tensors are stored beside it."""
         return {
             "kind": "physical_effects",
             "mechanism": self._mechanism[0].describe(),
@@ -158,7 +158,7 @@ class PhysicalEffects(nn.Module):
     @classmethod
     def from_description(cls, description: dict[str, Any]) -> PhysicalEffects:
         """The module as it was described, its tensors 0."""
-        # Whether code may run says whoever reads the file that this stands in.
+        # The reader of the file that contains this decides whether code may run.
         mechanism = mechanism_from_description(description["mechanism"], allow_code=True)
         weight, damping, *most, free = description["care"]
         gain, inverse_gain = (math.inf if m is None else float(m) for m in most)

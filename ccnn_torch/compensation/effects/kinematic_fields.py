@@ -44,7 +44,7 @@ _POSITION, _ROTATION = "platform position", "platform rotation"
 
 
 class _Watched(Situation):
-    """Notes what is looked at."""
+    """Records which quantities are read."""
 
     def __getattribute__(self, name: str) -> Any:
         if name in _NAMES:
@@ -61,7 +61,7 @@ def looked_at(situation: Situation, use: Callable[[Situation], object]) -> set[s
     """
     use(situation)
     watched = _Watched(situation.mechanism, situation.joints, situation.covariates, situation.gravity)
-    # With everything at hand nothing is looked at only to work something else out.
+    # With everything at hand nothing is read only to compute something else.
     watched.__dict__.update({name: value for name, value in situation.__dict__.items() if name in _NAMES})
     use(watched)
     seen: set[str] = watched.__dict__.get("_seen", set())
@@ -74,7 +74,7 @@ class Fields(nn.Module):
     Attributes:
         layout: name and shape of each quantity.
         source: a module from joints `... x n` to the quantities side by side, `... x o` [SI], or a `ClosedKinematics`,
-            which gives them by name; None where nothing is looked at.
+            which gives them by name; None where none is read.
         typical_torque, low, high, down: what a `Situation` takes from the workspace and from gravity.
     """
 
@@ -109,7 +109,7 @@ class Fields(nn.Module):
             "down": self.down,
             "samples": self._samples[0],
         }
-        # A cached property that stands in the instance's dictionary is not worked out.
+        # A cached property that is in the instance's dictionary is not computed again.
         situation.__dict__.update(values | constants)
         return situation
 
@@ -133,7 +133,7 @@ class Fields(nn.Module):
         return out
 
     def describe(self) -> dict[str, Any]:
-        """Everything `from_description` needs; the tensors stand beside it."""
+        """Everything `from_description` needs; the tensors are stored beside it."""
         about: dict[str, Any] = {"layout": [[name, list(shape)] for name, shape in self.layout]}
         if isinstance(self.source, TrigonometricExpansion):
             about["turns"] = self.source.turns
@@ -172,7 +172,7 @@ def make_fields(mechanism: Mechanism, gravity: Tensor, names: set[str], joints: 
 
     Args:
         gravity: `3` [m/s²], base frame.
-        names: as `looked_at` tells them.
+        names: as `looked_at` returns them.
         joints: commanded joints of the training rows, `s x n` [SI].
         margin: of the compensator's domain.
 
@@ -182,7 +182,7 @@ def make_fields(mechanism: Mechanism, gravity: Tensor, names: set[str], joints: 
 
     def quantities(points: Tensor) -> dict[str, Tensor]:
         situation = Situation(mechanism, points, {}, gravity)
-        # Where the machine cannot stand other quantities are 0, and the Jacobian is no number.
+        # Where the machine cannot take the pose, other quantities are 0 and the Jacobian is NaN.
         lost = torch.where(torch.isfinite(situation.jacobian).flatten(1).all(-1), 0.0, torch.nan)
         found: dict[str, Tensor] = {}
         for name in _NAMES:

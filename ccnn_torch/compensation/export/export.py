@@ -2,8 +2,8 @@
 
 In double, ONNX Runtime has kernels for Gemm, Sigmoid, Tanh, Exp, Sin, Cos, Min, Max, Where, comparisons and arithmetic,
 and none for Tan, Asin, Acos, Atan, Softplus, Elu, Gelu and Erf: a network made of those cannot be exported. The
-exporter rounds a number that stands in the code (0.01 * x) to single precision: one that is not exact there has to be a
-buffer.
+exporter rounds a number that is a literal in the code (0.01 * x) to single precision: one that is not exact there has
+to be a buffer.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def export_pt2(compensator: Compensator, program: torch.export.ExportedProgram, 
     """The traced compensator as a verified `torch.export` file; arguments and errors as `export_onnx`.
 
     Nothing in the file is pickled: it carries no example inputs, which are the one thing torch would pickle here. What
-    is verified is the program that is written, since opening such a file can run code that stands in it. All steps of
+    is verified is the program that is written, since opening such a file can run code that it contains. All steps of
     the fixed point are put into the program itself, which no other form can be made of afterwards.
     """
     outputs: Any = program.graph.output_node().args[0]

@@ -84,7 +84,7 @@ def expand(
     """Expand functions of the joints over the domain of the training rows, by least squares, checked at other points.
 
     Args:
-        function: commanded joints `s x n` -> `s x o` [SI]; NaN where the mechanism cannot stand.
+        function: commanded joints `s x n` -> `s x o` [SI]; NaN where the mechanism has no such pose.
         joints: commanded joints of the training rows, `s x n` [SI].
         margin: as in `fit_compensator`.
         what: is expanded, for messages.

@@ -26,8 +26,8 @@ _LOST = 1e9
 class ClosedKinematics(nn.Module):
     """Pose, frame and derivatives of a mechanism with nominal parameters, by closed forms and central differences.
 
-    Differences are right to about 1e-11 of the derivative away from singular poses. Where the mechanism cannot stand
-    everything is as in its home pose, but the Jacobian is out of all proportion.
+    Differences are right to about 1e-11 of the derivative away from singular poses. Where the mechanism has no such
+    pose everything is as in its home pose, but the Jacobian is out of all proportion.
 
     Attributes:
         start: polynomial from which Newton's method finds the pose, where only the inverse kinematics are closed.
@@ -71,7 +71,7 @@ class ClosedKinematics(nn.Module):
         return found
 
     def _standing(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Joints and poses with which the mechanism can stand: those at hand, or its home; and which, `s x 1`."""
+        """Joints and poses that the mechanism can take: those at hand, or its home; and which, `s x 1`."""
         mechanism = self._mechanism[0]
         if self.start is None:
             pose = mechanism.forward_kinematics(joints)

@@ -17,7 +17,7 @@ class ExpandedGeometry(ChebyshevExpansion):
     """δ(q), commanded joints `... x n` -> `... x n` [SI], as a polynomial.
 
     Attributes:
-        extrapolates: a polynomial says nothing outside the points it was fitted to.
+        extrapolates: a polynomial is not valid outside the points it was fitted to.
         export_tolerance: share of the limit to which exports agree; sums of many terms are rounded.
     """
 
@@ -25,7 +25,7 @@ class ExpandedGeometry(ChebyshevExpansion):
     export_tolerance = 1e-10
 
     def describe(self) -> dict[str, Any]:
-        """Everything `from_description` needs; the tensors stand beside it."""
+        """Everything `from_description` needs; the tensors are stored beside it."""
         return {"kind": "expanded_geometry", "joints": len(self.centre), "degree": self.degree}
 
     @classmethod
@@ -39,7 +39,7 @@ def expand_geometry(deviation: Callable[[Tensor], Tensor], joints: Tensor, margi
     """Expand a geometric deviation over the domain of the training rows.
 
     Args:
-        deviation: commanded joints `s x n` -> δ `s x n` [SI]; NaN where the mechanism cannot stand.
+        deviation: commanded joints `s x n` -> δ `s x n` [SI]; NaN where the mechanism has no such pose.
         joints: commanded joints of the training rows, `s x n` [SI].
         margin: as in `fit_compensator`.
 

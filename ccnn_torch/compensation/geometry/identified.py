@@ -56,7 +56,7 @@ def geometric_deviation(
     Args:
         nominal, identified: all parameters, `... x k` [SI], leading dims as the joints' to come.
         rotation_weight, damping: of a serial arm, see `SerialGeometry`.
-        guess: poses near which forward kinematics stand, `... x p` [SI]; the mechanism's home when None.
+        guess: poses near which forward kinematics are solved, `... x p` [SI]; the mechanism's home when None.
     """
     if isinstance(mechanism, SerialArm):
         return SerialGeometry(mechanism, nominal, identified, rotation_weight, damping)

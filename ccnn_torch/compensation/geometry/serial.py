@@ -125,13 +125,13 @@ class SerialGeometry(nn.Module):
     def _moved(self, joints: Tensor, links: Tensor) -> Tensor:
         """Transforms of the links, `... x n x 4 x 4`; links `3 x ... x n x 4 x 4`."""
         turned = torch.cos(joints) * self._turns
-        # A prismatic joint moves along by itself, a revolute one by its sine.
+        # A prismatic joint enters linearly, a revolute one by its sine.
         other = torch.sin(joints) * self._turns + joints * self._slides
         return turned[..., None, None] * links[0] + other[..., None, None] * links[1] + links[2]
 
     def _slope(self, joints: Tensor) -> Tensor:
         """Jacobian of the nominal arm with its rows weighted, `... x c x n`: every link's derivative between the links
-        before and behind it, whatever the convention."""
+        before and behind it, for every convention."""
         links = self._nominal_links
         moved = self._moved(joints, links)
         before = _chain(moved)

@@ -1,6 +1,6 @@
 """Functions of a serial arm's joints that are linear in the sine and cosine of each: exactly, from a few samples.
 
-Every joint of an arm stands in its forward kinematics as cos q C + sin q S + D (a sliding one as q S + D), so that
+Every joint of an arm enters its forward kinematics as cos q C + sin q S + D (a sliding one as q S + D), so that
 places, directions, their derivatives and sums of them are such functions, and 3ⁿ samples determine them.
 """
 
@@ -17,7 +17,7 @@ from ccnn_torch.errors import InputError, MethodFailedError
 __all__ = ["TrigonometricExpansion", "expand_arm"]
 
 _MOST_JOINTS = 7
-# Share of the largest value to which a function of this form comes back at other joints.
+# Tolerance, as a share of the largest value, with which a function of this form is reproduced at other joints.
 _EXACT = 1e-9
 
 

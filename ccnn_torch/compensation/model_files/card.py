@@ -23,7 +23,7 @@ def read_model(path: Path) -> bytes:
     if path.suffix == ".pt2":
         raise ModelFileError(
             f"{path}: a .pt2 is written for other programs and never read back, because opening one can run code that "
-            f"stands in it; give the .safetensors or .onnx beside it, or, if you trust whoever wrote it, open it "
+            f"it contains; give the .safetensors or .onnx beside it, or, if you trust its author, open it "
             f"yourself in Python: torch.export.load({str(path)!r}).module()"
         )
     if path.suffix not in MODEL_FORMS:
@@ -40,7 +40,7 @@ def read_model(path: Path) -> bytes:
 
 
 def card_of(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
-    """The card in the file's folder that lists the SHA-256 of these bytes, under whatever name; and the card's bytes.
+    """The card in the file's folder that lists the SHA-256 of these bytes, under any name; and the card's bytes.
 
     Raises:
         ModelFileError: there is none, or a card is damaged.

@@ -67,9 +67,9 @@ class IdentifiedGeometry:
 
         Returns:
             `command`, `deviation` and `ideal`, `... x n` [SI], all finite; `inside_domain` and `ideal_inside_domain`,
-            `...`, bool: False where the machine cannot take the pose, and the joints come back as they are (the home
+            `...`, bool: False where the machine cannot take the pose, and the joints are returned unchanged (the home
             joints for what is no number); `fallback`, `...`, bool: where the file gives what is no command, and the
-            joints come back as well.
+            joints are returned unchanged as well.
 
         Raises:
             InputError: the last dimension is wrong.

@@ -41,7 +41,7 @@ class LoadedModel:
     Attributes:
         path: the file.
         card: the card that vouches for it.
-        facts: what the file says about itself; equal to the card where both say something.
+        facts: the file's metadata; equal to the card where both have a key.
         joints, covariates, pose: coordinates in order.
         compensator: the torch module, where the file is the master (.safetensors); None for exports.
     """
@@ -59,8 +59,9 @@ class LoadedModel:
     def __call__(self, joints: ArrayLike, covariates: ArrayLike | None = None) -> dict[str, Array]:
         """Commands of ideal joints, and ideal joints were they commands.
 
-        Every number is finite for whatever is given. A row in which the file breaks what its card promises, say by a
-        deviation above the limit, falls back: the joints are commanded as they are; `FallbackWarning` tells how many.
+        Every number is finite for every input. A row in which the file breaks what its card promises, say by a
+        deviation above the limit, falls back: the joints are commanded as they are; `FallbackWarning` gives their
+            number.
 
         Args:
             joints: `... x n` [SI].
@@ -150,7 +151,7 @@ class LoadedModel:
 
 
 def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_code: bool = False) -> LoadedModel:
-    """Read a .safetensors or .onnx file whose SHA-256 stands in a card in its folder.
+    """Read a .safetensors or .onnx file whose SHA-256 is in a card in its folder.
 
     Args:
         path: the file.
@@ -168,7 +169,7 @@ def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_
     if public_key is not None:
         check_signature(path, content, card_content, public_key)
     try:
-        with code_refused("what it says about itself", allow_code):
+        with code_refused("its metadata", allow_code):
             facts, run, compensator = open_model(path, content)
     except InputError as reason:
         raise ModelFileError(f"{path}: {reason}") from None

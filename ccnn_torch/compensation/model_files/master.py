@@ -1,4 +1,4 @@
-"""From the bytes of a model file to what it says about itself and a way to run it; nothing in it runs as code."""
+"""From the bytes of a model file to its metadata and a way to run it; nothing in it runs as code."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ def _facts(text: Any) -> dict[str, Any]:
     try:
         facts = check_keys(from_json(text or "null"))
     except ValueError:
-        raise ModelFileError("what it says about itself is no JSON" + TAKE_AGAIN) from None
+        raise ModelFileError("its metadata is not JSON" + TAKE_AGAIN) from None
     # Two texts can mean one number (long decimals do), so the text itself must be the one we would write.
     if to_json(facts) != text:
-        raise ModelFileError("what it says about itself was edited after it was written")
+        raise ModelFileError("its metadata was edited after it was written")
     check_form(facts)
     return facts
 
@@ -67,7 +67,7 @@ def _facts(text: Any) -> dict[str, Any]:
 def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
     try:
         tensors = load_tensors(content)
-        # The header's length stands in the first eight bytes, the header behind it; load() keeps it to itself.
+        # The header's length is in the first eight bytes, the header behind it; load() keeps it to itself.
         header = from_json(content[8 : 8 + int.from_bytes(content[:8], "little")])
     except (SafetensorError, ValueError, KeyError):
         raise ModelFileError("it is damaged, or no safetensors file" + TAKE_AGAIN) from None
@@ -77,9 +77,11 @@ def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
         compensator = _rebuild(facts, tensors)
         limits = compensator.limit.tolist()
     except RUN_ERRORS as reason:
-        raise ModelFileError(f"its tensors are not those that it tells of ({said(reason)})" + TAKE_AGAIN) from None
+        raise ModelFileError(
+            f"its tensors are not those that its metadata lists ({said(reason)})" + TAKE_AGAIN
+        ) from None
     if limits != [facts["limits"][c["name"]]["limit"] for c in facts["joints"]]:
-        raise ModelFileError("it holds other limits than it tells of" + TAKE_AGAIN)
+        raise ModelFileError("its limits are not those of its metadata" + TAKE_AGAIN)
     return facts, compensator
 
 

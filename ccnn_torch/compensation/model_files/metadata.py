@@ -1,4 +1,4 @@
-"""What a model file says about itself: one JSON text, the same in the master and in every export."""
+"""Metadata of a model file: one JSON text, the same in the master and in every export."""
 
 from __future__ import annotations
 
@@ -98,10 +98,12 @@ def check_keys(facts: Any) -> dict[str, Any]:
             f"{', '.join(repr(form) for form in _KNOWN)}; write it again with this version (ccnn run …, or save_model)"
         )
     if not isinstance(facts, dict) or not known:
-        raise ModelFileError(f"it says nothing of the form '{FORMAT}', so this package did not write it" + TAKE_AGAIN)
+        raise ModelFileError(
+            f"its metadata does not have the form '{FORMAT}', so this package did not write it" + TAKE_AGAIN
+        )
     stated = facts.get("sha256")
     if not isinstance(stated, dict) or stated.get("keys") != _digest(facts):
-        raise ModelFileError("what it says about itself was edited after it was written" + TAKE_AGAIN)
+        raise ModelFileError("its metadata was edited after it was written" + TAKE_AGAIN)
     return facts
 
 
@@ -112,7 +114,7 @@ def check_tensors(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
 
 
 def coordinates(entries: list[dict[str, str]]) -> tuple[Coordinate, ...]:
-    """Inverse of how coordinates stand in the facts."""
+    """Inverse of how coordinates are written in the metadata."""
     return tuple(Coordinate(entry["name"], entry["unit"]) for entry in entries)
 
 
@@ -145,7 +147,7 @@ def from_json(text: str | bytes) -> Any:
 
 
 def _format(compensator: Compensator) -> str:
-    """The least form that says all."""
+    """The shortest form without loss."""
     if compensator.effects is not None:
         return FORMAT_EFFECTS
     return FORMAT if compensator.geometry is None else FORMAT_GEOMETRY

@@ -1,4 +1,4 @@
-"""The form of what a model file says about itself: every number that is used later is there, and finite."""
+"""The form of a model file's metadata: every number that is used later is there, and finite."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ RUN_ERRORS: tuple[type[Exception], ...] = (
 
 
 def said(reason: Exception) -> str:
-    """What such an error says, short enough for a sentence: names out of the file stand in it."""
+    """Message of such an error, short enough for a sentence: it contains names from the file."""
     return " ".join("".join(c if c.isprintable() else " " for c in str(reason)).split())[:200] or type(reason).__name__
 
 

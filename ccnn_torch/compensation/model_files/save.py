@@ -40,7 +40,7 @@ def save_model(
     """Write METHOD.safetensors, .onnx, .float32.onnx, .pt2 and the card; each whole or not at all, the card last.
 
     The master and the exports are byte-identical for one model and one set of fields; what changes from run to run
-    stands in the card alone.
+    is in the card alone.
 
     Args:
         folder: made where it is not there.

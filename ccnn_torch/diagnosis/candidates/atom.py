@@ -53,7 +53,7 @@ class Atom:
 
     @property
     def is_discrepancy(self) -> bool:
-        """Whether it stands for something that no effect of the library describes."""
+        """Whether it describes something outside the library."""
         return self.effect is None
 
 

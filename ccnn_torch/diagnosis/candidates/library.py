@@ -161,7 +161,7 @@ def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped
 
 
 def _usual(situation: Situation, effect: Effect) -> list[Shaped]:
-    """The shapes of the textbook, which nobody has to search; none where an effect has no usual ones."""
+    """The shapes of the textbook, which need no search; none where an effect has no usual ones."""
     usual = [s.usual for s in effect.shapes(situation)]
     if any(value is None for value in usual):
         return []

@@ -98,7 +98,7 @@ class _Led(NamedTuple):
 
 
 class NuisanceFit:
-    """What nuisance columns with their prior leave of `y`, and of whatever is put beside them."""
+    """What nuisance columns with their prior leave of `y`, and of any columns put beside them."""
 
     def __init__(self, y: Tensor, nuisance: Tensor) -> None:
         """y: `s x c`; nuisance: `s x c x P`, whitened, in units of their prior scale."""

@@ -44,7 +44,7 @@ class Shaped(NamedTuple):
 
 @runtime_checkable
 class _OneByOne(Protocol):
-    """An effect on the joints that tells what `basis` tells without its zeros, for long grids."""
+    """An effect on the joints with the content of `basis` without its zeros, for long grids."""
 
     def one_by_one(self, situation: Situation, shape: Tensor, rows: Tensor | None = None) -> Tensor: ...
 
@@ -66,7 +66,7 @@ class _Part(NamedTuple):
 
 
 class _Turn(NamedTuple):
-    """Candidates `g x h`, the columns of each part there, and those that a part looks at: None = none this time."""
+    """Candidates `g x h`, the columns of each part there, and those that a part uses: None = none this time."""
 
     candidates: Tensor
     columns: list[TrialColumns]
@@ -294,7 +294,7 @@ def _of(values: Tensor, rows: Tensor | None, dim: int) -> Tensor:
 
 
 def _of_run(values: Tensor, columns: list[int]) -> Tensor:
-    """Some of the columns, without a copy where they stand side by side."""
+    """Some of the columns, without a copy where they are contiguous."""
     run = range(columns[0], columns[0] + len(columns)) if columns else range(0)
     return values[..., run.start : run.stop] if list(run) == columns else values[..., columns]
 

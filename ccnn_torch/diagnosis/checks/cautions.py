@@ -30,9 +30,9 @@ _QUIET, _LOUD = 0.5, 2.0
 _MANY = 0.1
 # So many rows set aside are evaluated together, against as many resampled so often; the share of these as close.
 _SEVERAL, _DRAWS, _BY_CHANCE = 5, 1000, 0.003
-# A joint that moves less than this share of its workspace stands still. Rows that may be copies of others.
+# A joint that moves less than this share of its workspace is at rest. Rows that may be copies of others.
 _STILL, _COPIES = 1e-3, 0.2
-# Effects that only the place of a row tells from one another.
+# Effects that only the place of a row distinguishes.
 _OF_PLACE = EXACT | {"coupling", "gravity", "transmission"}
 # Standard deviations from which a coefficient has a sign.
 _SIGNED = 3.0
@@ -50,7 +50,7 @@ class Caution(NamedTuple):
 def cautions(
     analysis: Analysis, judgement: Judgement, rows: PlausibleRows, missing: Sequence[Mapping[str, Any]], together: Gap
 ) -> list[Caution]:
-    """What speaks against taking a verdict at its word; none where all is as it should be.
+    """Reasons to doubt a verdict; empty where there are none.
 
     Args:
         analysis: of the rows.
@@ -100,7 +100,7 @@ def _of_place(analysis: Analysis, judgement: Judgement) -> list[Caution]:
 
 
 def _of_plan(analysis: Analysis, names: Sequence[str]) -> list[Caution]:
-    """Joints that stand still, and rows that are there more than once."""
+    """Joints that do not move, and rows that occur more than once."""
     situation, said = analysis.situation, []
     low, high = situation.workspace
     moved = (situation.joints.amax(0) - situation.joints.amin(0)) > _STILL * (high - low)
@@ -187,7 +187,7 @@ def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
             said.append(
                 Caution(
                     f"{atom.name} would have to be {float(size[worst]):.0f} times as large as is plausible "
-                    f"({coefficients[worst].name}): check the units of the columns that it goes by"
+                    f"({coefficients[worst].name}): check the units of the columns that it uses"
                 )
             )
     return said
@@ -209,7 +209,7 @@ def _of_signs(analysis: Analysis, judgement: Judgement) -> list[Caution]:
         if negative and not bool((signed & (mean > sure)).any()):
             where = ", ".join(coefficients[k].name for k in negative)
             wrong = f"{atom.name} would have to be negative ({where}), as in no machine"
-            said.append(Caution(f"{wrong}: check the signs of the columns that it goes by"))
+            said.append(Caution(f"{wrong}: check the signs of the columns that it uses"))
     return said
 
 

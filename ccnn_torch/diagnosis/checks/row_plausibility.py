@@ -26,7 +26,7 @@ class PlausibleRows(NamedTuple):
 
     Attributes:
         fine: those that are, `s` bool.
-        astray: those that are not because their pose lies elsewhere, `s` bool.
+        astray: those that are not because their pose is elsewhere, `s` bool.
         mistake: the one that many of these have in common, in words; empty where there is none.
     """
 
@@ -41,7 +41,7 @@ class PlausibleRows(NamedTuple):
 
 
 def plausible_rows(situation: Situation, measured: Tensor) -> PlausibleRows:
-    """Whether the pose of each row lies about where its joints put it.
+    """Whether the pose of each row is near where its joints put it.
 
     Raises:
         RowsError: most of them do not, or are out of reach.

@@ -51,7 +51,7 @@ def next_measurements(analysis: Analysis, judgement: Judgement, seed: int) -> li
     Between explanations the gain of a row is the divergence of what they predict for it, in nats: half the square of
     their difference in units of what noise and both posteriors leave open. Where one explanation has no rival, it is
     the information on its coefficients, half the log determinant (Bayesian D-optimality, Chaloner and Verdinelli 1995).
-    Rows are chosen one after the other, each for what it adds to those before it; `gain` is that of the row by itself.
+    Rows are chosen one after the other, each for what it adds to those before it; `gain` is that of the row alone.
     """
     rivals = _rivals(analysis, judgement)
     if not any(found.members for _, found in rivals):
@@ -211,7 +211,7 @@ def _gains(question: _Question) -> Tensor:
 
 
 def _measured(question: _Question, row: int) -> _Question:
-    """What is left to be told once a candidate is measured: a Kalman step towards no difference."""
+    """What remains to be distinguished once a candidate is measured: a Kalman step towards no difference."""
     x, covariance = question.x[row], question.covariance
     open_ = torch.eye(len(x), dtype=x.dtype) + x @ covariance @ x.mT
     step = torch.linalg.solve(open_, x @ covariance).mT

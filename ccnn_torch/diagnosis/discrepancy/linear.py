@@ -34,7 +34,7 @@ _TWIN = 2 * LOG_PRIOR
 
 
 def linear_discrepancies(situation: Situation, beside: Sequence[str]) -> list[Atom]:
-    """What acts through the drives, what stands between base and measurement, and what the platform carries.
+    """What acts through the drives, what is between base and measurement, and what the platform carries.
 
     Through the drives: each by its own track, or all by the place of all. Most are nearly of one form with an effect of
     the library; where that is a candidate it takes much to call the same something else.

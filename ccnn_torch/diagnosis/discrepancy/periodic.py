@@ -1,5 +1,5 @@
 """A discrepancy term that is found rather than given: the platform sways with a period of its own, faster than the
-waves that stand for any course of time can follow."""
+waves that approximate any course of time can follow."""
 
 from __future__ import annotations
 

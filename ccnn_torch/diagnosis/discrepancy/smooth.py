@@ -2,7 +2,7 @@
 
 A discrepancy term lets the joints deviate by a smooth function of its driver, alone and times the pose: physical causes
 act through the joints, and the Jacobian then carries most of the dependence on the pose. What follows time, temperature
-or a load may also move the platform as a whole, alike wherever it stands, and faster than a smooth function.
+or a load may also move the platform as a whole, equally at every pose, and faster than a smooth function.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ __all__ = [
 LOG_PRIOR = math.log(1e-3)
 # And one that holds most of what a library effect does has to be better than that effect by as much again.
 _NEAR_LIBRARY = math.log(1e-5)
-# A joint may be off by this much for reasons that nobody thought of [m], [rad].
+# A joint may be off by this much for unforeseen reasons [m], [rad].
 _SCALE = {"m": 3e-4, "rad": 5e-4}
 ANY = "*"
 """Stands in a driver's name for all of its kind; a verdict names the one that explains most alone."""

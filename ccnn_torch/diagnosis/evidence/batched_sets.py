@@ -26,7 +26,7 @@ class BatchedFits(NamedTuple):
         log_evidence: `b`.
         noise: σ² in the units of y, `b`.
         first, rest: posterior means of the first group's coefficients and of the others' side by side, `b x m` each.
-        energy: Σ (X_g θ_g)² of each group by itself, `b x g`.
+        energy: Σ (X_g θ_g)² of each group alone, `b x g`.
         rss: remaining sum of squares, `b`.
         effective: number of coefficients that the data determine, `b`.
         log_scale: log α², `b x g`.

@@ -54,7 +54,7 @@ class Dictionary:
         columns: whitened, of the library effects, name by name, and then of the discrepancy terms that are put beside
             them, side by side, `s x c x P`; rows that count.
         groups: which of the columns are those of an atom, for the atoms that have such.
-        grams: of the columns; NaN may stand between discrepancy terms and between atoms of one name, which are in no
+        grams: of the columns; NaN is possible between discrepancy terms and between atoms of one name, which are in no
             set together.
         axes: principal axes of the columns of each of these atoms, `m x m`.
         turned: `grams` with every group in its axes, and with a last column of zeros.
@@ -78,7 +78,7 @@ class Dictionary:
 
     @cached_property
     def begins(self) -> Tensor:
-        """The first of them, `a`: they stand side by side."""
+        """The first of them, `a`: they are contiguous."""
         return torch.tensor([int(self.groups[i][0]) if i in self.groups else 0 for i in range(len(self.atoms))])
 
     @cached_property
@@ -158,7 +158,7 @@ def dictionary_of(
     """
     library = [i for i, a in enumerate(atoms) if not a.is_discrepancy]
     names = list(dict.fromkeys(atoms[i].name for i in library))
-    # Atoms that are never in one set stand side by side.
+    # Atoms that are never in one set are contiguous.
     kinds = [*([i for i in library if atoms[i].name == name] for name in names), [*others]]
     chosen = [i for kind in kinds for i in kind]
     columns = torch.cat([y[..., None][..., :0], *(x[i] for i in chosen)], -1)
@@ -203,7 +203,7 @@ def _grams(
 
 
 def _run(group: Tensor) -> slice:
-    """Of columns that stand side by side."""
+    """Of contiguous columns."""
     return slice(int(group[0]), int(group[-1]) + 1)
 
 

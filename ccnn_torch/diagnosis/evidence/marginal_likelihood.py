@@ -40,7 +40,7 @@ class Fits(NamedTuple):
         slot: which group of its set a column belongs to, `b x M`.
         mean: posterior mean of the coefficients, `b x M`.
         covariance: posterior covariance of the coefficients, `b x M x M`.
-        energy: Σ (X_g θ_g)² of each group by itself, `b x g`.
+        energy: Σ (X_g θ_g)² of each group alone, `b x g`.
         rss: remaining sum of squares, `b`.
         effective: number of coefficients that the data determine, `b`.
         log_scale: log α², `b x g`.

@@ -79,7 +79,7 @@ def own_products(x: Tensor, y: Tensor, size: Tensor | float = 1.0) -> GroupProdu
 def fit_single_groups(
     groups: Sequence[GroupProducts], yy: Tensor, values: float, noise_dof: float, spread: float = SPREAD
 ) -> SingleFits:
-    """Fit every group by itself; `NO_COLUMNS` is what there is without any.
+    """Fit every group separately; `NO_COLUMNS` is what there is without any.
 
     Args:
         groups: inner products of each.
@@ -98,7 +98,7 @@ def fit_single_groups(
 def fit_in_axes(
     square: Tensor, along: Tensor, there: Tensor, yy: Tensor, values: float, noise_dof: float, spread: float = SPREAD
 ) -> SingleFits:
-    """Fit every group by itself.
+    """Fit every group separately.
 
     Args:
         square, along: inner products along each group's principal axes with themselves and with y, `b x M`, padded

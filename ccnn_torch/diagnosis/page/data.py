@@ -62,7 +62,7 @@ class Signature:
 
 @dataclass(frozen=True)
 class About:
-    """What a report tells beside `diagnosis.json`, all of it optional: the entry `about` of `diagnosis_pictures.json`.
+    """What a report shows beside `diagnosis.json`, all of it optional: the entry `about` of `diagnosis_pictures.json`.
 
     Attributes:
         name: title of the page.
@@ -83,7 +83,7 @@ class About:
     lines: tuple[int, ...] = ()
 
     def unit(self, name: str) -> str:
-        """SI unit of a column; by its name where it was not asked for, and `SI` where the name tells nothing."""
+        """SI unit of a column; by its name where it was not asked for, and `SI` where the name has no unit."""
         if name in self.units:
             return self.units[name]
         if name.startswith("load_"):
@@ -92,7 +92,7 @@ class About:
 
 
 def about_of(labels: Mapping[str, Any]) -> About:
-    """What `diagnosis_pictures.json` tells beside the axes; units of axes count as well.
+    """What `diagnosis_pictures.json` holds beside the axes; units of axes count as well.
 
     Raises:
         InputError: the entry `about` holds a key that is not known.

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 _KELVIN = 273.15
 # A driver with no more values than this (a direction, a load put on or not) is drawn as columns of points.
 _FEW = 6
-# Share of the fit's variance between neighbours along the driver up to which a line tells it all.
+# Share of the fit's variance between neighbours along the driver up to which a line shows it all.
 _SMOOTH = 0.03
 
 
@@ -132,7 +132,7 @@ def _draw_fit(axes: Axes, x: Array, fit: Array, values: Array | None, step: floa
     order = np.argsort(x, kind="stable")
     ordered = fit[order]
     rough = float(np.square(np.diff(ordered)).mean()) / 2
-    # A constant offset is a line as well, whatever rounding leaves of its variance.
+    # A constant offset is a line as well, even if rounding leaves some variance.
     if rough <= _SMOOTH * float(ordered.var()) or rough < 1e-6 * float(np.square(ordered).mean()):
         axes.plot(x[order], ordered, color=BEFORE, linewidth=2, label="fit")
     else:

@@ -73,7 +73,7 @@ def _bars(results: Block, block: Block, *, alone: bool) -> list[Bar]:
     if alone and network.get("gap_after") is not None:
         low, high = network["gap_after_ci95"]
         bars.append(("and a network on the remainder", network["gap_after"], (low, high), SERIES[2]))
-    # One effect alone is all of the verdict then: one bar tells it.
+    # One effect alone is all of the verdict then: one bar shows it.
     if len(verdict["effects"]) == 1:
         bars = [bar for bar in bars if bar[0] != f"with {verdict['effects'][0]} alone"]
     return [bar for bar in bars if bar[1] is not None]

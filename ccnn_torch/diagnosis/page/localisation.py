@@ -1,4 +1,4 @@
-"""Tables of a diagnosis that go by place: where the gap lies, what to measure next, which rows were set aside."""
+"""Tables of a diagnosis by place: where the gap lies, what to measure next, which rows were set aside."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def where_table(results: Block, about: About, *, telling: bool = False) -> Table
         return None
     note = _share_note(results)
     if hidden:
-        note += f" Not shown: {', '.join(hidden)}, over which the gap is even as far as these rows tell."
+        note += f" Not shown: {', '.join(hidden)}, over which these rows show no difference in the gap."
     return Table("Where is the gap?", ("part", *_SHARES), tuple(rows), note)
 
 
@@ -153,7 +153,7 @@ def _columns(results: Block) -> tuple[list[str], list[str]]:
 
 
 def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]], about: About) -> Table | None:
-    """Rows that were set aside, as a person finds them in the file, how far they are off, and why."""
+    """Rows that were set aside, by their lines in the file, how far they are off, and why."""
     numbers = results["rows_set_aside"]
     if not numbers:
         return None
@@ -176,5 +176,5 @@ def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]], about
         columns.append("why")
         for row, reason in zip(cells, reasons, strict=True):
             row.append(reason)
-    note = f"They speak neither for nor against any effect and count in no figure above. {note}"
+    note = f"They are evidence neither for nor against any effect and count in no figure above. {note}"
     return Table("Which rows were set aside?", tuple(columns), tuple(map(tuple, cells)), note, ("why",))

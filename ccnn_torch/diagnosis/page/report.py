@@ -1,4 +1,4 @@
-"""From `diagnosis.json` and its arrays to everything a person reads: terminal, Markdown, pictures, one HTML page."""
+"""From `diagnosis.json` and its arrays to everything that is read: terminal, Markdown, pictures, one HTML page."""
 
 from __future__ import annotations
 

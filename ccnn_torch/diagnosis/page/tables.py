@@ -97,7 +97,7 @@ def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
     before = number_text(_over(results["gap"]["before"], scale), 4)
     note = (
         f"● in the verdict. The gap without any of them is {before} {unit}. {_REMOVED} In brackets: 95 % interval. "
-        "Probability: of each name among those tried; the verdict claims less where something could stand for it or "
+        "Probability: of each name among those tried; the verdict claims less where something could replace it or "
         "speaks against it."
     )
     if hidden := len(results["effects"]) - len(shown):
@@ -153,7 +153,7 @@ def parameter_table(results: Block, most: int = 24) -> Table | None:
     if (hidden := len(rows) - most) > 0:
         least = sorted(sizes, reverse=True)[most - 1]
         rows = [row for row, size in zip(rows, sizes, strict=True) if size >= least]
-        note += f" The {hidden} that differ least from 0 stand in diagnosis.json only."
+        note += f" The {hidden} that differ least from 0 are in diagnosis.json only."
     return Table("How large is the effect?", columns, tuple(rows), note, ("unit",))
 
 

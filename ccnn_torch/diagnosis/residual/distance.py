@@ -39,7 +39,7 @@ def size_of(situation: Situation) -> Size:
 
 
 def distance(situation: Situation, measured: Tensor, size: Size) -> Tensor:
-    """How far each pose lies from the nominal one, in sizes of the machine, `s` [1].
+    """Distance of each pose from the nominal one, in sizes of the machine, `s` [1].
 
     The larger of position and rotation; NaN where the machine has no pose.
 

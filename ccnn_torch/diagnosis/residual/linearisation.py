@@ -51,7 +51,7 @@ def signature_at(situation: Situation, there: Situation, effect: Effect, shape: 
 def tangent(situation: Situation, left: Tensor, acting: Sequence[Acting]) -> tuple[Situation, Tensor]:
     """Where the effects bring the machine, and the residual that a linear model about there has to explain, `s x c`.
 
-    left: the effects' `remainder`; rows that the machine with the effects cannot reach are NaN there and come back so.
+    left: the effects' `remainder`; rows that the machine with the effects cannot reach are NaN.
     """
     there = moved(situation, acting)
     for one in acting:

@@ -107,7 +107,7 @@ def _additions(products: Sequence[GroupProducts], squares: Tensor, values: int) 
 class _Everything:
     """All that may be there, and its inner products channel by channel: these stay when the noise changes.
 
-    Columns count by their information, whatever their size: all have the same mean square.
+    Columns count by their information, not their size: all have the same mean square.
 
     Attributes:
         columns: of each candidate, `s x c x m` [m, rad].
@@ -167,7 +167,7 @@ def _spread(factors: Tensor) -> float:
 
 
 def _noise_share(every: _Everything, y: Tensor, white: Whitening) -> Tensor:
-    """Of the squares of each channel what the candidate that explains it best by itself leaves, `c`.
+    """Of the squares of each channel what the candidate that explains it best alone leaves, `c`.
 
     Channel by channel: one that is almost all gap would else be lost in the noise of the others.
 

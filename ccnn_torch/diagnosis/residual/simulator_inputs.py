@@ -21,7 +21,7 @@ __all__ = ["refuse_lost_rows", "simulator_inputs"]
 def simulator_inputs(
     records: Records, mechanism: Mechanism, covariates: Mapping[str, Tensor]
 ) -> tuple[Mechanism, dict[str, Tensor]]:
-    """What the nominal machine takes from the records beyond the covariates that every diagnosis looks at.
+    """What the nominal machine takes from the records beyond the covariates that every diagnosis uses.
 
     Args:
         records: with all their columns.

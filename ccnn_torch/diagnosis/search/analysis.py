@@ -125,7 +125,7 @@ class _Rows(NamedTuple):
 
 
 class _Fixed(NamedTuple):
-    """What stays whatever is found: effects that show, discrepancy terms, those of one place or sway found at first,
+    """What stays for any findings: effects that show, discrepancy terms, those of one place or sway found at first,
     and the noise of the richest fit, `c`."""
 
     effects: list[Effect]

@@ -49,7 +49,7 @@ def search(
     def fit_all(sets: Sequence[tuple[int, ...]]) -> None:
         fresh = sorted(set(sets) - seen)
         seen.update(fresh)
-        # Each kind by itself: what the library can do at best is asked for, too, however far a discrepancy term is
+        # Each kind separately: the best that the library can do is needed, too, however far a discrepancy term is
         # ahead.
         for wild in (False, True):
             mine = [s for s in fresh if discrepancies.isdisjoint(s) != wild]

@@ -127,7 +127,7 @@ def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, fl
     drawn = noise * (1 + (math.sqrt(2 / floor_dof) if floor_dof > 0 else 0.0) * draws.normal)
     rest, gap = (draws.counts @ torch.stack([new - unsure, old], -1) / len(old) - drawn[:, None]).unbind(-1)
     share = 1 - rest / gap.clamp_min(_LEAST_GAP * (b2 - noise))
-    # Less than the noise that was told is left: no cause takes away more than all, and the spread of the draws stays.
+    # Less than the noise that was given is left: no cause takes away more than all, and the spread of the draws stays.
     share = (share - (share.mean() - 1).clamp_min(0.0)).clamp(0.0, 1.0)
     # Where draws reach 1, all of the gap, the interval ends there and leaves out draws on the lower side alone.
     above = 0.0 if float((share >= 1).to(share.dtype).mean()) > _TAIL / 2 else _TAIL / 2

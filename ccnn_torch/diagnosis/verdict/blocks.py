@@ -112,7 +112,7 @@ def _effect(made: Blocks, name: str) -> dict[str, Any]:
 
 
 def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
-    """Value and standard deviation in the verdict's set, beside the corrections of its form; else by itself."""
+    """Value and standard deviation in the verdict's set, beside the corrections of its form; else alone."""
     analysis = made.analysis
     atoms = analysis.dictionary.atoms
     own = made.judgement.fullest if name in made.judgement.names else made.judgement.found

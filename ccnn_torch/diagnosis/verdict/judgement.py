@@ -26,7 +26,7 @@ _FORM_DISCREPANCY, _FORM_EXACT, _BESIDE_CATCH_ALL = 0.002, 1e-4, 0.1
 _CARRIES = 0.5
 # Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is accepted.
 _VETO, _MUCH = 0.005, 1.5
-# Or times the noise's energy, whatever the gap.
+# Or times the noise's energy, for any gap.
 _VETO_NOISE = 25.0
 # In any case by so many standard deviations of the noise's mean square.
 _CLEARLY = 5.0
@@ -43,7 +43,7 @@ _OWN, _DOUBTED = 0.1, 0.5
 _MAIN, _MENDED = 0.5, 15.0
 # Odds up to which the data do not distinguish one name from another.
 _ODDS = math.log(20.0)
-# Log odds against the most probable set beyond which nobody looks.
+# Log odds against the most probable set beyond which sets are not considered.
 _FAR = 12.0
 
 
@@ -52,7 +52,7 @@ class Judgement:
     """The verdict on the names.
 
     Attributes:
-        found: the set that speaks for the verdict.
+        found: the set that represents the verdict.
         fullest: the most probable set with the same members and with what corrects their form, whose coefficients are
             told; `found` itself where it has no corrections.
         names: library effects, the favourite of each class.
@@ -174,7 +174,7 @@ def _best_without(
 def _could_be_another(analysis: Analysis, found: FittedSet) -> bool:
     """Whether what the effects of a set can do holds what some candidate beside it is likely to do, up to the noise.
 
-    All that they can do, in whatever joints or legs: the one leg that explains most was picked from all of them.
+    All that they can do, in any joints or legs: the one leg that explains most was picked from all of them.
     """
     atoms, groups, grams = analysis.dictionary.atoms, analysis.dictionary.groups, analysis.dictionary.grams
     names = {atoms[i].name for i in found.members}
@@ -271,7 +271,7 @@ def _with_less(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...]
     ]
     if not idle:
         return found
-    # A discrepancy term can stand in for much of the library, so it is the first to go; else what is missed least.
+    # A discrepancy term can replace much of the library, so it is the first to go; else what is missed least.
     least = max(idle, key=lambda i: (atoms[i].is_discrepancy, tried[shares[i][1]].log_posterior))
     return tried[shares[least][1]]
 
@@ -345,7 +345,7 @@ def _driver_of_single(analysis: Analysis) -> str | None:
 def _classes(
     analysis: Analysis, found: FittedSet, names: frozenset[str], tried: dict[tuple[int, ...], FittedSet]
 ) -> dict[str, tuple[str, ...]]:
-    """For each name of the set those that can stand in its place, as far as these rows can tell."""
+    """For each name of the set those that these rows cannot distinguish from it."""
     atoms = analysis.dictionary.atoms
     library = [i for i, a in enumerate(atoms) if not a.is_discrepancy]
     classes: dict[str, tuple[str, ...]] = {}

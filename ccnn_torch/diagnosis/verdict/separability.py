@@ -17,12 +17,12 @@ _RANK = 1e-9
 
 
 def signature_angles(analysis: Analysis, judgement: Judgement) -> dict[str, dict[str, dict[str, float]]]:
-    """Of each of the verdict's effects how far its signature is from those that may stand in its place.
+    """Of each of the verdict's effects how far its signature is from those that may replace it.
 
     A signature is the fitted part of an effect in units of the noise, the verdict's other effects projected out. The
     angle is the principal one between it and all that the other effect can do (Björck and Golub 1973): 0 where the
     other can do the very same. What no fit of the other can copy is the sine of the angle times the size of the
-    signature, the root of a sum of squares over all rows: below about 3 noise hides it, whatever the angle.
+    signature, the root of a sum of squares over all rows: below about 3 noise hides it, at any angle.
 
     Returns:
         `{effect: {other: {"angle" [rad], "separation" [1, times the noise]}}}`.
@@ -44,7 +44,7 @@ def signature_angles(analysis: Analysis, judgement: Judgement) -> dict[str, dict
         size = float(torch.linalg.vector_norm(own))
         block[atoms[i].name] = {}
         for name in like:
-            # Where a name stands for several atoms (shapes), the one that comes closest.
+            # Where a name has several atoms (shapes), the closest one.
             angles = [_angle(own, _span(_without(beside, columns([j])))) for j, a in enumerate(atoms) if a.name == name]
             angle = min(angles)
             block[atoms[i].name][name] = {"angle": angle, "separation": size * math.sin(angle)}

@@ -57,7 +57,7 @@ _DRIVERS = {"workspace": "the place in the workspace", "temperature": "the tempe
 
 
 def effect_words(name: str) -> str:
-    """What an effect of the library is called in a sentence; a user's own effect goes by its name."""
+    """What an effect of the library is called in a sentence; a user's own effect by its name."""
     kind, _, parameter = name.partition(" ")
     if kind == "parameter" and parameter:
         return f"a wrong value of the parameter {parameter}"
@@ -220,7 +220,7 @@ def _cause(results: Block) -> str:
 
 
 def _with_class(name: str, like: Sequence[str], signatures: Block) -> str:
-    """An effect with those that may stand in its place, and why these rows do not distinguish them: the angles."""
+    """An effect with those that may replace it, and why these rows do not distinguish them: the angles."""
     if not like:
         return effect_words(name)
     angles = [signatures[n]["angle"] for n in like if n in signatures]
@@ -236,7 +236,7 @@ def _with_class(name: str, like: Sequence[str], signatures: Block) -> str:
 def _removed(results: Block, joint: str) -> str:
     """What the verdict's effects take away, on the first of position and rotation that has a gap."""
     verdict, blocks = results["verdict"], _blocks(results)
-    # An interval from nothing on tells no size; a caution stands in its place.
+    # An interval from nothing on tells no size; a caution replaces it.
     nothing = verdict["shrink_ci95"] is not None and verdict["shrink_ci95"][0] <= 0
     if verdict["shrink"] is None or not blocks or nothing:
         return ""
@@ -247,7 +247,7 @@ def _removed(results: Block, joint: str) -> str:
         low, high = (f"{100 * v:.{digits}f}" for v in verdict["shrink_ci95"])
         text += f" [{low}, {high}]"
     before, after = (_size(blocks[0][key], blocks[0]) for key in ("before", "after"))
-    return f"{text} of what lies above the noise on rows not used for fitting ({before} → {after})"
+    return f"{text} of what is above the noise on rows not used for fitting ({before} → {after})"
 
 
 def _blocks(results: Block) -> list[Block]:

@@ -33,10 +33,10 @@ class ConstraintRows:
 
     Attributes:
         joints: `s x n` [SI].
-        said: what the constraint says of each row, `s x o` [m]: the socket's place on the plate (o = 3), the distance,
+        said: the constraint's value of each row, `s x o` [m]: the socket's place on the plate (o = 3), the distance,
             or the reading (o = 1).
         group: number of each row's placement, anchor or plane, `s`.
-        labels: what each number stands for: the grouping columns and their values.
+        labels: the meaning of each number: the grouping columns and their values.
         weights: `s` [1]; 1 = row to identify from, 0 = held-out row.
         data_hash: SHA-256 of the records.
     """
@@ -95,7 +95,7 @@ def _taking_part(table: Table, where: Mapping[str, float]) -> Tensor:
         chosen &= table.raw(name) == value
     if not chosen.any():
         wanted = ", ".join(f"{name} = {value:g}" for name, value in where.items())
-        raise InputError(f"constraint.where: no row of {table.path} has {wanted}; write values that stand there")
+        raise InputError(f"constraint.where: no row of {table.path} has {wanted}; write values that it contains")
     return torch.from_numpy(np.flatnonzero(chosen))
 
 

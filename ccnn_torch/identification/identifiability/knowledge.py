@@ -28,7 +28,7 @@ class Knowledge:
         parameters: the free ones.
         sd: standard errors, `r x k` [SI], priors included; inf where the rows (and priors) leave a parameter open.
         correlation: of the estimates, `r x k x k` [1]; NaN in the rows and columns of parameters left open.
-        identifiable: `r x k`, bool: whether the rows alone determine the parameter, whatever the priors.
+        identifiable: `r x k`, bool: whether the rows alone determine the parameter, without the priors.
         singular_values: of the Jacobian with residuals in their unit and parameters in plausible errors, falling,
             without priors, `r x k` [1].
         directions: its right singular vectors, one a row, `r x k x k`, in plausible errors; those from `rank` on
@@ -74,7 +74,8 @@ def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
     of its own; one that is moved by less keeps a finite error, with that movement in it.
 
     Args:
-        problem: for a robust fit, that of `robust.reweighted`; its errors are then approximate, `bootstrap` tells.
+        problem: for a robust fit, that of `robust.reweighted`; its standard deviations are then approximate; see
+        `bootstrap`.
         values: `r x k` or `k` [SI].
 
     Raises:
@@ -92,7 +93,7 @@ def what_is_known(problem: Problem, values: Tensor) -> Knowledge:
     _, strength, basis = torch.linalg.svd(_tall(torch.cat([slope, pull], dim=-2)), full_matrices=False)
     freedom, noise = _noise(residual, slope, rows.equations, strength, basis)
     unit = torch.ones_like(noise) if problem.noise_known else noise
-    # Without an equation to spare nobody knows the noise: then only rounding says what is not seen.
+    # Without redundant equations the noise is unknown: only rounding then decides what is unobservable.
     least = torch.where(torch.isfinite(unit), unit / OPEN, 0.0)[:, None]
 
     _, singular, directions = torch.linalg.svd(_tall(slope), full_matrices=False)
@@ -140,7 +141,7 @@ def require_identifiable(knowledge: Knowledge) -> None:
     """For what needs every parameter.
 
     Raises:
-        InputError: the identification matrix is singular; the sentence says what of the parameters is known.
+        InputError: the identification matrix is singular; the sentence names the parameters that are determined.
     """
     if knowledge.combinations:
         k = len(knowledge.parameters)

@@ -18,7 +18,7 @@ class Rows:
 
     Attributes:
         joints: as recorded, `r x s x n` [SI].
-        observed: what was measured, `r x s x o` [SI]: pose coordinates of the view, or what a constraint says.
+        observed: what was measured, `r x s x o` [SI]: pose coordinates of the view, or values of a constraint.
     """
 
     joints: Tensor
@@ -44,7 +44,7 @@ class Measured:
         start: where the search begins, `r x K` [SI]: nominal, or with the frames fitted.
         truth: the simulated machines' parameters, `r x K` [SI]; None for records.
         wanted, wanted_joints: held-out poses that machines are sent to, `r x t x p` [SI], and joints near by,
-            `r x t x n` [SI], which tell the branch; None for records.
+            `r x t x n` [SI], which select the branch; None for records.
         reached: true poses of the held-out rows, `r x t x p` [SI]; None for records.
         map: poses of the map, `m x p` [SI]; None where none is drawn.
         pose_noise: standard deviation of each observed coordinate, `o` [SI]; None where it is to be estimated.

@@ -19,12 +19,12 @@ _HOLDERS = {
 
 
 def holder(results: Mapping[str, Any]) -> str:
-    """What stands where the tool is expected, with a verb: `the plane puts` (the tool)."""
+    """Subject and verb that say what places the tool: `the plane puts` (the tool)."""
     return _HOLDERS[results["constraint"]["kind"]]
 
 
 def constraint_table(results: Mapping[str, Any]) -> Table | None:
-    """Where plates, anchors or planes stand, with standard deviations."""
+    """Positions of plates, anchors or planes, with standard deviations."""
     about = results.get("constraint")
     if about is None:
         return None

@@ -62,7 +62,7 @@ def parameter_plot(results: Results, arrays: Arrays) -> Plot | None:
     return Plot(
         "parameters",
         figure,
-        f"Identified parameters{which} with 95 % intervals; a cross marks a parameter that these rows do not tell.",
+        f"Identified parameters{which} with 95 % intervals; a cross marks a parameter that the rows do not determine.",
     )
 
 

@@ -20,7 +20,7 @@ __all__ = ["identified_plots"]
 Array = NDArray[np.float64]
 Arrays = Mapping[str, Array]
 Results = Mapping[str, Any]
-# Pooled over machines, more poses than this tell nothing more on paper.
+# Pooled over machines, more poses than this add nothing to a picture.
 _DRAWN = 4000
 
 

@@ -57,7 +57,7 @@ def identified_verdict(results: Block) -> str:
 
 
 def not_settled(results: Block) -> str:
-    """What is to be said first where the first method did not converge; empty where it did."""
+    """The sentence that comes first where the first method did not converge; empty where it did."""
     method, machines = results["method"], results["methods"][results["method"]]["machines"]
     failed = round((1 - results["methods"][method]["converged"]) * machines)
     if failed == 0:
@@ -98,7 +98,7 @@ def print_identified(results: Block, console: Console) -> None:
 
 
 def unknown_sentences(results: Block) -> list[str]:
-    """What speaks against the figures, and which combinations of parameters the rows do not tell, as sentences."""
+    """What speaks against the figures, and which combinations of parameters the rows do not determine, as sentences."""
     found = results["combinations_not_identifiable"]
     said = [f"Not identifiable from these rows: {'; '.join(found)}."] if found else []
     return [*results.get("doubts", []), *said]

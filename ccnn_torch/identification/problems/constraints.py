@@ -1,7 +1,7 @@
 """Constraints instead of poses: a ball in sockets of a plate, distances from an anchor, points on a plane.
 
 Each builder gives a `Problem` in the free parameters of the machine and in what is unknown of the constraint itself,
-which the same fit finds: where a plate stands, an anchor, a plane. Neither needs a measuring device. What such rows
+which the same fit finds: the place of a plate, an anchor, a plane. Neither needs a measuring device. What such rows
 cannot tell by their nature is left out: the arm's base frame (the constraint moves along with it), the tool's
 orientation (only its point is held), the roll of a plate about a single line of sockets.
 """
@@ -49,7 +49,7 @@ def socket_problem(
     start: Tensor | None = None,
     plate_tolerance: float = 0.0,
 ) -> Problem:
-    """The tool's ball in sockets of a plate that stood somewhere: b(q) - (c + R x), c and R unknown per placement.
+    """The tool's ball in sockets of a plate at unknown places: b(q) - (c + R x), c and R unknown per placement.
 
     Sockets at known points x of the plate give the scale; a single socket (all points 0) holds one unknown point.
 
@@ -122,7 +122,7 @@ def distance_problem(
     choice: ParameterChoice | None = None,
     start: Tensor | None = None,
 ) -> Problem:
-    """Measured distance of the tool from an anchor that stands somewhere (draw wire, telescopic ball bar).
+    """Measured distance of the tool from an anchor at an unknown place (draw wire, telescopic ball bar).
 
     Args:
         anchor: number of the anchor, `s`, any numbers.
@@ -169,7 +169,7 @@ def plane_problem(
     choice: ParameterChoice | None = None,
     start: Tensor | None = None,
 ) -> Problem:
-    """The tool's point on a plane that stands somewhere, or a dial gauge's reading of its distance from it.
+    """The tool's point on a plane at an unknown place, or a dial gauge's reading of its distance from it.
 
     Args:
         plane: number of the plane, `s`, any numbers.

@@ -13,7 +13,7 @@ from ccnn_torch.identification.problems.problem import Problem
 __all__ = ["OPEN", "SparseResidual", "WeightedRows", "row_jacobian"]
 
 # A direction in which the rows leave more than so many plausible errors open (0.1 m, 0.2 rad) counts as unseen: what a
-# linearised problem says so far away means nothing.
+# linearised problem is not valid so far away.
 OPEN = 100.0
 
 # Numbers in the residual's copies below which one backward pass through all of them beats a pass for each channel.

@@ -30,9 +30,9 @@ def fit_links(
     """Fit all link parameters, and with them the frames that are unknown, in each repeat on its own rows.
 
     Every link parameter is drawn to the maker's value with the tolerance as standard deviation, against the noise that
-    the rows show: what the rows cannot tell (two parallel axes, a tool length along the last axis) stays nominal, so
-    that nothing needs to be left out by hand. Frames in `arm.unknown_frames` are free but for the tool's position, as
-    in `fit_frames`. Gross outliers are left out.
+    the rows show: what the rows do not determine (two parallel axes, a tool length along the last axis) stays nominal,
+    so that nothing needs to be left out by hand. Frames in `arm.unknown_frames` are free but for the tool's position,
+    as in `fit_frames`. Gross outliers are left out.
 
     Args:
         arm: the arm, with one base and one tool frame for all rows.

@@ -43,7 +43,7 @@ class Selection:
     """The free parameters of a choice, and the way back from their values to the whole geometry.
 
     Attributes:
-        parameters: the `k` free ones; a tied group goes by its first name, with no leg if it spans several.
+        parameters: the `k` free ones; a tied group has its first name, with no leg if it spans several.
         groups: names of the parameters that each free one sets.
         start: `r x k` [SI].
         scale: plausible errors, `k` [SI].

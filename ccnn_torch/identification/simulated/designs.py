@@ -43,7 +43,7 @@ def plan_places(
 ) -> tuple[Tensor, dict[int, Tensor]]:
     """The most informative places for all parameters, `s x .`, and for each leg alone (`planned_per_leg`), by leg.
 
-    Chosen at the nominal geometry, as nobody knows a better one before measuring.
+    Chosen at the nominal geometry, since no better one is known before measuring.
 
     Raises:
         InputError: too few poses, the poses cannot be dealt to the legs, or the legs are not apart.

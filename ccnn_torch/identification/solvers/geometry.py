@@ -28,7 +28,7 @@ def fit_geometry(
 
     A serial arm is fitted by its pose (`fit_links`), any other mechanism by the residual of inverse calibration
     (`inverse_problem`). Every parameter is drawn to its start by a plausible error as standard deviation, against the
-    noise that the rows show: what they cannot tell stays where it was.
+    noise that the rows show: what they do not determine keeps its value.
 
     Args:
         joints: commanded, `s x n` [SI].

@@ -151,7 +151,7 @@ def polish(objective: Objective, points: Tensor, tell: Progress) -> tuple[Tensor
 def _one_step(objective: Objective, points: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
     """A Gauss-Newton step of each machine, where it makes the gradient less.
 
-    At its end the cost is flat, and differs by rounding alone between points that the gradient still tells apart.
+    At its end the cost is flat, and differs by rounding alone between points that still differ in their gradient.
     """
     turn = objective.even_coordinates(points)
     gradient = (turn.mT @ objective.cost_and_gradient(points)[1][..., None])[..., 0]

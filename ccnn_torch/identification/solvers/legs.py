@@ -60,7 +60,7 @@ def split_by_leg(problem: Problem) -> list[Problem]:
 
 
 def solve_per_leg(solver: Solver, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
-    """Solve each leg by itself and put the values together.
+    """Solve each leg separately and join the values.
 
     Args:
         solver: any.

@@ -43,8 +43,8 @@ def solve_lm(
         starts: searches of each machine.
         loss: `squared`, `huber` or `cauchy`, by reweighting whole rows (`robust.loss_weights`).
         max_iterations: bound on the trials.
-        tolerance: a search ends when what is left to go, as the fall of its steps tells, is below so many standard
-            deviations of the estimate.
+        tolerance: a search ends when the remaining distance, estimated from the decrease of its steps, is below so many
+            standard deviations of the estimate.
 
     Returns:
         Fit; its cost is the squared loss with the problem's weights, and its `evaluations` count a residual and its

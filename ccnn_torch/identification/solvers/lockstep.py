@@ -1,7 +1,7 @@
 """Searches that ask for one point at a time, run side by side so that each round is one batched evaluation.
 
 SciPy's searches call a function and wait for its answer. Here each search has a thread that does little but wait; when
-all have asked, the points of all machines are evaluated in one call. A search sees the same numbers whatever runs
+all have asked, the points of all machines are evaluated in one call. A search sees the same numbers, whatever else runs
 beside it, and the rounds are the same in every run, so the result does not depend on the threads' order.
 """
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 class _EndedError(Exception):
-    """Ends a search whose answers nobody will compute any more."""
+    """Ends a search whose function values will not be computed any more."""
 
 
 def run_side_by_side(

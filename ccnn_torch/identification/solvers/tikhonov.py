@@ -82,7 +82,7 @@ def solve_tikhonov(problem: Problem, seed: int = 0, progress: Progress | None = 
     compare with. The seed is not needed.
 
     Returns:
-        Fit; `converged` where the residual at the new values is finite. Where it is not, the start stands.
+        Fit; `converged` where the residual at the new values is finite. Where it is not, the start is kept.
 
     Raises:
         InputError: the residual is not finite at the start.

@@ -132,7 +132,7 @@ class _Table:
         return [list(g) for g in value]
 
     def frame(self, key: str, scales: list[float]) -> list[float] | None:
-        """The frame in SI, None when unknown; the text that says so may say more, before and after."""
+        """The frame in SI, None when unknown; the cell may hold other text before and after."""
         value = self.content.get(key, "unknown")
         if isinstance(value, str) and "unknown" in value.split(";")[0]:
             return None

@@ -28,7 +28,7 @@ _FORM = "a mechanism file has mechanism, keys and parameters: {NAME: {value: …
 
 
 class MechanismFile:
-    """What a mechanism file says; `recipe` builds the mechanism, `values` and `nominal` are its parameters by name."""
+    """A mechanism file; `recipe` builds the mechanism, `values` and `nominal` are its parameters by name."""
 
     def __init__(self, path: str, content: Mapping[str, Any]) -> None:
         """Check the form; names and units are checked against the mechanism by `parameters_of`.
@@ -69,7 +69,7 @@ class MechanismFile:
 
 
 def read_mechanism_file(path: str, content: bytes | None = None) -> MechanismFile | None:
-    """What the file says, or None where it is no mechanism file: has no key `mechanism`, or cannot be read at all.
+    """Contents of the file, or None where it is no mechanism file: has no key `mechanism`, or cannot be read at all.
 
     Args:
         path: of the file.
@@ -82,7 +82,7 @@ def read_mechanism_file(path: str, content: bytes | None = None) -> MechanismFil
         text = read_text(path, CONFIG_LIMIT) if content is None else content.decode("utf-8")
         tree = parse_yaml(text, path)
     except (InputError, UnicodeDecodeError):
-        # Whoever asked knows what else the file should have been, and says so.
+        # The caller knows what else the file should have been, and reports it.
         return None
     if not isinstance(tree, Mapping) or "mechanism" not in tree:
         return None

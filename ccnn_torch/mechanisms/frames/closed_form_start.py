@@ -85,7 +85,7 @@ def rigid_body_frame(here: Frame, there: Frame, weights: Tensor, rotation_weight
     """The rigid motion that takes some frames nearest to others (Kabsch 1976, with orientation beside the points).
 
     Points in one plane leave no choice of its normal: of the two motions that fit them up to a reflection, the proper
-    rotation keeps their order in the plane. A rotation about points that stand in one line stays near none.
+    rotation keeps their order in the plane. A rotation about collinear points stays near zero.
 
     Args:
         here, there: position `... x s x 3` [m] and rotation `... x s x 3 x 3`, or None.

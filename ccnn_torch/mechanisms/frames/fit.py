@@ -44,13 +44,13 @@ def fit_frames(
     """Fit the unknown ones of base and tool frame to rows, nominal links kept; each repeat on its own rows.
 
     With orientation both frames are fitted in (position, rotation_weight x rotation vector); without, the base frame
-    and the tool's position (the tool's rotation is then nothing that the rows could tell and stays nominal). Damped
+    and the tool's position (the rows do not determine the tool's rotation then, which stays nominal). Damped
     least squares from several closed-form starts, the best of which is kept; gross outliers are first weighed down and
     then left out. Directions that the rows do not show (the roll of a plate about the line of its two sockets) stay at
     the start, and the tool's position is drawn to its nominal one by a quarter of the reach.
 
     Args:
-        arm: the arm; `arm.unknown_frames` says what is fitted, `arm.frame_per` and `arm.tool_per` per which groups.
+        arm: the arm; `arm.unknown_frames` lists what is fitted, `arm.frame_per` and `arm.tool_per` per which groups.
         joints: `s x n` [SI].
         pose: measured, `s x p` [SI].
         weights: `r x s` or `s` [1]; 0 leaves a row out (held-out rows); all 1 when None.

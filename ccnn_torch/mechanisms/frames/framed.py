@@ -32,9 +32,9 @@ class Framed(Mechanism):
     base is in the measuring frame; with `base`), those of the mechanism, tool_x … tool_rz (the measured point and
     axes on its platform; with `tool`); all frames are nominally the identity. A measured frame may have more
     coordinates than the mechanism has joints: `solve_inverse` gives the joints of the closest pose in
-    (position, rotation_weight x rotation vector), where `closure` tells what remains. The frame of the mechanism's pose
-    is that of the nominal machine: a parameter that moves the platform at given pose coordinates acts by the joints
-    only.
+    (position, rotation_weight x rotation vector), where `closure` gives the remaining error. The frame of the
+    mechanism's pose is that of the nominal machine: a parameter that moves the platform at given pose coordinates acts
+    by the joints only.
 
     Attributes:
         mechanism: a copy of the mechanism, without hooks.

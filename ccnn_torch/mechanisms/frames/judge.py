@@ -41,7 +41,7 @@ def judge_frames(
         values: parameters with fitted frames, `k` or `r x 1 x k`, or one set a row, `s x k` or `r x s x k` [SI].
         weights: `r x s` or `s` [1]; 0 = a row that was not fitted to; all 1 when None.
         where: the file, which opens the sentence.
-        name_rows: says rows (0-based) as a person finds them; they are only counted when None.
+        name_rows: formats rows (0-based) as the user knows them; they are only counted when None.
 
     Returns:
         Sentences on rows that are gross outliers.

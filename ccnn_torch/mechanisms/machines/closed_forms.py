@@ -12,7 +12,7 @@ def real_sqrt(square: Tensor) -> tuple[Tensor, Tensor]:
     """Square root, any shape, and where it is real (bool); elsewhere 0.
 
     What follows from a root that is not real is set to NaN last, by the mask: a NaN on the way, times a zero gradient,
-    would become the gradient of whatever the rows share.
+    would become the gradient of everything that the rows share.
     """
     real = square >= 0
     return torch.where(real, torch.sqrt(torch.where(real, square, 1.0)), 0.0), real

@@ -89,7 +89,8 @@ class Delta(_Parallelograms):
     z points up and is 0 in the plane of the cranks' axes, so that the platform's z is negative. Leg i has the
     parameters basei (radius of the crank's axis), anglei (of the leg's plane, from +x), cranki, platformi (radius of
     the platform's joint), rodi (length of the parallelogram) and offseti (the crank is at the joint plus this).
-    Base and platform radius of a leg act only by their difference: an identification says so, or one of them is fixed.
+    Base and platform radius of a leg act only by their difference: an identification reports this, or one of them is
+        fixed.
     """
 
     def __init__(self, base: float = 0.2, crank: float = 0.25, platform: float = 0.05, rod: float = 0.55) -> None:

@@ -36,7 +36,7 @@ class FiveBar(Mechanism):
     closed_form = "forward"
 
     def __init__(self, l: float = 0.75, L: float = 1.1, a: float = 0.5) -> None:
-        """l, L: lengths of cranks and couplers; a: distance of the cranks' feet from the origin, at (∓a, 0) [m].
+        """l, L: lengths of cranks and couplers; a: distance of the cranks' axes from the origin, at (∓a, 0) [m].
 
         Raises:
             InputError: the lengths leave no workspace.

@@ -15,7 +15,7 @@ _GRID, _ROUNDS = 17, 20
 
 
 def inscribed_circle(crank: Tensor, coupler: Tensor, foot: Tensor) -> tuple[Tensor, Tensor]:
-    """Largest circle above the cranks' feet with the elbows outward and no singularity of either kind inside.
+    """Largest circle above the cranks' axes with the elbows outward and no singularity of either kind inside.
 
     First kind, a leg stretched or folded: circles around its foot with radius L + l and |L - l|. Second kind, the
     couplers in line: a curve, sampled. The centre is searched on ever finer grids.
@@ -59,7 +59,7 @@ def _margin(points: Tensor, crank: Tensor, coupler: Tensor, foot: Tensor, edge: 
     elbow = _outward_elbows(points, crank, coupler, foot)
     across, to_tool = elbow[:, 1] - elbow[:, 0], points - elbow[:, 0]
     inside &= across[:, 0] * to_tool[:, 1] - across[:, 1] * to_tool[:, 0] > 0
-    # The mechanism must keep its side of the feet: below them the angles of the cranks jump.
+    # The mechanism must keep its side of the cranks' axes: below them the cranks' angles jump.
     nearest = torch.minimum(legs, points[:, 1] - foot[:, 1].amax())
     if len(edge):
         nearest = torch.minimum(nearest, torch.cdist(points, edge).amin(-1))

@@ -142,7 +142,7 @@ class SerialArm(Mechanism):
     def with_link_frames(self) -> SerialArm:
         """The same arm with six parameters a link, in the URDF form, nominal parameters and kinematics unchanged.
 
-        Four Denavit-Hartenberg parameters cannot tilt one of two parallel axes about the direction that lies across
+        Four Denavit-Hartenberg parameters cannot tilt one of two parallel axes about the direction across
         both (Hayati 1983); a UR10 has three such axes. The nominal tool frame takes in the constant part of the last
         link; frames that are unknown stay so.
         """
@@ -258,7 +258,7 @@ class SerialArm(Mechanism):
         return torch.cat([tool_position - position, weight * turn], dim=-1)
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
-        """Joints of the closest pose, as `nearest_joints`. Never NaN: `pose_error` tells how close it comes."""
+        """Joints of the closest pose, as `nearest_joints`. Never NaN: `pose_error` gives the distance that remains."""
         x = self.nearest_joints(pose, parameters, guess, self.rotation_weight)
         values = self.resolve(parameters)
         position, rotation = self.frame(pose)

@@ -20,10 +20,10 @@ class Stewart(Mechanism):
     """Six legs that change their length; joints q1..q6 [m], pose x, y, z [m] and rotation vector rx, ry, rz [rad].
 
     Leg i has the parameters Bix, Biy, Biz (its joint on the base), Pix, Piy, Piz (on the platform, in its frame) [m],
-    offseti [m] and gaini [1] of the drive: its length is gain * q + offset. Nominally the joints stand in pairs on two
-    circles, the base's pairs around 0°, 120° and 240°, the platform's between them, and the joints are the lengths. The
-    workspace is the assembly mode of the middle of the sampling box: x, y ±0.1 m, z height ±0.1 m, rotation ±0.25 rad
-    about each axis.
+    offseti [m] and gaini [1] of the drive: its length is gain * q + offset. Nominally the joints are placed in pairs on
+    two circles, the base's pairs around 0°, 120° and 240°, the platform's between them, and the joints are the lengths.
+    The workspace is the assembly mode of the middle of the sampling box: x, y ±0.1 m, z height ±0.1 m, rotation ±0.25
+    rad about each axis.
     """
 
     closed_form = "inverse"
@@ -103,7 +103,7 @@ class Stewart(Mechanism):
         legs = self._legs(pose, self.resolve(parameters))
         on_platform = legs.direction @ legs.rotation
         length = joints.unsqueeze(-1).expand(*on_platform.shape[:-1], 1)
-        # By the joint on the base and on the platform, offset and gain of a leg: what its own joint's value goes by.
+        # By the joint on the base and on the platform, offset and gain of a leg, which change its own joint's value.
         own = torch.cat([-legs.direction, on_platform, -torch.ones_like(length), -length], -1) / legs.gain
         rates, known = _inverted(legs.rates(), pose)
         return torch.where(known, -(rates[..., None] * own.unsqueeze(-3)).flatten(-2), torch.nan)

@@ -249,6 +249,6 @@ class BlackBox(Mechanism):
 
     def _own_file(self) -> dict[str, Any]:
         raise InputError(
-            f"simulator '{self.name}' was made in Python and stands under no name; write it to a file and use "
+            f"simulator '{self.name}' was made in Python and has no name to load it by; write it to a file and use "
             "load_mechanism('file.py:NAME')"
         )

@@ -31,7 +31,7 @@ _WATCHER: ContextVar[Callable[[int], None] | None] = ContextVar("watcher", defau
 
 @contextmanager
 def simulated_rows(tell: Callable[[int], None]) -> Iterator[None]:
-    """Within it, `tell` hears how many rows a slow simulator (one that remembers) has simulated so far."""
+    """Within it, `tell` is called with the number of rows a slow simulator (one with a cache) has simulated so far."""
     count = 0
 
     def more(rows: int) -> None:
@@ -65,7 +65,8 @@ class Calls:
     def pose(self, joints: Tensor, parameters: Tensor, conditions: Mapping[str, Tensor]) -> Tensor:
         """Pose of joints `... x n` with parameters `... x k` under conditions `...` each, all broadcast; `... x p`.
 
-        Parameters beyond their bounds are taken at the bound; rows that are not finite come back as NaN, unasked.
+        Parameters beyond their bounds are taken at the bound; rows that are not finite are returned as NaN without a
+        call.
 
         Raises:
             InputError: the callable fails or gives another shape.
@@ -127,7 +128,7 @@ class Calls:
             pose = np.array(plain, dtype=np.float64)
         except CcnnError:
             raise
-        except (Exception, SystemExit) as error:  # whatever a user's code may raise
+        except (Exception, SystemExit) as error:  # a user's code may raise anything
             said = (str(error).strip().splitlines() or [""])[0]
             raise InputError(
                 f"simulator '{simulator.name}': simulate fails{_line(error)} on {count_text(len(rows), 'row')}: "

@@ -19,7 +19,7 @@ __all__ = ["MujocoMachine"]
 _AXES = "xyz"
 # A pose coordinate as an axis of the wrench that its load is: forces, then moments.
 _WRENCH = {name: k for k, name in enumerate(("x", "y", "z", "rx", "ry", "rz"))}
-# Between two looks at whether everything stands still [s].
+# Time between two checks of whether everything is at rest [s].
 _LOOK = 0.1
 # What moves faster than this when the time is over is not at rest [rad/s, m/s].
 _MOVING = 1e-2
@@ -117,7 +117,7 @@ class MujocoMachine:
         return self._read_poses(models, state)
 
     def _control(self, commands: Array, loads: Array) -> Array:
-        """`N x steps x nu`: what is not commanded stands as in the first keyframe, or at 0."""
+        """`N x steps x nu`: what is not commanded is as in the first keyframe, or 0."""
         rows, steps = np.broadcast_shapes(commands.shape[:2], loads.shape[:2])
         control = np.zeros((rows, steps, self.model.nu))
         if self.model.nkey:
@@ -140,7 +140,7 @@ class MujocoMachine:
         return np.array(states[:, -1])
 
     def _speed(self, state: Array) -> Array:
-        """Largest speed of each row; time and positions stand before the speeds."""
+        """Largest speed of each row; time and positions come before the speeds."""
         start = 1 + self.model.nq
         speed: Array = np.abs(state[:, start : start + self.model.nv]).max(-1, initial=0.0)
         return speed

@@ -30,7 +30,7 @@ def mujoco_simulator(
     """A simulator that commands position servos of a MuJoCo model and reads a site when it has come to rest.
 
     Loads `load_NAME` along the pose coordinates act on the site in the axes of the world. Without equality constraints
-    a row starts at its command, or `approach` before it on the side that `direction1` … tell; with them it starts at
+    a row starts at its command, or `approach` before it on the side that `direction1` … give; with them it starts at
     the first keyframe (or qpos0), where the loops must be closed, and goes to its command on a ramp.
 
     Args:

@@ -125,7 +125,7 @@ class ModelNumbers:
         return bool(self.model.jnt_type[joint] == self.mujoco.mjtJoint.mjJNT_HINGE)
 
     def _cells(self, model: Any, p: ModelParameter) -> list[tuple[Array, int, float]]:
-        """Where a parameter stands in a model: array, index in it, sign."""
+        """Place of a parameter in a model: array, index in it, sign."""
         if (p.kind, p.field) not in _FIELDS:
             known = ", ".join(f"{kind} {field}" for kind, field in _FIELDS)
             raise InputError(f"{self.path}: '{p.kind} {p.field}' is no parameter; there are {known}")

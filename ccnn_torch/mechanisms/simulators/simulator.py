@@ -49,8 +49,8 @@ class Simulator:
             `Condition`.
         frame: pose `... x p` (tensor) -> position `... x 3` [m] and rotation matrix or None, differentiable in torch.
         home: commands of an ordinary configuration; the middle of the joints' workspace when None.
-        step: of the differences that stand for derivatives, as a share of half a joint's workspace; parameters move
-            by a tenth of their scale. A simulator that is exact to 1e-9 only wants 1e-3.
+        step: of the finite differences that replace derivatives, as a share of half a joint's workspace; parameters
+            move by a tenth of their scale. A simulator that is exact to 1e-9 only wants 1e-3.
         tensors: whether `simulate` gets float64 tensors rather than numpy arrays.
         remember: whether rows that come again are looked up; for one that takes more than some 10 µs a row.
     """
@@ -68,7 +68,7 @@ class Simulator:
     remember: bool = False
 
     def __deepcopy__(self, memo: object) -> Simulator:
-        """Itself: nothing in it changes, and what stands behind `simulate` need not be something that can be copied."""
+        """Itself: nothing in it changes, and `simulate` need not be something that can be copied."""
         return self
 
     def checked(self) -> Simulator:
