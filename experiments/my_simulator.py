@@ -12,7 +12,7 @@ from ccnn_torch.mechanisms import Joint, Simulator
 
 
 def simulate(commands, covariates, parameters):
-    """Where the tool stands: commands N x 2 [rad], covariates {name: N}, parameters N x 5 -> N x 2 [m]."""
+    """Position of the tool: commands N x 2 [rad], covariates {name: N}, parameters N x 5 -> N x 2 [m]."""
     crank, coupler, foot = parameters[:, 0], parameters[:, 1], parameters[:, 2]
     feet = np.stack([-foot, foot], -1)
     force = np.stack([covariates["load_x"], covariates["load_y"] - 9.81 * covariates["payload"]], -1)

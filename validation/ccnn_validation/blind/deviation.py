@@ -16,7 +16,7 @@ __all__ = ["Deviation", "measured_pose", "stack", "weighted"]
 
 @dataclass(frozen=True)
 class Deviation:
-    """One cause at unit size; what it does not change is 0. Leading dims `...` stand for cases and causes.
+    """One cause at unit size; what it does not change is 0. Leading dims `...` are cases and causes.
 
     Attributes:
         joints: change of the joints, `... x s x n` [SI].

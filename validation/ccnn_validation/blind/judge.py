@@ -2,7 +2,7 @@
 
 An answer is *right* where its names explain the true gap as well as the true causes do, with no more names, to within
 the noise (`Judge.as_well`): then the data cannot distinguish it from the truth, whether it is the truth, one of its
-class, or one name for a pair. What lies outside the library is right where the answer says so and names the driver.
+class, or one name for a pair. What is outside the library is right where the answer says so and names the driver.
 """
 
 from __future__ import annotations

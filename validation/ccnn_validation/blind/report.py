@@ -28,9 +28,9 @@ _EDGES = (0.0, 0.5, 0.8, 0.95, 0.99, 1.0)
 _CONFIDENT = 0.95
 DEFINITIONS = {
     "right": "the names explain the true gap as well as the true causes, with no more names, to within the noise; what "
-    "lies outside the library is called outside and by its driver; nothing is found where there is nothing",
+    "is outside the library is called outside and by its driver; nothing is found where there is nothing",
     "exact": "the true names and no other",
-    "found": "share of the true causes that are named, or stood for by a name that these rows cannot tell from them",
+    "found": "share of the true causes that are named, or represented by one that these rows cannot distinguish",
     "class": "names that explain the true gap as well as the true cause does",
     "claims": "verdicts with a probability of 0.95 or more that are right",
     "wrong_name": "a name with a probability above 0.9 that does not explain the gap",
@@ -86,7 +86,7 @@ def summary(cases: Sequence[Case]) -> Block:
         "by_machine": _grouped(cases, lambda c: c["machine"]),
         "by_rows": _grouped(cases, lambda c: str(c["rows"])),
         "by_disturbance": _grouped(cases, lambda c: c["disturbance"] or "none"),
-        "by_noise": _grouped(cases, lambda c: "told" if c["noise_told"] else "not told"),
+        "by_noise": _grouped(cases, lambda c: "given" if c["noise_told"] else "not given"),
         "by_cause": _by_cause(kinds),
         "confusion": _confusion(kinds),
         "reliability": _reliability(cases),

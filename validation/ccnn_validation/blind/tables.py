@@ -18,7 +18,7 @@ _GROUPS = {
     "by_machine": ("machine", "Right answers by machine"),
     "by_rows": ("rows", "Right answers by number of rows"),
     "by_disturbance": ("disturbance", "Right answers by what disturbs the rows"),
-    "by_noise": ("noise", "Right answers by whether the noise is told"),
+    "by_noise": ("noise", "Right answers by whether the noise is given"),
 }
 _MOST = 6
 """Verdicts named in a row of the confusion table; the rest are counted together."""
