@@ -226,7 +226,7 @@ def test_columns_by_another_name_are_said(cli: Cli, rows: Path, tmp_path: Path) 
     code, shown, _ = cli("diagnose", *words)
     assert code == 0
     notes = json.loads((tmp_path / "found" / "diagnosis.json").read_text(encoding="utf-8"))["notes"]
-    assert any("not evaluated: force_x; effects go by time, temperature, load_x" in note for note in notes)
+    assert any("not evaluated: force_x; effects use time, temperature, load_x" in note for note in notes)
     assert "force_x" in shown and "force_x" in (tmp_path / "found" / "report.html").read_text(encoding="utf-8")
     # One that was asked for is there for effects of one's own.
     code, shown, told = cli("check", *words[:4], "covariates=[time,temperature,load_*,direction*,force_x]")

@@ -133,14 +133,14 @@ def test_nothing_held_out_leaves_the_sd_as_the_learner_says() -> None:
 def test_a_run_tells_coverage_sd_and_that_nothing_was_held_out() -> None:
     calibration = calibrate(short(repeats=2, methods=["constant"]))
     block = calibration.results["methods"]["constant"]
-    assert any("No row was held out" in note for note in calibration.results["notes"])
+    assert any("No rows were held out" in note for note in calibration.results["notes"])
     # Noise of 1e-5 m is most of what the constant leaves of q1 and q2.
     assert 0.9e-5 < block["sd"]["q1"]["median"] < 1.5e-5
     assert len(block["coverage"]["values"]) == 2 and 0.8 < block["coverage"]["median"] <= 1
     assert block["converged"] is None
     held = calibrate(short(repeats=2, methods=["constant"], training={"early_stop": False, "folds": 5}))
     assert held.results["rows"] == calibration.results["rows"]
-    assert not any("No row was held out" in note for note in held.results["notes"])
+    assert not any("No rows were held out" in note for note in held.results["notes"])
     assert torch.equal(held.outcomes["constant"].deviation, calibration.outcomes["constant"].deviation)
     assert not torch.equal(held.outcomes["constant"].fitted.sd_scale, torch.ones(2, 3, dtype=torch.float64))
 

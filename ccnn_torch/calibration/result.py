@@ -126,8 +126,8 @@ def assemble(
 def _notes(plan: Plan) -> list[str]:
     if not plan.holds_out:
         return [
-            "No row was held out to choose by: the predictive sd is the learners' own, by no other rows corrected "
-            "(training.folds=5 does that without changing the model)."
+            "No rows were held out for choices: the predictive sd is the learner's own, not corrected on "
+            "other rows (training.folds=5 does that without changing the model)."
         ]
     if plan.folds > 1:
         blocks = "neighbouring blocks" if plan.kind == "block" else "whole groups" * (plan.kind == "group") or "rows"

@@ -191,9 +191,7 @@ def _notes(
             "named"
         )
     if judgement.outside and not proposed:
-        notes.append(
-            "no measurement is proposed: no effect says what would be measured of a cause outside of the library"
-        )
+        notes.append("no measurement is proposed: no model predicts the measurements of a cause outside the library")
     if not judgement.names and not judgement.outside and analysis.whitening.known == 0 and missing:
         columns = ", ".join(column for entry in missing for column in entry["columns"])
         notes.append(

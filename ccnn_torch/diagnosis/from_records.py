@@ -82,7 +82,7 @@ def _unread(records: Records, situation: Situation) -> list[str]:
         return []
     more = f" and {len(names) - _FEW_NAMES} more" if len(names) > _FEW_NAMES else ""
     return [
-        f"columns that were not evaluated: {', '.join(names[:_FEW_NAMES])}{more}; effects go by time, temperature, "
+        f"columns that were not evaluated: {', '.join(names[:_FEW_NAMES])}{more}; effects use time, temperature, "
         f"load_{mechanism.pose[0].name}, direction1, speed1 and the like"
     ]
 

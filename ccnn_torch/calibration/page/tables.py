@@ -262,7 +262,7 @@ def _pose_table(results: Results) -> Table:
             (
                 "not_compensable",
                 "RMS not compensable",
-                "Not compensable: the part of the measured error that no joint deviation, damped as it was, explains.",
+                "Not compensable: the part of the measured error that the (damped) joint deviations do not explain.",
             ),
         )
         if any(extra[0] in block for block in blocks.values())

@@ -214,8 +214,8 @@ def record_table(results: Block) -> Table | None:
         for name, size in entry["effects"].items()
     )
     note = (
-        "Size: what an effect of plausible size does to the usual of these poses in a workshop; so much of the gap it "
-        "may make, and cannot be named, until the column is recorded."
+        "Size: median error that an effect of plausible size makes at these poses. Without the column the effect can "
+        "make that part of the gap and not be named."
     )
     columns = ("column", "would show", f"size [{unit}]")
     return Table("What should be recorded as well?", columns, rows, note, ("would show",))
