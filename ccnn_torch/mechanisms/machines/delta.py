@@ -90,7 +90,7 @@ class Delta(_Parallelograms):
     parameters basei (radius of the crank's axis), anglei (of the leg's plane, from +x), cranki, platformi (radius of
     the platform's joint), rodi (length of the parallelogram) and offseti (the crank is at the joint plus this).
     Base and platform radius of a leg act only by their difference: an identification reports this, or one of them is
-        fixed.
+    fixed.
     """
 
     def __init__(self, base: float = 0.2, crank: float = 0.25, platform: float = 0.05, rod: float = 0.55) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
@@ -52,12 +52,12 @@ class SourceCase:
 
     family: str
     mechanism: str
-    columns: Mapping[str, NDArray]
+    columns: Mapping[str, NDArray[Any]]
     noise: Mapping[str, float] | None
     truth: Truth
-    mechanism_keys: Mapping[str, object] | None = None
-    clean: Mapping[str, NDArray] | None = None
-    baseline: Mapping[str, NDArray] | None = None
+    mechanism_keys: Mapping[str, Any] | None = None
+    clean: Mapping[str, NDArray[Any]] | None = None
+    baseline: Mapping[str, NDArray[Any]] | None = None
     noise_kind: str = "white"
 
 

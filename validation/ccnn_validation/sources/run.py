@@ -1,0 +1,151 @@
+"""Diagnose the cases of an independent source and judge the answers, resumable: one file for each case."""
+
+from __future__ import annotations
+
+import importlib
+import time
+import zlib
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, cast
+
+import torch
+from numpy.typing import NDArray
+
+from ccnn_torch.diagnosis import Diagnosis, diagnose
+from ccnn_torch.diagnosis.residual.linearisation import remainder
+from ccnn_torch.errors import CcnnError, InputError
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.records import load_records, write_table
+from ccnn_torch.report.json_files import read_json, write_json
+from ccnn_torch.report.screen import note
+from ccnn_validation.sources.case import Source, SourceCase
+from ccnn_validation.sources.judge import judged
+
+__all__ = ["SOURCES", "diagnosed", "run_source", "source_of"]
+
+SOURCES = ("semi_real", "multibody", "adversarial")
+
+
+def source_of(name: str) -> Source:
+    """The source of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    if name not in SOURCES:
+        raise InputError(f"--source: '{name}' is not there; known: blind, {', '.join(SOURCES)}")
+    return cast(Source, importlib.import_module(f"ccnn_validation.sources.{name}"))
+
+
+def run_source(
+    name: str,
+    seeds: Sequence[int],
+    out: Path,
+    families: Sequence[str] | None = None,
+    processes: int = 2,
+    quiet: bool = False,
+) -> list[dict[str, Any]]:
+    """Diagnose every family with every seed and judge; finished cases are kept.
+
+    Args:
+        name: of `SOURCES`.
+        seeds: of the cases of each family.
+        out: folder of the finished cases.
+        families: those to take; all when None.
+        processes: how many at once.
+
+    Raises:
+        InputError: an unknown source or family, or data that the source reads is not there.
+    """
+    source = source_of(name)
+    strange = [f for f in families or () if f not in source.FAMILIES]
+    if strange:
+        raise InputError(f"families: '{strange[0]}' is not one of {', '.join(source.FAMILIES)}")
+    out.mkdir(parents=True, exist_ok=True)
+    tasks = [
+        (name, family, seed, out / f"{family}-{seed}.json") for seed in seeds for family in families or source.FAMILIES
+    ]
+    left = [task for task in tasks if not task[3].is_file()]
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        for position, line in enumerate(pool.map(_one, left), 1):
+            note(f"[{position}/{len(left)}] {line}", quiet)
+    return [dict(read_json(task[3])) for task in tasks]
+
+
+def _one(task: tuple[str, str, int, Path]) -> str:
+    torch.set_num_threads(1)
+    name, family, seed, path = task
+    case = source_of(name).make(family, seed)
+    began = time.perf_counter()
+    answer = diagnosed(case, case.columns)
+    seconds = time.perf_counter() - began
+    baseline = None if case.baseline is None else diagnosed(case, case.baseline)
+    truth = case.truth
+    found = {
+        "source": name,
+        "family": family,
+        "seed": seed,
+        "kind": truth.kind,
+        "causes": list(truth.causes),
+        "accepted": [sorted(names) for names in truth.accepted],
+        "truth_outside": truth.outside,
+        "drivers": list(truth.drivers),
+        "noise_kind": case.noise_kind,
+        "noise_given": case.noise is not None,
+        "rows": len(next(iter(case.columns.values()))),
+        "seconds": seconds,
+        **judged(truth, answer, baseline),
+        "shrink": answer.get("true_shrink"),
+        "cautions": answer.get("cautions"),
+    }
+    write_json(path, found)
+    return f"{family} {seed}: {'right' if found['right'] else 'WRONG'} {found.get('names')} {found.get('driver')}"
+
+
+def diagnosed(case: SourceCase, columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """The answer to records of a case, as a user gets it from files; `{"failed": sentence}` where it is refused."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "records.csv"
+        write_table(path, dict(columns))
+        try:
+            mechanism = _mechanism(case, Path(folder))
+            records = load_records(path, mechanism, learns=False)
+            noise = None if case.noise is None else {c.name: case.noise[c.unit] for c in mechanism.pose}
+            found = diagnose(records, mechanism, noise=noise)
+        except CcnnError as problem:
+            return {"failed": str(problem)}
+    return {**found.to_json(), "true_shrink": _shrink(case, found)}
+
+
+def _mechanism(case: SourceCase, folder: Path) -> Mechanism:
+    keys = dict(case.mechanism_keys or {})
+    if "\n" not in case.mechanism:
+        return load_mechanism(case.mechanism, **keys)
+    # The name says which machine it is: the same text has the same name.
+    path = folder / f"machine-{zlib.crc32(case.mechanism.encode()):08x}.yaml"
+    write_whole(path, case.mechanism)
+    return load_mechanism(str(path), **keys)
+
+
+def _shrink(case: SourceCase, found: Diagnosis) -> dict[str, Any] | None:
+    """The interval of the shrink against what the named effects take away of the noise-free gap."""
+    verdict, clean = found.verdict, case.clean
+    if clean is None or verdict["shrink"] is None or verdict["shrink_ci95"] is None or not found.acting:
+        return None
+    situation = found.analysis.situation
+    pose = torch.stack([torch.from_numpy(clean[c.header]) for c in situation.mechanism.pose], -1)
+    if len(pose) != len(situation.joints):
+        return None
+    keep = found.analysis.whitening.weight > 0
+    before, after = (
+        float(remainder(situation, pose, acting)[keep][:, :3].square().sum(-1).nanmean())
+        for acting in ((), found.acting)
+    )
+    low, high = verdict["shrink_ci95"]
+    true = 1 - after / before
+    return {"true": true, "said": verdict["shrink"], "low": low, "high": high, "holds": bool(low <= true <= high)}
