@@ -14,14 +14,14 @@ from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows, plausibl
 from ccnn_torch.diagnosis.design.next_measurements import next_measurements
 from ccnn_torch.diagnosis.discrepancy.smooth import SPEED
 from ccnn_torch.diagnosis.from_file import not_held_notes
-from ccnn_torch.diagnosis.residual.rows import picked
+from ccnn_torch.diagnosis.residual.rows import copies_of, picked
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.search.analysis import Analysis, analyse
 from ccnn_torch.diagnosis.shrink.by_block import by_block
 from ccnn_torch.diagnosis.verdict.blocks import Blocks, blocks, in_order
 from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge, without_names
 from ccnn_torch.diagnosis.verdict.localisation import localise
-from ccnn_torch.diagnosis.verdict.text import lacking_text, unseen_text, verdict_text
+from ccnn_torch.diagnosis.verdict.text import lacking_text, shared_text, unseen_text, verdict_text
 from ccnn_torch.effects import (
     Effect,
     Situation,
@@ -103,6 +103,7 @@ def diagnose_rows(
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
     rows = usable_rows(situation, measured)
+    copies = int((rows.fine & copies_of(situation, measured)).sum())
     situation, measured, chosen = drawn_rows(situation, measured, rows.fine, seed)
     residual = pose_residual(situation, measured)
     every = _made(situation, effects)
@@ -155,7 +156,7 @@ def diagnose_rows(
         rows_set_aside=sorted(why),
         why_set_aside=[why[row] for row in sorted(why)],
         cautions=texts,
-        notes=_notes(analysis, judgement, rows, unseen, missing, proposed),
+        notes=_notes(analysis, judgement, rows, copies, unseen, missing, proposed),
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,
         judgement=judgement,
@@ -166,6 +167,7 @@ def _notes(
     analysis: Analysis,
     judgement: Judgement,
     rows: PlausibleRows,
+    copies: int,
     lacking: Mapping[str, str],
     missing: Sequence[Mapping[str, Any]],
     proposed: Sequence[Mapping[str, Any]],
@@ -178,7 +180,10 @@ def _notes(
     for atom in (analysis.dictionary.atoms[i] for i in judgement.found.members):
         if atom.is_discrepancy and len(atom.shape):
             notes.append(f"what follows the time is a sway with a period of {float(atom.shape):.3g} s")
-    if len(analysis.measured) < int(rows.fine.sum()):
+    if copies:
+        notes.append(f"{copies} rows are exact copies of others and were counted once")
+    notes += [shared_text(analysis.correlation)] if analysis.correlation.value else []
+    if len(analysis.measured) < int(rows.fine.sum()) - copies:
         notes.append(f"{len(analysis.measured)} of {len(rows.fine)} rows, drawn at random, were evaluated")
     atoms = analysis.dictionary.atoms
     beside = [atoms[i] for i in judgement.fullest.members if i not in judgement.found.members]
@@ -233,8 +238,8 @@ def usable_rows(situation: Situation, measured: Tensor) -> PlausibleRows:
 
 
 def drawn_rows(situation: Situation, measured: Tensor, fine: Tensor, seed: int) -> tuple[Situation, Tensor, Tensor]:
-    """As many of the fine rows as are evaluated, in order, and which they are."""
-    chosen = torch.nonzero(fine).squeeze(-1)
+    """As many of the fine rows as are evaluated, in order and without copies, and which they are."""
+    chosen = torch.nonzero(fine & ~copies_of(situation, measured)).squeeze(-1)
     most = min(_MOST_ROWS, _MOST_VALUES // len(situation.mechanism.pose))
     if len(chosen) > most:
         drawn = torch.randperm(len(chosen), generator=torch.Generator().manual_seed(seed))[:most]

@@ -30,8 +30,8 @@ _QUIET, _LOUD = 0.5, 2.0
 _MANY = 0.1
 # So many rows set aside are evaluated together, against as many resampled so often; the share of these as close.
 _SEVERAL, _DRAWS, _BY_CHANCE = 5, 1000, 0.003
-# A joint that moves less than this share of its workspace is at rest. Rows that may be copies of others.
-_STILL, _COPIES = 1e-3, 0.2
+# A joint that moves less than this share of its workspace is at rest.
+_STILL = 1e-3
 # Effects that only the place of a row distinguishes.
 _OF_PLACE = EXACT | {"coupling", "gravity", "transmission"}
 # Standard deviations from which a coefficient has a sign.
@@ -100,7 +100,7 @@ def _of_place(analysis: Analysis, judgement: Judgement) -> list[Caution]:
 
 
 def _of_plan(analysis: Analysis, names: Sequence[str]) -> list[Caution]:
-    """Joints that do not move, and rows that occur more than once."""
+    """Joints that do not move."""
     situation, said = analysis.situation, []
     low, high = situation.workspace
     moved = (situation.joints.amax(0) - situation.joints.amin(0)) > _STILL * (high - low)
@@ -111,13 +111,6 @@ def _of_plan(analysis: Analysis, names: Sequence[str]) -> list[Caution]:
     elif still:
         named = " and ".join(still)
         said.append(Caution(f"{named} did not move: errors of {named} cannot be distinguished from those of a frame"))
-    columns = [situation.joints, analysis.measured, *(v[:, None] for v in situation.covariates.values())]
-    whole = torch.cat(columns, -1)
-    copies = 1 - len(torch.unique(whole, dim=0)) / len(whole)
-    if copies > _COPIES:
-        said.append(
-            Caution(f"{100 * copies:.0f} % of the rows are exact copies of others, and count here as if measured anew")
-        )
     return said
 
 

@@ -1,14 +1,15 @@
-"""Selected rows of a situation."""
+"""Selected rows of a situation, and rows that are copies of others."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from ccnn_torch.effects import Situation
 
-__all__ = ["picked"]
+__all__ = ["copies_of", "picked"]
 
 
 def picked(situation: Situation, rows: Tensor) -> Situation:
@@ -25,3 +26,14 @@ def picked(situation: Situation, rows: Tensor) -> Situation:
         parameters=pick(situation.parameters),
         guess=pick(situation.guess),
     )
+
+
+def copies_of(situation: Situation, measured: Tensor) -> Tensor:
+    """Rows that repeat an earlier one in joints, pose and every covariate, `s` bool; measured: poses, `s x p`."""
+    columns = [situation.joints, measured, *(v[:, None] for v in situation.covariates.values())]
+    # NaN is equal to nothing: a row without a pose is no copy.
+    number = torch.unique(torch.cat(columns, -1), dim=0, return_inverse=True)[1]
+    first = torch.full((int(number.max()) + 1,), len(number)).scatter_reduce_(
+        0, number, torch.arange(len(number)), "amin"
+    )
+    return first[number] < torch.arange(len(number))

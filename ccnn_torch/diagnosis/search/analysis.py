@@ -22,6 +22,7 @@ from ccnn_torch.diagnosis.discrepancy.linear import linear_discrepancies
 from ccnn_torch.diagnosis.discrepancy.local import local_discrepancies
 from ccnn_torch.diagnosis.discrepancy.smooth import smooth_discrepancies
 from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.diagnosis.residual.correlation import INDEPENDENT, Correlation
 from ccnn_torch.diagnosis.residual.linearisation import remainder, tangent
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.whitening import (
@@ -40,6 +41,12 @@ from ccnn_torch.diagnosis.search.convergence import (
     is_converged,
     known_shapes,
     most_probable_shapes,
+)
+from ccnn_torch.diagnosis.search.shared_noise import (
+    Explanation,
+    likeliest_correlation,
+    possible_correlations,
+    without_fitted,
 )
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 
@@ -81,6 +88,8 @@ class Analysis:
         floor: mean square of the noise in the units of `y`: 1 where it was given, else that of the richest fit or,
             where that is far less, of the most probable set.
         idle: effects that change no pose in these rows, and were no candidates.
+        correlation: of the noise between the rows that count.
+        shared: columns of all atoms and `y` before what rows share was taken out of them; None where that is nothing.
     """
 
     situation: Situation
@@ -93,6 +102,13 @@ class Analysis:
     near_singular: Tensor
     floor: float
     idle: tuple[str, ...] = ()
+    correlation: Correlation = INDEPENDENT
+    shared: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def plain(self) -> tuple[Tensor, Tensor]:
+        """Columns of all atoms and what they explain, as they are in the rows, `s x c x P` and `s x c`, whitened."""
+        return (self.dictionary.columns, self.y) if self.shared is None else self.shared
 
     @property
     def gap(self) -> float:
@@ -172,6 +188,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         local = before is None or discrepancy_is_active(result.dictionary, result.found, best)
         before = act
         result = _search_about_set(rows, fixed, result, acting, white, left, shapes, local)
+    result = _with_shared_noise(rows, fixed.rich, result)
     shown = {e.name for e in fixed.effects}
     return replace(result, idle=tuple(e.name for e in effects if e.name not in shown))
 
@@ -287,28 +304,73 @@ def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
     return torch.where(usable[:, None, None], columns, 0.0)
 
 
+def _with_shared_noise(rows: _Rows, rich: Tensor, result: Analysis) -> Analysis:
+    """The same candidates under noise that rows share, where the best sets found are more probable then."""
+    white, atoms = result.whitening, result.dictionary.atoms
+    keep = white.keep()
+    library = next(f for f in result.found if not any(atoms[i].is_discrepancy for i in f.members))
+    sets = [
+        Explanation([white(atoms[i].columns)[keep] for i in members], sum(atoms[i].log_prior for i in members))
+        for members in {(), library.members, result.found[0].members}
+    ]
+    correlation = likeliest_correlation(
+        white(result.residual)[keep],
+        white(rows.fitted)[keep],
+        sets,
+        possible_correlations(rows.situation, keep, False),
+        result.dictionary.noise_dof,
+    )
+    if not correlation.value:
+        return result
+    return _searched(rows, result.residual, white, [*atoms], rich, correlation=correlation)
+
+
 def _searched(
-    rows: _Rows, target: Tensor, white: Whitening, atoms: list[Atom], rich: Tensor, few: Tensor | None = None
+    rows: _Rows,
+    target: Tensor,
+    white: Whitening,
+    atoms: list[Atom],
+    rich: Tensor,
+    few: Tensor | None = None,
+    correlation: Correlation = INDEPENDENT,
 ) -> Analysis:
     """target: what a linear model has to explain, `s x c0`; rich: noise of the richest fit, `c`; few: rows for a quick
-    look, `t`; None = all that count, thoroughly."""
+    look, `t`; None = all that count, thoroughly; correlation: of the noise of the rows that count."""
     keep = white.keep() if few is None else few
     counted = slice(None) if len(keep) == len(target) else keep
     columns, y = [white(a.columns)[counted] for a in atoms], white(target)[counted]
-    if rows.fitted.shape[-1]:
-        # What was fitted before takes its part out of everything.
-        u, s, _ = torch.linalg.svd(white(rows.fitted)[counted].flatten(0, 1), full_matrices=False)
-        q = u[:, s > 1e-9 * s[0]]
-        y = (y.flatten() - q @ (q.mT @ y.flatten())).reshape(y.shape)
-        columns = [(c.flatten(0, 1) - q @ (q.mT @ c.flatten(0, 1))).reshape(c.shape) for c in columns]
+    fitted = white(rows.fitted)[counted]
+    plain = without_fitted(fitted, [y[..., None], *columns]) if correlation.value else []
+    fitted, y, columns = correlation(fitted), correlation(y), [correlation(c) for c in columns]
+    first, *columns = without_fitted(fitted, [y[..., None], *columns])
+    y = first[..., 0]
     # Noise that was given is right to some per cent, however many rows there are.
     known = white.known * (1 + y.numel() / _VALUES_A_UNIT)
     dictionary, found = search(atoms, columns, y, known, quick=few is not None)
+    shared = None
+    if plain:
+        x = torch.zeros_like(dictionary.columns)
+        for i, group in dictionary.groups.items():
+            x[..., group] = plain[1 + i]
+        shared = x, plain[0][..., 0]
     # The richest fit knows no shapes: where these are most of the gap the best set leaves far less.
     left = found[0].rss / max(y.numel() - found[0].effective, 1.0)
     floor = min(float((rich / white.sigma).square().mean()), 1.0)
-    floor = left if white.known == 0 and left < _NOISE_REDUCTION * floor else floor
-    return Analysis(rows.situation, rows.measured, target, white, dictionary, y, found, rows.near, floor)
+    # Nor does it know what rows share.
+    floor = left if white.known == 0 and (correlation.value or left < _NOISE_REDUCTION * floor) else floor
+    return Analysis(
+        rows.situation,
+        rows.measured,
+        target,
+        white,
+        dictionary,
+        y,
+        found,
+        rows.near,
+        floor,
+        correlation=correlation,
+        shared=shared,
+    )
 
 
 def _drawn(rows: Tensor, channels: int) -> Tensor:

@@ -71,6 +71,8 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
     """
     keep = analysis.whitening.keep()
     x, y = analysis.dictionary.columns, analysis.y
+    # What is left of a row is that of the row itself, whatever it shares with others.
+    plain_x, plain_y = analysis.plain
     fold = folds(len(keep), seed)
     weight = analysis.whitening.weight[keep].sqrt()[:, None]
     sigma = analysis.whitening.sigma
@@ -93,8 +95,8 @@ def held_out(analysis: Analysis, sets: Sequence[Sequence[int]], seed: int) -> li
             for row, i in enumerate(part):
                 columns = fits.columns[row][fits.columns[row] >= 0]
                 m = len(columns)
-                here = mine[..., columns]
-                left[i][there] = y[there] - here @ fits.mean[row, :m]
+                here = plain_x[there][..., columns]
+                left[i][there] = plain_y[there] - here @ fits.mean[row, :m]
                 uncertain[i][there] = ((here @ fits.covariance[row, :m, :m]) * here).sum(-1)
     return [
         HeldOut(r / weight * sigma, v / weight.square() * sigma.square()) for r, v in zip(left, uncertain, strict=True)

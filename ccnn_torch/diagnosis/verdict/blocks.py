@@ -76,9 +76,9 @@ def noise_floor(analysis: Analysis) -> Tensor:
     if white.known > 0 or not analysis.dictionary.grams.values:
         return white.sigma.square()
     keep = white.keep()
-    left = analysis.y
+    x, left = analysis.plain
     for i, mean in zip(best.members, best.mean, strict=True):
-        left = left - analysis.dictionary.columns[..., analysis.dictionary.groups[i]] @ mean
+        left = left - x[..., analysis.dictionary.groups[i]] @ mean
     free = max(1 - best.effective / analysis.dictionary.grams.values, LEAST_FREE)
     # No more than the richest fit leaves.
     share = min(analysis.floor / max(float(left.square().mean()) / free, 1e-300), 1.0)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ccnn_torch.coordinates import Condition
+from ccnn_torch.diagnosis.residual.correlation import Correlation
 from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.records.table import name_lines
 
@@ -124,6 +125,18 @@ def lacking_text(name: str, condition: Condition) -> str:
     """That a simulator takes what the records do not have, without a full stop."""
     usual = f"{condition.usual:g} {condition.unit}"
     return f"{name} takes {condition.name}, which the records do not have: it was simulated with {usual}"
+
+
+def shared_text(correlation: Correlation) -> str:
+    """What noise the rows share, without a full stop."""
+    value = number_text(correlation.value, 2)
+    if correlation.target is None:
+        return f"the noise of a row has a correlation of about {value} with that of the row before, allowed for"
+    targets = int(correlation.target.max()) + 1
+    return (
+        f"readings of one target share about {100 * correlation.value:.0f} % of the noise's variance, allowed for: "
+        f"{len(correlation.target)} rows of {targets} targets"
+    )
 
 
 def aside_text(rows: Sequence[int], why: Sequence[str], lines: Sequence[int] = ()) -> str:

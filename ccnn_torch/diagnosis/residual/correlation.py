@@ -1,0 +1,78 @@
+"""Noise that rows share: with the row before (autocorrelated), or with the other readings of the same target.
+
+Rows that share their noise are fewer than they look. What they share is taken out of residual and columns by a linear
+operator on the rows of each channel, so that the rest of the method sees rows of independent noise again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+__all__ = ["INDEPENDENT", "Correlation", "targets_of"]
+
+# Targets from which it can be seen what their readings share.
+_FEWEST_TARGETS = 8
+# Joints that differ by less than this share of their range are of one target.
+_SAME_TARGET = 1e-6
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Correlation of the noise between rows; channels are independent.
+
+    Attributes:
+        value: ρ of `autoregressive` noise, e_t = ρ e_(t-1) + u_t with the variance of e kept; or the share of the
+            variance that readings of one target have in common. 0 = independent rows.
+        target: number of each row's target, `s`; None = the row before.
+        within: whether the noise is that of one target's readings, which then leaves out what they share.
+    """
+
+    value: float = 0.0
+    target: Tensor | None = None
+    within: bool = False
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """Rows of unit noise with this correlation to rows of independent unit noise, `s x c` or `s x c x m`."""
+        if self.value == 0:
+            return values
+        if self.target is None:
+            out = values.clone()
+            out[1:] -= self.value * values[:-1]
+            out[1:] /= math.sqrt(1 - self.value**2)
+            return out
+        count = torch.bincount(self.target).to(values.dtype)
+        flat = values.flatten(1)
+        mean = torch.zeros(len(count), flat.shape[1], dtype=values.dtype).index_add_(0, self.target, flat)
+        mean = mean / count[:, None]
+        own, shared = self._deviations(count)
+        return ((flat - mean[self.target]) / own + (mean / shared[:, None])[self.target]).reshape(values.shape)
+
+    def log_determinant(self, rows: int, channels: int) -> float:
+        """Logarithm of the operator's determinant, by which densities before and after it differ."""
+        if self.value == 0:
+            return 0.0
+        if self.target is None:
+            return -0.5 * channels * (rows - 1) * math.log(1 - self.value**2)
+        count = torch.bincount(self.target).to(torch.float64)
+        own, shared = self._deviations(count)
+        return -channels * float(((count - 1) * math.log(own) + shared.log()).sum())
+
+    def _deviations(self, count: Tensor) -> tuple[float, Tensor]:
+        """Standard deviation of a reading about its target's mean, and of √m times the mean of m readings."""
+        own = 1.0 if self.within else math.sqrt(1 - self.value)
+        total = own**2 / (1 - self.value)
+        return own, (own**2 + count * total * self.value).sqrt()
+
+
+INDEPENDENT = Correlation()
+
+
+def targets_of(joints: Tensor) -> Tensor | None:
+    """Number of each row's target, `s`: rows of equal joints `s x n`; None where each has its own, or there are few."""
+    spread = (joints.amax(0) - joints.amin(0)).clamp_min(1e-300)
+    number = torch.unique((joints / (spread * _SAME_TARGET)).round(), dim=0, return_inverse=True)[1]
+    return number if _FEWEST_TARGETS <= int(number.max()) + 1 < len(number) else None
