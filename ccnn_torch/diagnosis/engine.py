@@ -12,6 +12,7 @@ from ccnn_torch.diagnosis.checks.cautions import cautions
 from ccnn_torch.diagnosis.checks.missing_covariates import missing_covariates
 from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows, plausible_rows
 from ccnn_torch.diagnosis.design.next_measurements import next_measurements
+from ccnn_torch.diagnosis.discrepancy.interaction import CROSS
 from ccnn_torch.diagnosis.discrepancy.smooth import SPEED
 from ccnn_torch.diagnosis.from_file import not_held_notes
 from ccnn_torch.diagnosis.residual.rows import copies_of, picked
@@ -125,6 +126,7 @@ def diagnose_rows(
     missing = missing_covariates(analysis, every, lacking, judgement.driver, seed)
     doubts = cautions(analysis, judgement, rows, missing, together)
     texts = [caution.text for caution in doubts]
+    drivers = [d for d in (judgement.driver or "").split(CROSS) if d and not d.startswith(SPEED)]
     verdict = {
         "effects": [OUTLIER] if outlier else list(judgement.names),
         "probability": min([judgement.probability, *(caution.most for caution in doubts)]),
@@ -132,7 +134,8 @@ def diagnose_rows(
         "shrink_ci95": None if together.interval is None else list(together.interval),
         "none": nothing and not outlier,
         "outside_library": judgement.outside,
-        "driver": None if (judgement.driver or "").startswith(SPEED) else judgement.driver,
+        "driver": drivers[0] if drivers else None,
+        "drivers": drivers,
         "text": "",
     }
     why = why_set_aside(analysis, rows, chosen)
@@ -156,7 +159,7 @@ def diagnose_rows(
         rows_set_aside=sorted(why),
         why_set_aside=[why[row] for row in sorted(why)],
         cautions=texts,
-        notes=_notes(analysis, judgement, rows, copies, unseen, missing, proposed),
+        notes=_notes(analysis, judgement, rows, chosen, copies, unseen, missing, proposed),
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,
         judgement=judgement,
@@ -167,6 +170,7 @@ def _notes(
     analysis: Analysis,
     judgement: Judgement,
     rows: PlausibleRows,
+    chosen: Tensor,
     copies: int,
     lacking: Mapping[str, str],
     missing: Sequence[Mapping[str, Any]],
@@ -178,8 +182,9 @@ def _notes(
     notes += [lacking_text(mechanism.name, condition) for condition in mechanism.lacking(covariates)]
     notes += not_held_notes(judgement.names)
     for atom in (analysis.dictionary.atoms[i] for i in judgement.found.members):
-        if atom.is_discrepancy and len(atom.shape):
-            notes.append(f"what follows the time is a sway with a period of {float(atom.shape):.3g} s")
+        if atom.note and atom.is_discrepancy:
+            row = "" if atom.begins is None else f" from row {int(chosen[atom.begins]) + 1} on (counted from 1)"
+            notes.append(atom.note + row)
     if copies:
         notes.append(f"{copies} rows are exact copies of others and were counted once")
     notes += [shared_text(analysis.correlation)] if analysis.correlation.value else []

@@ -20,11 +20,13 @@ class Atom:
     Attributes:
         name: of the effect, or the driver of a discrepancy term (`workspace`, `joint q1`, `load z`, …).
         effect: None for a discrepancy term.
-        shape: values of the effect's shapes, `h` [SI]; of a discrepancy term that sways its period [s], of others none.
+        shape: values of the effect's shapes, `h` [SI]; empty for a discrepancy term.
         columns: first-order change of the pose per plausible size of each coefficient, `s x c x m` [m, rad].
         log_prior: log prior odds, the search over shapes charged.
         used: the coefficients that the columns belong to; None = all, in order.
         plain: whether a discrepancy term has straight lines, planes or gentle curves only.
+        note: what is to be said of a discrepancy term that was found, without a full stop.
+        begins: the first row that it acts in, counted from 0; None = all.
     """
 
     name: str
@@ -34,6 +36,8 @@ class Atom:
     log_prior: float
     used: tuple[int, ...] | None = None
     plain: bool = False
+    note: str = ""
+    begins: int | None = None
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Those that the columns belong to; () for a discrepancy term."""

@@ -15,6 +15,8 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns, search_charge
+from ccnn_torch.diagnosis.discrepancy.interaction import interaction_discrepancies
+from ccnn_torch.diagnosis.discrepancy.jump import jump_discrepancies
 from ccnn_torch.diagnosis.discrepancy.periodic import periodic_discrepancy
 from ccnn_torch.diagnosis.discrepancy.smooth import LOG_PRIOR, joint_moves, platform_moves, spread_out, unit_range
 from ccnn_torch.diagnosis.residual.whitening import Whitening
@@ -37,12 +39,14 @@ _MOST_VALUES = 1800
 _BELIEVED = 20.0
 # What else is there may have so many plausible sizes.
 _LOOSE = 10.0
+# A platform turns where its rotation matrix changes by this.
+_TURNS = 1e-6
 
 
 def local_discrepancies(
     situation: Situation, jacobian: Tensor, target: Tensor, white: Whitening, others: Tensor
 ) -> list[Atom]:
-    """The best bump of each joint's track, and that of the workspace; and the best sine of time.
+    """The best bump of each joint's track and of the workspace; the best jump, sine of time and pair of drivers.
 
     Args:
         situation: `s` rows.
@@ -90,8 +94,16 @@ def local_discrepancies(
     kinds = [moved, platform]
     for raw in [torch.stack(kinds)] if moved.shape == platform.shape else [k[None] for k in kinds]:
         found += atoms(["workspace"] * len(raw), place.expand(len(raw), -1, -1), places, raw)
+    lead = white(platform)
+    moves = white(moved)
+    found += interaction_discrepancies(situation, moved, moves, few, plain, _LOOSE)
+    moving = {"the frame": platform, "several joints": moved}
+    moving |= {f"joint {j.name}": moved[..., i : i + 1] for i, j in enumerate(situation.mechanism.joints)}
+    rotation = situation.platform[1]
+    if rotation is not None and float((rotation - rotation[:1]).abs().max()) > _TURNS:
+        moving["the tool"] = platform[..., :3] @ rotation
+    found += jump_discrepancies(moving, {name: white(m) for name, m in moving.items()}, few, plain, _LOOSE)
     if "time" in situation.covariates:
-        lead = white(platform)
         found += periodic_discrepancy(
             situation.covariates["time"], platform, lead, few, plain.beside(_LOOSE * lead[few])
         )

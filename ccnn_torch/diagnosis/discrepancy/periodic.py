@@ -22,7 +22,7 @@ _FINE, _ROUNDS = 9, 3
 
 
 def periodic_discrepancy(time: Tensor, raw: Tensor, lead: Tensor, few: Tensor, left: NuisanceFit) -> list[Atom]:
-    """The sine of time that explains most, its search charged, with its period [s] as `shape`; none where there are too
+    """The sine of time that explains most, its search charged, with its period in its `note`; none where there are too
     few rows for any.
 
     Args:
@@ -53,7 +53,8 @@ def periodic_discrepancy(time: Tensor, raw: Tensor, lead: Tensor, few: Tensor, l
         step *= 2 / (_FINE - 1)
     charge = search_charge(len(lead) / len(few) * score)
     columns = (raw[..., None] * _waves(share, best[None])[0][:, None, None]).flatten(-2)
-    return [Atom("time", None, span / best[None], columns, LOG_PRIOR - charge)]
+    note = f"what follows the time is a sway with a period of {span / float(best):.3g} s"
+    return [Atom("time", None, columns.new_zeros(0), columns, LOG_PRIOR - charge, note=note)]
 
 
 def _waves(share: Tensor, periods: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ __all__ = [
     "ANY",
     "LOG_PRIOR",
     "SPEED",
+    "driver_of",
     "joint_moves",
     "platform_moves",
     "products",
@@ -87,7 +88,7 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
         found.append(_atom(situation, f"joint {ANY}", torch.stack(own, 1), most=most))
     together: dict[str, list[Tensor]] = {}
     for name, value in situation.covariates.items():
-        driver = _driver(name)
+        driver = driver_of(name)
         if driver is None or float(value.max() - value.min()) <= 0:
             continue
         d = unit_range(value.unsqueeze(-1))
@@ -123,7 +124,8 @@ def smooth_discrepancies(situation: Situation, beside: Sequence[str]) -> list[At
     return found
 
 
-def _driver(name: str) -> str | None:
+def driver_of(name: str) -> str | None:
+    """What a covariate is called as a driver; None for one that is none."""
     if name.startswith("load_"):
         return f"load {name.removeprefix('load_')}"
     if name.startswith("direction"):

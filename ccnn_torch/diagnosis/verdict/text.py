@@ -212,7 +212,9 @@ def _cause(results: Block) -> str:
         rows = count_text(len(results["rows_set_aside"]), "bad row")
         return f"It comes from {rows}, set aside, and from no effect of the library ({_probability(verdict)})."
     if verdict["outside_library"] or not names:
-        follows = f"follows {driver_words(verdict['driver'])}" if verdict["driver"] else "has no known driver"
+        # Files of earlier versions name one driver.
+        drivers = verdict.get("drivers") or [verdict["driver"]] * bool(verdict["driver"])
+        follows = f"follows {listed([driver_words(d) for d in drivers])}" if drivers else "has no known driver"
         if not names:
             return f"{_none_of(results)} explains it: the residual {follows} ({_probability(verdict)})."
         verb = "explains" if len(names) == 1 else "together explain"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccnn_validation.sources.case import Truth
@@ -27,12 +27,12 @@ def judged(truth: Truth, answer: Mapping[str, Any], baseline: Mapping[str, Any] 
         right = bool(truth.mention) and _mentions(truth, failed)
         return {"failed": failed, "right": right, "exact": right, "found": right, "wrong_name": False, "probability": 0}
     verdict = answer["verdict"]
-    names, outside, driver = frozenset(verdict["effects"]), bool(verdict["outside_library"]), verdict["driver"]
+    names, outside, drivers = frozenset(verdict["effects"]), bool(verdict["outside_library"]), verdict["drivers"]
     before = frozenset(baseline["verdict"]["effects"]) if baseline is not None else frozenset()
     gained = names - before
     named = gained in truth.accepted or (baseline is not None and names in truth.accepted)
     said = truth.outside is None or outside == truth.outside or (baseline is not None and truth.outside is False)
-    driven = not outside or truth.outside is False or not truth.drivers or follows(driver, truth)
+    driven = not outside or truth.outside is False or not truth.drivers or follows(drivers, truth)
     texts = " ".join([*answer["cautions"], *answer["notes"], verdict["text"]]).lower()
     right = named and said and driven
     if truth.mention:
@@ -43,7 +43,7 @@ def judged(truth: Truth, answer: Mapping[str, Any], baseline: Mapping[str, Any] 
         "names": sorted(names),
         "gained": sorted(gained),
         "outside": outside,
-        "driver": driver,
+        "drivers": list(drivers),
         "probability": probability,
         "right": right,
         "exact": right and (baseline is not None or not outside or truth.outside is True),
@@ -52,11 +52,11 @@ def judged(truth: Truth, answer: Mapping[str, Any], baseline: Mapping[str, Any] 
     }
 
 
-def follows(driver: str | None, truth: Truth) -> bool:
-    """Whether a verdict's driver (`joint q2`, `load x`, `workspace`, two of them joined by a cross) is a right one."""
-    parts = [_plain(part) for part in re.split(r" × | and ", driver or "")]
+def follows(drivers: Sequence[str], truth: Truth) -> bool:
+    """Whether one of a verdict's drivers (`joint q2`, `load x`, `workspace`) is a right one."""
+    parts = [_plain(driver) for driver in drivers]
     wanted = [_plain(d) for d in truth.drivers]
-    return any(p == w or p.startswith(w + "_") or (p and w.startswith(p + "_")) for p in parts for w in wanted)
+    return any(p == w or p.startswith(w + "_") or (p != "" and w.startswith(p + "_")) for p in parts for w in wanted)
 
 
 def _plain(driver: str) -> str:

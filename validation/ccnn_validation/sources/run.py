@@ -104,7 +104,7 @@ def _one(task: tuple[str, str, int, Path]) -> str:
         "cautions": answer.get("cautions"),
     }
     write_json(path, found)
-    return f"{family} {seed}: {'right' if found['right'] else 'WRONG'} {found.get('names')} {found.get('driver')}"
+    return f"{family} {seed}: {'right' if found['right'] else 'WRONG'} {found.get('names')} {found.get('drivers')}"
 
 
 def diagnosed(case: SourceCase, columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
