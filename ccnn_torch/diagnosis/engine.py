@@ -15,6 +15,7 @@ from ccnn_torch.diagnosis.design.next_measurements import next_measurements
 from ccnn_torch.diagnosis.discrepancy.interaction import CROSS
 from ccnn_torch.diagnosis.discrepancy.smooth import SPEED
 from ccnn_torch.diagnosis.from_file import not_held_notes
+from ccnn_torch.diagnosis.residual.noise_evidence import Noise, noise_of_repeats
 from ccnn_torch.diagnosis.residual.rows import copies_of, picked
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.search.analysis import Analysis, analyse
@@ -90,6 +91,7 @@ def diagnose_rows(
     noise: Tensor | None = None,
     effects: Sequence[Effect | str] | None = None,
     seed: int = 0,
+    instrument: Noise | None = None,
 ) -> Diagnosis:
     """Diagnose rows of commanded joints and measured poses.
 
@@ -99,6 +101,8 @@ def diagnose_rows(
         noise: standard deviation of each channel of position and rotation vector, `c` [m, rad]; estimated when None.
         effects: candidates, or their names, "all" for those of the library; the whole library when None.
         seed: of folds and resampling.
+        instrument: the noise as columns of the records have it; where there are none, and no `noise`, readings of one
+            target show it.
 
     Raises:
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
@@ -109,7 +113,11 @@ def diagnose_rows(
     residual = pose_residual(situation, measured)
     every = _made(situation, effects)
     usable, lacking = candidates(situation, every)
-    analysis = analyse(situation, measured, usable, noise)
+    if noise is not None:
+        known: Noise | None = Noise(noise, "given")
+    else:
+        known = instrument or noise_of_repeats(situation, measured)
+    analysis = analyse(situation, measured, usable, noise, None if known is None else known.sd)
     # What no column would bring into sight is no reason to record one.
     unseen = lacking | dict.fromkeys(analysis.idle, UNSHOWN)
     judgement = judge(analysis)
@@ -139,11 +147,13 @@ def diagnose_rows(
         "text": "",
     }
     why = why_set_aside(analysis, rows, chosen)
+    source = "estimated" if known is None or (noise is None and analysis.instrument is None) else known.source
     content = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": texts}
-    verdict["text"] = verdict_text(content | {"rows_set_aside": sorted(why)})
+    verdict["text"] = verdict_text(content | {"noise": source, "rows_set_aside": sorted(why)})
     places, intervals = localise(analysis, residual, seed)
     proposed = next_measurements(analysis, judgement, seed)
     return Diagnosis(
+        noise=source,
         gap=gap,
         gap_rotation=gap_rotation,
         where=places,

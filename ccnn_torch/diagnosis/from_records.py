@@ -14,6 +14,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.discrepancy.network import with_network
 from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.residual.distance import size_of
+from ccnn_torch.diagnosis.residual.noise_evidence import Noise, noise_of_columns
 from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, simulator_inputs
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Effect, Situation, default_gravity
@@ -66,9 +67,16 @@ def diagnose(
         )
     situation = situation_of(records, mechanism, gravity)
     with naming(records):
-        said = diagnose_rows(situation, records.pose, noise_of(noise, situation), effects, seed)
+        said = diagnose_rows(
+            situation, records.pose, noise_of(noise, situation), effects, seed, _instrument(records, situation)
+        )
     said = replace(said, lines=tuple(records.lines.tolist()), notes=[*said.notes, *_unread(records, situation)])
     return with_network(said, seed) if network else said
+
+
+def _instrument(records: Records, situation: Situation) -> Noise | None:
+    names = [c.name for c in situation.mechanism.pose]
+    return noise_of_columns(records, names, {**_POSITION, **_TURN}, situation.jacobian.shape[-2])
 
 
 def _unread(records: Records, situation: Situation) -> list[str]:

@@ -52,7 +52,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str]
     mechanism = diagnosis.analysis.situation.mechanism
     units = covariate_units(mechanism) | {c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)}
     lines = [diagnosis.lines[row] for row in diagnosis.rows_set_aside] if diagnosis.lines else []
-    noise = noise_text(diagnosis.analysis.whitening.known > 0)
+    noise = noise_text(diagnosis.noise)
     labels = labels | {"about": {"noise": noise, **(about or {}), "units": units, "lines": lines}}
     write_diagnosis_report(folder, plain(diagnosis.to_json()), arrays, labels)
     return path

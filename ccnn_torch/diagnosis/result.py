@@ -20,6 +20,8 @@ class Diagnosis:
     """Which effect, where, how far.
 
     Attributes:
+        noise: where its size is from: `given`, `columns` of the records, `repeats` of targets, or `estimated` from what
+            the best explanation leaves, which may hold another cause.
         gap, gap_rotation: `{"unit", "before", "after", "noise_floor", "reducible_share"}`, held-out RMS; the rotation's
             is None without orientation.
         where: shares of the gap by `outputs`, `joints`, `legs`, `regions`, `covariates`.
@@ -43,6 +45,7 @@ class Diagnosis:
         lines: line of every row in the file that it came from, the header being line 1; () for rows of no file.
     """
 
+    noise: str
     gap: dict[str, Any]
     gap_rotation: dict[str, Any] | None
     where: dict[str, Any]

@@ -87,6 +87,7 @@ class Analysis:
         near_singular: `s`, bool.
         floor: mean square of the noise in the units of `y`: 1 where it was given, else that of the richest fit or,
             where that is far less, of the most probable set.
+        instrument: standard deviation of the noise that the records show without a model, `c0` [m, rad], or None.
         idle: effects that change no pose in these rows, and were no candidates.
         correlation: of the noise between the rows that count.
         shared: columns of all atoms and `y` before what rows share was taken out of them; None where that is nothing.
@@ -104,6 +105,7 @@ class Analysis:
     idle: tuple[str, ...] = ()
     correlation: Correlation = INDEPENDENT
     shared: tuple[Tensor, Tensor] | None = None
+    instrument: Tensor | None = None
 
     @property
     def plain(self) -> tuple[Tensor, Tensor]:
@@ -150,7 +152,13 @@ class _Fixed(NamedTuple):
     rich: Tensor
 
 
-def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], noise: Tensor | None) -> Analysis:
+def analyse(
+    situation: Situation,
+    measured: Tensor,
+    effects: Sequence[Effect],
+    noise: Tensor | None,
+    instrument: Tensor | None = None,
+) -> Analysis:
     """The whole search.
 
     Args:
@@ -158,6 +166,7 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         measured: poses, `s x p` [SI].
         effects: candidates, all of which the rows have the covariates for.
         noise: standard deviation of each pose channel, `c0` [m, rad], or None.
+        instrument: the same as the records show it without a model: what is left above it is no noise.
     """
     rows = _rows_of(situation, measured, noise)
     result, fixed = _search_about_nominal(rows, effects)
@@ -189,6 +198,8 @@ def analyse(situation: Situation, measured: Tensor, effects: Sequence[Effect], n
         before = act
         result = _search_about_set(rows, fixed, result, acting, white, left, shapes, local)
     result = _with_shared_noise(rows, fixed.rich, result)
+    if instrument is not None and noise is None and result.correlation.target is None:
+        result = _above_instrument(result, instrument)
     shown = {e.name for e in fixed.effects}
     return replace(result, idle=tuple(e.name for e in effects if e.name not in shown))
 
@@ -302,6 +313,13 @@ def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
     index = [k for k, g in enumerate(situation.mechanism.geometry) if g.name.partition("_")[0] in unknown]
     columns = situation.parameter_jacobian[..., index] if index else situation.jacobian[..., :0]
     return torch.where(usable[:, None, None], columns, 0.0)
+
+
+def _above_instrument(result: Analysis, instrument: Tensor) -> Analysis:
+    """The noise floor is that of the instrument where the best fit leaves more; sets are as probable as before."""
+    white = result.whitening
+    floor = float((instrument[white.channels] / white.sigma).square().mean())
+    return replace(result, floor=min(result.floor, floor), instrument=instrument)
 
 
 def _with_shared_noise(rows: _Rows, rich: Tensor, result: Analysis) -> Analysis:

@@ -115,7 +115,8 @@ def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, fl
         held: with the set.
         floor: variance of the noise, `c`.
         channels: `c`, bool.
-        floor_dof: on how many values the noise's variance rests; 0 = exactly known.
+        floor_dof: on how many values an estimate of the noise's variance rests, whose interval then reaches from "the
+            rest is another cause" to "the rest is noise"; 0 = known.
         draws: of the rows.
     """
     old = before[:, channels].square().sum(-1)
@@ -131,10 +132,16 @@ def shrink_of(before: Tensor, held: HeldOut, floor: Tensor, channels: Tensor, fl
     share = 1 - rest / gap.clamp_min(_LEAST_GAP * (b2 - noise))
     # Less than the noise that was given is left: no cause takes away more than all, and the spread of the draws stays.
     share = (share - (share.mean() - 1).clamp_min(0.0)).clamp(0.0, 1.0)
+    # Noise that was estimated may be another cause: then all that is left belongs to the gap.
+    if floor_dof > 0:
+        left, whole = (draws.counts @ torch.stack([new - unsure, old], -1) / len(old)).unbind(-1)
+        least = float(torch.quantile((1 - left / whole).clamp(0.0, 1.0), _TAIL / 2))
+    else:
+        least = 1.0
     # Where draws reach 1, all of the gap, the interval ends there and leaves out draws on the lower side alone.
     above = 0.0 if float((share >= 1).to(share.dtype).mean()) > _TAIL / 2 else _TAIL / 2
     low, high = torch.quantile(share, torch.tensor([_TAIL - above, 1 - above], dtype=share.dtype)).tolist()
-    return Gap(math.sqrt(b2), math.sqrt(a2), math.sqrt(noise), plain, (min(low, plain), max(high, plain)))
+    return Gap(math.sqrt(b2), math.sqrt(a2), math.sqrt(noise), plain, (min(low, plain, least), max(high, plain)))
 
 
 def draws(rows: int, seed: int) -> Draws:

@@ -43,7 +43,7 @@ class Blocks:
         """In position [m] or rotation [rad]; before: `s x c` [m, rad], None = the nominal residual."""
         white = self.analysis.whitening
         channels = self.position if position else ~self.position
-        exact = white.known > 0
+        exact = white.known > 0 or self.analysis.instrument is not None
         dof = 0.0 if exact else max(self.analysis.dictionary.grams.values - self.judgement.found.effective, 1.0)
         return shrink_of(self.before if before is None else before, held, self.floor, channels, dof, self.draws)
 
@@ -71,10 +71,12 @@ def in_order(made: Blocks) -> list[dict[str, Any]]:
 
 
 def noise_floor(analysis: Analysis) -> Tensor:
-    """Variance of the noise, `c`: given, or the mean square that the most probable set of all leaves, tails and all."""
+    """Variance of the noise, `c`: given, shown by the records, or the mean square that the most probable set leaves."""
     white, best = analysis.whitening, analysis.found[0]
     if white.known > 0 or not analysis.dictionary.grams.values:
         return white.sigma.square()
+    if analysis.instrument is not None:
+        return analysis.instrument[white.channels].square()
     keep = white.keep()
     x, left = analysis.plain
     for i, mean in zip(best.members, best.mean, strict=True):

@@ -109,7 +109,10 @@ def judge(analysis: Analysis) -> Judgement:
         same = [p for members, drive, p, _ in leading if drive is None and _equals(members, names, classes)]
         probability = sum(same)
     else:
-        probability = sum(p for _, drive, p, _ in leading if drive is not None) if leading[0][1] is not None else 0.5
+        # What is left above a noise that is known is no noise, whatever it follows.
+        known = analysis.whitening.known > 0 or analysis.instrument is not None
+        told = [p for members, drive, p, _ in leading if drive is not None or (known and members == names)]
+        probability = sum(told) if leading[0][1] is not None or (known and not borrowed) else 0.5
     if (names and (len(names) > 2 or _smallest(analysis, found, tried) < _SMALL)) or (
         names and not outside and _above_noise(analysis, found)
     ):

@@ -40,7 +40,8 @@ class _Drawn:
         drawn = draws(len(analysis.whitening.keep()), seed)
         self.counts = drawn.counts
         values, effective = analysis.dictionary.grams.values, analysis.found[0].effective
-        spread = 0.0 if analysis.whitening.known > 0 else math.sqrt(2 / max(values - effective, 1.0))
+        exact = analysis.whitening.known > 0 or analysis.instrument is not None
+        spread = 0.0 if exact else math.sqrt(2 / max(values - effective, 1.0))
         self.floor = analysis.floor
         self.floors = (analysis.floor * (1 + spread * drawn.normal[:, None])).clamp_min(0.0)
 

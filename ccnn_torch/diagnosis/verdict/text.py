@@ -65,6 +65,12 @@ def effect_words(name: str) -> str:
     return _EFFECTS.get(name, f"the effect {name}")
 
 
+_NOISE_FROM = {
+    "columns": " (from the columns of standard deviations)",
+    "repeats": " (from repeated readings of one target)",
+}
+
+
 def driver_words(driver: str | None) -> str:
     """What `verdict.driver` is called in a sentence.
 
@@ -95,7 +101,13 @@ def gap_words(results: Block) -> str:
     times = [_times(block["before"] / block["noise_floor"]) for block in blocks if block["noise_floor"]]
     if len(times) < len(blocks):
         return f"The gap is {gaps}; how large the noise is, is not known."
-    return f"The gap of {gaps} is {' and '.join(times)} times the noise."
+    many = " and ".join(times)
+    if results.get("noise", "given") == "estimated":
+        return (
+            f"The noise is not known: the gap of {gaps} is {many} times what the best explanation leaves, and that may "
+            "hold another cause."
+        )
+    return f"The gap of {gaps} is {many} times the noise{_NOISE_FROM.get(results.get('noise', 'given'), '')}."
 
 
 def verdict_text(results: Block) -> str:
@@ -262,6 +274,12 @@ def _removed(results: Block, joint: str) -> str:
         low, high = (f"{100 * v:.{digits}f}" for v in verdict["shrink_ci95"])
         text += f" [{low}, {high}]"
     before, after = (_size(blocks[0][key], blocks[0]) for key in ("before", "after"))
+    if results.get("noise", "given") == "estimated":
+        whole = 1 - (blocks[0]["after"] / blocks[0]["before"]) ** 2
+        return (
+            f"{joint}{100 * max(whole, 0.0):.0f} % of its mean square on rows not used for fitting "
+            f"({before} → {after}), or {text.removeprefix(joint)} of it without what is left as noise"
+        )
     return f"{text} of what is above the noise on rows not used for fitting ({before} → {after})"
 
 
@@ -292,6 +310,10 @@ def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def noise_text(given: bool) -> str:
-    """Where the standard deviation of the noise is from."""
-    return "The noise was given." if given else "The noise was estimated from the residual of the most probable set."
+def noise_text(source: str) -> str:
+    """Where the standard deviation of the noise is from; source: `noise` of diagnosis.json."""
+    return {
+        "given": "The noise was given.",
+        "columns": "The noise is that of the records' columns of standard deviations.",
+        "repeats": "The noise is that of repeated readings of one target.",
+    }.get(source, "The noise was estimated from the residual of the most probable set; it may hold another cause.")

@@ -1,0 +1,81 @@
+"""The noise as the records themselves show it, without any model: readings of one target, or columns of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.residual.correlation import targets_of
+from ccnn_torch.effects import Situation, pose_residual
+from ccnn_torch.records import Records
+from ccnn_torch.units import si_unit_of
+
+__all__ = ["Noise", "noise_of_columns", "noise_of_repeats"]
+
+# Readings beyond the first of their target that make an estimate.
+_FEWEST = 20
+# What a column of standard deviations may be called, `{}` being the coordinate.
+_NAMES = ("s{}", "sd_{}", "std_{}", "sigma_{}")
+_ANGLES = {"rx": "seuler_x", "ry": "seuler_y", "rz": "seuler_z"}
+# Covariates that may differ between readings under the same conditions.
+_FREE = ("time", "temperature")
+
+
+class Noise(NamedTuple):
+    """Standard deviation of each channel of position and rotation vector, `c` [m, rad], and where it is from: `given`,
+    `columns`, `repeats`."""
+
+    sd: Tensor
+    source: str
+
+
+def noise_of_repeats(situation: Situation, measured: Tensor) -> Noise | None:
+    """From readings of one target under the same conditions; None where there are too few.
+
+    Args:
+        situation: `s` rows.
+        measured: poses, `s x p` [SI].
+    """
+    held = [v[:, None] for name, v in situation.covariates.items() if name not in _FREE]
+    residual = pose_residual(situation, measured)
+    fine = torch.isfinite(residual).all(-1)
+    target = targets_of(torch.cat([situation.joints, *held], -1)[fine])
+    if target is None:
+        return None
+    count = torch.bincount(target)
+    free = int((count - 1).sum())
+    if free < _FEWEST:
+        return None
+    values = residual[fine]
+    mean = torch.zeros(len(count), values.shape[-1], dtype=values.dtype).index_add_(0, target, values)
+    apart = values - (mean / count[:, None])[target]
+    sd = (apart.square().sum(0) / free).sqrt()
+    return Noise(sd, "repeats") if bool((sd > 0).any()) else None
+
+
+def noise_of_columns(records: Records, names: Sequence[str], channels: Mapping[str, int], count: int) -> Noise | None:
+    """From columns of the standard deviation of each reading; None where a coordinate has none.
+
+    Args:
+        records: with all their columns.
+        names: of the pose coordinates, which are channels themselves.
+        channels: channel of each of these names.
+        count: of the channels.
+    """
+    sd = torch.full((count,), torch.nan, dtype=torch.float64)
+    for name in names:
+        column = next((c for c in (*(t.format(name) for t in _NAMES), _ANGLES.get(name)) if c in records.columns), None)
+        if column is None or name not in channels:
+            return None
+        values, unit = records.columns[column], records.units[column]
+        if not unit or si_unit_of(unit) != ("rad" if name in _ANGLES else "m"):
+            return None
+        if not bool(np.isfinite(values).all()) or not bool((values >= 0).all()) or not bool((values > 0).any()):
+            return None
+        sd[channels[name]] = float(np.sqrt(np.square(values).mean()))
+    # A channel that is no coordinate shows nothing of its own.
+    return Noise(torch.nan_to_num(sd, nan=float(np.nanmax(sd.numpy()))), "columns")
