@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .arm import Arm, Pose
+from .kinds import Floats
 
 __all__ = ["gain_basis", "left_over", "stack"]
 
@@ -15,7 +15,7 @@ METRES_PER_RADIAN = 0.3
 FIELDS = ("a", "d", "alpha", "theta", "beta")
 
 
-def stack(first: Pose, second: Pose, oriented: bool) -> NDArray:
+def stack(first: Pose, second: Pose, oriented: bool) -> Floats:
     """Difference of two sets of poses, second less first, `s x 3` or `s x 6` [m]; rotations to first order."""
     moved = second.position - first.position
     if not oriented:
@@ -26,7 +26,7 @@ def stack(first: Pose, second: Pose, oriented: bool) -> NDArray:
     return np.concatenate([moved, METRES_PER_RADIAN * vector], -1)
 
 
-def left_over(arm: Arm, joints: NDArray, error: NDArray, more: Sequence[NDArray] = (), geometry: bool = True) -> float:
+def left_over(arm: Arm, joints: Floats, error: Floats, more: Sequence[Floats] = (), geometry: bool = True) -> float:
     """Share of an error (root mean square) that frames, geometry and further columns do not take.
 
     Args:
@@ -46,7 +46,9 @@ def left_over(arm: Arm, joints: NDArray, error: NDArray, more: Sequence[NDArray]
     return float(np.linalg.norm(error.ravel() - matrix @ found) / np.linalg.norm(error))
 
 
-def gain_basis(arm: Arm, joints: NDArray, oriented: bool, coupled: bool, skip: tuple[int, int] | None = None) -> list[NDArray]:
+def gain_basis(
+    arm: Arm, joints: Floats, oriented: bool, coupled: bool, skip: tuple[int, int] | None = None
+) -> list[Floats]:
     """Errors of joints that are proportional to a joint: to itself (gain), or to another one (coupling).
 
     Args:
@@ -62,7 +64,7 @@ def gain_basis(arm: Arm, joints: NDArray, oriented: bool, coupled: bool, skip: t
     return [slopes[..., i] * (joints[:, j] - joints[:, j].mean())[:, None] for i, j in pairs]
 
 
-def joint_slopes(arm: Arm, joints: NDArray, oriented: bool) -> NDArray:
+def joint_slopes(arm: Arm, joints: Floats, oriented: bool) -> Floats:
     """Derivatives of the pose by the joints, `s x 3 x n` or `s x 6 x n` [m]."""
     jacobian = arm.jacobian(joints)
     if not oriented:
@@ -70,7 +72,7 @@ def joint_slopes(arm: Arm, joints: NDArray, oriented: bool) -> NDArray:
     return np.concatenate([jacobian[:, :3], METRES_PER_RADIAN * jacobian[:, 3:]], 1)
 
 
-def frame_basis(arm: Arm, joints: NDArray, oriented: bool) -> list[NDArray]:
+def frame_basis(arm: Arm, joints: Floats, oriented: bool) -> list[Floats]:
     """Errors of the base frame and of the tool frame."""
     pose = arm.pose(joints)
     rows, out = len(joints), []
@@ -87,7 +89,7 @@ def frame_basis(arm: Arm, joints: NDArray, oriented: bool) -> list[NDArray]:
     return out
 
 
-def geometry_basis(arm: Arm, joints: NDArray, oriented: bool) -> list[NDArray]:
+def geometry_basis(arm: Arm, joints: Floats, oriented: bool) -> list[Floats]:
     """Errors of all lengths and angles of the links, by central differences."""
     out, step, n = [], 1e-5, joints.shape[-1]
     for field in FIELDS:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+
+from .kinds import Floats
 
 __all__ = ["Arm", "Pose"]
 
@@ -19,8 +20,8 @@ class Pose:
         rotation: `s x 3 x 3`, of the flange or of the measured target.
     """
 
-    position: NDArray
-    rotation: NDArray
+    position: Floats
+    rotation: Floats
 
 
 @dataclass(frozen=True)
@@ -32,18 +33,18 @@ class Arm:
         tool: the measured point in the flange's frame, `3` or `s x 3` [m].
     """
 
-    a: NDArray
-    alpha: NDArray
-    d: NDArray
-    theta: NDArray
-    beta: NDArray
-    tool: NDArray
+    a: Floats
+    alpha: Floats
+    d: Floats
+    theta: Floats
+    beta: Floats
+    tool: Floats
 
-    def with_values(self, **values: NDArray) -> Arm:
+    def with_values(self, **values: Floats) -> Arm:
         """The same arm with other values of some fields."""
         return replace(self, **values)
 
-    def links(self, joints: NDArray) -> tuple[NDArray, NDArray]:
+    def links(self, joints: Floats) -> tuple[Floats, Floats]:
         """Frames of base and links.
 
         Args:
@@ -64,13 +65,13 @@ class Arm:
             rotations.append(half @ about("x", alpha[:, i]) @ about("y", beta[:, i]))
         return np.stack(origins, 1), np.stack(rotations, 1)
 
-    def pose(self, joints: NDArray) -> Pose:
+    def pose(self, joints: Floats) -> Pose:
         """Position of the measured point and rotation of the flange, in the base frame; joints `s x n` [rad]."""
         origins, rotations = self.links(joints)
         tool = np.broadcast_to(self.tool, (len(joints), 3))
         return Pose(origins[:, -1] + (rotations[:, -1] @ tool[..., None])[..., 0], rotations[:, -1])
 
-    def jacobian(self, joints: NDArray) -> NDArray:
+    def jacobian(self, joints: Floats) -> Floats:
         """Derivatives of position and rotation by the joints, in the base frame, `s x 6 x n` [m/rad, 1]."""
         origins, rotations = self.links(joints)
         axes = rotations[:, :-1, :, 2]
@@ -78,7 +79,7 @@ class Arm:
         return np.concatenate([np.cross(axes, arms), axes], -1).swapaxes(-1, -2)
 
 
-def about(axis: str, angle: NDArray) -> NDArray:
+def about(axis: str, angle: Floats) -> Floats:
     """Rotations about one axis; angle `s` [rad] -> `s x 3 x 3`."""
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3

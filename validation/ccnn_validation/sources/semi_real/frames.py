@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from .arm import Arm
+from .kinds import Floats
 
 __all__ = ["Seen", "see"]
 
@@ -24,15 +24,15 @@ class Seen:
     """
 
     arm: Arm
-    base: NDArray
+    base: Floats
     own_error: float
 
 
-def see(arm: Arm, joints: NDArray, position: NDArray) -> Seen:
+def see(arm: Arm, joints: Floats, position: Floats) -> Seen:
     """Fits base frame and tool point to measured positions.
 
-    For each tool point the base frame has a closed form, so that only three numbers are searched. The search starts from
-    several points, since it is not linear.
+    For each tool point the base frame has a closed form, so that only three numbers are searched, from several starts,
+    since it is not linear.
 
     Args:
         arm: nominal arm.
@@ -40,7 +40,7 @@ def see(arm: Arm, joints: NDArray, position: NDArray) -> Seen:
         position: measured, `s x 3` [m].
     """
 
-    def rest(tool: NDArray) -> NDArray:
+    def rest(tool: Floats) -> Floats:
         points = arm.with_values(tool=tool).pose(joints).position
         turn, shift = kabsch(points, position)
         return np.ravel(points @ turn.T + shift - position)
@@ -52,8 +52,8 @@ def see(arm: Arm, joints: NDArray, position: NDArray) -> Seen:
     return Seen(seen, turn, float(np.sqrt((best.fun.reshape(-1, 3) ** 2).sum(-1).mean())))
 
 
-def kabsch(points: NDArray, targets: NDArray) -> tuple[NDArray, NDArray]:
-    """The rotation and shift that bring points closest to targets, both `s x 3` [m]; targets ~ points @ turn.T + shift."""
+def kabsch(points: Floats, targets: Floats) -> tuple[Floats, Floats]:
+    """Rotation and shift that bring points closest to targets, `s x 3` [m]: targets ~ points @ turn.T + shift."""
     middle, goal = points.mean(0), targets.mean(0)
     left, _, right = np.linalg.svd((targets - goal).T @ (points - middle))
     turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from ccnn_torch.errors import InputError
 
 from .arm import Arm
 from .frames import Seen, see
+from .kinds import Floats
 
 __all__ = ["ROBOTS", "Robot", "robot_of"]
 
@@ -38,10 +38,10 @@ class Robot:
 
     name: str
     text: str
-    joints: NDArray
-    position: NDArray
-    turn: NDArray | None
-    direction: NDArray
+    joints: Floats
+    position: Floats
+    turn: Floats | None
+    direction: Floats
     seen: Seen
 
 
@@ -92,7 +92,7 @@ def read(name: str, records: Path, geometry: Path) -> Robot:
     return Robot(name, text, joints, position, turn, directions(joints), see(arm, joints, position))
 
 
-def directions(joints: NDArray) -> NDArray:
+def directions(joints: Floats) -> Floats:
     """Sign of each joint's way from the row before, `s x n`; a joint that stands still keeps its last sign."""
     way = np.sign(np.diff(joints, axis=0, prepend=joints[:1]))
     way[0] = np.where(way[0] == 0, 1, way[0])

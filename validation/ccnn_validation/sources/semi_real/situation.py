@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .arm import Arm
+from .kinds import Floats
 from .robots import Robot
 
 __all__ = ["Rows", "draw_rows", "smooth_course"]
@@ -35,24 +35,24 @@ class Rows:
 
     robot: Robot
     arm: Arm
-    joints: NDArray
-    position: NDArray
-    turn: NDArray | None
-    direction: NDArray
-    way: NDArray
-    time: NDArray
-    temperature: NDArray
-    load: NDArray
-    speed: NDArray
-    span: NDArray
-    middle: NDArray
-    lever: NDArray
+    joints: Floats
+    position: Floats
+    turn: Floats | None
+    direction: Floats
+    way: Floats
+    time: Floats
+    temperature: Floats
+    load: Floats
+    speed: Floats
+    span: Floats
+    middle: Floats
+    lever: Floats
 
-    def good_joints(self, shortest: float = 0.1, travel: float = 0.6) -> NDArray:
+    def good_joints(self, shortest: float = 0.1, travel: float = 0.6) -> Floats:
         """Joints that move the measured point and that were moved themselves, as numbers from 0."""
         return np.flatnonzero((self.lever > shortest) & (self.span > travel))
 
-    def torque(self) -> NDArray:
+    def torque(self) -> Floats:
         """Torque of the load on the joints, `s x n` [N*m]: the force is along the tracker's axes, as the pose is."""
         slopes = self.arm.jacobian(self.joints)[:, :3]
         return ((self.load @ self.robot.seen.base)[:, None] @ slopes)[:, 0]
@@ -87,7 +87,7 @@ def draw_rows(robot: Robot, rng: np.random.Generator) -> Rows:
         direction=direction,
         way=rng.uniform(0.02, 0.3, (count, n)) if drawn else way,
         time=time,
-        temperature=smooth_course(rng, time, rng.uniform(19, 23), rng.uniform(1, 3)),
+        temperature=smooth_course(rng, time, rng.uniform(19, 23), rng.uniform(1, 3))[0],
         load=rng.normal(0, LOADS[robot.name], (count, 3)),
         speed=direction * rng.uniform(0.02, 0.6, (count, n)),
         span=np.ptp(joints, axis=0),
@@ -96,20 +96,25 @@ def draw_rows(robot: Robot, rng: np.random.Generator) -> Rows:
     )
 
 
-def smooth_course(rng: np.random.Generator, time: NDArray, middle: float, swing: float, lag: float = 0.0) -> NDArray:
-    """A hall's temperature: a part of the day's swing, heating that comes and goes; [degC].
+def smooth_course(
+    rng: np.random.Generator, time: Floats, middle: float, swing: float, lag: float = 0.0
+) -> tuple[Floats, Floats]:
+    """A hall's temperature, a part of the day's swing with heating that comes and goes, and what follows it late.
 
     Args:
         rng: draws the course.
         time: `s` [s].
         middle: mean temperature [degC].
-        swing: how far it goes, root mean square [K].
+        swing: how far it goes, standard deviation over the rows [K].
         lag: time constant of what follows the hall [s]; its answer to sines is known in closed form.
+
+    Returns:
+        The hall's temperature and that of what follows it, `s` each [degC].
     """
-    periods = np.array([1.4, 0.45, 0.13]) * time[-1] * rng.uniform(0.8, 1.25, 3)
+    periods = np.array([1.4, 0.45, 0.13]) * time.max() * rng.uniform(0.8, 1.25, 3)
     phases, sizes = rng.uniform(0, 2 * np.pi, 3), np.array([1.0, 0.7, 0.35]) * rng.uniform(0.7, 1.3, 3)
     rate = 2 * np.pi / periods
-    course = sizes * np.sin(np.outer(time, rate) + phases)
-    scale = swing / course.sum(1).std()
-    late = sizes / np.hypot(1, rate * lag) * np.sin(np.outer(time, rate) + phases - np.arctan(rate * lag))
-    return middle + scale * (late.sum(1) - course.sum(1).mean())
+    now = (sizes * np.sin(np.outer(time, rate) + phases)).sum(1)
+    late = (sizes / np.hypot(1, rate * lag) * np.sin(np.outer(time, rate) + phases - np.arctan(rate * lag))).sum(1)
+    scale = swing / now.std()
+    return middle + scale * (now - now.mean()), middle + scale * (late - now.mean())
