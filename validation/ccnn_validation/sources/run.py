@@ -74,13 +74,21 @@ def run_source(
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
         for position, line in enumerate(pool.map(_one, left), 1):
             note(f"[{position}/{len(left)}] {line}", quiet)
-    return [dict(read_json(task[3])) for task in tasks]
+    found = [dict(read_json(task[3])) for task in tasks]
+    skipped = [case["skipped"] for case in found if "skipped" in case]
+    if len(skipped) == len(found):
+        raise InputError(f"--source {name}: no case can be made: {skipped[0]}")
+    return [case for case in found if "skipped" not in case]
 
 
 def _one(task: tuple[str, str, int, Path]) -> str:
     torch.set_num_threads(1)
     name, family, seed, path = task
-    case = source_of(name).make(family, seed)
+    try:
+        case = source_of(name).make(family, seed)
+    except InputError as problem:
+        write_json(path, {"skipped": str(problem)})
+        return f"{family} {seed}: skipped, {problem}"
     began = time.perf_counter()
     answer = diagnosed(case, case.columns)
     seconds = time.perf_counter() - began
