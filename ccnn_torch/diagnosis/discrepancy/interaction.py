@@ -70,10 +70,8 @@ def _drivers(situation: Situation, joint: int) -> dict[str, Tensor]:
         driver = driver_of(name)
         if driver is not None and not driver.startswith(("load", "speed")) and bool((value != value[0]).any()):
             found[driver] = unit_range(value[:, None])[:, 0]
-    loads = [name for name in situation.covariates if name.startswith("load_")]
-    if loads:
-        torques = {n: situation.with_covariates({n: situation.covariates[n]}).load_torque[:, joint] for n in loads}
-        for name, value in torques.items():
-            if bool((value != value[0]).any()):
-                found[driver_of(name) or name] = value / value.abs().amax().clamp_min(1e-300)
+    for name in (name for name in situation.covariates if name.startswith("load_")):
+        # 0 where the load does not act on this joint: every joint has the same drivers.
+        torque = situation.with_covariates({name: situation.covariates[name]}).load_torque[:, joint]
+        found[driver_of(name) or name] = torque / torque.abs().amax().clamp_min(1e-300)
     return found

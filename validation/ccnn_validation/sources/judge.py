@@ -27,7 +27,9 @@ def judged(truth: Truth, answer: Mapping[str, Any], baseline: Mapping[str, Any] 
         right = bool(truth.mention) and _mentions(truth, failed)
         return {"failed": failed, "right": right, "exact": right, "found": right, "wrong_name": False, "probability": 0}
     verdict = answer["verdict"]
-    names, outside, drivers = frozenset(verdict["effects"]), bool(verdict["outside_library"]), verdict["drivers"]
+    names, outside = frozenset(verdict["effects"]), bool(verdict["outside_library"])
+    # Earlier versions name one driver.
+    drivers = verdict.get("drivers") or [verdict["driver"]] * bool(verdict["driver"])
     before = frozenset(baseline["verdict"]["effects"]) if baseline is not None else frozenset()
     gained = names - before
     named = gained in truth.accepted or (baseline is not None and names in truth.accepted)

@@ -94,6 +94,12 @@ def _one(task: tuple[str, str, int, Path]) -> str:
     seconds = time.perf_counter() - began
     baseline = None if case.baseline is None else diagnosed(case, case.baseline)
     truth = case.truth
+    already = (
+        frozenset(baseline["verdict"]["effects"]) if baseline is not None and "verdict" in baseline else frozenset()
+    )
+    if any(names and names <= already for names in truth.accepted):
+        write_json(path, {"skipped": f"{family}: the name is in the verdict on the rows without the cause"})
+        return f"{family} {seed}: skipped, the machine has the cause already"
     found = {
         "source": name,
         "family": family,
@@ -154,6 +160,8 @@ def _shrink(case: SourceCase, found: Diagnosis) -> dict[str, Any] | None:
         float(remainder(situation, pose, acting)[keep][:, :3].square().sum(-1).nanmean())
         for acting in ((), found.acting)
     )
+    if before == 0:
+        return None
     low, high = verdict["shrink_ci95"]
     true = 1 - after / before
     return {"true": true, "said": verdict["shrink"], "low": low, "high": high, "holds": bool(low <= true <= high)}

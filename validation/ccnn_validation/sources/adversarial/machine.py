@@ -117,7 +117,8 @@ class Machine:
         after = np.array(pose + twist)
         if self.spatial:
             before, turn = (
-                Rotation.from_rotvec(np.array(np.broadcast_to(x, after.shape)[..., -3:]).reshape(-1, 3)) for x in (pose, twist)
+                Rotation.from_rotvec(np.array(np.broadcast_to(x, after.shape)[..., -3:]).reshape(-1, 3))
+                for x in (pose, twist)
             )
             after[..., -3:] = (turn * before).as_rotvec().reshape(*after.shape[:-1], 3)
         return after
