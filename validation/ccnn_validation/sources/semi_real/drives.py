@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .absorb import joint_slopes
 from .causes import Cause, changes_joints, named, on_joints
 from .kinds import Floats
 from .situation import Rows
@@ -27,7 +28,9 @@ def added_backlash(rows: Rows, rng: np.random.Generator) -> Cause:
         crossed = np.tanh(rows.way[:, chosen] / np.quantile(rows.way[:, chosen], 0.15, axis=0))
     change = on_joints(rows, chosen, -0.5 * sizes * rows.direction[:, chosen] * crossed)
     words = f"{'smooth ' if smooth else ''}dead zone of {names(chosen)}"
-    return Cause(words, changes_joints(rows, change), named("backlash"), ("direction",))
+    slopes = joint_slopes(rows.arm, rows.joints, False)
+    own = tuple(slopes[..., j] * rows.direction[:, j, None] for j in range(slopes.shape[-1]))
+    return Cause(words, changes_joints(rows, change), named("backlash"), ("direction",), own=own)
 
 
 def added_friction(rows: Rows, rng: np.random.Generator) -> Cause:
