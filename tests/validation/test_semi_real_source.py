@@ -97,7 +97,7 @@ def test_the_arm_is_that_of_its_geometry_file(tmp_path):
 
 
 def test_orientation_turns_with_the_position():
-    """A first joint that is 1 mrad off turns the target about the base's upright axis, and shifts it across that axis."""
+    """A first joint that is 1 mrad off turns the target about the base's upright axis, and shifts it across."""
     robot = robot_of("ur10_b")
     rows, upright = draw_rows(robot, np.random.default_rng(0)), robot.seen.base[:, 2]
     pose = changes_joints(rows, on_joints(rows, np.array([0]), np.full((400, 1), 1e-3)))
