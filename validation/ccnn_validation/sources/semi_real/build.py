@@ -1,4 +1,4 @@
-"""A case from a family and a seed: rows, a cause at its strength, and the columns as a user would have recorded them."""
+"""A case from a family and a seed: rows, a cause at its strength, and the columns as a user would record them."""
 
 from __future__ import annotations
 

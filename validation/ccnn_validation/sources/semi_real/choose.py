@@ -96,4 +96,5 @@ def shown_already(rows: Rows, cause: Cause) -> bool:
 def own_shift(rows: Rows) -> Floats:
     """The measured arm's own errors of position in its base frame, up to the frames, `s x 3` [m]."""
     shift: Floats = rows.position @ rows.robot.seen.base - rows.arm.pose(rows.joints).position
-    return shift - shift.mean(0)
+    shift -= shift.mean(0)
+    return shift
