@@ -29,7 +29,7 @@ def added_outliers(rows: Rows, rng: np.random.Generator) -> Cause:
         turn = Rotation.from_rotvec(strength * turned).as_matrix()
         return Pose(nominal.position + strength * shift, turn @ nominal.rotation)
 
-    # Strength 0: each bad row is off by eight to fourteen times the arm's own error (`make` takes the size as it stands).
+    # Strength 0: each bad row is off by eight to fourteen times the arm's own error, as `make` gives it.
     return Cause(f"{len(hit)} gross outliers", pose, named("outlier"), strengths=(0.0,))
 
 
