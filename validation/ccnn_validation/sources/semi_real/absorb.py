@@ -46,9 +46,7 @@ def left_over(arm: Arm, joints: Floats, error: Floats, more: Sequence[Floats] = 
     return float(np.linalg.norm(error.ravel() - matrix @ found) / np.linalg.norm(error))
 
 
-def gain_basis(
-    arm: Arm, joints: Floats, oriented: bool, coupled: bool, skip: tuple[int, int] | None = None
-) -> list[Floats]:
+def gain_basis(arm: Arm, joints: Floats, oriented: bool, coupled: bool) -> list[Floats]:
     """Errors of joints that are proportional to a joint: to itself (gain), or to another one (coupling).
 
     Args:
@@ -56,11 +54,10 @@ def gain_basis(
         joints: `s x n` [rad].
         oriented: with orientation.
         coupled: True = couplings, False = gains.
-        skip: a pair (moved joint, moving joint) that is left out.
     """
     slopes = joint_slopes(arm, joints, oriented)
     n = joints.shape[-1]
-    pairs = [(i, j) for i in range(n) for j in range(n) if (i != j) == coupled and (i, j) != skip]
+    pairs = [(i, j) for i in range(n) for j in range(n) if (i != j) == coupled]
     return [slopes[..., i] * (joints[:, j] - joints[:, j].mean())[:, None] for i, j in pairs]
 
 

@@ -1,9 +1,8 @@
-"""A case from a family and a seed: rows, a cause that nothing else explains, its strength, the columns."""
+"""A case from a family and a seed: rows, a cause at its strength, and the columns as a user would record them."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,44 +11,17 @@ from scipy.spatial.transform import Rotation
 from ccnn_torch.errors import InputError
 
 from ..case import SourceCase, Truth
-from .absorb import left_over, stack
 from .arm import Pose
 from .causes import Cause
-from .device import added_nothing, added_outliers, added_scale
-from .drives import added_backlash, added_friction, added_latency, added_transmission
-from .joints import added_coupling, added_joint_gain, added_local, added_product
+from .choose import MAKERS, draw_cause, shown_already
 from .kinds import Floats
-from .loads import added_compliance, added_gravity_sag
 from .robots import ROBOTS, robot_of
 from .situation import Rows, draw_rows
-from .slow import added_drift, added_jump, added_thermal
 
 __all__ = ["FAMILIES", "make"]
 
-MAKERS: dict[str, Callable[[Rows, np.random.Generator], Cause]] = {
-    maker.__name__: maker
-    for maker in (
-        added_backlash,
-        added_friction,
-        added_transmission,
-        added_compliance,
-        added_gravity_sag,
-        added_thermal,
-        added_drift,
-        added_outliers,
-        added_latency,
-        added_joint_gain,
-        added_coupling,
-        added_scale,
-        added_jump,
-        added_local,
-        added_product,
-        added_nothing,
-    )
-}
 FAMILIES = tuple(MAKERS)
 DECOYS = ("time", "temperature", "load", "direction")
-DRAWS = 40
 
 
 def make(family: str, seed: int) -> SourceCase:
@@ -62,12 +34,12 @@ def make(family: str, seed: int) -> SourceCase:
         raise InputError(f"there is no family {family!r}; one of {', '.join(FAMILIES)}.")
     rng = np.random.default_rng([seed, zlib.crc32(family.encode())])
     robot = robot_of(ROBOTS[seed % len(ROBOTS)])
-    rows, cause = draw_cause(family, draw_rows(robot, rng), rng)
-    relative = float(rng.choice(cause.strengths))
+    drawn = draw_cause(family, draw_rows(robot, rng), rng)
+    rows, cause, relative = drawn.rows, drawn.cause, drawn.strength
     before = rows.arm.pose(rows.joints)
-    after = cause.pose(
-        strength_for(cause, before, relative * robot.seen.own_error) if relative else robot.seen.own_error
-    )
+    # Outliers are not scaled to a root mean square: each is off by its own multiple of the arm's error.
+    size = strength_for(cause, before, relative * robot.seen.own_error) if relative else robot.seen.own_error
+    after = cause.pose(size)
     named = [c for c in DECOYS if c not in cause.columns and c not in cause.clashes]
     decoys = tuple(c for c in named if rng.random() < (0.75 if family == "added_nothing" else 0.35))
     if family == "added_nothing":
@@ -84,7 +56,7 @@ def make(family: str, seed: int) -> SourceCase:
         truth=Truth(
             kind="none" if family == "added_nothing" else "outside" if cause.outside else "single",
             causes=() if family == "added_nothing" else (f"{cause.words}{strength} ({robot.name})",),
-            accepted=(*cause.accepted, frozenset()) if shown_already(rows, cause) else cause.accepted,
+            accepted=(*drawn.accepted, frozenset()) if shown_already(rows, cause) else drawn.accepted,
             outside=cause.outside,
             drivers=cause.drivers,
         ),
@@ -94,24 +66,6 @@ def make(family: str, seed: int) -> SourceCase:
     )
 
 
-def draw_cause(family: str, rows: Rows, rng: np.random.Generator) -> tuple[Rows, Cause]:
-    """A cause that frames, geometry and what it must be told from leave enough of; the clearest of the draws else."""
-    best: tuple[float, Rows, Cause] | None = None
-    for _ in range(DRAWS):
-        cause = MAKERS[family](rows, rng)
-        if family == "added_nothing":
-            return rows, cause
-        error = stack(rows.arm.pose(rows.joints), cause.pose(1e-4), rows.turn is not None)
-        margin = left_over(rows.arm, rows.joints, error, cause.others) - cause.least_left
-        if best is None or margin > best[0]:
-            best = margin, cause.rows or rows, cause
-        if margin >= 0:
-            break
-    if best is None or best[0] < 0:
-        raise InputError(f"{family}: no case on {rows.robot.name} that geometry leaves enough of; take another seed.")
-    return best[1], best[2]
-
-
 def strength_for(cause: Cause, before: Pose, wanted: float) -> float:
     """The strength at which positions change by `wanted` [m], root mean square of the distance."""
     strength = 1e-4
@@ -119,15 +73,6 @@ def strength_for(cause: Cause, before: Pose, wanted: float) -> float:
         moved = cause.pose(strength).position - before.position
         strength *= wanted / float(np.sqrt((moved**2).sum(-1).mean()))
     return strength
-
-
-def shown_already(rows: Rows, cause: Cause) -> bool:
-    """Whether the measured arm itself has the cause: more than 1 % of what geometry leaves of its own errors."""
-    if not cause.own:
-        return False
-    shift = rows.position @ rows.robot.seen.base - rows.arm.pose(rows.joints).position
-    without, with_it = (left_over(rows.arm, rows.joints, shift, more) for more in ((), cause.own))
-    return with_it**2 < 0.99 * without**2
 
 
 def pose_columns(rows: Rows, before: Pose, after: Pose) -> dict[str, Floats]:

@@ -29,9 +29,10 @@ class Cause:
         outside: True = no name of the library is all of it.
         drivers: right drivers of what is outside.
         clashes: covariates that are not given beside it, since by chance they tell about the same.
-        others: further errors (as of `absorb.stack`) that must not explain it either.
+        others: further errors (as of `absorb.stack`) that must not explain it as well as geometry does.
         own: errors of the same cause: where the measured arm itself shows them, nothing new is right as well.
-        least_left: share of the error that geometry and `others` must leave, else another one is drawn.
+        least_share: share of what geometry leaves of the error that `others` must leave, else another one is drawn.
+        fit: False = these rows do not show it, another one is drawn.
         rows: the rows, where the cause changes what was recorded beside the poses.
     """
 
@@ -45,7 +46,8 @@ class Cause:
     clashes: tuple[str, ...] = ()
     others: tuple[Floats, ...] = ()
     own: tuple[Floats, ...] = ()
-    least_left: float = 0.5
+    least_share: float = 0.0
+    fit: bool = True
     rows: Rows | None = None
 
 

@@ -29,8 +29,8 @@ def added_outliers(rows: Rows, rng: np.random.Generator) -> Cause:
         turn = Rotation.from_rotvec(strength * turned).as_matrix()
         return Pose(nominal.position + strength * shift, turn @ nominal.rotation)
 
-    # Strength 0: each bad row is off by eight to fourteen times the arm's own error (`make` takes it as it stands).
-    return Cause(f"{len(hit)} gross outliers", pose, named("outlier"), strengths=(0.0,), least_left=0.3)
+    # Strength 0: each bad row is off by eight to fourteen times the arm's own error, as `make` gives it.
+    return Cause(f"{len(hit)} gross outliers", pose, named("outlier"), strengths=(0.0,))
 
 
 def added_scale(rows: Rows, rng: np.random.Generator) -> Cause:
@@ -46,7 +46,7 @@ def added_scale(rows: Rows, rng: np.random.Generator) -> Cause:
         return Pose(nominal.position + strength * away @ pull.T, nominal.rotation)
 
     strengths = (0.25, 0.5) if rows.robot.name == "wam_tracker" else (0.25, 0.5, 1.0)
-    return Cause("scales of the tracker's axes", pose, named("instrument"), strengths=strengths, least_left=0.4)
+    return Cause("scales of the tracker's axes", pose, named("instrument"), strengths=strengths)
 
 
 def added_nothing(rows: Rows, rng: np.random.Generator) -> Cause:
@@ -56,5 +56,6 @@ def added_nothing(rows: Rows, rng: np.random.Generator) -> Cause:
 
 def unit(rng: np.random.Generator, count: int) -> Floats:
     """Random directions, `s x 3`."""
-    out: Floats = rng.normal(size=(count, 3))
-    return out / np.linalg.norm(out, axis=-1, keepdims=True)
+    drawn = rng.normal(size=(count, 3))
+    out: Floats = drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
+    return out

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .absorb import joint_slopes
 from .causes import Cause, changes_joints, named, on_joints
 from .kinds import Floats
 from .situation import Rows
@@ -27,7 +28,7 @@ def added_backlash(rows: Rows, rng: np.random.Generator) -> Cause:
         crossed = np.tanh(rows.way[:, chosen] / np.quantile(rows.way[:, chosen], 0.15, axis=0))
     change = on_joints(rows, chosen, -0.5 * sizes * rows.direction[:, chosen] * crossed)
     words = f"{'smooth ' if smooth else ''}dead zone of {names(chosen)}"
-    return Cause(words, changes_joints(rows, change), named("backlash"), ("direction",))
+    return Cause(words, changes_joints(rows, change), named("backlash"), ("direction",), own=own_play(rows))
 
 
 def added_friction(rows: Rows, rng: np.random.Generator) -> Cause:
@@ -36,12 +37,8 @@ def added_friction(rows: Rows, rng: np.random.Generator) -> Cause:
     chosen = rng.choice(rows.good_joints(), count, replace=False)
     sizes = rng.uniform(0.6, 1.4, count)
     change = on_joints(rows, chosen, -sizes * rows.direction[:, chosen] * np.abs(rows.torque()[:, chosen]) / 50)
-    return Cause(
-        f"friction under load of {names(chosen)}",
-        changes_joints(rows, change),
-        named("friction"),
-        ("direction", "load"),
-    )
+    words, columns = f"friction under load of {names(chosen)}", ("direction", "load")
+    return Cause(words, changes_joints(rows, change), named("friction"), columns, own=own_play(rows))
 
 
 def added_transmission(rows: Rows, rng: np.random.Generator) -> Cause:
@@ -72,6 +69,12 @@ def added_latency(rows: Rows, rng: np.random.Generator) -> Cause:
         ("speed",),
         rows=replace(rows, direction=np.sign(rows.speed)),
     )
+
+
+def own_play(rows: Rows) -> tuple[Floats, ...]:
+    """Errors of position by the directions that are recorded, one for each joint, `s x 3` [m]."""
+    slopes = joint_slopes(rows.arm, rows.joints, False)
+    return tuple(slopes[..., j] * rows.direction[:, j, None] for j in range(slopes.shape[-1]))
 
 
 def names(joints: Floats) -> str:

@@ -17,7 +17,7 @@ NOTHING: frozenset[str] = frozenset()
 def added_joint_gain(rows: Rows, rng: np.random.Generator) -> Cause:
     """One joint that moves by a share too far or too short.
 
-    A Denavit-Hartenberg table has no gains; cases in which it takes most of one are not drawn.
+    A Denavit-Hartenberg table has no gains, and couplings of all pairs that could follow one are the longer story.
     """
     joint = int(rng.choice(rows.good_joints(travel=1.0)))
     change = on_joints(rows, np.array([joint]), rng.choice([-1, 1]) * centred(rows, joint)[:, None])
@@ -25,8 +25,6 @@ def added_joint_gain(rows: Rows, rng: np.random.Generator) -> Cause:
         f"gain of q{joint + 1}",
         changes_joints(rows, change),
         named("joint_gain"),
-        others=tuple(gain_basis(rows.arm, rows.joints, rows.turn is not None, coupled=True)),
-        least_left=0.3,
     )
 
 
@@ -44,7 +42,7 @@ def added_coupling(rows: Rows, rng: np.random.Generator) -> Cause:
         changes_joints(rows, change),
         named("coupling"),
         others=tuple(gain_basis(rows.arm, rows.joints, oriented, coupled=False)),
-        least_left=0.4,
+        least_share=0.4,
     )
 
 
@@ -64,7 +62,7 @@ def added_local(rows: Rows, rng: np.random.Generator) -> Cause:
         strengths=(0.5, 1.0),
         outside=True,
         drivers=drivers,
-        least_left=0.6 if enough else 2.0,
+        fit=bool(enough),
     )
 
 
@@ -83,7 +81,7 @@ def added_product(rows: Rows, rng: np.random.Generator) -> Cause:
         outside=True,
         drivers=tuple(f"q{i + 1}" for i in sorted((int(j), int(k)))),
         others=tuple(bases[0] + bases[1]),
-        least_left=0.5,
+        least_share=0.5,
     )
 
 

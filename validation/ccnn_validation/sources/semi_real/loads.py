@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .absorb import joint_slopes
+from .absorb import gain_basis, joint_slopes
 from .arm import Pose
 from .causes import Cause, changes_joints, named, on_joints
 from .drives import names
@@ -61,8 +61,8 @@ def added_gravity_sag(rows: Rows, rng: np.random.Generator) -> Cause:
         named("gravity"),
         strengths=(1.0, 3.0),
         own=tuple(slopes[..., j] * torque[:, j, None] for j in soft),
-        # Much of a sag is a cosine of one angle, which a link's place takes as well.
-        least_left=0.3,
+        others=tuple(gain_basis(rows.arm, rows.joints, rows.turn is not None, coupled=False)),
+        least_share=0.3,
     )
 
 
@@ -77,4 +77,5 @@ def weight_torque(rows: Rows, payload: float) -> Floats:
     carried = np.arange(n + 1)[None, :] >= np.arange(n)[:, None]
     levers = centres[:, None] - origins[:, :n, None]
     push = np.cross(levers, np.array([0.0, 0.0, -9.81]))
-    return np.einsum("snc,snmc,nm,m->sn", axes, push, carried.astype(float), weights)
+    out: Floats = np.einsum("snc,snmc,nm,m->sn", axes, push, carried.astype(float), weights)
+    return out

@@ -8,9 +8,9 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import parse_yaml
 
 from .arm import Arm
 from .frames import Seen, see
@@ -71,7 +71,7 @@ def read(name: str, records: Path, geometry: Path) -> Robot:
     table = np.genfromtxt(records, delimiter=",", names=True, deletechars="", dtype=float)
     columns = {header: table[header] for header in table.dtype.names or ()}
     text = geometry.read_text(encoding="utf-8")
-    keys = yaml.safe_load(text)
+    keys = parse_yaml(text, str(geometry))
     n = int(keys["dof"])
     keep = columns["set[1]"] == 0 if "set[1]" in columns else np.ones(len(table), bool)
     order = np.argsort(columns["step[1]"][keep], kind="stable") if "step[1]" in columns else np.arange(keep.sum())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .arm import Arm
 from .kinds import Floats
@@ -48,7 +49,7 @@ class Rows:
     middle: Floats
     lever: Floats
 
-    def good_joints(self, shortest: float = 0.1, travel: float = 0.6) -> Floats:
+    def good_joints(self, shortest: float = 0.1, travel: float = 0.6) -> NDArray[np.intp]:
         """Joints that move the measured point and that were moved themselves, as numbers from 0."""
         return np.flatnonzero((self.lever > shortest) & (self.span > travel))
 

@@ -41,14 +41,13 @@ def added_thermal(rows: Rows, rng: np.random.Generator) -> Cause:
             return rows.arm.with_values(a=rows.arm.a * growth, d=rows.arm.d * growth).pose(rows.joints)
 
         words = f"links that grow with the temperature{late}"
-        accepted, strengths = named("thermal"), (0.25, 0.5)
-        return Cause(words, pose, accepted, columns, strengths, others=others, least_left=0.4, rows=warmed)
+        return Cause(words, pose, named("thermal"), columns, (0.25, 0.5), others=others, least_share=0.5, rows=warmed)
     chosen = rng.choice(rows.good_joints(), int(rng.integers(1, 3)), replace=False)
     change = on_joints(rows, chosen, 1e-4 * warmth * rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.4, len(chosen)))
     words = f"{names(chosen)} turned by warmth{late}"
     strengths = (0.25, 0.5, 1.0)
     move = changes_joints(rows, change)
-    return Cause(words, move, named("thermal"), columns, strengths, others=others, least_left=0.4, rows=warmed)
+    return Cause(words, move, named("thermal"), columns, strengths, others=others, least_share=0.5, rows=warmed)
 
 
 def added_drift(rows: Rows, rng: np.random.Generator) -> Cause:
@@ -65,7 +64,6 @@ def added_drift(rows: Rows, rng: np.random.Generator) -> Cause:
         ("time",),
         clashes=likeness(rows, course),
         own=tuple(slopes[..., j] * (course - course.mean())[:, None] for j in range(slopes.shape[-1])),
-        least_left=0.3,
     )
 
 
@@ -78,7 +76,7 @@ def added_jump(rows: Rows, rng: np.random.Generator) -> Cause:
     if rng.random() < 0.6:
         joint = rng.choice(rows.good_joints(travel=0.0), 1)
         # A step is a change in time as well: a drift may be named for the part of it that a slope takes.
-        accepted = (nothing, frozenset({"drift"}))
+        accepted: tuple[frozenset[str], ...] = (nothing, frozenset({"drift"}))
         move, words = changes_joints(rows, on_joints(rows, joint, after)), f"{names(joint)} jumps at row {at}"
     else:
         shift = rng.normal(size=3)
@@ -88,7 +86,7 @@ def added_jump(rows: Rows, rng: np.random.Generator) -> Cause:
             """The arm with a tool that is moved in the later rows."""
             return rows.arm.with_values(tool=rows.arm.tool + strength * after * shift).pose(rows.joints)
 
-    return Cause(words, move, accepted, ("time",), strengths, True, ("time",), clashes, least_left=0.3)
+    return Cause(words, move, accepted, ("time",), strengths, True, ("time",), clashes)
 
 
 def likeness(rows: Rows, course: Floats) -> tuple[str, ...]:
