@@ -134,7 +134,9 @@ def _wrong_payload(family: str, rng: np.random.Generator) -> SourceCase:
         effect = Effect("gravity", turn)
         enough = absorbed(rig, effect) * strength < 2.0
         names = (frozenset({"gravity"}), frozenset({"compliance"}), *(SMOOTH if enough else ()))
-        return plain_case(family, rig, effect, strength, Truth("single", ("gravity",), names, False))
+        # An arm's own weight is spread over its links; a payload pulls at the tool.
+        outside = None if rig.machine.name == ARM else False
+        return plain_case(family, rig, effect, strength, Truth("single", ("gravity",), names, outside))
     kilograms = rng.choice([0.0, 2.0, 5.0, 10.0], rig.rows)
     down = "z" if "z" in rig.machine.pose_names else "y"
     rig.load = np.zeros_like(rig.load)

@@ -47,7 +47,7 @@ def _cable_drag(family: str, rng: np.random.Generator) -> SourceCase:
 
 
 def _eccentricity(family: str, rng: np.random.Generator) -> SourceCase:
-    """Periods of a whole turn, and half of one: a transmission's, or outside by its joint. The travel is half a turn."""
+    """Periods of a turn and of half a turn: a transmission's, or outside by its joint. The travel is half a turn."""
     rig = draw_rig(rng, (ARM,), (150, 400))
     joint = int(rng.choice([0, 3, 5]))
     effect = Effect(family, odd.eccentricity(rig, joint))
