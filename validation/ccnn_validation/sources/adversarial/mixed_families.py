@@ -129,7 +129,8 @@ def _wrong_payload(family: str, rng: np.random.Generator) -> SourceCase:
     """
     rig = draw_rig(rng)
     strength = float(rng.choice([10.0, 30.0]))
-    turn = weight_torque(rig) * _some(rig)
+    # All drives: a vertical axis alone would feel no weight.
+    turn = weight_torque(rig) * rng.uniform(0.5, 1.5, rig.machine.count)
     if rng.random() < 0.5:
         effect = Effect("gravity", turn)
         enough = absorbed(rig, effect) * strength < 2.0

@@ -74,6 +74,8 @@ def _finish_with(family: str, rig: Rig, kind: _Kind, effect: Effect | None, stre
 def _builder(kind: _Kind, with_cause: bool) -> Builder:
     def build(family: str, rng: np.random.Generator) -> SourceCase:
         rig = draw_rig(rng, design=kind.design)
+        if "time" in kind.drivers:
+            rig.show("time")
         effect = ordinary(rig, kind.causes[int(rng.integers(len(kind.causes)))]) if with_cause else None
         return _finish_with(family, rig, kind, effect, float(rng.choice(_STRENGTHS)))
 
