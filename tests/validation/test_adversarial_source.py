@@ -60,10 +60,9 @@ def _check_truth(truth, columns, machine):
 @pytest.mark.parametrize("name", [*ORDINARY, "geometry"])
 @pytest.mark.parametrize("machine", ALL)
 def test_strength(machine, name):
-    rig = draw_rig(np.random.default_rng(3), [machine], (60, 60))
-    for strength in (5.0, 30.0):
-        effect = scaled(rig, ordinary(rig, name), strength)
-        assert strength_of(rig, measured(rig, effect)) == pytest.approx(strength, rel=1e-3)
+    rig = draw_rig(np.random.default_rng(3), [machine], (40, 40))
+    effect = scaled(rig, ordinary(rig, name), 30.0)
+    assert strength_of(rig, measured(rig, effect)) == pytest.approx(30.0, rel=1e-3)
 
 
 def test_geometry_is_absorbed_by_geometry_and_a_transmission_is_not():
@@ -79,3 +78,18 @@ def test_noise_is_of_the_size_given():
     header = next(h for h in case.clean if h.endswith("[m]"))
     spread = np.std(case.columns[header] - case.clean[header])
     assert spread == pytest.approx(case.noise["m"], rel=0.3)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_derivatives_are_those_of_the_forward_kinematics(name):
+    rig = draw_rig(np.random.default_rng(5), [name], (20, 20))
+    machine, rng = rig.machine, np.random.default_rng(6)
+    change = 1e-6 * rng.normal(size=machine.count)
+    moved = machine.twist(machine.forward(rig.joints + change, near=rig.pose), rig.pose)
+    np.testing.assert_allclose(moved, rig.jacobian @ change, atol=1e-9)
+    which = machine.parameters_like()
+    sizes = 1e-6 * rng.normal(size=len(which))
+    parameters = np.array(machine.nominal)
+    parameters[which] += sizes
+    moved = machine.twist(machine.forward(rig.joints, parameters, rig.pose), rig.pose)
+    np.testing.assert_allclose(moved, machine.parameter_jacobian(rig.joints, rig.pose, which) @ sizes, atol=1e-9)
