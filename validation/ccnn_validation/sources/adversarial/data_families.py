@@ -52,9 +52,7 @@ def _shifted_half(family: str, rng: np.random.Generator) -> SourceCase:
     rig = draw_rig(rng)
     half = rig.rows // 2
     source = np.where(np.arange(rig.rows) < half, np.arange(rig.rows), np.arange(rig.rows) - 1)
-    truth = _mistake(
-        "poses one row late", ("shift", "late", "row order", "order of the rows", "another row", "mixed up")
-    )
+    truth = _mistake("poses one row late", ("shift", "late", "row order", "order of the rows", "another row"))
     return finish(family, rig, truth, rig.pose[source])
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,8 +33,14 @@ class Effect:
 
     def times(self, factor: float) -> Effect:
         """The same error, larger."""
-        parts = (None if x is None else np.asarray(x * factor) for x in (self.joints, self.parameters, self.twist))
-        return Effect(self.name, *parts, textbook=self.textbook)
+        return self.changed(lambda part: np.asarray(part * factor))
+
+    def changed(self, change: Callable[[Array], Array]) -> Effect:
+        """The same error with each part changed."""
+        joints, parameters, twist = (
+            None if x is None else change(x) for x in (self.joints, self.parameters, self.twist)
+        )
+        return Effect(self.name, joints, parameters, twist, self.textbook)
 
 
 def combined(name: str, effects: Sequence[Effect]) -> Effect:

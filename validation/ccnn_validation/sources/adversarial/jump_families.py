@@ -63,10 +63,7 @@ def _geometry(rig: Rig) -> Effect:
 
 def _gated(rig: Rig, effect: Effect, state: Array) -> Effect:
     """The error in the rows where the state is 1."""
-    parts = (
-        None if x is None else np.asarray(x * state[:, None]) for x in (effect.joints, effect.parameters, effect.twist)
-    )
-    return Effect(effect.name, *parts)
+    return effect.changed(lambda part: np.asarray(part * state[:, None]))
 
 
 def _jump_truth(rig: Rig, cause: str, effect: Effect) -> Truth:

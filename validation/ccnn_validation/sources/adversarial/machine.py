@@ -19,6 +19,7 @@ from ccnn_torch.mechanisms import Mechanism, load_mechanism
 __all__ = ["ARM", "PARALLEL", "Array", "Machine", "machine_of"]
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
 
 PARALLEL = ("five_bar", "tripod", "stewart", "delta", "delta_linear")
 ARM = "arm"
@@ -132,7 +133,7 @@ class Machine:
         shifts = _STEP * np.eye(len(self.pose_names))[:, None, :]
         change = (self.inverse(self.moved(pose, shifts)) - self.inverse(self.moved(pose, -shifts))) / (2 * _STEP)
         inverse = np.moveaxis(change, 0, -1)
-        good = np.isfinite(inverse).all((-1, -2))
+        good: Rows = np.asarray(np.isfinite(inverse).all((-1, -2)))
         good[good] &= np.abs(np.linalg.det(inverse[good])) > 1e-12
         found = np.full_like(inverse, np.nan)
         found[good] = np.linalg.inv(inverse[good])
@@ -172,9 +173,9 @@ class Machine:
             pose = (low + high) / 2 + share * (cube - 0.5) * (high - low)
             joints = self.inverse(pose)
         jacobian = self.jacobian(joints, pose)
-        jacobian = jacobian * np.where(np.array(self.pose_units) == "rad", _LEVER, 1.0)[:, None]
-        good = np.isfinite(jacobian).all((-1, -2))
-        values = np.linalg.svd(np.where(good[:, None, None], jacobian, 0.0), compute_uv=False)
+        jacobian = np.asarray(jacobian * np.where(np.array(self.pose_units) == "rad", _LEVER, 1.0)[:, None])
+        good: Rows = np.asarray(np.isfinite(jacobian).all((-1, -2)))
+        values = np.linalg.svd(np.where(good[:, None, None], jacobian, 0.0).astype(np.float64), compute_uv=False)
         return joints, pose, good & (values[:, 0] < _WORST * values[:, -1])
 
     @functools.cached_property

@@ -129,12 +129,15 @@ def _wrong_payload(family: str, rng: np.random.Generator) -> SourceCase:
     """
     rig = draw_rig(rng)
     strength = float(rng.choice([10.0, 30.0]))
-    turn = weight_torque(rig) * _some(rig)
+    # All drives: a vertical axis alone would feel no weight.
+    turn = weight_torque(rig) * rng.uniform(0.5, 1.5, rig.machine.count)
     if rng.random() < 0.5:
         effect = Effect("gravity", turn)
         enough = absorbed(rig, effect) * strength < 2.0
         names = (frozenset({"gravity"}), frozenset({"compliance"}), *(SMOOTH if enough else ()))
-        return plain_case(family, rig, effect, strength, Truth("single", ("gravity",), names, False))
+        # An arm's own weight is spread over its links; a payload pulls at the tool.
+        outside = None if rig.machine.name == ARM else False
+        return plain_case(family, rig, effect, strength, Truth("single", ("gravity",), names, outside))
     kilograms = rng.choice([0.0, 2.0, 5.0, 10.0], rig.rows)
     down = "z" if "z" in rig.machine.pose_names else "y"
     rig.load = np.zeros_like(rig.load)

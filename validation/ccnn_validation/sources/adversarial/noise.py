@@ -18,7 +18,7 @@ def heteroscedastic(rig: Rig) -> Array:
     corner = rig.rng.choice([0.0, 1.0], rig.pose.shape[1])
     away = np.linalg.norm((rig.pose - low) / np.maximum(high - low, 1e-12) - corner, axis=1)
     size = 1 + rig.rng.uniform(2.0, 7.0) * (away - away.min()) / np.ptp(away)
-    return white(rig) * (size / np.sqrt(np.mean(size**2)))[:, None]
+    return np.asarray(white(rig) * (size / np.sqrt(np.mean(size**2)))[:, None])
 
 
 def correlated(rig: Rig) -> Array:
@@ -29,7 +29,7 @@ def correlated(rig: Rig) -> Array:
 
 def autoregressive(rig: Rig) -> Array:
     """Each row keeps 0.9 of the error of the row before."""
-    fresh = white(rig)
+    fresh: Array = white(rig)
     fresh[1:] *= np.sqrt(1 - 0.9**2)
     return np.asarray(lfilter([1.0], [1.0, -0.9], fresh, axis=0))
 

@@ -64,10 +64,8 @@ _KINDS = {
 
 def _finish_with(family: str, rig: Rig, kind: _Kind, effect: Effect | None, strength: float) -> SourceCase:
     clean = measured(rig, None if effect is None else scaled(rig, effect, strength))
-    if effect is None:
-        truth = none(kind.outside, kind.drivers)
-    else:
-        truth = single(effect, strength, kind.outside, kind.drivers)
+    beside = kind.outside, kind.drivers
+    truth = none(*beside) if effect is None else single(effect, strength, *beside)
     with_extra = [a | {e} for a in truth.accepted for e in kind.extra]
     truth = replace(truth, accepted=(*truth.accepted, *with_extra))
     return finish(family, rig, truth, clean, kind.make(rig), kind=family.removeprefix("noise_").rsplit("_", 1)[0])
@@ -76,6 +74,8 @@ def _finish_with(family: str, rig: Rig, kind: _Kind, effect: Effect | None, stre
 def _builder(kind: _Kind, with_cause: bool) -> Builder:
     def build(family: str, rng: np.random.Generator) -> SourceCase:
         rig = draw_rig(rng, design=kind.design)
+        if "time" in kind.drivers:
+            rig.show("time")
         effect = ordinary(rig, kind.causes[int(rng.integers(len(kind.causes)))]) if with_cause else None
         return _finish_with(family, rig, kind, effect, float(rng.choice(_STRENGTHS)))
 

@@ -29,7 +29,7 @@ def bump(rig: Rig, joint: int) -> Array:
 
 
 def cable(rig: Rig) -> Array:
-    """A cable along joint 1 that becomes taut beyond 40 to 60 % of its travel, and pulls by the square of its stretch."""
+    """A cable along joint 1 that becomes taut at 40 to 60 % of its travel and pulls by the square of its stretch."""
     change = np.zeros_like(rig.joints)
     change[:, 0] = -(np.maximum(of_travel(rig)[:, 0] - rig.rng.uniform(0.4, 0.6), 0.0) ** 2)
     return change

@@ -85,7 +85,7 @@ def compliance(rig: Rig, textbook: bool, which: Sequence[int]) -> Effect:
 def thermal(rig: Rig, textbook: bool, which: Sequence[int]) -> Effect:
     """All lengths of the structure grow with its temperature; glass scales do not.
 
-    The structure follows the hall by a lag of 20 to 60 minutes, otherwise by no lag and with 10 % more growth when warm.
+    The structure follows the hall by a lag of 20 to 60 minutes, otherwise by no lag and by 10 % more when warm.
     """
     del which
     rig.show("temperature", "time")

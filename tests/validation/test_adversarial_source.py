@@ -1,0 +1,95 @@
+"""The adversarial source: cases are repeatable, finite, of the strength stated, and their truths are consistent."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from ccnn_validation.sources.adversarial import FAMILIES, make
+from ccnn_validation.sources.adversarial.effect import absorbed, measured, scaled, strength_of
+from ccnn_validation.sources.adversarial.machine import ARM, machine_of
+from ccnn_validation.sources.adversarial.ordinary import ORDINARY, ordinary
+from ccnn_validation.sources.adversarial.rig import ALL, draw_rig
+
+_NAMES = {
+    *("geometry", "joint_offset", "joint_gain", "transmission", "backlash", "friction", "compliance", "gravity"),
+    *("thermal", "drift", "frame", "tool", "coupling", "latency", "instrument", "outlier", "jump"),
+}
+_KINDS = {"none", "single", "pair", "several", "outside", "data"}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_case(family):
+    case, again = make(family, 1), make(family, 1)
+    assert case.family == family
+    machine = machine_of(case.mechanism if case.mechanism in ALL else ARM)
+    joints = [f"{j.name}[{j.unit}]" for j in machine.model.joints]
+    poses = [f"{c.name}[{c.unit}]" for c in machine.model.pose]
+    assert list(case.columns)[: len(joints) + len(poses)] == [*joints, *poses]
+    assert list(case.clean) == poses
+    rows = {len(v) for v in (*case.columns.values(), *case.clean.values())}
+    assert len(rows) == 1 and 35 <= rows.pop() <= 5000
+    for header, values in case.columns.items():
+        assert np.isfinite(values).all()
+        np.testing.assert_array_equal(values, again.columns[header])
+    assert dataclasses.replace(case, columns={}, clean=None) == dataclasses.replace(again, columns={}, clean=None)
+    if case.noise is not None:
+        assert set(case.noise) == set(machine.pose_units) and min(case.noise.values()) > 0
+    _check_truth(case.truth, case.columns, machine)
+    if case.truth.kind == "data":
+        return
+    nominal = machine.forward(np.stack([case.columns[h] for h in joints], -1))
+    gap = machine.twist(np.stack([case.clean[h] for h in poses], -1), nominal)
+    size = np.sqrt(np.mean(gap**2))
+    assert size < 1e-9 if case.truth.kind == "none" and family != "quantised_commands" else 1e-7 < size < 0.05
+
+
+def _check_truth(truth, columns, machine):
+    names = {h.split("[")[0] for h in columns}
+    assert truth.kind in _KINDS and truth.accepted
+    assert set().union(*truth.accepted) <= _NAMES
+    assert set(truth.drivers) <= names | {"position", "direction", "time"}
+    if truth.kind in ("none", "outside"):
+        assert frozenset() in truth.accepted
+    if truth.kind == "none":
+        assert truth.outside is not True and not truth.causes
+    if truth.kind in ("single", "pair", "several"):
+        assert frozenset(truth.causes) in truth.accepted and truth.outside is not True
+    assert (truth.kind == "data") == bool(truth.mention)
+
+
+@pytest.mark.parametrize("name", [*ORDINARY, "geometry"])
+@pytest.mark.parametrize("machine", ALL)
+def test_strength(machine, name):
+    rig = draw_rig(np.random.default_rng(3), [machine], (40, 40))
+    effect = scaled(rig, ordinary(rig, name), 30.0)
+    assert strength_of(rig, measured(rig, effect)) == pytest.approx(30.0, rel=1e-3)
+
+
+def test_geometry_is_absorbed_by_geometry_and_a_transmission_is_not():
+    rig = draw_rig(np.random.default_rng(4), ["delta"])
+    assert absorbed(rig, ordinary(rig, "geometry")) < 1e-4
+    assert absorbed(rig, ordinary(rig, "transmission")) > 0.9
+
+
+def test_noise_is_of_the_size_given():
+    case = make("decoys_transmission", 2)
+    for seed in range(3, 9):
+        case = case if case.noise is not None else make("decoys_transmission", seed)
+    header = next(h for h in case.clean if h.endswith("[m]"))
+    spread = np.std(case.columns[header] - case.clean[header])
+    assert spread == pytest.approx(case.noise["m"], rel=0.3)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_derivatives_are_those_of_the_forward_kinematics(name):
+    rig = draw_rig(np.random.default_rng(5), [name], (20, 20))
+    machine, rng = rig.machine, np.random.default_rng(6)
+    change = 1e-6 * rng.normal(size=machine.count)
+    moved = machine.twist(machine.forward(rig.joints + change, near=rig.pose), rig.pose)
+    np.testing.assert_allclose(moved, rig.jacobian @ change, atol=1e-9)
+    which = machine.parameters_like()
+    sizes = 1e-6 * rng.normal(size=len(which))
+    parameters = np.array(machine.nominal)
+    parameters[which] += sizes
+    moved = machine.twist(machine.forward(rig.joints, parameters, rig.pose), rig.pose)
+    np.testing.assert_allclose(moved, machine.parameter_jacobian(rig.joints, rig.pose, which) @ sizes, atol=1e-9)
