@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 from scipy.spatial.transform import Rotation
 
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_validation.sources.multibody.arrays import Array
 from ccnn_validation.sources.multibody.design import Design
 from ccnn_validation.sources.multibody.machine import Machine
 from ccnn_validation.sources.multibody.plan import gap
 
-__all__ = ["as_right", "left_after"]
+__all__ = ["as_right", "columns_of", "geometry_columns", "left_after"]
 
-# What a name cannot copy, over all rows together and in units of the noise: below this it is hidden.
-_HIDDEN = 3.0
+# What a name cannot copy, over all rows together and in units of the noise: below this either name is right.
+_HIDDEN = 5.0
 
 
-def as_right(machine: Machine, mechanism: Mechanism, design: Design, error: NDArray, noise: NDArray) -> tuple[str, ...]:
+def as_right(machine: Machine, mechanism: Mechanism, design: Design, error: Array, noise: Array) -> tuple[str, ...]:
     """Names that copy an error `s x p` to within the noise `p`."""
-    columns = _columns(machine, mechanism, design)
+    columns = columns_of(machine, mechanism, design)
     return tuple(name for name, basis in columns.items() if left_after(error, basis, noise) < _HIDDEN)
 
 
-def left_after(error: NDArray, basis: NDArray, noise: NDArray) -> float:
+def left_after(error: Array, basis: Array, noise: Array) -> float:
     """Norm over all rows of what columns `s x p x k` leave of an error `s x p`, in units of the noise."""
     wanted = (error / noise).ravel()
     flat = (basis / noise[:, None]).reshape(len(wanted), -1)
@@ -31,7 +32,7 @@ def left_after(error: NDArray, basis: NDArray, noise: NDArray) -> float:
     return float(np.linalg.norm(wanted - flat @ np.linalg.lstsq(flat, wanted, rcond=1e-10)[0]))
 
 
-def _columns(machine: Machine, mechanism: Mechanism, design: Design) -> dict[str, NDArray]:
+def columns_of(machine: Machine, mechanism: Mechanism, design: Design) -> dict[str, Array]:
     """Changes of the pose by each name's coefficients, `s x p x k`."""
     step = 1e-6
     slopes = []
@@ -60,7 +61,21 @@ def _columns(machine: Machine, mechanism: Mechanism, design: Design) -> dict[str
     return columns
 
 
-def _seen(machine: Machine, moved: NDArray, turned: NDArray) -> NDArray:
+def geometry_columns(machine: Machine, mechanism: Mechanism, design: Design) -> Array:
+    """Changes of the pose by all parameters of the mechanism, drives and frames among them, `s x p x k`."""
+    nominal, step = mechanism.nominal, 1e-6
+    joints = torch.from_numpy(design.joints)
+    slopes = []
+    with torch.no_grad():
+        for number in range(len(nominal)):
+            change = torch.zeros_like(nominal)
+            change[number] = step
+            ahead, behind = (mechanism.forward_kinematics(joints, nominal + way * change).numpy() for way in (1, -1))
+            slopes.append(gap(machine, ahead, behind) / (2 * step))
+    return np.stack(slopes, -1)
+
+
+def _seen(machine: Machine, moved: Array, turned: Array) -> Array:
     """Changes of the position `s x 3 x k`, and of the rotation by the last of them, as the machine's pose has them."""
     places = sum(c in ("x", "y", "z") for c in machine.pose)
     if not machine.turns:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ccnn_validation.sources.multibody.arrays import Array
 from ccnn_validation.sources.multibody.build import Build, document, drive_joints, inertia, numbers, placed
 from ccnn_validation.sources.multibody.machine import Machine
 
@@ -98,7 +98,7 @@ def _serial(
         end = f'<site name="tool" {tool}/>{extra}'
         return document(_link(0, n, now, masses, build, end, sliding), [], n, build, (0.0, 0.0, -1.0))
 
-    def start(joints: NDArray, pose: NDArray) -> Mapping[str, NDArray]:
+    def start(joints: Array, pose: Array) -> Mapping[str, Array]:
         return {f"q{i + 1}": joints[:, i] for i in range(n)}
 
     return Machine(

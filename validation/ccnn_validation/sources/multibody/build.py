@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
+from ccnn_validation.sources.multibody.arrays import Array
 
 __all__ = ["RIGID", "Build", "document", "drive_joints", "inertia", "numbers", "placed", "platform_joints"]
 
@@ -38,34 +39,34 @@ class Build:
     """
 
     lengths: dict[str, float] = field(default_factory=dict)
-    zero: NDArray | None = None
-    gain: NDArray | None = None
-    servo: NDArray | None = None
+    zero: Array | None = None
+    gain: Array | None = None
+    servo: Array | None = None
     gravity: bool = False
     carried: float = 0.0
     payload: float = 0.0
-    friction: NDArray | None = None
-    damping: NDArray | None = None
-    play: NDArray | None = None
-    flex: NDArray | None = None
+    friction: Array | None = None
+    damping: Array | None = None
+    play: Array | None = None
+    flex: Array | None = None
     base: tuple[float, ...] = (0.0,) * 6
     tool: tuple[float, ...] = (0.0,) * 6
     stop: tuple[int, float, float, float] | None = None
     cable: tuple[tuple[float, float, float], float, float] | None = None
 
 
-def numbers(values: Sequence[float] | NDArray) -> str:
+def numbers(values: Sequence[float] | Array) -> str:
     """Numbers as MJCF has them, to the last digit."""
     return " ".join(repr(float(v)) for v in values)
 
 
-def placed(position: Sequence[float] | NDArray, rotation: Rotation | None = None) -> str:
+def placed(position: Sequence[float] | Array, rotation: Rotation | None = None) -> str:
     """Attributes `pos` and `quat` of a body or site."""
     quaternion = (Rotation.identity() if rotation is None else rotation).as_quat()
     return f'pos="{numbers(position)}" quat="{numbers(quaternion[[3, 0, 1, 2]])}"'
 
 
-def inertia(mass: float, centre: Sequence[float] | NDArray, build: Build) -> tuple[str, str]:
+def inertia(mass: float, centre: Sequence[float] | Array, build: Build) -> tuple[str, str]:
     """The attribute `gravcomp` of a body and its element `inertial`; only the mass matters at rest."""
     element = f'<inertial mass="{mass!r}" pos="{numbers(centre)}" diaginertia="{numbers([0.01 * mass] * 3)}"/>'
     return f'gravcomp="{build.carried!r}"', element

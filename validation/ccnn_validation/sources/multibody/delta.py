@@ -1,13 +1,13 @@
-"""The delta robot in MuJoCo: three cranks, six rods with a universal joint each, and a platform that is free to turn."""
+"""The delta robot in MuJoCo: three cranks, six rods on universal joints, and a platform that is free to turn."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ccnn_validation.sources.multibody.arrays import Array
 from ccnn_validation.sources.multibody.build import Build, document, drive_joints, inertia, placed, platform_joints
 from ccnn_validation.sources.multibody.machine import Machine
 
@@ -20,7 +20,7 @@ _HALF = 0.04
 def delta(base: float = 0.2, crank: float = 0.25, platform: float = 0.05, rod: float = 0.55) -> Machine:
     """The machine with these radii and lengths [m]."""
     angles = np.radians([0.0, 120.0, 240.0])
-    lengths = {}
+    lengths: dict[str, float] = {}
     for i in range(3):
         lengths |= {f"base{i + 1}": base, f"angle{i + 1}": float(angles[i]), f"crank{i + 1}": crank}
         lengths |= {f"platform{i + 1}": platform, f"rod{i + 1}": rod}
@@ -39,7 +39,7 @@ def delta(base: float = 0.2, crank: float = 0.25, platform: float = 0.05, rod: f
         bodies = f'{legs}<body {carried}>{mass}{platform_joints()}{sites}<site name="tool"/>{extra}</body>'
         return document(bodies, loops, 3, build, (0.0, 0.0, -1.0))
 
-    def start(joints: NDArray, pose: NDArray) -> Mapping[str, NDArray]:
+    def start(joints: Array, pose: Array) -> Mapping[str, Array]:
         state = {f"p{c}": pose[:, i] for i, c in enumerate("xyz")}
         for i, angle in enumerate(angles):
             q = joints[:, i]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_validation.sources.multibody.arrays import Array
 from ccnn_validation.sources.multibody.machine import Machine
 
 __all__ = ["Design", "draw_design"]
@@ -27,13 +27,13 @@ class Design:
         load: force and moment on the tool, `s x 6` [N, N*m]; applied only where a cause has loads.
     """
 
-    joints: NDArray
-    pose: NDArray
-    direction: NDArray
-    speed: NDArray
-    time: NDArray
-    temperature: NDArray
-    load: NDArray
+    joints: Array
+    pose: Array
+    direction: Array
+    speed: Array
+    time: Array
+    temperature: Array
+    load: Array
 
 
 def draw_design(machine: Machine, mechanism: Mechanism, rng: np.random.Generator, moving: bool = False) -> Design:
@@ -45,7 +45,7 @@ def draw_design(machine: Machine, mechanism: Mechanism, rng: np.random.Generator
         # A path of three sines a coordinate, in shares of the workspace from its middle.
         rate, phase = rng.uniform(0.3, 1.6, (3, 1, 7)), rng.uniform(0, 2 * np.pi, (3, 1, 7))
 
-        def path(t: NDArray) -> NDArray:
+        def path(t: Array) -> Array:
             share = np.sin(rate * t[:, None] + phase).sum(0)[:, : _width(machine, mechanism)] / 3.2
             return _joints_at(machine, mechanism, share)
 
@@ -60,8 +60,8 @@ def draw_design(machine: Machine, mechanism: Mechanism, rng: np.random.Generator
         drawn = rng.integers(0, 2, joints.shape) * 2.0 - 1.0
         direction = drawn if rng.random() < 0.5 else np.where(joints < before, -1.0, 1.0)
     shift = time / time[-1]
-    swing = rng.uniform(3, 6) * np.sin(2 * np.pi * (rng.uniform(0.7, 2.5) * shift + rng.random()))
-    temperature = 20 + rng.uniform(-2, 6) + swing + rng.normal(0, 0.3, rows)
+    swing = rng.uniform(5, 10) * np.sin(2 * np.pi * (rng.uniform(0.7, 2.5) * shift + rng.random()))
+    temperature = rng.uniform(22, 28) + swing + rng.normal(0, 0.3, rows)
     moments = rng.normal(0, 6.0, (rows, 3)) * (machine.turns and rng.random() < 0.5)
     load = np.hstack([rng.normal(0, 60.0, (rows, 3)), moments])
     if machine.pose == ("x", "y"):
@@ -77,7 +77,7 @@ def _width(machine: Machine, mechanism: Mechanism) -> int:
     return machine.drives if machine.low is not None else len(mechanism.pose)
 
 
-def _joints_at(machine: Machine, mechanism: Mechanism, share: NDArray) -> NDArray:
+def _joints_at(machine: Machine, mechanism: Mechanism, share: Array) -> Array:
     """Joints where shares from -1 to 1 of the workspace are, `s x n`."""
     if machine.low is not None and machine.high is not None:
         return (machine.low + machine.high) / 2 + share * (machine.high - machine.low) / 2
@@ -87,4 +87,5 @@ def _joints_at(machine: Machine, mechanism: Mechanism, share: NDArray) -> NDArra
         # From a square to the disc that the five-bar reaches, so that no corner is out of reach.
         u, v = share.T
         share = np.stack([u * np.sqrt(1 - v**2 / 2), v * np.sqrt(1 - u**2 / 2)], -1)
-    return machine.inverse(mechanism, middle + 0.85 * half * share)
+    joints: Array = machine.inverse(mechanism, middle + 0.85 * half * share)
+    return joints

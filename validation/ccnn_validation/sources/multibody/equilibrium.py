@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+
+from ccnn_validation.sources.multibody.arrays import Array
 
 __all__ = ["Rest", "settle"]
 
@@ -34,18 +35,18 @@ class Rest:
         joints: all joints of the model, `s x v`.
     """
 
-    position: NDArray
-    rotation: NDArray
-    joints: NDArray
+    position: Array
+    rotation: Array
+    joints: Array
 
 
 def settle(
     model: mujoco.MjModel,
-    commands: NDArray,
-    start: NDArray,
-    load: NDArray | None = None,
-    motion: NDArray | None = None,
-    speed: NDArray | None = None,
+    commands: Array,
+    start: Array,
+    load: Array | None = None,
+    motion: Array | None = None,
+    speed: Array | None = None,
     vary: Callable[[int], None] | None = None,
 ) -> Rest:
     """Solve for rest, row by row of commands.
@@ -91,7 +92,7 @@ def settle(
     raise RuntimeError(f"no rest was found: the last step was {moved:.1e}")
 
 
-def _play(model: mujoco.MjModel, drive: NDArray) -> tuple[NDArray, NDArray]:
+def _play(model: mujoco.MjModel, drive: Array) -> tuple[Array, Array]:
     """Joints that are play, `k`, and the number of the drive before each, `k`."""
     names = [model.joint(i).name for i in range(model.njnt)]
     play = [i for i, name in enumerate(names) if name.startswith("play")]
@@ -102,11 +103,11 @@ def _play(model: mujoco.MjModel, drive: NDArray) -> tuple[NDArray, NDArray]:
 def _balance(
     model: mujoco.MjModel,
     data: mujoco.MjData,
-    commands: NDArray,
-    joints: NDArray,
-    load: NDArray | None,
+    commands: Array,
+    joints: Array,
+    load: Array | None,
     vary: Callable[[int], None] | None,
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+) -> tuple[Array, Array, Array, Array]:
     """Forces `s x v`, stiffness `s x v x v`, gaps of the loops `s x c` and their slopes `s x c x v`.
 
     One row after the other, as MuJoCo's function takes one state.
@@ -140,7 +141,7 @@ def _balance(
     return forces, stiffness, np.array(gaps).reshape(rows, -1), np.array(slopes).reshape(rows, -1, size)
 
 
-def _tendon_slope(model: mujoco.MjModel, data: mujoco.MjData, number: int) -> NDArray:
+def _tendon_slope(model: mujoco.MjModel, data: mujoco.MjData, number: int) -> Array:
     """Length of a tendon by all joints, `v`."""
     dense = np.zeros(model.nv)
     begin, count = int(model.ten_J_rowadr[number]), int(model.ten_J_rownnz[number])
@@ -149,9 +150,7 @@ def _tendon_slope(model: mujoco.MjModel, data: mujoco.MjData, number: int) -> ND
     return dense
 
 
-def _newton(
-    force: NDArray, stiffness: NDArray, gap: NDArray, slope: NDArray, fixed: NDArray
-) -> tuple[NDArray, NDArray]:
+def _newton(force: Array, stiffness: Array, gap: Array, slope: Array, fixed: Array) -> tuple[Array, Array]:
     """Steps of the joints, `s x v`, and forces in the loops, `s x c`; fixed joints do not move."""
     rows, size = force.shape
     loops = gap.shape[1]
@@ -170,7 +169,7 @@ def _newton(
     return found[:, :size], found[:, size:] * scale[:, None]
 
 
-def _tool(model: mujoco.MjModel, data: mujoco.MjData, joints: NDArray, vary: Callable[[int], None] | None) -> Rest:
+def _tool(model: mujoco.MjModel, data: mujoco.MjData, joints: Array, vary: Callable[[int], None] | None) -> Rest:
     """The tool's frame of all rows."""
     position, rotation = np.empty((len(joints), 3)), np.empty((len(joints), 3, 3))
     tool = model.site("tool").id

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ccnn_validation.sources.multibody.arrays import Array
 from ccnn_validation.sources.multibody.build import Build, document, drive_joints, inertia, placed
 from ccnn_validation.sources.multibody.machine import Machine
 
@@ -16,7 +16,7 @@ __all__ = ["five_bar"]
 
 def five_bar(crank: float = 0.75, coupler: float = 1.1, foot: float = 0.5) -> Machine:
     """The machine with cranks, couplers and feet of these lengths [m]."""
-    lengths = {}
+    lengths: dict[str, float] = {}
     for leg, x in ((1, -foot), (2, foot)):
         lengths |= {f"l{leg}": crank, f"L{leg}": coupler, f"A{leg}x": x, f"A{leg}y": 0.0}
 
@@ -25,7 +25,7 @@ def five_bar(crank: float = 0.75, coupler: float = 1.1, foot: float = 0.5) -> Ma
         bodies = "".join(_leg(leg, now, build) for leg in (1, 2))
         return document(bodies, [("end1", "end2")], 2, build, (0.0, -1.0, 0.0))
 
-    def start(joints: NDArray, pose: NDArray) -> Mapping[str, NDArray]:
+    def start(joints: Array, pose: Array) -> Mapping[str, Array]:
         feet = np.array([[-foot, 0.0], [foot, 0.0]])
         elbow = feet + crank * np.stack([np.cos(joints), np.sin(joints)], -1)
         rest = pose[:, None, :] - elbow

@@ -6,13 +6,14 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_validation.sources.multibody.arrays import Array
 from ccnn_validation.sources.multibody.build import Build
 
 __all__ = ["Machine"]
@@ -38,15 +39,15 @@ class Machine:
 
     name: str
     mechanism: str
-    keys: Mapping[str, object] | None
+    keys: Mapping[str, float] | None
     units: tuple[str, ...]
     pose: tuple[str, ...]
-    low: NDArray | None
-    high: NDArray | None
+    low: Array | None
+    high: Array | None
     lengths: Mapping[str, float]
     model: Callable[[Build], str]
-    start: Callable[[NDArray, NDArray], Mapping[str, NDArray]]
-    stiff: NDArray
+    start: Callable[[Array, Array], Mapping[str, Array]]
+    stiff: Array
     reach: float
 
     @property
@@ -62,7 +63,8 @@ class Machine:
     def nominal(self) -> Mechanism:
         """The project's mechanism."""
         if "\n" not in self.mechanism:
-            return load_mechanism(self.mechanism, **dict(self.keys or {}))
+            keys: dict[str, Any] = dict(self.keys or {})
+            return load_mechanism(self.mechanism, **keys)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "machine.yaml"
             path.write_text(self.mechanism, encoding="utf-8")
@@ -72,19 +74,19 @@ class Machine:
         """The MuJoCo model of the machine as built."""
         return mujoco.MjModel.from_xml_string(self.model(build))
 
-    def begin(self, model: mujoco.MjModel, joints: NDArray, pose: NDArray) -> NDArray:
+    def begin(self, model: mujoco.MjModel, joints: Array, pose: Array) -> Array:
         """All joints of a model at nominal poses, `s x v`."""
         state = np.zeros((len(joints), model.nq))
         for name, values in self.start(joints, pose).items():
             state[:, model.joint(name).id] = values
         return state
 
-    def forward(self, mechanism: Mechanism, joints: NDArray) -> NDArray:
+    def forward(self, mechanism: Mechanism, joints: Array) -> Array:
         """Nominal poses, `s x p`; NaN out of reach."""
         with torch.no_grad():
             return np.asarray(mechanism.forward_kinematics(torch.from_numpy(joints)).numpy())
 
-    def inverse(self, mechanism: Mechanism, pose: NDArray) -> NDArray:
+    def inverse(self, mechanism: Mechanism, pose: Array) -> Array:
         """Nominal joints of poses, `s x n`; NaN out of reach."""
         with torch.no_grad():
             return np.asarray(mechanism.solve_inverse(torch.from_numpy(pose)).numpy())

@@ -35,7 +35,7 @@ def _softening(machine: Machine, design: Design, rng: np.random.Generator) -> Pl
         lambda strength: Build(servo=servo / strength),
         truth,
         frozenset({"load", "temperature"}),
-        softening=0.06,
+        softening=0.03,
         sizes=(20.0, 40.0),
         plain=False,
     )

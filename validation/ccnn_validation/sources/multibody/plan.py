@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, fields, replace
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ccnn_validation.sources.case import Truth
+from ccnn_validation.sources.multibody.arrays import Array
 from ccnn_validation.sources.multibody.build import Build
 from ccnn_validation.sources.multibody.design import Design
 from ccnn_validation.sources.multibody.equilibrium import settle
@@ -48,7 +48,7 @@ class Plan:
     plain: bool = True
 
 
-def poses(machine: Machine, plan: Plan, strength: float, design: Design) -> NDArray:
+def poses(machine: Machine, plan: Plan, strength: float, design: Design) -> Array:
     """Measured coordinates without noise, `s x p` [m, rad]."""
     model = machine.compiled(plan.build(strength))
     rest = settle(
@@ -68,7 +68,7 @@ def poses(machine: Machine, plan: Plan, strength: float, design: Design) -> NDAr
     return np.where(np.arange(len(measured))[:, None] < plan.after, design.pose, measured)
 
 
-def gap(machine: Machine, measured: NDArray, nominal: NDArray) -> NDArray:
+def gap(machine: Machine, measured: Array, nominal: Array) -> Array:
     """Error of poses, `s x p`: positions, and the small rotation that turns the nominal platform [m, rad]."""
     if not machine.turns:
         return measured - nominal
@@ -101,7 +101,7 @@ def _differing(build: Build, plain: Build) -> set[str]:
     return {name for name, now, before in pairs if now is not None and (before is None or now != before)}
 
 
-def _near(turn: NDArray, wanted: NDArray) -> NDArray:
+def _near(turn: Array, wanted: Array) -> Array:
     """Rotation vectors `s x 3` as those of the same rotation that are nearest to others [rad]."""
     angle = np.linalg.norm(turn, axis=1, keepdims=True)
     other = turn * (1 - 2 * np.pi / np.maximum(angle, 1e-9))

@@ -7,11 +7,11 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_validation.sources.case import SourceCase, Truth
 from ccnn_validation.sources.multibody.alternatives import as_right
+from ccnn_validation.sources.multibody.arrays import Array
 from ccnn_validation.sources.multibody.build import Build
 from ccnn_validation.sources.multibody.design import Design, draw_design
 from ccnn_validation.sources.multibody.families import MACHINES, machines_of, parts_of
@@ -30,7 +30,8 @@ def make(family: str, seed: int) -> SourceCase:
     mechanism = machine.nominal()
     parts = parts_of(family)
     design = draw_design(machine, mechanism, rng, moving="latency" in parts)
-    lengths = float(np.exp(rng.uniform(np.log(5e-6), np.log(2e-5))))
+    # Growth of a plausible size shows where it is measured well.
+    lengths = float(np.exp(rng.uniform(np.log(5e-6), np.log(8e-6 if "thermal" in parts else 2e-5))))
     noise = np.array([2e-5 if c.startswith("r") else lengths for c in machine.pose])
     plan, strength = _plan(parts, machine, mechanism, design, noise, rng)
     clean = poses(machine, plan, strength, design)
@@ -53,7 +54,7 @@ def _plan(
     machine: Machine,
     mechanism: Mechanism,
     design: Design,
-    noise: NDArray,
+    noise: Array,
     rng: np.random.Generator,
 ) -> tuple[Plan, float]:
     """What acts, with its truth, and how strongly."""
@@ -81,11 +82,30 @@ def _plan(
         for plan, strength in zip(plans, strengths, strict=True)
     ]
     accepted = tuple(dict.fromkeys(one | other for one, other in product(*sets)))
+    accepted += _hidden(parts, plans, strengths, machine, mechanism, design, noise)
     causes = tuple(cause for plan in plans for cause in plan.truth.causes)
     return joined((plans[0], plans[1]), strengths, Truth("pair", causes, accepted, False)), 1.0
 
 
-def _strength(machine: Machine, plan: Plan, design: Design, noise: NDArray, target: float) -> float:
+def _hidden(
+    parts: tuple[str, ...],
+    plans: list[Plan],
+    strengths: tuple[float, ...],
+    machine: Machine,
+    mechanism: Mechanism,
+    design: Design,
+    noise: Array,
+) -> tuple[frozenset[str], ...]:
+    """One cause alone, where its coefficients copy the other one to within the noise."""
+    errors = [gap(machine, poses(machine, p, s, design), design.pose) for p, s in zip(plans, strengths, strict=True)]
+    alone = []
+    for error, name in zip(reversed(errors), parts, strict=True):
+        if name in as_right(machine, mechanism, design, error, noise):
+            alone.append(frozenset({name}))
+    return tuple(alone)
+
+
+def _strength(machine: Machine, plan: Plan, design: Design, noise: Array, target: float) -> float:
     """The strength at which the root mean square of the error is `target` times the noise."""
     strength = 1.0
     # Twice, as stops and springs are not quite linear in their strength.
@@ -96,7 +116,7 @@ def _strength(machine: Machine, plan: Plan, design: Design, noise: NDArray, targ
 
 
 def _names(
-    plan: Plan, strength: float, machine: Machine, mechanism: Mechanism, design: Design, noise: NDArray
+    plan: Plan, strength: float, machine: Machine, mechanism: Mechanism, design: Design, noise: Array
 ) -> tuple[frozenset[str], ...]:
     """The right names, and simple ones that explain these rows as well."""
     if plan.truth.kind == "outside":
@@ -106,22 +126,22 @@ def _names(
     return tuple(dict.fromkeys((*plan.truth.accepted, *also)))
 
 
-def _commands(machine: Machine, design: Design) -> dict[str, NDArray]:
+def _commands(machine: Machine, design: Design) -> dict[str, Array]:
     return {f"q{i + 1}[{unit}]": design.joints[:, i] for i, unit in enumerate(machine.units)}
 
 
-def _pose(machine: Machine, values: NDArray) -> dict[str, NDArray]:
+def _pose(machine: Machine, values: Array) -> dict[str, Array]:
     return {f"{c}[{'rad' if c.startswith('r') else 'm'}]": values[:, i] for i, c in enumerate(machine.pose)}
 
 
-def _covariates(machine: Machine, plan: Plan, design: Design, rng: np.random.Generator) -> dict[str, NDArray]:
+def _covariates(machine: Machine, plan: Plan, design: Design, rng: np.random.Generator) -> dict[str, Array]:
     """What shows the cause, and some of what does not."""
     kept = set(plan.columns)
     kept |= {name for name in ("time", "temperature", "direction") if rng.random() < 0.5}
     if plan.plain and rng.random() < 0.3:
         # Nothing gives in this machine: its loads are recorded and do nothing.
         kept.add("load")
-    columns: dict[str, NDArray] = {}
+    columns: dict[str, Array] = {}
     if "time" in kept:
         columns["time[s]"] = design.time
     if "temperature" in kept:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ccnn_validation.sources.case import Truth
+from ccnn_validation.sources.multibody.arrays import Array
 from ccnn_validation.sources.multibody.build import Build
 from ccnn_validation.sources.multibody.design import Design
 from ccnn_validation.sources.multibody.machine import Machine
@@ -23,14 +24,15 @@ def named(*causes: str, also: tuple[tuple[str, ...], ...] = (), outside: bool | 
     return Truth("single", causes, sets, outside)
 
 
-def _spread(machine: Machine, rng: np.random.Generator) -> np.ndarray:
+def _spread(machine: Machine, rng: np.random.Generator) -> Array:
     """One factor for each drive, `n`: no two drives are alike."""
     return rng.uniform(0.4, 1.6, machine.drives)
 
 
-def _signed(machine: Machine, rng: np.random.Generator) -> np.ndarray:
+def _signed(machine: Machine, rng: np.random.Generator) -> Array:
     """The same with signs."""
-    return _spread(machine, rng) * rng.choice([-1.0, 1.0], machine.drives)
+    signs: Array = rng.choice([-1.0, 1.0], machine.drives)
+    return signs * _spread(machine, rng)
 
 
 def _geometry(machine: Machine, design: Design, rng: np.random.Generator) -> Plan:
@@ -86,6 +88,8 @@ def _gravity(machine: Machine, design: Design, rng: np.random.Generator) -> Plan
 def _payload(machine: Machine, design: Design, rng: np.random.Generator) -> Plan:
     """A mass at the tool that the records do not have; the own weight is fed forward."""
     servo, mass = machine.stiff / _spread(machine, rng), float(rng.uniform(2, 8))
+    if machine.name == "stewart":
+        mass *= 10
     return Plan(
         lambda strength: Build(servo=servo / strength, gravity=True, carried=1.0, payload=mass),
         named("gravity"),

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ccnn_validation.sources.multibody.arrays import Array
 from ccnn_validation.sources.multibody.build import Build, document, drive_joints, inertia, placed, platform_joints
 from ccnn_validation.sources.multibody.machine import Machine
 
@@ -27,7 +27,7 @@ def stewart(base: float = 0.5, platform: float = 0.3, height: float = 0.6) -> Ma
     frames = [
         Rotation.align_vectors(h[None], [[0.0, 0.0, 1.0]])[0] for h in home / np.linalg.norm(home, axis=1)[:, None]
     ]
-    lengths = {}
+    lengths: dict[str, float] = {}
     for i in range(6):
         lengths |= {f"B{i + 1}{c}": float(v) for c, v in zip("xyz", feet[i], strict=True)}
         lengths |= {f"P{i + 1}{c}": float(v) for c, v in zip("xyz", heads[i], strict=True)}
@@ -36,13 +36,13 @@ def stewart(base: float = 0.5, platform: float = 0.3, height: float = 0.6) -> Ma
         now = {**lengths, **build.lengths}
         legs = "".join(_leg(i, [now[f"B{i + 1}{c}"] for c in "xyz"], frames[i], build) for i in range(6))
         sites = "".join(f'<site name="head{i + 1}" {placed([now[f"P{i + 1}{c}"] for c in "xyz"])}/>' for i in range(6))
-        carried, mass = inertia(15.0, (0.0, 0.0, 0.03), build)
+        carried, mass = inertia(40.0, (0.0, 0.0, 0.03), build)
         extra = f"<body>{inertia(build.payload, (0, 0, 0), build)[1]}</body>" if build.payload else ""
         tool = placed(build.tool[:3], Rotation.from_rotvec(build.tool[3:]))
         bodies = f'{legs}<body {carried}>{mass}{platform_joints()}{sites}<site name="tool" {tool}/>{extra}</body>'
         return document(bodies, [(f"end{i + 1}", f"head{i + 1}") for i in range(6)], 6, build, (0.0, 0.0, -1.0))
 
-    def start(joints: NDArray, pose: NDArray) -> Mapping[str, NDArray]:
+    def start(joints: Array, pose: Array) -> Mapping[str, Array]:
         turn = Rotation.from_rotvec(pose[:, 3:])
         bend = turn.as_euler("XYZ")
         state = {f"p{c}": pose[:, i] for i, c in enumerate("xyz")} | {f"r{c}": bend[:, i] for i, c in enumerate("xyz")}
@@ -65,7 +65,7 @@ def stewart(base: float = 0.5, platform: float = 0.3, height: float = 0.6) -> Ma
         lengths=lengths,
         model=model,
         start=start,
-        stiff=np.full(6, 4e6),
+        stiff=np.full(6, 2e6),
         reach=height,
     )
 
