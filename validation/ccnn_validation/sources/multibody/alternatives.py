@@ -44,7 +44,9 @@ def columns_of(machine: Machine, mechanism: Mechanism, design: Design) -> dict[s
     space[:, : len(places)] = design.pose[:, : len(places)]
     turned = np.stack([np.cross(axis, space) for axis in np.eye(3)], -1)
     shifted = np.broadcast_to(np.eye(3), turned.shape)
-    strain = np.stack([space[:, [j]] * np.eye(3)[i] for i in range(3) for j in range(3)], -1)
+    # A scale of each axis, and what each pair of axes leans: the part of it that is no turn.
+    pairs = [(i, j) for i in range(3) for j in range(i, 3)]
+    strain = np.stack([space[:, [j]] * np.eye(3)[i] + space[:, [i]] * np.eye(3)[j] for i, j in pairs], -1)
     columns = {
         "joint_offset": by_joint,
         "joint_gain": by_joint * design.joints[:, None, :],

@@ -123,7 +123,11 @@ def _names(
     if plan.truth.kind == "outside":
         return plan.truth.accepted
     error = gap(machine, poses(machine, plan, strength, design), design.pose)
-    also = tuple(frozenset({name}) for name in as_right(machine, mechanism, design, error, noise))
+    names = as_right(machine, mechanism, design, error, noise)
+    also = tuple(frozenset({name}) for name in names)
+    if "instrument" in names:
+        # A scale about another point than the middle is a shift as well.
+        also += (frozenset({"instrument", "frame"}),)
     return tuple(dict.fromkeys((*plan.truth.accepted, *also)))
 
 
