@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from ccnn_torch.mechanisms import Mechanism
@@ -12,7 +11,7 @@ from ccnn_validation.sources.multibody.design import Design
 from ccnn_validation.sources.multibody.machine import Machine
 from ccnn_validation.sources.multibody.plan import gap
 
-__all__ = ["as_right", "columns_of", "geometry_columns", "left_after"]
+__all__ = ["as_right", "columns_of", "left_after"]
 
 # What a name cannot copy, over all rows together and in units of the noise: below this either name is right.
 _HIDDEN = 5.0
@@ -35,19 +34,19 @@ def left_after(error: Array, basis: Array, noise: Array) -> float:
 def columns_of(machine: Machine, mechanism: Mechanism, design: Design) -> dict[str, Array]:
     """Changes of the pose by each name's coefficients, `s x p x k`."""
     step = 1e-6
-    slopes = []
-    for joint in range(machine.drives):
-        ahead, behind = (
-            machine.forward(mechanism, design.joints + sign * step * np.eye(machine.drives)[joint]) for sign in (1, -1)
-        )
-        slopes.append(gap(machine, ahead, behind) / (2 * step))
-    by_joint = np.stack(slopes, -1)
+    # All joints ahead and behind in one call, `2n s x n`.
+    moves = step * np.concatenate([np.eye(machine.drives), -np.eye(machine.drives)])
+    moved = machine.forward(mechanism, (design.joints + moves[:, None, :]).reshape(-1, machine.drives))
+    ahead, behind = np.split(moved, 2)
+    by_joint = (gap(machine, ahead, behind) / (2 * step)).reshape(machine.drives, *design.pose.shape).transpose(1, 2, 0)
     space = np.zeros((len(design.pose), 3))
     places = [c for c in machine.pose if c in ("x", "y", "z")]
     space[:, : len(places)] = design.pose[:, : len(places)]
     turned = np.stack([np.cross(axis, space) for axis in np.eye(3)], -1)
     shifted = np.broadcast_to(np.eye(3), turned.shape)
-    strain = np.stack([space[:, [j]] * np.eye(3)[i] for i in range(3) for j in range(3)], -1)
+    # A scale of each axis, and what each pair of axes leans: the part of it that is no turn.
+    pairs = [(i, j) for i in range(3) for j in range(i, 3)]
+    strain = np.stack([space[:, [j]] * np.eye(3)[i] + space[:, [i]] * np.eye(3)[j] for i, j in pairs], -1)
     columns = {
         "joint_offset": by_joint,
         "joint_gain": by_joint * design.joints[:, None, :],
@@ -59,20 +58,6 @@ def columns_of(machine: Machine, mechanism: Mechanism, design: Design) -> dict[s
         place = np.concatenate([turn, np.zeros_like(turn)], 1)
         columns["tool"] = np.concatenate([place, np.concatenate([np.zeros_like(turn), turn], 1)], -1)
     return columns
-
-
-def geometry_columns(machine: Machine, mechanism: Mechanism, design: Design) -> Array:
-    """Changes of the pose by all parameters of the mechanism, drives and frames among them, `s x p x k`."""
-    nominal, step = mechanism.nominal, 1e-6
-    joints = torch.from_numpy(design.joints)
-    slopes = []
-    with torch.no_grad():
-        for number in range(len(nominal)):
-            change = torch.zeros_like(nominal)
-            change[number] = step
-            ahead, behind = (mechanism.forward_kinematics(joints, nominal + way * change).numpy() for way in (1, -1))
-            slopes.append(gap(machine, ahead, behind) / (2 * step))
-    return np.stack(slopes, -1)
 
 
 def _seen(machine: Machine, moved: Array, turned: Array) -> Array:

@@ -80,8 +80,9 @@ def _width(machine: Machine, mechanism: Mechanism) -> int:
 def _joints_at(machine: Machine, mechanism: Mechanism, share: Array) -> Array:
     """Joints where shares from -1 to 1 of the workspace are, `s x n`."""
     if machine.low is not None and machine.high is not None:
-        return (machine.low + machine.high) / 2 + share * (machine.high - machine.low) / 2
-    middle = ((mechanism.low + mechanism.high) / 2).numpy()
+        drawn: Array = (machine.low + machine.high) / 2 + share * (machine.high - machine.low) / 2
+        return drawn
+    middle: Array = ((mechanism.low + mechanism.high) / 2).numpy()
     half = ((mechanism.high - mechanism.low) / 2).numpy()
     if machine.pose == ("x", "y"):
         # From a square to the disc that the five-bar reaches, so that no corner is out of reach.

@@ -17,6 +17,8 @@ from ccnn_validation.sources.multibody.arrays import Array
 __all__ = ["Rest", "settle"]
 
 _ROUNDS = 60
+# After these rounds a link that balances between its flanks stays on one.
+_CHOOSING = 15
 # In rad and m: far below all noise, and above the rounding of forces in stiff servos.
 _STILL = 1e-11
 # A link's own bearing holds it against pushes as small as rounding makes in stiff servos [N*m, N].
@@ -75,13 +77,13 @@ def settle(
     half = model.jnt_range[play, 1]
     if len(play):
         joints[:, play] = 0.0 if motion is None else -half * motion[:, behind]
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS):
         force, stiffness, gap, slope = _balance(model, data, commands, joints, load, vary)
         force = force + held
         step, pull = _newton(force, stiffness, gap, slope, play)
         joints += step
         flank = joints[:, play]
-        if len(play):
+        if len(play) and number < _CHOOSING:
             # What weight, load and loops push with decides the flank, unless the friction of the link holds it.
             pushed = (force + (slope.swapaxes(1, 2) @ pull[..., None])[..., 0])[:, play]
             flank = np.where(np.abs(pushed) > _HOLD, half * np.sign(pushed), flank)

@@ -70,9 +70,10 @@ def _plan(
     # Thermal growth has the size that temperatures of a workshop give it; the other cause follows.
     shares = (target, min(target, second.sizes[1]) if second.sizes[1] < 20 else float(target * rng.uniform(0.6, 1.6)))
     if parts == ("gravity", "compliance"):
-        # One set of servos gives under both.
+        # One set of servos gives under both: between the strengths that either cause alone would have.
         plans[1] = replace(second, build=first.build)
-        strengths = (_strength(machine, first, design, noise, target),) * 2
+        weight, load = (_strength(machine, plan, design, noise, target) for plan in (first, second))
+        strengths = (float(np.sqrt(weight * load)),) * 2
     else:
         strengths = tuple(  # type: ignore[assignment]
             _strength(machine, plan, design, noise, share) for plan, share in zip(plans, shares, strict=True)
@@ -122,7 +123,11 @@ def _names(
     if plan.truth.kind == "outside":
         return plan.truth.accepted
     error = gap(machine, poses(machine, plan, strength, design), design.pose)
-    also = tuple(frozenset({name}) for name in as_right(machine, mechanism, design, error, noise))
+    names = as_right(machine, mechanism, design, error, noise)
+    also = tuple(frozenset({name}) for name in names)
+    if "instrument" in names:
+        # A scale about another point than the middle is a shift as well.
+        also += (frozenset({"instrument", "frame"}),)
     return tuple(dict.fromkeys((*plan.truth.accepted, *also)))
 
 

@@ -157,7 +157,7 @@ def _thermal(machine: Machine, design: Design, rng: np.random.Generator) -> Plan
         frozenset({"temperature"}),
         growth=1.2e-5,
         screws=bool(rng.random() < 0.5),
-        sizes=(5.0, 12.0),
+        sizes=(5.0, 8.0),
     )
 
 
