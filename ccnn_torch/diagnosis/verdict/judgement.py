@@ -20,7 +20,7 @@ __all__ = ["Judgement", "judge", "without_names"]
 
 # As `FORM`, of a discrepancy term beside library effects, and of library effects beside a discrepancy term, which
 # stands for whatever was not thought of. Exact effects leave no more than the second order.
-_FORM_DISCREPANCY, _FORM_EXACT, _BESIDE_CATCH_ALL = 0.002, 1e-4, 0.1
+_FORM_DISCREPANCY, _FORM_EXACT, _BESIDE_CATCH_ALL = 0.006, 1e-4, 0.1
 # A library effect whose own part is more than this share of the gap is no form of other ones, however well these could
 # do without it.
 _CARRIES = 0.5
@@ -41,6 +41,12 @@ _OWN, _DOUBTED = 0.1, 0.5
 # Or that must come from other coefficients than those that mend its form, where these are so many times as large, in
 # plausible sizes.
 _MAIN, _MENDED = 0.5, 15.0
+# Log odds by which a small effect must improve a set that leaves no more than a known noise.
+_NEEDED = 20.0
+# Share of the gap that the best explanation must account for; below it no name is given.
+_LEAST_EXPLAINED = 0.5
+# Log odds that a cause of another form may lose for its sizes.
+_FAR_FETCHED = 20.0
 # Odds up to which the data do not distinguish one name from another.
 _ODDS = math.log(20.0)
 # Log odds against the most probable set beyond which sets are not considered.
@@ -89,6 +95,10 @@ def judge(analysis: Analysis) -> Judgement:
     names, driver, probability, found = leading[0]
     alike = [f for f in groups[names, driver] if set(found.members) <= set(f.members)]
     fullest = max(alike, key=lambda f: f.log_posterior)
+    plainer = _library_form(analysis, found, frozenset(), tried) if driver is not None else None
+    if plainer is not None:
+        found = fullest = plainer
+        names, driver = _named(analysis, found)
     outside = driver is not None
     if not outside and _unexplained(analysis, found):
         outside = True
@@ -96,10 +106,14 @@ def judge(analysis: Analysis) -> Judgement:
     borrowed = _borrowed(analysis, found, tried)
     if borrowed:
         # Something is there that looks like a part of these effects, and nothing of what makes them what they are.
-        found = fullest = _best_without(analysis, borrowed, tried) or found
+        other = _library_form(analysis, found, borrowed, tried)
+        found = fullest = other or _best_without(analysis, borrowed, tried) or found
         names, driver = _named(analysis, found)
-        names, outside = names - borrowed, True
-        driver = driver or _driver_of_single(analysis)
+        names, outside = names - borrowed, other is None or _unexplained(analysis, found)
+        driver = (driver or _driver_of_single(analysis)) if outside else None
+    if outside and _little(analysis):
+        found = fullest = next(f for f in analysis.found if not f.members)
+        names = frozenset()
     marginal: dict[str, float] = {a.name: 0.0 for a in analysis.dictionary.atoms if not a.is_discrepancy}
     for members, _, p, _ in leading:
         for name in members:
@@ -107,10 +121,10 @@ def judge(analysis: Analysis) -> Judgement:
     classes = {} if outside else _classes(analysis, found, names, tried)
     if not outside:
         same = [p for members, drive, p, _ in leading if drive is None and _equals(members, names, classes)]
-        probability = sum(same)
+        probability = sum(same) if plainer is None and not borrowed else _UNSURE
     else:
         # What is left above a noise that is known is no noise, whatever it follows.
-        known = analysis.whitening.known > 0 or analysis.instrument is not None
+        known = _is_known(analysis)
         told = [p for members, drive, p, _ in leading if drive is not None or (known and members == names)]
         probability = sum(told) if leading[0][1] is not None or (known and not borrowed) else 0.5
     if (names and (len(names) > 2 or _smallest(analysis, found, tried) < _SMALL)) or (
@@ -127,6 +141,44 @@ def without_names(analysis: Analysis, judgement: Judgement) -> Judgement:
     """None in the place of names that are not likely and that no row outside the fit shows."""
     empty = next(f for f in analysis.found if not f.members)
     return replace(judgement, found=empty, fullest=empty, names=(), classes={}, probability=0.5)
+
+
+def _library_form(
+    analysis: Analysis, found: FittedSet, without: frozenset[str], tried: dict[tuple[int, ...], FittedSet]
+) -> FittedSet | None:
+    """A set of as few names of the library that explains a set up to a small change of form; None where there is none.
+
+    A cause need not have the form of the textbook, and a discrepancy term can have any.
+
+    Args:
+        analysis: with the sets that were tried.
+        found: the set.
+        without: names that are not to be in it.
+        tried: all sets that were fitted, by their members.
+    """
+    atoms = analysis.dictionary.atoms
+    most = max(1, sum(not atoms[i].is_discrepancy for i in found.members))
+    empty = next(f for f in analysis.found if not f.members)
+    explained = max(empty.rss - found.rss, 1e-300)
+    known, count = analysis.dictionary.noise_dof, analysis.dictionary.grams.values
+    for f in sorted(analysis.found, key=lambda f: (len(f.members), -f.log_posterior)):
+        mine = {atoms[i].name for i in f.members}
+        if not 0 < len(f.members) <= most or mine & without or any(atoms[i].is_discrepancy for i in f.members):
+            continue
+        form = _FORM_EXACT if _exact(analysis, f.members) else _FORM_DISCREPANCY
+        # What is lost beyond what the rows show is lost to implausible sizes, which no other form excuses.
+        shown = 0.5 * (count + known) * math.log((f.rss + known) / max(found.rss + known, 1e-300))
+        implausible = found.log_posterior - f.log_posterior - max(shown, 0.0) > _FAR_FETCHED
+        if (f.rss - found.rss) / explained < form and not implausible and not _borrowed(analysis, f, tried):
+            return f
+    return None
+
+
+def _little(analysis: Analysis) -> bool:
+    """Whether the best explanation of all accounts for little of the gap above the noise."""
+    best, count = analysis.found[0], analysis.dictionary.grams.values
+    left = best.rss / max(count - best.effective, 1.0) - analysis.floor
+    return left > (1 - _LEAST_EXPLAINED) * max(float(analysis.dictionary.grams.yy) / count - analysis.floor, 0.0)
 
 
 def _borrowed(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]) -> frozenset[str]:
@@ -267,10 +319,19 @@ def _with_less(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...]
     carries = {i for i, e in zip(found.members, found.energy, strict=True) if alone and e > large}
     # What leaves more than the noise when it goes is missed, however small it is.
     missed = _unexplained(analysis, found)
+    # A small effect that takes a set to a known noise is no form of the others: theirs would leave more.
+    exact = alone and _is_known(analysis) and not _above_noise(analysis, found)
+    needed = {
+        i
+        for i, (_, without) in shares.items()
+        if exact
+        and _above_noise(analysis, tried[without])
+        and found.log_posterior - tried[without].log_posterior > _NEEDED
+    }
     idle = [
         i
         for i, (share, without) in shares.items()
-        if i not in carries and share < limits[i] and (missed or not _unexplained(analysis, tried[without]))
+        if i not in carries | needed and share < limits[i] and (missed or not _unexplained(analysis, tried[without]))
     ]
     if not idle:
         return found
@@ -303,6 +364,11 @@ def _leader(analysis: Analysis, kind: str) -> str:
 
 def _energy(analysis: Analysis, found: FittedSet, name: str) -> float:
     return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.dictionary.atoms[i].name == name)
+
+
+def _is_known(analysis: Analysis) -> bool:
+    """Whether the noise was given or the records show it."""
+    return analysis.whitening.known > 0 or analysis.instrument is not None
 
 
 def _above_noise(analysis: Analysis, found: FittedSet) -> bool:
