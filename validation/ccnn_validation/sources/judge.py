@@ -10,6 +10,7 @@ from ccnn_validation.sources.case import Truth
 
 __all__ = ["follows", "judged"]
 
+_OUTLIER = "outlier"
 _SURE = 0.9
 """Probability above which a wrong name is counted."""
 
@@ -36,6 +37,9 @@ def judged(truth: Truth, answer: Mapping[str, Any], baseline: Mapping[str, Any] 
     said = truth.outside is None or outside == truth.outside or (baseline is not None and truth.outside is False)
     driven = not outside or truth.outside is False or not truth.drivers or follows(drivers, truth)
     texts = " ".join([*answer["cautions"], *answer["notes"], verdict["text"]]).lower()
+    if frozenset({_OUTLIER}) in truth.accepted and not gained and (names or outside):
+        # Bad rows are the verdict only where they are the only finding: else they have to be set aside.
+        named = len(answer["rows_set_aside"]) > len((baseline or {"rows_set_aside": ()})["rows_set_aside"])
     right = named and said and driven
     if truth.mention:
         right = _mentions(truth, texts)

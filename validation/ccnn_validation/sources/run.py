@@ -129,7 +129,11 @@ def diagnosed(case: SourceCase, columns: Mapping[str, NDArray[Any]]) -> dict[str
         try:
             mechanism = _mechanism(case, Path(folder))
             records = load_records(path, mechanism, learns=False)
-            noise = None if case.noise is None else {c.name: case.noise[c.unit] for c in mechanism.pose}
+            noise = (
+                None
+                if case.noise is None
+                else {c.name: case.noise[c.unit] for c in mechanism.pose if c.unit in case.noise}
+            )
             found = diagnose(records, mechanism, noise=noise)
         except CcnnError as problem:
             return {"failed": str(problem)}
