@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import os
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -22,9 +23,13 @@ from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import load_records, write_table
 from ccnn_torch.report.json_files import read_json, write_json
-from ccnn_torch.report.screen import note
+from ccnn_torch.report.screen import note, say_place, stdout
+from ccnn_torch.report.table import print_table
+from ccnn_torch.run_folder.folder import kept_for
+from ccnn_torch.run_folder.lock import locked
 from ccnn_validation.sources.case import Source, SourceCase
 from ccnn_validation.sources.judge import judged
+from ccnn_validation.sources.report import source_tables, write_source
 
 __all__ = ["SOURCES", "diagnosed", "run_source", "source_of"]
 
@@ -43,42 +48,42 @@ def source_of(name: str) -> Source:
 
 
 def run_source(
-    name: str,
-    seeds: Sequence[int],
-    out: Path,
-    families: Sequence[str] | None = None,
-    processes: int = 2,
-    quiet: bool = False,
+    name: str, cases: int, out: Path, seed: int = 0, processes: int | None = None, quiet: bool = False
 ) -> list[dict[str, Any]]:
-    """Diagnose every family with every seed and judge; finished cases are kept.
+    """Diagnose and judge the cases of a source, and write its figures; finished cases are kept.
 
     Args:
         name: of `SOURCES`.
-        seeds: of the cases of each family.
-        out: folder of the finished cases.
-        families: those to take; all when None.
-        processes: how many at once.
+        cases: their number, rounded up to as many for each family.
+        out: folder to write, with one file for each case.
+        seed: of the first case of each family; the others follow.
+        processes: how many at once; as many as there are processors when None.
 
     Raises:
-        InputError: an unknown source or family, or data that the source reads is not there.
+        InputError: an unknown source, no case, a folder in use, or data that the source reads is not there.
     """
     source = source_of(name)
-    strange = [f for f in families or () if f not in source.FAMILIES]
-    if strange:
-        raise InputError(f"families: '{strange[0]}' is not one of {', '.join(source.FAMILIES)}")
-    out.mkdir(parents=True, exist_ok=True)
-    tasks = [
-        (name, family, seed, out / f"{family}-{seed}.json") for seed in seeds for family in families or source.FAMILIES
-    ]
-    left = [task for task in tasks if not task[3].is_file()]
-    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        for position, line in enumerate(pool.map(_one, left), 1):
-            note(f"[{position}/{len(left)}] {line}", quiet)
-    found = [dict(read_json(task[3])) for task in tasks]
-    skipped = [case["skipped"] for case in found if "skipped" in case]
-    if len(skipped) == len(found):
-        raise InputError(f"--source {name}: no case can be made: {skipped[0]}")
-    return [case for case in found if "skipped" not in case]
+    if cases < 1:
+        raise InputError(f"--cases: generate at least 1 case, not {cases}")
+    seeds = range(seed, seed + -(-cases // len(source.FAMILIES)))
+    with locked(out), kept_for("the same command"):
+        tasks = [
+            (name, family, number, out / f"{family}-{number}.json") for number in seeds for family in source.FAMILIES
+        ]
+        left = [task for task in tasks if not task[3].is_file()]
+        with ProcessPoolExecutor(processes or os.cpu_count() or 1, get_context("spawn")) as pool:
+            for position, line in enumerate(pool.map(_one, left), 1):
+                note(f"[{position}/{len(left)}] {line}", quiet)
+        every = [dict(read_json(task[3])) for task in tasks]
+        found = [case for case in every if "skipped" not in case]
+        if not found:
+            raise InputError(f"--source {name}: no case can be made: {every[0]['skipped']}")
+        write_source(out, name, found)
+    if not quiet:
+        for table in source_tables(name, found):
+            print_table(table, stdout)
+        say_place(f"Everything is in {out}")
+    return found
 
 
 def _one(task: tuple[str, str, int, Path]) -> str:
