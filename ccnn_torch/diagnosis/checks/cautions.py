@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis.checks.column_mistakes import column_mistake
 from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows
 from ccnn_torch.diagnosis.evidence.dictionary import covariance
 from ccnn_torch.diagnosis.residual.distance import distance, size_of
@@ -66,6 +67,7 @@ def cautions(
         *_of_nothing_gained(analysis, judgement, together),
         *_of_sizes(analysis, judgement),
         *_of_signs(analysis, judgement),
+        *_of_columns(analysis, judgement),
         *_of_inputs(analysis, missing),
     ]
 
@@ -204,6 +206,12 @@ def _of_signs(analysis: Analysis, judgement: Judgement) -> list[Caution]:
             wrong = f"{atom.name} would have to be negative ({where}), as in no machine"
             said.append(Caution(f"{wrong}: check the signs of the columns that it uses"))
     return said
+
+
+def _of_columns(analysis: Analysis, judgement: Judgement) -> list[Caution]:
+    """Columns that are late, exchanged or of the other sign, where something is not explained."""
+    wrong = column_mistake(analysis) if judgement.outside else ""
+    return [Caution(wrong, _HOLLOW)] if wrong else []
 
 
 def _of_temperature(situation: Situation) -> list[Caution]:

@@ -14,11 +14,13 @@ from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.effects import Situation
 from ccnn_torch.mechanisms import BlackBox, Framed
 
-__all__ = ["mistake"]
+__all__ = ["late_rows", "mistake"]
 
 # A mistake is named where without it so small a share of the distance is left.
 _MENDED = 0.1
 _FEW = 40
+# Rows that have to be far off before their order is questioned.
+_FEWEST_LATE = 8
 # Mistakes that leave no more than this many times the least are as likely.
 _ALIKE = 1.2
 # Distance in sizes of the machine that a row without a pose counts as.
@@ -42,6 +44,25 @@ def mistake(situation: Situation, measured: Tensor, size: Size) -> str:
     # On a machine that is its own mirror image two mistakes may come to the same.
     least = min((left for left, _ in found), default=0.0)
     return ", or ".join(words for left, words in found if left <= _ALIKE * least)
+
+
+def late_rows(situation: Situation, measured: Tensor, size: Size) -> str:
+    """Poses that belong to the row before or after, in words; empty where there are none."""
+    before = distance(situation, measured, size).nan_to_num(nan=_UNREACHED)
+    far = before > _MENDED * USUAL
+    if int(far.sum()) < _FEWEST_LATE:
+        return ""
+    for step, word in ((-1, "late"), (1, "early")):
+        shifted = measured.roll(step, 0)
+        other = replace(situation, guess=_guess(situation, shifted))
+        left = distance(other, shifted, size).nan_to_num(nan=_UNREACHED)
+        if float(left[far].median()) < _MENDED * min(float(before[far].median()), USUAL):
+            first = int(torch.nonzero(far)[0])
+            return (
+                f"the poses seem to be one row {word} from row {first + 1} on (counted from 1), shifted against their "
+                "joints: look whether a row is missing or twice there"
+            )
+    return ""
 
 
 def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Situation, Tensor]]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.checks.mistakes import mistake
+from ccnn_torch.diagnosis.checks.mistakes import late_rows, mistake
 from ccnn_torch.diagnosis.residual.distance import USUAL, distance, size_of
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.effects import Situation
@@ -44,10 +44,13 @@ def plausible_rows(situation: Situation, measured: Tensor) -> PlausibleRows:
     """Whether the pose of each row is near where its joints put it.
 
     Raises:
-        RowsError: most of them do not, or are out of reach.
+        RowsError: most of them do not, are out of reach, or belong to the row before or after.
     """
     size = size_of(situation)
     far = distance(situation, measured, size)
+    late = late_rows(situation, measured, size)
+    if late:
+        raise RowsError(late)
     reached = torch.isfinite(far)
     if 2 * int(reached.sum()) < len(far):
         raise RowsError(

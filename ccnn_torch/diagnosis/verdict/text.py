@@ -278,7 +278,7 @@ def _removed(results: Block, joint: str) -> str:
         whole = 1 - (blocks[0]["after"] / blocks[0]["before"]) ** 2
         return (
             f"{joint}{100 * max(whole, 0.0):.0f} % of its mean square on rows not used for fitting "
-            f"({before} → {after}), or {text.removeprefix(joint)} of it without what is left as noise"
+            f"({before} → {after}), or {text.removeprefix(joint)} of it if all that is left is noise"
         )
     return f"{text} of what is above the noise on rows not used for fitting ({before} → {after})"
 

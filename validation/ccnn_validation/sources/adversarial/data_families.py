@@ -24,7 +24,7 @@ from ccnn_validation.sources.case import SourceCase, Truth
 __all__ = ["DATA_FAMILIES"]
 
 _STRONG = (10.0, 30.0)
-_WHAT_TO_CHECK = ("axes", "axis", "unit", "frame", "convention", "joint", "order", "zero", "sign")
+_WHAT_TO_CHECK = ("swap", "axes", "axis", "unit", "frame", "convention", "joint", "order", "zero", "sign")
 
 
 def _mistake(cause: str, mention: Sequence[str], *names: str) -> Truth:
