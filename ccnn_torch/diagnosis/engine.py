@@ -135,6 +135,8 @@ def diagnose_rows(
     doubts = cautions(analysis, judgement, rows, missing, together)
     texts = [caution.text for caution in doubts]
     drivers = [d for d in (judgement.driver or "").split(CROSS) if d and not d.startswith(SPEED)]
+    # A condition says more than the joint that it acts beside.
+    drivers.sort(key=lambda d: d.startswith("joint"))
     verdict = {
         "effects": [OUTLIER] if outlier else list(judgement.names),
         "probability": min([judgement.probability, *(caution.most for caution in doubts)]),

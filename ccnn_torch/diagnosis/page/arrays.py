@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.diagnosis.discrepancy.interaction import CROSS
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import held_out
@@ -60,7 +59,7 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
     labels: dict[str, Any] = {}
     parts = [analysis.dictionary.atoms[i].columns @ mean for i, mean in zip(found.members, found.mean, strict=True)]
     columns = _drivers(analysis, place)
-    shown = set(diagnosis.verdict["effects"]) | {CROSS.join(diagnosis.verdict["drivers"])}
+    shown = set(diagnosis.verdict["effects"]) | {diagnosis.judgement.driver}
     # What the whole set leaves, discrepancy term and all: the signature of one cause is drawn with all others taken
     # off.
     left = _remainder(analysis, residual, found.members, seed, with_discrepancies=True)
