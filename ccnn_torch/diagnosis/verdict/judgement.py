@@ -163,7 +163,7 @@ def _library_form(
     known, count = analysis.dictionary.noise_dof, analysis.dictionary.grams.values
     for f in sorted(analysis.found, key=lambda f: (len(f.members), -f.log_posterior)):
         mine = {atoms[i].name for i in f.members}
-        if not 0 < len(f.members) <= most or mine & without or any(atoms[i].is_discrepancy for i in f.members):
+        if not 0 < len(f.members) <= most or mine & without or any(_bends(analysis, i) for i in f.members):
             continue
         form = _FORM_EXACT if _exact(analysis, f.members) else _FORM_DISCREPANCY
         # What is lost beyond what the rows show is lost to implausible sizes, which no other form excuses.
@@ -172,6 +172,15 @@ def _library_form(
         if (f.rss - found.rss) / explained < form and not implausible and not _borrowed(analysis, f, tried):
             return f
     return None
+
+
+def _bends(analysis: Analysis, member: int) -> bool:
+    """Whether an atom can have nearly any form: a discrepancy term, an effect with no usual shape, all couplings."""
+    atom = analysis.dictionary.atoms[member]
+    if atom.effect is None or any(shape.usual is None for shape in atom.effect.shapes(analysis.situation)):
+        return True
+    # Between all joints they are any linear map, which is near to much of what geometry does.
+    return atom.name == "coupling" and atom.used is None
 
 
 def _little(analysis: Analysis) -> bool:
