@@ -14,7 +14,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.discrepancy.network import with_network
 from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.residual.distance import size_of
-from ccnn_torch.diagnosis.residual.noise_evidence import Noise, noise_of_columns
+from ccnn_torch.diagnosis.residual.noise_evidence import Noise, column_names, noise_of_columns
 from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, simulator_inputs
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Effect, Situation, default_gravity
@@ -70,7 +70,7 @@ def diagnose(
         said = diagnose_rows(
             situation, records.pose, noise_of(noise, situation), effects, seed, _instrument(records, situation)
         )
-    said = replace(said, lines=tuple(records.lines.tolist()), notes=[*said.notes, *_unread(records, situation)])
+    said = replace(said, lines=tuple(records.lines.tolist()), notes=[*said.notes, *_unread(records, situation, said)])
     return with_network(said, seed) if network else said
 
 
@@ -79,12 +79,13 @@ def _instrument(records: Records, situation: Situation) -> Noise | None:
     return noise_of_columns(records, names, {**_POSITION, **_TURN}, situation.jacobian.shape[-2])
 
 
-def _unread(records: Records, situation: Situation) -> list[str]:
+def _unread(records: Records, situation: Situation, said: Diagnosis) -> list[str]:
     """A note of columns that no effect uses: one of them may be misnamed."""
     mechanism = situation.mechanism
     known = [*DEFAULT_COVARIATES, *situation.covariates, *(condition.name for condition in mechanism.takes)]
     known += [*mechanism.frame_per, *mechanism.tool_per] if isinstance(mechanism, SerialArm) else []
     known += [FILE] if records.parts else []
+    known += [name for c in mechanism.pose for name in column_names(c.name)] if said.noise == "columns" else []
     names = [name for name in records.columns if not any(fnmatchcase(name, pattern) for pattern in known)]
     if not names:
         return []

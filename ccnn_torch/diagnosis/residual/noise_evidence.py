@@ -14,7 +14,7 @@ from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.records import Records
 from ccnn_torch.units import si_unit_of
 
-__all__ = ["Noise", "noise_of_columns", "noise_of_repeats"]
+__all__ = ["Noise", "column_names", "noise_of_columns", "noise_of_repeats"]
 
 # Readings beyond the first of their target that make an estimate.
 _FEWEST = 20
@@ -31,6 +31,12 @@ class Noise(NamedTuple):
 
     sd: Tensor
     source: str
+
+
+def column_names(coordinate: str) -> list[str]:
+    """What a column of the standard deviation of a pose coordinate may be called."""
+    angles = [_ANGLES[coordinate]] if coordinate in _ANGLES else []
+    return [*(name.format(coordinate) for name in _NAMES), *angles]
 
 
 def noise_of_repeats(situation: Situation, measured: Tensor) -> Noise | None:
@@ -68,7 +74,7 @@ def noise_of_columns(records: Records, names: Sequence[str], channels: Mapping[s
     """
     sd = torch.full((count,), torch.nan, dtype=torch.float64)
     for name in names:
-        column = next((c for c in (*(t.format(name) for t in _NAMES), _ANGLES.get(name)) if c in records.columns), None)
+        column = next((c for c in column_names(name) if c in records.columns), None)
         if column is None or name not in channels:
             return None
         values, unit = records.columns[column], records.units[column]
