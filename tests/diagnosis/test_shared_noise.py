@@ -27,6 +27,24 @@ def test_the_operator_makes_rows_independent(target: torch.Tensor | None, within
     assert float(torch.linalg.slogdet(operator).logabsdet) == pytest.approx(correlation.log_determinant(12, 1))
 
 
+def test_the_operator_of_noise_that_drifts_and_scatters() -> None:
+    correlation, rows = Correlation(0.9, alone=0.4), torch.arange(12)
+    operator = correlation(torch.eye(12, dtype=torch.float64)[:, None])[:, 0]
+    covariance = 0.6 * 0.9 ** (rows[:, None] - rows).abs().to(torch.float64) + 0.4 * torch.eye(12, dtype=torch.float64)
+    torch.testing.assert_close(operator @ covariance @ operator.mT, torch.eye(12, dtype=torch.float64))
+    assert float(torch.linalg.slogdet(operator).logabsdet) == pytest.approx(correlation.log_determinant(12, 1))
+
+
+def test_a_device_that_wanders_less_than_it_scatters_is_no_cause() -> None:
+    situation = rows_of("five_bar", 250, 15)
+    g = torch.Generator().manual_seed(16)
+    walk = 0.2 * torch.randn(250, 2, generator=g, dtype=torch.float64).cumsum(0)
+    scatter = torch.randn(250, 2, generator=g, dtype=torch.float64)
+    found = diagnose_rows(situation, situation.pose + NOISE * (walk + scatter))
+    assert not found.verdict["effects"]
+    assert any("drifts slowly from row to row" in note for note in found.notes)
+
+
 def drifting(situation: Situation, seed: int) -> torch.Tensor:
     """Errors of a measuring device with a correlation of 0.9 from row to row, `s x 2` [m]."""
     drawn = NOISE * torch.randn(len(situation.joints), 2, generator=torch.Generator().manual_seed(seed)).double()

@@ -14,7 +14,7 @@ from ccnn_torch.diagnosis.evidence.dictionary import covariance
 from ccnn_torch.diagnosis.residual.distance import distance, size_of
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import Gap
-from ccnn_torch.diagnosis.verdict.judgement import Judgement
+from ccnn_torch.diagnosis.verdict.judgement import IMPLAUSIBLE, Judgement
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Situation
 
@@ -22,8 +22,6 @@ __all__ = ["Caution", "cautions", "row_cautions"]
 
 # What a verdict is worth beside a caution; and beside one that says that it rests on nothing.
 _DOUBTED, _HOLLOW = 0.9, 0.5
-# Plausible sizes: sealed machines whose gap was 30 times the noise had up to 185 of them; a wrong prefix makes 1000.
-_IMPLAUSIBLE = 250.0
 # Size of the machine, of which no calibration is so far off.
 _LARGE = 0.1
 # Standard deviation left, of that which was given; heavy tails left 0.7 of it in sealed machines.
@@ -178,7 +176,7 @@ def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
             continue
         size = torch.where(torch.tensor([c.secondary for c in coefficients]), 0.0, mean.abs())
         worst = int(size.argmax())
-        if float(size[worst]) > _IMPLAUSIBLE:
+        if float(size[worst]) > IMPLAUSIBLE:
             said.append(
                 Caution(
                     f"{atom.name} would have to be {float(size[worst]):.0f} times as large as is plausible "

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -28,17 +29,24 @@ class Correlation:
         value: ρ of `autoregressive` noise, e_t = ρ e_(t-1) + u_t with the variance of e kept; or the share of the
             variance that readings of one target have in common. 0 = independent rows.
         target: number of each row's target, `s`; None = the row before.
+        alone: share of the variance of autoregressive noise that is of each row alone, as a device has that drifts and
+            scatters.
         within: whether the noise is that of one target's readings, which then leaves out what they share.
     """
 
     value: float = 0.0
     target: Tensor | None = None
     within: bool = False
+    alone: float = 0.0
 
     def __call__(self, values: Tensor) -> Tensor:
         """Rows of unit noise with this correlation to rows of independent unit noise, `s x c` or `s x c x m`."""
         if self.value == 0:
             return values
+        if self.target is None and self.alone:
+            factor = _factor(len(values), self.value, self.alone)
+            whole: Tensor = torch.linalg.solve_triangular(factor, values.flatten(1), upper=False)
+            return whole.reshape(values.shape)
         if self.target is None:
             out = values.clone()
             out[1:] -= self.value * values[:-1]
@@ -55,6 +63,8 @@ class Correlation:
         """Logarithm of the operator's determinant, by which densities before and after it differ."""
         if self.value == 0:
             return 0.0
+        if self.target is None and self.alone:
+            return -channels * float(_factor(rows, self.value, self.alone).diagonal().log().sum())
         if self.target is None:
             return -0.5 * channels * (rows - 1) * math.log(1 - self.value**2)
         count = torch.bincount(self.target).to(torch.float64)
@@ -69,6 +79,15 @@ class Correlation:
 
 
 INDEPENDENT = Correlation()
+
+
+@lru_cache(maxsize=2)
+def _factor(rows: int, value: float, alone: float) -> Tensor:
+    """Cholesky factor of the correlation of noise that drifts and scatters, `rows x rows`."""
+    number = torch.arange(rows, dtype=torch.float64)
+    drifts = (1 - alone) * value ** (number[:, None] - number).abs()
+    factor: Tensor = torch.linalg.cholesky(drifts + alone * torch.eye(rows, dtype=torch.float64))
+    return factor
 
 
 def targets_of(joints: Tensor) -> Tensor | None:

@@ -17,6 +17,9 @@ __all__ = ["Explanation", "likeliest_correlation", "possible_correlations", "wit
 
 # Correlations from row to row, and shares of the variance that readings of a target have in common.
 _FROM_ROW, _IN_TARGET = (0.3, 0.6, 0.8, 0.9, 0.95, 0.98), (0.2, 0.5, 0.8, 0.9, 0.95, 0.99)
+# The same of a device that drifts and scatters, with the share of the variance that is of each row alone; and the rows
+# up to which that is tried, as its cost grows with their square.
+_DRIFTS, _SCATTERS, _MOST_ROWS = (0.9, 0.97, 0.99), (0.3, 0.6, 0.85), 1000
 _LOG_PRIOR = math.log(0.1)
 # Directions of what was fitted before with less than this share of the largest one are rounding.
 _DIGITS = 1e-9
@@ -39,6 +42,8 @@ def possible_correlations(situation: Situation, keep: Tensor, within: bool) -> l
     """
     target = targets_of(situation.joints[keep])
     found = [INDEPENDENT, *(Correlation(value) for value in _FROM_ROW)]
+    if len(keep) <= _MOST_ROWS:
+        found += [Correlation(value, alone=alone) for value in _DRIFTS for alone in _SCATTERS]
     if target is not None:
         found += [Correlation(value, target, within) for value in _IN_TARGET]
     return found

@@ -16,7 +16,7 @@ from ccnn_torch.diagnosis.search.convergence import FORM
 from ccnn_torch.diagnosis.search.sets import scored, subsets_with_one_less
 from ccnn_torch.effects import EXACT
 
-__all__ = ["Judgement", "judge", "without_names"]
+__all__ = ["IMPLAUSIBLE", "Judgement", "judge", "without_names"]
 
 # As `FORM`, of a discrepancy term beside library effects, and of library effects beside a discrepancy term, which
 # stands for whatever was not thought of. Exact effects leave no more than the second order.
@@ -47,6 +47,9 @@ _NEEDED = 20.0
 _LEAST_EXPLAINED = 0.5
 # Log odds that a cause of another form may lose for its sizes.
 _FAR_FETCHED = 20.0
+IMPLAUSIBLE = 250.0
+"""Plausible sizes that no cause has: sealed machines whose gap was 30 times the noise had up to 185; a prefix makes
+1000."""
 # Odds up to which the data do not distinguish one name from another.
 _ODDS = math.log(20.0)
 # Log odds against the most probable set beyond which sets are not considered.
@@ -191,11 +194,18 @@ def _little(analysis: Analysis) -> bool:
 
 
 def _borrowed(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]) -> frozenset[str]:
-    """Names of a set that rest on what other effects do as well, or on what should only correct their form."""
+    """Names of a set that rest on what other effects do as well, or on what should only correct their form, or that
+    would be of a size beside others that no cause has."""
     grams, names = analysis.dictionary.grams, set()
     for i, mean in zip(found.members, found.mean, strict=True):
         atom, group = analysis.dictionary.atoms[i], analysis.dictionary.groups[i]
+        if atom.is_discrepancy:
+            continue
         coefficients = atom.coefficients(analysis.situation)
+        main_sizes = [abs(float(v)) for c, v in zip(coefficients, mean, strict=True) if not c.secondary]
+        if len(found.members) > 1 and max(main_sizes, default=0.0) > IMPLAUSIBLE:
+            names.add(atom.name)
+            continue
         if not any(c.borrowed or c.doubtful or c.mends for c in coefficients):
             continue
         borrowed, doubtful, corrections = (

@@ -142,6 +142,9 @@ def lacking_text(name: str, condition: Condition) -> str:
 def shared_text(correlation: Correlation) -> str:
     """What noise the rows share, without a full stop."""
     value = number_text(correlation.value, 2)
+    if correlation.target is None and correlation.alone:
+        share = f"{100 * (1 - correlation.alone):.0f} %"
+        return f"about {share} of the noise's variance drifts slowly from row to row, allowed for"
     if correlation.target is None:
         return f"the noise of a row has a correlation of about {value} with that of the row before, allowed for"
     targets = int(correlation.target.max()) + 1
