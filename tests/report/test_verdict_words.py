@@ -87,3 +87,14 @@ def test_words() -> None:
     assert told[1:3] == ["the load along z", "the direction of joint 2"]
     assert told[3:] == ["joint", "odd", "nothing that was recorded"]
     assert [probability_words(p) for p in (1.0, 0.983, 0.004)] == ["above 0.99", "0.98", "below 0.01"]
+
+
+def test_noise_that_was_estimated_is_no_floor() -> None:
+    results = one_effect()[0]
+    assert gap_table(results, About()).columns[3] == "noise floor"
+    results["noise"] = "estimated"
+    assert gap_table(results, About()).columns[3] == "noise, estimated"
+    assert verdict_text(results).startswith("The noise is not known: the gap of 420 µm is 20 times what the best")
+    assert "93 % of its mean square" in verdict_text(results)
+    results["noise"] = "repeats"
+    assert "20 times the noise (from repeated readings of one target)" in verdict_text(results)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ccnn_torch.diagnosis.page.data import gaps_of
-from ccnn_torch.diagnosis.verdict.text import driver_words, probability_words
+from ccnn_torch.diagnosis.verdict.text import driver_words, floor_words, probability_words
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, GREY, SERIES, Plot, styled
 
@@ -38,16 +38,17 @@ def gap_plot(results: Block) -> Plot | None:
         _draw_bars(axes, bars[name], scale, unit)
         floor = block["noise_floor"]
         if floor is not None:
-            axes.axvline(
-                floor / scale, color=FLOOR, linestyle="--", label=f"noise floor {number_text(floor / scale, 3)} {unit}"
-            )
+            label = f"{floor_words(results)} {number_text(floor / scale, 3)} {unit}"
+            # An estimate is no bound, and not drawn as one.
+            dashes = ":" if results.get("noise") == "estimated" else "--"
+            axes.axvline(floor / scale, color=FLOOR, linestyle=dashes, label=label)
             axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
         axes.set_xlabel(f"{name} gap, RMS on rows not used for fitting [{unit}]")
         axes.set_title(f"{name.capitalize()} gap")
     caption = (
         "How far the model is from the machine on rows not used for fitting: as it is, with one effect alone, and "
-        "with all effects of the verdict. Whiskers: 95 % intervals. Dashed: the noise as given, below which no model "
-        "can get, or else what the most probable explanation leaves."
+        "with all effects of the verdict. Whiskers: 95 % intervals. Dashed: the noise as given or as the records show "
+        "it. Dotted: an estimate of the noise, which may hold another cause, so that a model can get below it."
     )
     return Plot("gap", figure, caption)
 

@@ -7,7 +7,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccnn_torch.diagnosis.page.data import About, gaps_of
-from ccnn_torch.diagnosis.verdict.text import block_text, effect_words, listed, network_text, probability_words
+from ccnn_torch.diagnosis.verdict.text import (
+    block_text,
+    effect_words,
+    floor_words,
+    listed,
+    network_text,
+    probability_words,
+)
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.table import Table
 
@@ -54,7 +61,7 @@ def gap_table(results: Block, about: About) -> Table:
         sizes = (number_text(_over(block[part], scale), 4) for part in ("before", "after", "noise_floor"))
         ratio = block["before"] / block["noise_floor"] if block["noise_floor"] and block["before"] is not None else None
         rows.append((f"{name} [{unit}]", *sizes, number_text(ratio, 3), percent(block["reducible_share"])))
-    columns = ("gap", "before", "after", "noise floor", "before / floor [1]", "above the noise [%]")
+    columns = ("gap", "before", "after", floor_words(results), "before / noise [1]", "above the noise [%]")
     note = (
         "RMS over the rows not used for fitting of the distance between measured and modelled pose; after: with the "
         "effects of the verdict in the model; above the noise: share of the mean square that a better model could "
@@ -124,7 +131,7 @@ def order_table(results: Block) -> Table | None:
         rows.append(("all of them, by block", size, percent(far["shrink"]), percent_interval(far["shrink_ci95"])))
     if network.get("gap_after") is not None:
         rows.append(("+ a network on the remainder", number_text(network["gap_after"] / scale, 4), "–", "–"))
-    rows.append(("noise floor", number_text(_over(gap["noise_floor"], scale), 4), "–", "–"))
+    rows.append((floor_words(results), number_text(_over(gap["noise_floor"], scale), 4), "–", "–"))
     columns = ("added to the model", f"gap on held-out rows [{unit}]", "removed in all [%]", "95 % interval [%]")
     notes = (_REMOVED, block_text(results), network_text(results))
     return Table("How far does it shrink?", columns, tuple(rows), " ".join(n for n in notes if n))

@@ -19,6 +19,7 @@ __all__ = [
     "block_text",
     "driver_words",
     "effect_words",
+    "floor_words",
     "gap_words",
     "lacking_text",
     "listed",
@@ -311,6 +312,11 @@ def listed(words: Sequence[str], last: str = "and") -> str:
 
 def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
+
+
+def floor_words(results: Block) -> str:
+    """What the noise floor is called: no bound where it is but an estimate."""
+    return "noise, estimated" if results.get("noise") == "estimated" else "noise floor"
 
 
 def noise_text(source: str) -> str:
