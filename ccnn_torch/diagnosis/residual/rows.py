@@ -1,4 +1,4 @@
-"""Selected rows of a situation, and rows that are copies of others."""
+"""Rows of a situation: selected ones, copies of others, those near a singularity, and what fitted frames do in them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,15 @@ from torch import Tensor
 
 from ccnn_torch.effects import Situation
 
-__all__ = ["copies_of", "picked"]
+__all__ = ["copies_of", "frame_columns", "near_singular", "picked"]
+
+# Rows are left out where the Jacobian is worse conditioned than this and than ten times the usual.
+_CONDITION = 50.0
+_TIMES_USUAL = 10.0
+# Length that is worth a radian in that number [m].
+_LEVER = 0.3
+# Or where the joints move the platform so many times as far as usual.
+_GAIN = 3.0
 
 
 def picked(situation: Situation, rows: Tensor) -> Situation:
@@ -37,3 +45,23 @@ def copies_of(situation: Situation, measured: Tensor) -> Tensor:
         0, number, torch.arange(len(number)), "amin"
     )
     return first[number] < torch.arange(len(number))
+
+
+def near_singular(situation: Situation, channels: Tensor) -> Tensor:
+    """Rows whose Jacobian is far worse conditioned than the others', `s`."""
+    jacobian = torch.nan_to_num(situation.jacobian[:, channels]).clone()
+    jacobian[:, channels >= 3] *= _LEVER
+    values = torch.linalg.svdvals(jacobian)
+    condition = values[:, 0] / values[:, -1].clamp_min(1e-300)
+    far: Tensor = (condition > _CONDITION) & (condition > _TIMES_USUAL * condition.median())
+    # First order does not hold where the joints move the platform much more, and a few such rows have the whole gap.
+    far = far | (values[:, 0] > _GAIN * values[:, 0].median())
+    return far
+
+
+def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
+    """What frames that were fitted to these rows can do, `s x c0 x r`, in sizes that no evidence holds back."""
+    unknown = getattr(situation.mechanism, "unknown_frames", ())
+    index = [k for k, g in enumerate(situation.mechanism.geometry) if g.name.partition("_")[0] in unknown]
+    columns = situation.parameter_jacobian[..., index] if index else situation.jacobian[..., :0]
+    return torch.where(usable[:, None, None], columns, 0.0)

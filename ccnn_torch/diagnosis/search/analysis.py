@@ -25,6 +25,7 @@ from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.diagnosis.residual.correlation import INDEPENDENT, Correlation
 from ccnn_torch.diagnosis.residual.linearisation import remainder, tangent
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
+from ccnn_torch.diagnosis.residual.rows import frame_columns, near_singular
 from ccnn_torch.diagnosis.residual.whitening import (
     LEAST_FREE,
     LEAST_NOISE,
@@ -50,19 +51,12 @@ from ccnn_torch.diagnosis.search.shared_noise import (
 )
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 
-__all__ = ["Analysis", "analyse", "frame_columns"]
+__all__ = ["Analysis", "analyse"]
 
-# Rows are left out where the Jacobian is worse conditioned than this and than ten times the usual.
-_CONDITION = 50.0
-_TIMES_USUAL = 10.0
-# Length that is worth a radian in that number [m].
-_LEVER = 0.3
 # Share of the rows at which the machine must be linearised about a set; else it is so about the nominal machine.
 _LINEARISED = 0.9
 # Values for which the weight of a noise that was given grows by one: it is right to some per cent.
 _VALUES_A_UNIT = 100
-# Or where the joints move the platform so many times as far as usual.
-_GAIN = 3.0
 _NOISE_REDUCTION = 0.5
 # No third search where, with its shapes searched beside its best, the library is so far behind (log odds).
 _MUCH_LESS_PROBABLE = 20.0
@@ -206,7 +200,7 @@ def analyse(
 
 def _rows_of(situation: Situation, measured: Tensor, noise: Tensor | None) -> _Rows:
     residual = pose_residual(situation, measured)
-    near = _near_singular(situation, moving_channels(situation))
+    near = near_singular(situation, moving_channels(situation))
     usable = torch.isfinite(residual).all(-1) & torch.isfinite(situation.jacobian).flatten(1).all(-1) & ~near
     residual = torch.where(usable[:, None], residual, 0.0)
     jacobian = torch.where(usable[:, None, None], situation.jacobian, 0.0)
@@ -293,26 +287,6 @@ def _search_about_set(
         again = local_discrepancies(situation, rows.jacobian, target, white, beside)
     every = [*atoms, *fixed.rest, *fixed.local, *(without_unused_rows(a, ok) for a in again)]
     return _searched(rows, target, white, every, fixed.rich)
-
-
-def _near_singular(situation: Situation, channels: Tensor) -> Tensor:
-    """Rows whose Jacobian is far worse conditioned than the others', `s`."""
-    jacobian = torch.nan_to_num(situation.jacobian[:, channels]).clone()
-    jacobian[:, channels >= 3] *= _LEVER
-    values = torch.linalg.svdvals(jacobian)
-    condition = values[:, 0] / values[:, -1].clamp_min(1e-300)
-    far: Tensor = (condition > _CONDITION) & (condition > _TIMES_USUAL * condition.median())
-    # First order does not hold where the joints move the platform much more, and a few such rows have the whole gap.
-    far = far | (values[:, 0] > _GAIN * values[:, 0].median())
-    return far
-
-
-def frame_columns(situation: Situation, usable: Tensor) -> Tensor:
-    """What frames that were fitted to these rows can do, `s x c0 x r`, in sizes that no evidence holds back."""
-    unknown = getattr(situation.mechanism, "unknown_frames", ())
-    index = [k for k, g in enumerate(situation.mechanism.geometry) if g.name.partition("_")[0] in unknown]
-    columns = situation.parameter_jacobian[..., index] if index else situation.jacobian[..., :0]
-    return torch.where(usable[:, None, None], columns, 0.0)
 
 
 def _above_instrument(result: Analysis, instrument: Tensor) -> Analysis:

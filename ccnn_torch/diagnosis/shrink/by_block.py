@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
-from ccnn_torch.diagnosis.search.analysis import frame_columns
+from ccnn_torch.diagnosis.residual.rows import frame_columns
 from ccnn_torch.diagnosis.shrink.held_out import HeldOut
 from ccnn_torch.diagnosis.verdict.blocks import Blocks
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,24 +11,20 @@ from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.discrepancy.smooth import ANY
 from ccnn_torch.diagnosis.evidence.dictionary import FittedSet
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.search.convergence import FORM
-from ccnn_torch.diagnosis.search.sets import scored, subsets_with_one_less
-from ccnn_torch.effects import EXACT
+from ccnn_torch.diagnosis.verdict.essential import (
+    FORM_DISCREPANCY,
+    FORM_EXACT,
+    above_noise,
+    essential,
+    fits,
+    is_exact,
+    is_known,
+    smallest,
+    unexplained,
+)
 
 __all__ = ["IMPLAUSIBLE", "Judgement", "judge", "without_names"]
 
-# As `FORM`, of a discrepancy term beside library effects, and of library effects beside a discrepancy term, which
-# stands for whatever was not thought of. Exact effects leave no more than the second order.
-_FORM_DISCREPANCY, _FORM_EXACT, _BESIDE_CATCH_ALL = 0.006, 1e-4, 0.1
-# A library effect whose own part is more than this share of the gap is no form of other ones, however well these could
-# do without it.
-_CARRIES = 0.5
-# Remainder above that of the richest fit, as a share of the gap's energy, beyond which no library name is accepted.
-_VETO, _MUCH = 0.005, 1.5
-# Or times the noise's energy, for any gap.
-_VETO_NOISE = 25.0
-# In any case by so many standard deviations of the noise's mean square.
-_CLEARLY = 5.0
 # What a claim is worth where a name carries less than this share of the gap, or where there are three names or more:
 # the textbook forms of effects are too rough to be surer.
 _SMALL, _UNSURE = 0.1, 0.85
@@ -41,15 +36,13 @@ _OWN, _DOUBTED = 0.1, 0.5
 # Or that must come from other coefficients than those that mend its form, where these are so many times as large, in
 # plausible sizes.
 _MAIN, _MENDED = 0.5, 15.0
-# Log odds by which a small effect must improve a set that leaves no more than a known noise.
-_NEEDED = 20.0
 # Share of the gap that the best explanation must account for; below it no name is given.
 _LEAST_EXPLAINED = 0.5
 # Log odds that a cause of another form may lose for its sizes.
 _FAR_FETCHED = 20.0
 IMPLAUSIBLE = 250.0
-"""Plausible sizes that no cause has: sealed machines whose gap was 30 times the noise had up to 185; a prefix makes
-1000."""
+"""Plausible sizes that no cause has: sealed machines whose gap was 30 times the noise had up to 185; a unit mistaken
+makes 1000."""
 # Odds up to which the data do not distinguish one name from another.
 _ODDS = math.log(20.0)
 # Log odds against the most probable set beyond which sets are not considered.
@@ -90,8 +83,8 @@ def judge(analysis: Analysis) -> Judgement:
     top = analysis.found[0].log_posterior
     tried = {f.members: f for f in analysis.found}
     near = [f for f in analysis.found if f.log_posterior > top - _FAR]
-    for found, essential in zip(near, _essential(analysis, near, tried), strict=True):
-        groups.setdefault(_named(analysis, essential), []).extend([found, essential])
+    for found, least in zip(near, essential(analysis, near, tried), strict=True):
+        groups.setdefault(_named(analysis, least), []).extend([found, least])
     weights = {key: math.exp(max(f.log_posterior for f in fs) - top) for key, fs in groups.items()}
     total = sum(weights.values())
     leading = sorted(((k[0], k[1], w / total, _plainest(groups[k])) for k, w in weights.items()), key=lambda x: -x[2])
@@ -103,7 +96,7 @@ def judge(analysis: Analysis) -> Judgement:
         found = fullest = plainer
         names, driver = _named(analysis, found)
     outside = driver is not None
-    if not outside and _unexplained(analysis, found):
+    if not outside and unexplained(analysis, found):
         outside = True
         driver = _driver_of_remainder(analysis)
     borrowed = _borrowed(analysis, found, tried)
@@ -112,7 +105,7 @@ def judge(analysis: Analysis) -> Judgement:
         other = _library_form(analysis, found, borrowed, tried)
         found = fullest = other or _best_without(analysis, borrowed, tried) or found
         names, driver = _named(analysis, found)
-        names, outside = names - borrowed, other is None or _unexplained(analysis, found)
+        names, outside = names - borrowed, other is None or unexplained(analysis, found)
         driver = (driver or _driver_of_single(analysis)) if outside else None
     if outside and _little(analysis):
         found = fullest = next(f for f in analysis.found if not f.members)
@@ -127,11 +120,11 @@ def judge(analysis: Analysis) -> Judgement:
         probability = sum(same) if plainer is None and not borrowed else _UNSURE
     else:
         # What is left above a noise that is known is no noise, whatever it follows.
-        known = _is_known(analysis)
+        known = is_known(analysis)
         told = [p for members, drive, p, _ in leading if drive is not None or (known and members == names)]
         probability = sum(told) if leading[0][1] is not None or (known and not borrowed) else 0.5
-    if (names and (len(names) > 2 or _smallest(analysis, found, tried) < _SMALL)) or (
-        names and not outside and _above_noise(analysis, found)
+    if (names and (len(names) > 2 or smallest(analysis, found, tried) < _SMALL)) or (
+        names and not outside and above_noise(analysis, found)
     ):
         probability *= _UNSURE
     if names and not outside and _could_be_another(analysis, found):
@@ -168,7 +161,7 @@ def _library_form(
         mine = {atoms[i].name for i in f.members}
         if not 0 < len(f.members) <= most or mine & without or any(_bends(analysis, i) for i in f.members):
             continue
-        form = _FORM_EXACT if _exact(analysis, f.members) else _FORM_DISCREPANCY
+        form = FORM_EXACT if is_exact(analysis, f.members) else FORM_DISCREPANCY
         # What is lost beyond what the rows show is lost to implausible sizes, which no other form excuses.
         shown = 0.5 * (count + known) * math.log((f.rss + known) / max(found.rss + known, 1e-300))
         implausible = found.log_posterior - f.log_posterior - max(shown, 0.0) > _FAR_FETCHED
@@ -241,7 +234,7 @@ def _best_without(
     atoms = analysis.dictionary.atoms
     for found in analysis.found:
         if any(atoms[i].is_discrepancy for i in found.members) and not names & {atoms[i].name for i in found.members}:
-            return _essential(analysis, [found], tried)[0]
+            return essential(analysis, [found], tried)[0]
     return None
 
 
@@ -276,89 +269,6 @@ def _whole(analysis: Analysis, member: int) -> int:
     return next((i for i in alike if not mine.is_discrepancy and torch.equal(atoms[i].shape, mine.shape)), member)
 
 
-def _net(
-    analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]
-) -> dict[int, tuple[float, tuple[int, ...]]]:
-    """Of each member the share of the gap's energy that goes with it and not without it, and the set without it."""
-    gap = analysis.gap
-    without = _fits(analysis, subsets_with_one_less(found.members), tried)
-    return {i: ((f.rss - found.rss) / gap, f.members) for i, f in zip(found.members, without, strict=True)}
-
-
-def _fits(
-    analysis: Analysis, sets: Sequence[tuple[int, ...]], tried: dict[tuple[int, ...], FittedSet]
-) -> list[FittedSet]:
-    """The sets, those fitted that are not among the tried, where they then are."""
-    fresh = [s for s in dict.fromkeys(sets) if s not in tried]
-    tried.update(zip(fresh, scored(analysis.dictionary, fresh, tried), strict=True))
-    return [tried[s] for s in sets]
-
-
-def _smallest(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]) -> float:
-    """Share of the gap that the least member of a set carries."""
-    return min(share for share, _ in _net(analysis, found, tried).values())
-
-
-def _essential(
-    analysis: Analysis, sets: Sequence[FittedSet], tried: dict[tuple[int, ...], FittedSet]
-) -> list[FittedSet]:
-    """Each of the sets without members that only correct the form of the others."""
-    found = [*sets]
-    going = list(range(len(found)))
-    while going:
-        # What is asked for one by one below is fitted side by side first.
-        _fits(
-            analysis,
-            [s for k in going if len(found[k].members) > 1 for s in subsets_with_one_less(found[k].members)],
-            tried,
-        )
-        less = {k: _with_less(analysis, found[k], tried) for k in going}
-        going = [k for k in going if less[k].members != found[k].members]
-        for k in going:
-            found[k] = less[k]
-    return found
-
-
-def _with_less(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]) -> FittedSet:
-    """The set without the first of its members that only correct the form of the others; itself where there is none."""
-    atoms = analysis.dictionary.atoms
-    if len(found.members) < 2:
-        return found
-    shares = _net(analysis, found, tried)
-    # Library effects are a form of the discrepancy term beside them only where that carries much more than they do.
-    wild = max((share for i, (share, _) in shares.items() if atoms[i].is_discrepancy), default=0.0)
-    beside = min(_BESIDE_CATCH_ALL, wild / 2)
-    limits = {}
-    for i in found.members:
-        wide = _FORM_DISCREPANCY if atoms[i].is_discrepancy else FORM
-        form = _FORM_EXACT if _exact(analysis, [m for m in found.members if m != i]) else wide
-        limits[i] = form if atoms[i].is_discrepancy else max(form, beside)
-    alone = not any(atoms[i].is_discrepancy for i in found.members)
-    large = _CARRIES * analysis.gap
-    carries = {i for i, e in zip(found.members, found.energy, strict=True) if alone and e > large}
-    # What leaves more than the noise when it goes is missed, however small it is.
-    missed = _unexplained(analysis, found)
-    # A small effect that takes a set to a known noise is no form of the others: theirs would leave more.
-    exact = alone and _is_known(analysis) and not _above_noise(analysis, found)
-    needed = {
-        i
-        for i, (_, without) in shares.items()
-        if exact
-        and _above_noise(analysis, tried[without])
-        and found.log_posterior - tried[without].log_posterior > _NEEDED
-    }
-    idle = [
-        i
-        for i, (share, without) in shares.items()
-        if i not in carries | needed and share < limits[i] and (missed or not _unexplained(analysis, tried[without]))
-    ]
-    if not idle:
-        return found
-    # A discrepancy term can replace much of the library, so it is the first to go; else what is missed least.
-    least = max(idle, key=lambda i: (atoms[i].is_discrepancy, tried[shares[i][1]].log_posterior))
-    return tried[shares[least][1]]
-
-
 def _plainest(found: list[FittedSet]) -> FittedSet:
     """Of sets that come to the same names the smallest, and of those the most probable."""
     return min(found, key=lambda f: (len(f.members), -f.log_posterior))
@@ -383,35 +293,6 @@ def _leader(analysis: Analysis, kind: str) -> str:
 
 def _energy(analysis: Analysis, found: FittedSet, name: str) -> float:
     return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.dictionary.atoms[i].name == name)
-
-
-def _is_known(analysis: Analysis) -> bool:
-    """Whether the noise was given or the records show it."""
-    return analysis.whitening.known > 0 or analysis.instrument is not None
-
-
-def _above_noise(analysis: Analysis, found: FittedSet) -> bool:
-    """Whether a set leaves more than the noise by three standard deviations."""
-    count = analysis.dictionary.grams.values
-    return found.rss / max(count - found.effective, 1.0) > analysis.floor * (1 + 3 * math.sqrt(2 / count))
-
-
-def _unexplained(analysis: Analysis, found: FittedSet) -> bool:
-    """Whether what a set leaves is clearly more than the noise (given, or of the richest fit)."""
-    count = analysis.dictionary.grams.values
-    left = found.rss / max(count - found.effective, 1.0)
-    floor = analysis.floor
-    significant = left > floor * (1 + _CLEARLY * math.sqrt(2 / count))
-    gap = float(analysis.dictionary.grams.yy) / count
-    much = left - floor > _VETO * max(gap - floor, 0.0) and left > _MUCH * floor
-    return significant and (much or left > _VETO_NOISE * floor or _exact(analysis, found.members))
-
-
-def _exact(analysis: Analysis, members: Sequence[int]) -> bool:
-    """Whether there are library effects among these, and none could have another form than it was fitted with."""
-    atoms = (analysis.dictionary.atoms[i] for i in members)
-    names = {a.name for a in atoms if not a.is_discrepancy}
-    return bool(names) and names <= EXACT
 
 
 def _driver_of_remainder(analysis: Analysis) -> str | None:
@@ -442,7 +323,7 @@ def _classes(
             continue
         others = [j for j in library if atoms[j].name not in names]
         sets = [tuple(sorted(j if m == i else m for m in found.members)) for j in others]
-        trials = _fits(analysis, sets, tried)
+        trials = fits(analysis, sets, tried)
         like = {
             atoms[j].name: t.log_posterior
             for j, t in zip(others, trials, strict=True)
