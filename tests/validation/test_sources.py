@@ -62,6 +62,8 @@ def test_a_case_is_diagnosed_from_files() -> None:
 
 def test_the_command(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccnn_validation.sources.adversarial.FAMILIES", ("rows_35", "one_joint_only"))
+    # Two processes would take longer to start than the cases take.
+    monkeypatch.setattr("ccnn_validation.sources.run.os.cpu_count", lambda: 1)
     out = tmp_path / "out"
     code, said, errors = cli("blind-check", "--source", "adversarial", "--cases", "2", "--out", str(out))
     assert code == 0, errors

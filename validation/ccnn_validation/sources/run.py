@@ -6,7 +6,7 @@ import importlib
 import os
 import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -33,6 +33,8 @@ from ccnn_validation.sources.report import source_tables, write_source
 
 __all__ = ["SOURCES", "diagnosed", "run_source", "source_of"]
 
+_Task = tuple[str, str, int, Path]
+"""Source, family, seed, and the file of its answer."""
 SOURCES = ("semi_real", "multibody", "adversarial")
 
 
@@ -71,9 +73,8 @@ def run_source(
             (name, family, number, out / f"{family}-{number}.json") for number in seeds for family in source.FAMILIES
         ]
         left = [task for task in tasks if not task[3].is_file()]
-        with ProcessPoolExecutor(processes or os.cpu_count() or 1, get_context("spawn")) as pool:
-            for position, line in enumerate(pool.map(_one, left), 1):
-                note(f"[{position}/{len(left)}] {line}", quiet)
+        for position, line in enumerate(_lines(left, processes or os.cpu_count() or 1), 1):
+            note(f"[{position}/{len(left)}] {line}", quiet)
         every = [dict(read_json(task[3])) for task in tasks]
         found = [case for case in every if "skipped" not in case]
         if not found:
@@ -86,7 +87,16 @@ def run_source(
     return found
 
 
-def _one(task: tuple[str, str, int, Path]) -> str:
+def _lines(tasks: Sequence[_Task], processes: int) -> Iterator[str]:
+    """A line for each task as it is done."""
+    if processes == 1:
+        yield from map(_one, tasks)
+        return
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        yield from pool.map(_one, tasks)
+
+
+def _one(task: _Task) -> str:
     torch.set_num_threads(1)
     name, family, seed, path = task
     try:
