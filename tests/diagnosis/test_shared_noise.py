@@ -13,16 +13,14 @@ from ccnn_torch.effects import Situation
 TARGETS = torch.arange(12) // 3
 
 
-@pytest.mark.parametrize("within", [False, True])
 @pytest.mark.parametrize("target", [None, TARGETS])
-def test_the_operator_makes_rows_independent(target: torch.Tensor | None, within: bool) -> None:
-    correlation, rows = Correlation(0.7, target, within), torch.arange(12)
+def test_the_operator_makes_rows_independent(target: torch.Tensor | None) -> None:
+    correlation, rows = Correlation(0.7, target), torch.arange(12)
     operator = correlation(torch.eye(12, dtype=torch.float64)[:, None])[:, 0]
     if target is None:
         covariance = 0.7 ** (rows[:, None] - rows).abs().to(torch.float64)
     else:
         covariance = 0.3 * torch.eye(12, dtype=torch.float64) + 0.7 * (target[:, None] == target)
-        covariance = covariance / 0.3 if within else covariance
     torch.testing.assert_close(operator @ covariance @ operator.mT, torch.eye(12, dtype=torch.float64))
     assert float(torch.linalg.slogdet(operator).logabsdet) == pytest.approx(correlation.log_determinant(12, 1))
 

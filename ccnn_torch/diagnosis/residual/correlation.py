@@ -31,12 +31,10 @@ class Correlation:
         target: number of each row's target, `s`; None = the row before.
         alone: share of the variance of autoregressive noise that is of each row alone, as a device has that drifts and
             scatters.
-        within: whether the noise is that of one target's readings, which then leaves out what they share.
     """
 
     value: float = 0.0
     target: Tensor | None = None
-    within: bool = False
     alone: float = 0.0
 
     def __call__(self, values: Tensor) -> Tensor:
@@ -73,9 +71,7 @@ class Correlation:
 
     def _deviations(self, count: Tensor) -> tuple[float, Tensor]:
         """Standard deviation of a reading about its target's mean, and of √m times the mean of m readings."""
-        own = 1.0 if self.within else math.sqrt(1 - self.value)
-        total = own**2 / (1 - self.value)
-        return own, (own**2 + count * total * self.value).sqrt()
+        return math.sqrt(1 - self.value), (1 - self.value + count * self.value).sqrt()
 
 
 INDEPENDENT = Correlation()

@@ -309,7 +309,7 @@ def _with_shared_noise(rows: _Rows, rich: Tensor, result: Analysis) -> Analysis:
         white(result.residual)[keep],
         white(rows.fitted)[keep],
         sets,
-        possible_correlations(rows.situation, keep, False),
+        possible_correlations(rows.situation, keep),
         result.dictionary.noise_dof,
     )
     if not correlation.value:

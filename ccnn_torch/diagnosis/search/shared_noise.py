@@ -32,20 +32,19 @@ class Explanation(NamedTuple):
     log_prior: float
 
 
-def possible_correlations(situation: Situation, keep: Tensor, within: bool) -> list[Correlation]:
+def possible_correlations(situation: Situation, keep: Tensor) -> list[Correlation]:
     """What may be: independent rows first.
 
     Args:
         situation: all rows.
         keep: those that count, in the order measured.
-        within: whether the noise is known from readings of one target.
     """
     target = targets_of(situation.joints[keep])
     found = [INDEPENDENT, *(Correlation(value) for value in _FROM_ROW)]
     if len(keep) <= _MOST_ROWS:
         found += [Correlation(value, alone=alone) for value in _DRIFTS for alone in _SCATTERS]
     if target is not None:
-        found += [Correlation(value, target, within) for value in _IN_TARGET]
+        found += [Correlation(value, target) for value in _IN_TARGET]
     return found
 
 

@@ -73,12 +73,13 @@ def run_source(
             (name, family, number, out / f"{family}-{number}.json") for number in seeds for family in source.FAMILIES
         ]
         left = [task for task in tasks if not task[3].is_file()]
+        line = ""
         for position, line in enumerate(_lines(left, processes or os.cpu_count() or 1), 1):
             note(f"[{position}/{len(left)}] {line}", quiet)
-        every = [dict(read_json(task[3])) for task in tasks]
+        every = [dict(read_json(task[3])) for task in tasks if task[3].is_file()]
         found = [case for case in every if "skipped" not in case]
         if not found:
-            raise InputError(f"--source {name}: no case can be made: {every[0]['skipped']}")
+            raise InputError(f"--source {name}: no case can be made ({line})")
         write_source(out, name, found)
     if not quiet:
         for table in source_tables(name, found):
@@ -102,7 +103,7 @@ def _one(task: _Task) -> str:
     try:
         case = source_of(name).make(family, seed)
     except InputError as problem:
-        write_json(path, {"skipped": str(problem)})
+        # Not kept: the data may be there the next time.
         return f"{family} {seed}: skipped, {problem}"
     began = time.perf_counter()
     answer = diagnosed(case, case.columns)
