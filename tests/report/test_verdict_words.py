@@ -49,7 +49,7 @@ def test_the_verdict_of_each_kind() -> None:
     ) in verdict_text(indistinguishable()[0])
     assert "420 µm and 900 µrad is 20 and 8.2 times" in verdict_text(with_rotation()[0])
     results = outside()[0]
-    assert "; the rest follows the temperature in a way" in verdict_text(results)
+    assert "; the rest follows the temperature, and no effect of the library describes it" in verdict_text(results)
     results["verdict"] |= {"effects": [], "shrink": None, "shrink_ci95": None, "driver": "joint q2"}
     assert verdict_text(results).endswith(
         "No effect of the library explains it: the residual follows joint q2 (probability 0.97)."

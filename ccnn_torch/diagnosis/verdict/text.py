@@ -235,7 +235,7 @@ def _cause(results: Block) -> str:
             return f"{_none_of(results)} explains it: the residual {follows} ({_probability(verdict)})."
         verb = "explains" if len(names) == 1 else "together explain"
         text = f"{_capital(listed([effect_words(n) for n in names]))} {verb} part of it{_removed(results, ', ')}; "
-        return f"{text}the rest {follows} in a way that no effect of the library describes ({_probability(verdict)})."
+        return f"{text}the rest {follows}, and no effect of the library describes it ({_probability(verdict)})."
     by_name = {e["name"]: e for e in results["effects"]}
     classes = {e["name"]: [n for n in e["indistinguishable_from"] if n not in names] for e in results["effects"]}
     likes = [classes.get(name, []) for name in names]
