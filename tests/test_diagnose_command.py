@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
 import jsonschema
 import pytest
+from rich.console import Console
 
 from ccnn_torch import diagnose, load_mechanism, load_records
+from ccnn_torch.diagnosis.progress import TO_VERDICT, watched
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import load_schema
+from ccnn_torch.report.screen import step_bar
 
 Cli = Callable[..., tuple[int, str, str]]
 
@@ -32,7 +37,7 @@ def test_a_config_beside_its_records_gives_verdict_and_report(
 ) -> None:
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    code, shown, told = cli("diagnose", "--config", rows.parent / "config.yaml", "--out", "found")
+    code, shown, told = cli("diagnose", "--config", rows.parent / "config.yaml", "--out", "found", "--details")
     assert code == 0 and told == ""
     results = json.loads(Path("found/diagnosis.json").read_text(encoding="utf-8"))
     jsonschema.validate(results, load_schema("diagnosis"))
@@ -231,3 +236,55 @@ def test_columns_by_another_name_are_said(cli: Cli, rows: Path, tmp_path: Path) 
     # One that was asked for is there for effects of one's own.
     code, shown, told = cli("check", *words[:4], "covariates=[time,temperature,load_*,direction*,force_x]")
     assert code == 0 and "not evaluated" not in shown, told
+
+
+def test_the_command_on_the_screen_puts_the_effect_in_a_compensator(
+    cli: Cli, rows: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (rows.parent / "my data").mkdir()
+    rows.rename(rows.parent / "my data" / "rows 1.csv")
+    monkeypatch.chdir(rows.parent)
+    words = ("--records", "my data/rows 1.csv", "--mechanism", "five_bar", "--noise", "1e-5", "--no-network")
+    code, shown, _ = cli("diagnose", *words, "--out", "found")
+    assert code == 0 and "How large is the gap?" not in shown and "--details" in shown
+    assert "found/next_measurements.csv" in shown and "where nothing was measured (by block)" in shown
+    assert "What is wrong: Backlash of joints 1 and 2: joint" in shown
+    run, correct = (shlex.split(line) for line in shown.splitlines() if line.startswith("  ccnn "))
+    # The time of day is left out, so that the model holds on other days.
+    assert "covariates=[temperature,load_x,load_y,direction1,direction2]" in run
+    assert "effects=from:found/diagnosis.json" in run and "records=my data/rows 1.csv" in run
+    code, _, told = cli(*run[1:], "methods=constant", "save_models=false", "--quiet")
+    assert code == 0, told
+    results = json.loads(Path("found_compensator/results.json").read_text(encoding="utf-8"))
+    position = results["pose"]["position"]
+    assert position["after"]["rms"]["median"] < 0.3 * position["before"]["rms"]["median"]
+    assert correct[:3] == ["ccnn", "compensate", "found_compensator/model.onnx"]
+    page = Path("found/report.html").read_text(encoding="utf-8")
+    assert "What is wrong" in page and "effects=from:found/diagnosis.json" in page
+    # Effects that a compensator cannot hold are left to the network, with the reason.
+    code, shown, _ = cli("diagnose", *words, "--effects", "drift", "--out", "drifted")
+    assert code == 0 and "effects=from" not in shown
+
+
+def test_a_terminal_shows_the_steps_and_the_time_left(rows: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    terminal = Console(file=screen, force_terminal=True, width=100)
+    monkeypatch.setattr("ccnn_torch.report.screen.stderr", terminal)
+    mechanism = load_mechanism("five_bar")
+    records = load_records(rows, mechanism)
+    with step_bar(TO_VERDICT, quiet=False) as tell, watched(tell):
+        diagnose(records, mechanism, effects=["backlash"])
+    drawn = screen.getvalue()
+    assert "5 of 5: next measurements" in drawn and "-:--:--" in drawn
+    told: list[tuple[str, float]] = []
+    with watched(lambda step, share: told.append((step, share))):
+        diagnose(records, mechanism, effects=["backlash"])
+    names = [name for name in TO_VERDICT if name != "reading the records"]
+    assert list(dict.fromkeys(step for step, _ in told)) == names
+    assert [s for n, s in told if n == names[0]] == sorted(s for n, s in told if n == names[0])
+    # Off a terminal nothing is drawn.
+    quiet = io.StringIO()
+    monkeypatch.setattr("ccnn_torch.report.screen.stderr", Console(file=quiet, force_terminal=False))
+    with step_bar(TO_VERDICT, quiet=False) as tell:
+        tell("by block", 0.5, "half")
+    assert quiet.getvalue() == ""

@@ -14,7 +14,16 @@ from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_
 
 from ccnn_torch.config.keys import list_keys
 from ccnn_torch.config.split import SplitConfig
-from ccnn_torch.config.tree import Columns, Files, Names, Section, config_from_file, config_from_keys, written
+from ccnn_torch.config.tree import (
+    Columns,
+    Files,
+    Names,
+    Section,
+    config_from_file,
+    config_from_keys,
+    config_from_options,
+    written,
+)
 from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.enn import ENNSettings
@@ -301,12 +310,14 @@ class RunConfig(_Part):
         return dataclasses.asdict(section) if section is not None else {}
 
 
-def load_config(path: str | Path, overrides: Iterable[str] = ()) -> RunConfig:
+def load_config(path: str | Path | None, overrides: Iterable[str] = ()) -> RunConfig:
     """Read a config file and put overrides ``key.sub=value`` over it.
 
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
+    if path is None:
+        return config_from_options(RunConfig, None, overrides)
     return config_from_file(RunConfig, path, overrides)
 
 

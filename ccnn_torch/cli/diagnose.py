@@ -35,6 +35,7 @@ def diagnose(
     network: Annotated[
         bool | None, typer.Option(help="Estimate the further gain by a network; the same as network=….")
     ] = None,
+    details: Annotated[bool, typer.Option("--details", help="Show all tables as well.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No verdict, no table.")] = False,
 ) -> None:
     """Find the physical effect that explains the error of a model, and how much of the error it removes.
@@ -56,4 +57,4 @@ def diagnose(
     """
     from ccnn_torch.diagnosis.job import run_diagnosis
 
-    run_diagnosis(configured(overrides, records, mechanism, noise, effects, config, seed, out, network), quiet)
+    run_diagnosis(configured(overrides, records, mechanism, noise, effects, config, seed, out, network), quiet, details)

@@ -13,7 +13,10 @@ __all__ = ["run"]
 
 
 def run(
-    config: Annotated[Path | None, typer.Argument(help="A YAML config, for example experiments/tripod.yaml.")] = None,
+    config: Annotated[
+        Path | None,
+        typer.Argument(help="A YAML config, for example experiments/tripod.yaml; defaults where there is none."),
+    ] = None,
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
     resume: Annotated[Path | None, typer.Option(help="Resume the run in this folder.")] = None,
     out: Annotated[str | None, typer.Option(help="Folder to write; the same as out=….")] = None,
@@ -32,6 +35,8 @@ def run(
 
     ccnn run experiments/records.yaml records=my_robot.csv mechanism=my_robot.yaml
 
+    ccnn run records=my_robot.csv mechanism=my_robot.yaml effects=from:runs/diagnosis/diagnosis.json
+
     ccnn run --resume runs/tripod30
     """
     from ccnn_torch.calibration.config import load_config
@@ -45,6 +50,8 @@ def run(
     if config is None:
         raise InputError("name a config, for example: ccnn run experiments/tripod.yaml (or --resume RUN_DIR)")
     changes = list(overrides or [])
+    if "=" in str(config) and not config.is_file():
+        changes, config = [str(config), *changes], None
     changes += [f"out={out}"] if out is not None else []
     changes += [f"seed={seed}"] if seed is not None else []
     start_run(load_config(config, changes), quiet=quiet)

@@ -15,6 +15,7 @@ from ccnn_torch.diagnosis.design.next_measurements import next_measurements
 from ccnn_torch.diagnosis.discrepancy.interaction import CROSS
 from ccnn_torch.diagnosis.discrepancy.smooth import SPEED
 from ccnn_torch.diagnosis.from_file import not_held_notes
+from ccnn_torch.diagnosis.progress import at_step
 from ccnn_torch.diagnosis.residual.noise_evidence import Noise, noise_of_repeats
 from ccnn_torch.diagnosis.residual.rows import copies_of, picked
 from ccnn_torch.diagnosis.result import Diagnosis
@@ -107,6 +108,7 @@ def diagnose_rows(
     Raises:
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
+    at_step("searching the effects")
     rows = usable_rows(situation, measured)
     copies = int((rows.fine & copies_of(situation, measured)).sum())
     situation, measured, chosen = drawn_rows(situation, measured, rows.fine, seed)
@@ -120,6 +122,7 @@ def diagnose_rows(
     analysis = analyse(situation, measured, usable, noise, None if known is None else known.sd)
     # What no column would bring into sight is no reason to record one.
     unseen = lacking | dict.fromkeys(analysis.idle, UNSHOWN)
+    at_step("judging on held-out rows")
     judgement = judge(analysis)
     made = Blocks(analysis, judgement, residual, seed)
     together = made.main(made.together)
@@ -153,6 +156,9 @@ def diagnose_rows(
     content = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": texts}
     verdict["text"] = verdict_text(content | {"noise": source, "rows_set_aside": sorted(why)})
     places, intervals = localise(analysis, residual, seed)
+    at_step("by block")
+    far = by_block(made, residual)
+    at_step("next measurements")
     proposed = next_measurements(analysis, judgement, seed)
     return Diagnosis(
         noise=source,
@@ -162,7 +168,7 @@ def diagnose_rows(
         where_ci95=intervals,
         effects=listed,
         in_order=in_order(made),
-        by_block=by_block(made, residual),
+        by_block=far,
         network=None,
         verdict=verdict,
         next_measurements=proposed,

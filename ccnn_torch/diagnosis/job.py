@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ccnn_torch.config.noise import noise_of_pose
 from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of, with_network
@@ -12,14 +13,16 @@ from ccnn_torch.diagnosis.checks.identifiable import Check, check_rows
 from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.diagnosis.from_records import naming
 from ccnn_torch.diagnosis.outputs import write_diagnosis, write_result
-from ccnn_torch.diagnosis.page.data import about_of, load_labels
+from ccnn_torch.diagnosis.page.compensate import compensate_lines, typed_path
+from ccnn_torch.diagnosis.page.data import RESULT, about_of, load_labels
 from ccnn_torch.diagnosis.page.report import print_diagnosis
+from ccnn_torch.diagnosis.progress import TO_REPORT, TO_VERDICT, watched
 from ccnn_torch.display import short_path
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.mechanisms import Mechanism, load_mechanism, simulated_rows
 from ccnn_torch.records import Records, load_records
-from ccnn_torch.report.screen import say_place, stdout, with_status
+from ccnn_torch.report.screen import say_place, stdout, step_bar
 from ccnn_torch.report.table import print_text
 from ccnn_torch.run_folder.interrupt import if_stopped
 from ccnn_torch.run_folder.lock import locked
@@ -27,8 +30,13 @@ from ccnn_torch.run_folder.lock import locked
 __all__ = ["run_check", "run_diagnosis"]
 
 
-def run_diagnosis(config: DiagnoseConfig, quiet: bool = False) -> Path:
+def run_diagnosis(config: DiagnoseConfig, quiet: bool = False, details: bool = False) -> Path:
     """Diagnose, and write the folder of the config; the verdict is shown and kept before all that takes longer.
+
+    Args:
+        config: of the diagnosis.
+        quiet: no verdict, no table, no progress.
+        details: show all tables.
 
     Raises:
         InputError: something is missing or wrong in the files or keys, the rows carry no verdict, or the folder cannot
@@ -36,15 +44,16 @@ def run_diagnosis(config: DiagnoseConfig, quiet: bool = False) -> Path:
     """
     if config.out is None:
         raise InputError("name the folder to write with --out DIR")
-    with if_stopped("interrupted before there was a verdict; nothing was written"):
-        found = with_status("looking for the effects that make the gap …", lambda tell: _verdict(config, tell), quiet)
+    stopped = if_stopped("interrupted before there was a verdict; nothing was written")
+    with stopped, step_bar(TO_VERDICT, quiet) as tell, watched(tell):
+        found = _verdict(config, tell)
     folder = Path(config.out)
     try:
         with locked(folder):
             sweep(folder)
             kept = write_result(folder, found)
             with if_stopped(f"interrupted after the verdict, which is kept in {kept}; the rest is not complete"):
-                _complete(config, folder, found, quiet)
+                _complete(config, folder, found, quiet, details)
     except InputError:
         print_diagnosis(found.to_json(), stdout)
         raise
@@ -60,29 +69,30 @@ def run_check(config: DiagnoseConfig) -> Check:
     return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside])
 
 
-def _verdict(config: DiagnoseConfig, tell: Callable[[str], None]) -> Diagnosis:
+def _verdict(config: DiagnoseConfig, tell: Callable[..., None]) -> Diagnosis:
     records, mechanism, effects = _loaded(config)
     noise = _noise(config, mechanism)
-    with simulated_rows(lambda n: tell(f"{n:,} rows simulated")):
+    with simulated_rows(lambda n: tell(note=f"{n:,} rows simulated")):
         return diagnose(records, mechanism, noise=noise, effects=effects, gravity=config.gravity, seed=config.seed)
 
 
-def _complete(config: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool) -> None:
+def _complete(config: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool, details: bool) -> None:
     """The network on the remainder, the report, the tables."""
     if not quiet:
         print_text(found.verdict["text"], stdout, "bold")
-    if config.network:
-        found = with_status(
-            "training a network on what the effects leave …",
-            lambda tell: with_network(found, config.seed, lambda share: tell(f"{100 * share:.0f} %")),
-            quiet,
-        )
-    files = config.records if isinstance(config.records, list) else [config.records]
-    rows = ", ".join(short_path(str(file)) for file in files)
-    about = {"name": folder.name, "mechanism": short_path(str(config.mechanism)), "records": rows}
-    path = write_diagnosis(folder, found, about, config.seed)
+    steps = TO_REPORT if config.network else {"figures and report": TO_REPORT["figures and report"]}
+    with step_bar(steps, quiet) as tell:
+        if config.network:
+            found = with_network(found, config.seed, lambda share: tell("network on the remainder", share))
+        tell("figures and report")
+        files = config.records if isinstance(config.records, list) else [config.records]
+        rows = ", ".join(short_path(str(file)) for file in files)
+        about: dict[str, Any] = {"name": folder.name, "mechanism": short_path(str(config.mechanism)), "records": rows}
+        lines = compensate_lines(config, found, folder / RESULT)
+        about |= {"folder": typed_path(str(folder)), "compensate": lines}
+        path = write_diagnosis(folder, found, about, config.seed)
     if not quiet:
-        print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False)
+        print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False, details=details)
         say_place(f"Written: {path} and report.html beside it")
 
 

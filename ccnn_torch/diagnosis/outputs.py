@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from ccnn_torch.diagnosis.checks.identifiable import Check
 from ccnn_torch.diagnosis.page.arrays import picture_arrays
+from ccnn_torch.diagnosis.page.data import RESULT
 from ccnn_torch.diagnosis.page.report import write_diagnosis_report
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.verdict.text import noise_text
@@ -23,7 +25,7 @@ def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
     Raises:
         InputError: the folder cannot be written.
     """
-    path = folder / "diagnosis.json"
+    path = folder / RESULT
     write_json(path, plain(diagnosis.to_json()))
     return path
 
@@ -35,13 +37,13 @@ def write_check(folder: Path, check: Check) -> Path:
     return path
 
 
-def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, str] | None = None, seed: int = 0) -> Path:
+def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any] | None = None, seed: int = 0) -> Path:
     """Write `diagnosis.json`, the arrays of its figures, and the report.
 
     Args:
         folder: made where it does not exist.
         diagnosis: what to write.
-        about: for the head of the report: `name`, `mechanism`, `records`.
+        about: for the head of the report: what `About` holds.
         seed: of the diagnosis.
 
     Raises:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TypeVar
 
 from rich.console import Console
@@ -10,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressC
 
 from ccnn_torch.report.table import print_text
 
-__all__ = ["note", "progress_bar", "say", "say_place", "stderr", "stdout", "with_status"]
+__all__ = ["note", "progress_bar", "say", "say_place", "stderr", "stdout", "step_bar", "with_status"]
 
 _Result = TypeVar("_Result")
 
@@ -41,6 +42,34 @@ def progress_bar(quiet: bool, steps: bool = False, transient: bool = False) -> P
         *([TextColumn("{task.fields[note]}", markup=False)] if steps else []),
     )
     return Progress(*columns, console=stderr, disable=quiet or not stderr.is_terminal, transient=transient)
+
+
+@contextmanager
+def step_bar(steps: Mapping[str, float], quiet: bool) -> Iterator[Callable[..., None]]:
+    """One bar over several steps, with the time left; silent off a terminal, removed at the end.
+
+    Args:
+        steps: names in their order, and about the seconds that each takes.
+        quiet: silent on a terminal as well.
+
+    Yields:
+        `tell(step, share, note)`: the step that is at work, the share of it that is done, 0 to 1, and a remark on it;
+        without a step the one before goes on.
+    """
+    names, at = list(steps), (next(iter(steps)), 0.0)
+    with progress_bar(quiet, transient=True) as bar:
+        task = bar.add_task(names[0], total=sum(steps.values()))
+
+        def tell(step: str = "", share: float = 0.0, note: str = "") -> None:
+            nonlocal at
+            at = (step, share) if step else at
+            place = names.index(at[0])
+            done = sum(steps[before] for before in names[:place]) + at[1] * steps[at[0]]
+            label = f"{place + 1} of {len(names)}: {at[0]}{f' ({note})' if note else ''}"
+            bar.update(task, description=label, completed=done)
+
+        tell()
+        yield tell
 
 
 def with_status(text: str, work: Callable[[Callable[[str], None]], _Result], quiet: bool) -> _Result:

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from ccnn_torch.display import visible
 
-__all__ = ["Table", "fitting_columns", "markdown_table", "print_table", "print_text"]
+__all__ = ["Table", "fitting_columns", "markdown_table", "print_labelled", "print_table", "print_text"]
 
 # Characters that the first column and columns of words get where the terminal is too narrow for their longest cell.
 _LEAST_FIRST = 14
@@ -66,6 +66,12 @@ def print_text(text: str, console: Console, style: str = "", wrap: bool = True) 
         wrap: break lines between words at the edge of a terminal; a file or a pipe gets whole lines.
     """
     console.print(_plain(text), style=style, soft_wrap=not (wrap and console.is_terminal))
+
+
+def print_labelled(label: str, text: str, console: Console) -> None:
+    """Print `label: text`, the label in bold, as `print_text` prints text."""
+    line = Text.assemble((f"{_plain(label)}: ", "bold"), _plain(text))
+    console.print(line, soft_wrap=not console.is_terminal)
 
 
 def _plain(text: str) -> Text:

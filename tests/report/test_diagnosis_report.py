@@ -257,9 +257,14 @@ def test_tensorboard_gets_the_same_figures_once(folder: Path) -> None:
 def test_terminal_and_markdown_of_every_case(name: str) -> None:
     results, _, labels = CASES[name]()
     screen = io.StringIO()
-    print_diagnosis(results, Console(file=screen, width=100), about_of(labels))
+    print_diagnosis(results, Console(file=screen, width=100), about_of(labels), details=True)
     told = " ".join(screen.getvalue().split())
     assert verdict_text(results) in told and "How large is the gap?" in told
+    first = io.StringIO()
+    print_diagnosis(results, Console(file=first, width=100), about_of(labels))
+    assert verdict_text(results) in " ".join(first.getvalue().split())
+    assert "How large is the gap?" not in first.getvalue() and "--details" in first.getvalue()
+    assert len(first.getvalue().splitlines()) < 40
     text = diagnosis_markdown(results, about_of(labels))
     assert all(f"{note}." in text for note in results["notes"] if "cannot be seen" not in note)
     blocks = text.split("## ")[1:]

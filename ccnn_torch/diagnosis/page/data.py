@@ -22,6 +22,8 @@ from ccnn_torch.report.json_files import read_json, write_json
 __all__ = [
     "ARRAYS",
     "LABELS",
+    "NEXT",
+    "RESULT",
     "About",
     "Signature",
     "about_of",
@@ -36,6 +38,8 @@ __all__ = [
 Array = NDArray[np.float64]
 ARRAYS = "diagnosis.safetensors"
 LABELS = "diagnosis_pictures.json"
+RESULT = "diagnosis.json"
+NEXT = "next_measurements.csv"
 _KNOWN_UNITS = {"x": "m", "y": "m", "z": "m", "rx": "rad", "ry": "rad", "rz": "rad", "time": "s", "temperature": "K"}
 
 
@@ -72,6 +76,8 @@ class About:
         units: SI units of joints, covariates and place coordinates by name.
         notes: further sentences.
         lines: line in the file of each row of `rows_set_aside`, the header being line 1; () where it was not asked for.
+        folder: of the report, as on the command line.
+        compensate: how to put the effects in a compensator: a sentence, then command lines; () where it is not known.
     """
 
     name: str = "Diagnosis"
@@ -81,6 +87,8 @@ class About:
     units: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     lines: tuple[int, ...] = ()
+    folder: str = ""
+    compensate: tuple[str, ...] = ()
 
     def unit(self, name: str) -> str:
         """SI unit of a column; by its name where it was not asked for, and `SI` where the name has no unit."""
@@ -105,7 +113,7 @@ def about_of(labels: Mapping[str, Any]) -> About:
         )
     axes = [block["x"] for name, block in labels.items() if name != "about"]
     given["units"] = {axis["name"]: axis["unit"] for axis in axes} | dict(given.get("units", {}))
-    given |= {key: tuple(given.get(key, ())) for key in ("notes", "lines")}
+    given |= {key: tuple(given.get(key, ())) for key in ("notes", "lines", "compensate")}
     return About(**given)
 
 

@@ -15,7 +15,16 @@ from ccnn_torch.display import display_unit, number_text, unit_text
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.table import Table
 
-__all__ = ["aside_table", "next_table", "quantity_text", "region_table", "shares", "where_table", "write_next_csv"]
+__all__ = [
+    "aside_table",
+    "next_table",
+    "quantity_text",
+    "regime_words",
+    "region_table",
+    "shares",
+    "where_table",
+    "write_next_csv",
+]
 
 Block = Mapping[str, Any]
 _KELVIN = 273.15
@@ -46,7 +55,7 @@ def shares(results: Block, about: About) -> Iterator[tuple[str, str, float, list
     for name, regimes in where["covariates"].items():
         intervals = known.get("covariates", {}).get(name) or [None] * len(regimes)
         for regime, interval in zip(regimes, intervals, strict=True):
-            yield name, _regime(name, regime, about.unit(name)), regime["share"], interval
+            yield name, regime_words(name, regime, about.unit(name)), regime["share"], interval
 
 
 def _share_note(results: Block) -> str:
@@ -55,7 +64,8 @@ def _share_note(results: Block) -> str:
     return _SHARE
 
 
-def _regime(name: str, regime: Block, unit: str) -> str:
+def regime_words(name: str, regime: Block, unit: str) -> str:
+    """A covariate with the range or the value of one of its regimes."""
     if regime["from"] == regime["to"]:
         return f"{name} {quantity_text(regime['from'], unit, 3)}"
     low, high = (quantity_text(regime[key], unit, 3) for key in ("from", "to"))

@@ -14,6 +14,8 @@ from torch import Tensor
 from ccnn_torch.diagnosis.page.data import (
     ARRAYS,
     LABELS,
+    NEXT,
+    RESULT,
     About,
     about_of,
     load_diagnosis_arrays,
@@ -25,7 +27,14 @@ from ccnn_torch.diagnosis.page.data import (
 from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
 from ccnn_torch.diagnosis.page.figure_signature import signature_plot
 from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
+from ccnn_torch.diagnosis.page.first_screen import (
+    ON_PAGE,
+    first_screen,
+    first_screen_markdown,
+    print_first_screen,
+)
 from ccnn_torch.diagnosis.page.localisation import aside_table, next_table, region_table, where_table, write_next_csv
+from ccnn_torch.diagnosis.page.numbers import numbers_table
 from ccnn_torch.diagnosis.page.tables import (
     confusable_table,
     effect_table,
@@ -48,8 +57,6 @@ __all__ = ["NEXT", "Section", "diagnosis_markdown", "print_diagnosis", "write_di
 
 Block = Mapping[str, Any]
 Arrays = Mapping[str, NDArray[np.float64]]
-NEXT = "next_measurements.csv"
-_RESULT = "diagnosis.json"
 _MARKDOWN = "diagnosis.md"
 # On a terminal only what may matter; the page and the Markdown list every candidate.
 _LEAST = 0.01
@@ -93,7 +100,7 @@ def write_diagnosis_report(
         InputError: a file is not there or damaged.
     """
     folder = Path(folder)
-    results = read_json(folder / _RESULT) if results is None else results
+    results = read_json(folder / RESULT) if results is None else results
     if arrays is not None:
         save_diagnosis_arrays(folder, arrays, labels or {})
     numbers, labels = load_diagnosis_arrays(folder), load_labels(folder)
@@ -112,8 +119,11 @@ def write_diagnosis_report(
         facts=_facts(results, numbers, about),
         verdict=verdict_text(results),
         failures=[],
+        answers=first_screen(results, about),
+        numbers=numbers_table(results, ON_PAGE),
+        machine=trusted([figures[name] for name in ("machine",) if name in figures]),
         sections=_sections(results, numbers, about, figures),
-        files=[f for f in (_RESULT, _MARKDOWN, NEXT, ARRAYS, LABELS) if f == _RESULT or (folder / f).is_file()],
+        files=[f for f in (RESULT, _MARKDOWN, NEXT, ARRAYS, LABELS) if f == RESULT or (folder / f).is_file()],
         config="",
         best=None,
     )
@@ -128,15 +138,40 @@ def diagnosis_markdown(results: Block, about: About | None = None) -> str:
     """Verdict and tables as Markdown (`diagnosis.md`)."""
     about = about or About()
     tables = [table for section in _sections(results, {}, about, {}) for table in section.tables]
-    return (
-        "\n\n".join([f"# {about.name}", verdict_text(results), *map(markdown_table, tables), *_notes(results, about)])
-        + "\n"
-    )
+    first = [verdict_text(results), *first_screen_markdown(results, about)]
+    return "\n\n".join([f"# {about.name}", *first, *map(markdown_table, tables), *_notes(results, about)]) + "\n"
 
 
-def print_diagnosis(results: Block, console: Console, about: About | None = None, *, verdict: bool = True) -> None:
-    """Show what matters of the tables, and the verdict where it was not shown before, on a terminal."""
+def print_diagnosis(
+    results: Block, console: Console, about: About | None = None, *, verdict: bool = True, details: bool = False
+) -> None:
+    """Show on a terminal what a technician needs first.
+
+    Args:
+        results: as in `diagnosis.json`.
+        console: where.
+        about: for names, units and paths.
+        verdict: begin with the verdict; False where it was shown before.
+        details: show the tables as well.
+    """
     about = about or About()
+    if verdict:
+        print_text(verdict_text(results), console, "bold")
+    print_first_screen(results, console, about)
+    if details:
+        _print_tables(results, console, about)
+    aside = results["rows_set_aside"]
+    why = results.get("why_set_aside") or ["for an unknown reason"] * len(aside)
+    sentence_aside = aside_text(aside, why, about.lines)
+    for sentence in ([sentence_aside] if sentence_aside else []) + _notes(results, about):
+        print_text(sentence, console, "yellow")
+    if not details:
+        print_text(
+            "All tables are in report.html, diagnosis.md and diagnosis.json; --details shows them here.", console, "dim"
+        )
+
+
+def _print_tables(results: Block, console: Console, about: About) -> None:
     shown = (
         gap_table(results, about),
         effect_table(results, least=_LEAST),
@@ -150,15 +185,8 @@ def print_diagnosis(results: Block, console: Console, about: About | None = None
     for table in shown:
         if table is not None:
             print_table(table, console)
-    aside = results["rows_set_aside"]
-    why = results.get("why_set_aside") or ["for an unknown reason"] * len(aside)
-    sentence_aside = aside_text(aside, why, about.lines)
-    for sentence in ([sentence_aside] if sentence_aside else []) + _notes(results, about):
-        print_text(sentence, console, "yellow")
     if order_table(results) is None and (text := network_text(results)):
         print_text(text, console)
-    if verdict:
-        print_text(verdict_text(results), console, "bold")
 
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:

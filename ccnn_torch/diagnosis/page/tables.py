@@ -19,6 +19,7 @@ from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.table import Table
 
 __all__ = [
+    "columns_text",
     "confusable_table",
     "effect_table",
     "gap_table",
@@ -216,7 +217,7 @@ def record_table(results: Block) -> Table | None:
     typical = max(size for entry in missing for size in entry["effects"].values())
     scale, unit = display_unit(missing[0]["unit"], typical)
     rows = tuple(
-        (_columns_text(entry["columns"]), name, number_text(size / scale, 3))
+        (columns_text(entry["columns"]), name, number_text(size / scale, 3))
         for entry in missing
         for name, size in entry["effects"].items()
     )
@@ -228,8 +229,8 @@ def record_table(results: Block) -> Table | None:
     return Table("What should be recorded as well?", columns, rows, note, ("would show",))
 
 
-def _columns_text(columns: Sequence[str]) -> str:
-    """`direction1[1] … direction6[1]` for many of a kind."""
+def columns_text(columns: Sequence[str]) -> str:
+    """Columns of records, `direction1[1] … direction6[1]` for many of a kind."""
     return ", ".join(columns) if len(columns) < 4 else f"{columns[0]} … {columns[-1]}"
 
 

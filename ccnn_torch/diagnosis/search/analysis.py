@@ -22,6 +22,7 @@ from ccnn_torch.diagnosis.discrepancy.linear import linear_discrepancies
 from ccnn_torch.diagnosis.discrepancy.local import local_discrepancies
 from ccnn_torch.diagnosis.discrepancy.smooth import smooth_discrepancies
 from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.diagnosis.progress import at_step
 from ccnn_torch.diagnosis.residual.correlation import INDEPENDENT, Correlation
 from ccnn_torch.diagnosis.residual.linearisation import remainder, tangent
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
@@ -166,7 +167,9 @@ def analyse(
     result, fixed = _search_about_nominal(rows, effects)
     # Again about the best library set, with shapes searched beside it and the noise that the best set of all leaves.
     before: frozenset[str] | None = None
-    for _ in range(2):
+    for turn in range(2):
+        # The first look takes about a tenth of the time, the second of two turns is often shorter.
+        at_step("searching the effects", (0.1, 0.5)[turn])
         atoms = result.dictionary.atoms
         best = next(f for f in result.found if not any(atoms[i].is_discrepancy for i in f.members))
         if before is not None and result.found[0].log_posterior - best.log_posterior > _MUCH_LESS_PROBABLE:
@@ -191,6 +194,7 @@ def analyse(
         local = before is None or discrepancy_is_active(result.dictionary, result.found, best)
         before = act
         result = _search_about_set(rows, fixed, result, acting, white, left, shapes, local)
+    at_step("searching the effects", 0.8)
     result = _with_shared_noise(rows, fixed.rich, result)
     if instrument is not None and noise is None and result.correlation.target is None:
         result = _above_instrument(result, instrument)

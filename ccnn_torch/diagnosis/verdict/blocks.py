@@ -12,6 +12,7 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import Gap, HeldOut, draws, held_out, shrink_of
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.diagnosis.verdict.separability import signature_angles
+from ccnn_torch.effects import Coefficient
 
 __all__ = ["Blocks", "blocks", "in_order", "noise_floor"]
 
@@ -114,7 +115,10 @@ def _effect(made: Blocks, name: str) -> dict[str, Any]:
 
 
 def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
-    """Value and standard deviation in the verdict's set, beside the corrections of its form; else alone."""
+    """Value and standard deviation in the verdict's set, beside the corrections of its form; else alone.
+
+    With the joint, leg or link that it belongs to, and of a parameter of the mechanism what its model has.
+    """
     analysis = made.analysis
     atoms = analysis.dictionary.atoms
     own = made.judgement.fullest if name in made.judgement.names else made.judgement.found
@@ -129,8 +133,11 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
         covariance(analysis.dictionary, own).diagonal()[start : start + len(own.mean[place])].clamp_min(0).sqrt()
     )
     coefficients = atom.coefficients(analysis.situation)
+    mechanism = analysis.situation.mechanism
+    nominal = {p.name: float(v) for p, v in zip(mechanism.geometry, mechanism.nominal, strict=True)}
     found: dict[str, dict[str, Any]] = {
-        c.name: {"value": float(v) * c.scale, "sd": float(d) * c.scale, "unit": c.unit}
+        c.name: {"value": float(v) * c.scale, "sd": float(d) * c.scale, "unit": c.unit, "part": _part(c, name)}
+        | ({"nominal": nominal[c.name]} if atom.effect.kind == "parameters" and c.name in nominal else {})
         for c, v, d in zip(coefficients, own.mean[place], deviation, strict=True)
     }
     used = None if atom.used is None else set(atom.used)
@@ -138,6 +145,15 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
         if used is None or shape.columns is None or used & set(shape.columns):
             found[shape.name] = {"value": value, "sd": None, "unit": shape.unit}
     return found
+
+
+def _part(coefficient: Coefficient, effect: str) -> str | None:
+    """The one leg, joint or link that a coefficient belongs to, in words."""
+    if coefficient.leg is not None:
+        return f"leg {coefficient.leg}"
+    if coefficient.joint is None:
+        return None
+    return f"{'link' if effect == 'geometry' else 'joint'} {coefficient.joint.removeprefix('q')}"
 
 
 def _most_probable_single(analysis: Analysis) -> dict[str, int]:

@@ -11,21 +11,25 @@ import numpy as np
 from ccnn_torch.coordinates import Condition
 from ccnn_torch.diagnosis.residual.correlation import Correlation
 from ccnn_torch.display import count_text, display_unit, number_text
+from ccnn_torch.effects.words import words_of
 from ccnn_torch.records.table import name_lines
 
 __all__ = [
     "SURE",
     "aside_text",
     "block_text",
+    "capital",
     "driver_words",
     "effect_words",
     "floor_words",
+    "follows_words",
     "gap_words",
     "lacking_text",
     "listed",
     "network_text",
     "noise_text",
     "probability_words",
+    "size_text",
     "unseen_text",
     "verdict_text",
 ]
@@ -35,24 +39,6 @@ Block = Mapping[str, Any]
 SURE = 0.95
 """From this probability on a verdict is said as a fact, below it as the likeliest explanation."""
 
-_EFFECTS = {
-    "geometry": "an error of the geometry",
-    "joint_offset": "an offset of the joints",
-    "joint_gain": "a wrong gain of the joints",
-    "transmission": "a periodic error of the transmission",
-    "backlash": "backlash",
-    "friction": "friction in the joints",
-    "compliance": "joint compliance under load",
-    "gravity": "sag under the machine's own weight",
-    "thermal": "growth with temperature",
-    "drift": "drift over time",
-    "frame": "a shifted or tilted base frame",
-    "tool": "a shifted or tilted tool",
-    "coupling": "coupling between the joints",
-    "latency": "a delay between pose and command",
-    "instrument": "an error of the measuring device",
-    "outlier": "a few bad rows",
-}
 # Up to so many effects without support are named one by one.
 _FEW_TRIED = 3
 _DRIVERS = {"workspace": "the place in the workspace", "temperature": "the temperature", "time": "the time"}
@@ -60,10 +46,7 @@ _DRIVERS = {"workspace": "the place in the workspace", "temperature": "the tempe
 
 def effect_words(name: str) -> str:
     """What an effect of the library is called in a sentence; a user's own effect by its name."""
-    kind, _, parameter = name.partition(" ")
-    if kind == "parameter" and parameter:
-        return f"a wrong value of the parameter {parameter}"
-    return _EFFECTS.get(name, f"the effect {name}")
+    return words_of(name).cause
 
 
 _NOISE_FROM = {
@@ -86,6 +69,13 @@ def driver_words(driver: str | None) -> str:
     return _DRIVERS.get(driver) or (named.get(kind) if name else None) or driver
 
 
+def follows_words(verdict: Block) -> str:
+    """What a residual outside the library follows."""
+    # Files of earlier versions name one driver.
+    drivers = verdict.get("drivers") or [verdict["driver"]] * bool(verdict["driver"])
+    return f"follows {listed([driver_words(d) for d in drivers])}" if drivers else "has no known driver"
+
+
 def probability_words(probability: float) -> str:
     """A probability to two digits that is never said to be 0 or 1."""
     if probability > 0.99:
@@ -98,7 +88,7 @@ def gap_words(results: Block) -> str:
     blocks = _blocks(results)
     if not blocks:
         return "There is no gap between model and machine on the rows not used for fitting."
-    gaps = " and ".join(_size(block["before"], block) for block in blocks)
+    gaps = " and ".join(size_text(block["before"], block) for block in blocks)
     times = [_times(block["before"] / block["noise_floor"]) for block in blocks if block["noise_floor"]]
     if len(times) < len(blocks):
         return f"The gap is {gaps}; how large the noise is, is not known."
@@ -177,7 +167,7 @@ def aside_text(rows: Sequence[int], why: Sequence[str], lines: Sequence[int] = (
             more = f" and {len(those) - 5} more" if len(those) > 5 else ""
             numbers = ", ".join(str(rows[i] + 1) for i in those[:5])
             named = f"row{'s' if len(those) > 1 else ''} {numbers} (counted from 1){more}"
-        parts.append(f"{_capital(reason)}: {len(those)}, at {named}.")
+        parts.append(f"{capital(reason)}: {len(those)}, at {named}.")
     return f"{count_text(len(rows), 'row')} set aside. {' '.join(parts)}"
 
 
@@ -186,7 +176,7 @@ def block_text(results: Block) -> str:
     far = results.get("by_block")
     if far is None:
         return ""
-    before, after = (_size(far[key], far) for key in ("before", "after"))
+    before, after = (size_text(far[key], far) for key in ("before", "after"))
     return (
         f"Held out in {len(far['blocks'])} blocks along the direction in which the joints vary most, each judged by a "
         "fit to the other rows with the names and shapes of all rows, the effects take the gap from "
@@ -201,11 +191,13 @@ def network_text(results: Block) -> str:
         return ""
     if network["gap_after"] is None:
         return f"A network has nothing left to learn: {network['reason']}."
-    before, after = (_size(network[key], network) for key in ("gap_before", "gap_after"))
-    low, high = (_size(v, network) for v in network["gain_ci95"])
+    before, after = (size_text(network[key], network) for key in ("gap_before", "gap_after"))
+    low, high = (size_text(v, network) for v in network["gain_ci95"])
     if network["gain_ci95"][0] <= 0:
         return f"A network on what is left gains nothing on rows not used for training ({before} → {after})."
-    text = f"A network on what is left would gain {_size(network['gain'], network)} [{low}, {high}] more on rows not "
+    text = (
+        f"A network on what is left would gain {size_text(network['gain'], network)} [{low}, {high}] more on rows not "
+    )
     text += f"used for training ({before} → {after})"
     floor = results["gap"]["noise_floor"]
     if floor and network["gap_after_ci95"][1] < floor:
@@ -228,13 +220,11 @@ def _cause(results: Block) -> str:
         rows = count_text(len(results["rows_set_aside"]), "bad row")
         return f"It comes from {rows}, set aside, and from no effect of the library ({_probability(verdict)})."
     if verdict["outside_library"] or not names:
-        # Files of earlier versions name one driver.
-        drivers = verdict.get("drivers") or [verdict["driver"]] * bool(verdict["driver"])
-        follows = f"follows {listed([driver_words(d) for d in drivers])}" if drivers else "has no known driver"
+        follows = follows_words(verdict)
         if not names:
             return f"{_none_of(results)} explains it: the residual {follows} ({_probability(verdict)})."
         verb = "explains" if len(names) == 1 else "together explain"
-        text = f"{_capital(listed([effect_words(n) for n in names]))} {verb} part of it{_removed(results, ', ')}; "
+        text = f"{capital(listed([effect_words(n) for n in names]))} {verb} part of it{_removed(results, ', ')}; "
         return f"{text}the rest {follows}, and no effect of the library describes it ({_probability(verdict)})."
     by_name = {e["name"]: e for e in results["effects"]}
     classes = {e["name"]: [n for n in e["indistinguishable_from"] if n not in names] for e in results["effects"]}
@@ -247,7 +237,7 @@ def _cause(results: Block) -> str:
     else:
         verb = "together explain it" if sure else "together are the likeliest explanation"
     comma = "," if likes[-1] else ""
-    return f"{_capital(subject)}{comma} {verb} ({_probability(verdict)}){_removed(results, ' and would remove ')}."
+    return f"{capital(subject)}{comma} {verb} ({_probability(verdict)}){_removed(results, ' and would remove ')}."
 
 
 def _with_class(name: str, like: Sequence[str], signatures: Block) -> str:
@@ -277,7 +267,7 @@ def _removed(results: Block, joint: str) -> str:
     if verdict["shrink_ci95"] is not None:
         low, high = (f"{100 * v:.{digits}f}" for v in verdict["shrink_ci95"])
         text += f" [{low}, {high}]"
-    before, after = (_size(blocks[0][key], blocks[0]) for key in ("before", "after"))
+    before, after = (size_text(blocks[0][key], blocks[0]) for key in ("before", "after"))
     if results.get("noise", "given") == "estimated":
         whole = 1 - (blocks[0]["after"] / blocks[0]["before"]) ** 2
         return (
@@ -292,7 +282,8 @@ def _blocks(results: Block) -> list[Block]:
     return [b for b in (results["gap"], results.get("gap_rotation")) if b and b["before"]]
 
 
-def _size(value: float, block: Block) -> str:
+def size_text(value: float, block: Block) -> str:
+    """A size in the unit of a block of `diagnosis.json`, in the prefix that fits."""
     scale, unit = display_unit(block["unit"], value)
     return f"{number_text(value / scale, 3)} {unit}"
 
@@ -310,7 +301,8 @@ def listed(words: Sequence[str], last: str = "and") -> str:
     return f" {last} ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-def _capital(text: str) -> str:
+def capital(text: str) -> str:
+    """The text with its first letter as a capital."""
     return text[:1].upper() + text[1:]
 
 

@@ -1,0 +1,71 @@
+"""The command lines that put the effects of a diagnosis into a compensator, with the paths of the user."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+from pathlib import Path
+
+from ccnn_torch.diagnosis.config import DiagnoseConfig
+from ccnn_torch.diagnosis.from_file import Verdict, one_row_at_a_time, read_verdict
+from ccnn_torch.diagnosis.result import Diagnosis
+from ccnn_torch.effects import OUTLIER, Situation
+from ccnn_torch.errors import InputError
+
+__all__ = ["compensate_lines", "typed_path"]
+
+
+def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -> tuple[str, ...]:
+    """A sentence, and the command lines to copy; () where there is nothing to compensate.
+
+    Effects that a compensator cannot hold are left to its network, and the sentence says why.
+
+    Args:
+        config: of the diagnosis.
+        diagnosis: what was found.
+        path: the diagnosis.json that was written.
+    """
+    verdict, situation = diagnosis.verdict, diagnosis.analysis.situation
+    if verdict["none"] or verdict["effects"] == [OUTLIER]:
+        return ()
+    keys = {"records": _records(config), "mechanism": typed_path(str(config.mechanism))}
+    keys |= {k: json.dumps(v) for k, v in (("columns", config.columns), ("mechanism_keys", config.mechanism_keys)) if v}
+    covariates = config.covariates
+    try:
+        named = read_verdict(path, situation.mechanism.name, [j.name for j in situation.mechanism.joints])
+        named.on(situation)
+        keys["effects"] = f"from:{typed_path(str(path))}"
+        sentence = "These lines put the effects and a network on what they leave in a compensator and correct targets."
+        covariates = _outlasting(named, situation) or covariates
+    except InputError as reason:
+        sentence = f"These lines leave the gap to a network and correct targets ({reason})."
+    if covariates is not None:
+        keys["covariates"] = f"[{','.join(covariates)}]"
+    keys["out"] = f"{typed_path(str(path.parent))}_compensator"
+    run = " ".join(["ccnn run", *(shlex.quote(f"{key}={value}") for key, value in keys.items())])
+    model = shlex.quote(f"{keys['out']}/model.onnx")
+    return sentence, run, f"ccnn compensate {model} TARGETS.csv COMMANDS.csv"
+
+
+def _outlasting(named: Verdict, situation: Situation) -> list[str] | None:
+    """The inputs of a model that holds on other days: without the time, where the effects do not need it."""
+    alone = one_row_at_a_time(situation)
+    if "time" not in situation.covariates:
+        return None
+    try:
+        named.on(alone)
+    except InputError:
+        return None
+    return [*alone.covariates]
+
+
+def _records(config: DiagnoseConfig) -> str:
+    files = config.records if isinstance(config.records, list) else [str(config.records)]
+    return ",".join(typed_path(file) for file in files)
+
+
+def typed_path(path: str) -> str:
+    """A path as it may be typed here: relative where it is below the current folder."""
+    near = os.path.relpath(path)
+    return path if near.startswith("..") else near

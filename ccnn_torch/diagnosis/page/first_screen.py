@@ -1,0 +1,126 @@
+"""What a technician needs first: what is wrong, how sure that is, what it removes, and what to do now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from rich.console import Console
+
+from ccnn_torch.diagnosis.page.data import NEXT, About
+from ccnn_torch.diagnosis.page.numbers import numbers_table
+from ccnn_torch.diagnosis.page.place_words import where_words
+from ccnn_torch.diagnosis.page.tables import columns_text
+from ccnn_torch.diagnosis.verdict.findings import findings
+from ccnn_torch.diagnosis.verdict.text import capital, follows_words, listed, probability_words, size_text
+from ccnn_torch.effects import OUTLIER
+from ccnn_torch.report.table import markdown_table, print_labelled, print_table, print_text
+
+__all__ = ["ON_PAGE", "Answer", "first_screen", "first_screen_markdown", "print_first_screen"]
+
+Block = Mapping[str, Any]
+# Numbers of all effects on a screen; a page has room for more.
+_ON_SCREEN, ON_PAGE = 6, 16
+
+
+class Answer(NamedTuple):
+    """What is asked, sentences that answer it, and the command lines that go with it."""
+
+    label: str
+    text: str
+    commands: tuple[str, ...] = ()
+
+
+def first_screen(results: Block, about: About) -> list[Answer]:
+    """The answers in reading order.
+
+    Args:
+        results: as in `diagnosis.json`.
+        about: with the folder and the command of a compensator, where they are known.
+    """
+    said = [Answer("What is wrong", _wrong(results))]
+    if where := where_words(results, about):
+        said.append(Answer("Where", f"{capital('; '.join(where))}."))
+    said.append(Answer("How sure", _sure(results)))
+    if removed := _removed(results):
+        said.append(Answer("What it removes", removed))
+    if look := " ".join(f.look for f in findings(results)):
+        said.append(Answer("Look at", look))
+    if about.compensate:
+        said.append(Answer("Compensate", about.compensate[0], tuple(about.compensate[1:])))
+    if measure := _measure(results, about):
+        said.append(Answer("Measure next", measure))
+    return said
+
+
+def print_first_screen(results: Block, console: Console, about: About) -> None:
+    """Show the answers, the numbers to enter after the part to look at; a command line is never wrapped."""
+    for answer in first_screen(results, about):
+        print_labelled(answer.label, answer.text, console)
+        for command in answer.commands:
+            print_text(f"  {command}", console, wrap=False)
+        if answer.label == "Look at" and (table := numbers_table(results, _ON_SCREEN)):
+            print_table(table, console)
+
+
+def first_screen_markdown(results: Block, about: About) -> list[str]:
+    """The same as paragraphs of Markdown."""
+    parts = []
+    for answer in first_screen(results, about):
+        code = "".join(f"\n\n    {command}" for command in answer.commands)
+        parts.append(f"**{answer.label}:** {answer.text}{code}")
+    table = numbers_table(results, ON_PAGE)
+    return [*parts, *([markdown_table(table)] if table else [])]
+
+
+def _wrong(results: Block) -> str:
+    verdict = results["verdict"]
+    found = [f.text for f in findings(results)]
+    if verdict["none"]:
+        return "Nothing: model and machine differ by no more than the noise."
+    if verdict["outside_library"] or not found:
+        rest = "a rest" if found else "an error"
+        found.append(f"{rest} that {follows_words(verdict)}, which no effect of the library describes")
+    return " ".join(f"{capital(text)}." for text in found)
+
+
+def _sure(results: Block) -> str:
+    verdict = results["verdict"]
+    text = f"Probability {probability_words(verdict['probability'])}"
+    if results.get("noise") == "estimated":
+        text += "; the noise is not known, and what is taken for it may hold another cause"
+    return f"{text}."
+
+
+def _removed(results: Block) -> str:
+    """The gap before and after: on rows at random, and where nothing was measured."""
+    verdict, gap, far = results["verdict"], results["gap"], results.get("by_block")
+    if not verdict["effects"] or gap["before"] is None or gap["after"] is None:
+        return ""
+    text = f"{size_text(gap['before'], gap)} → {size_text(gap['after'], gap)} on rows at random"
+    if far is not None:
+        before, after = (size_text(far[key], far) for key in ("before", "after"))
+        text += f", {before} → {after} where nothing was measured (by block)"
+    elif verdict["effects"] != [OUTLIER]:
+        text += "; not known where nothing was measured"
+    floor = f"; the noise is {size_text(gap['noise_floor'], gap)}" if gap["noise_floor"] else ""
+    network = results.get("network") or {}
+    if network.get("gap_after") is not None and network["gain_ci95"][0] > 0:
+        floor += f"; with a network on the rest {size_text(network['gap_after'], network)}"
+    return f"{text}{floor}."
+
+
+def _measure(results: Block, about: About) -> str:
+    """The next measurements, and the columns to record as well."""
+    said = []
+    wanted = results["next_measurements"]
+    if wanted:
+        rivals = list(dict.fromkeys(name for entry in wanted for name in entry["separates"]))
+        aim = f"to tell {listed(rivals, 'from')} apart" if rivals else "to sharpen the numbers"
+        path = f"{about.folder}/{NEXT}" if about.folder else NEXT
+        said.append(f"{len(wanted)} poses {aim}: {path}.")
+    missing = results.get("missing_covariates")
+    if missing:
+        each = [f"{columns_text(entry['columns'])} (would show {listed(list(entry['effects']))})" for entry in missing]
+        said.append(f"Record as well: {listed(each)}.")
+    return " ".join(said)

@@ -1,0 +1,172 @@
+"""What is wrong, part by part: the joints, legs or links of each effect of a verdict, and the size there, in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ccnn_torch.diagnosis.verdict.text import listed
+from ccnn_torch.display import display_unit, number_text, unit_text
+from ccnn_torch.effects import OUTLIER
+from ccnn_torch.effects.words import words_of
+
+__all__ = ["Finding", "clear_parameters", "findings", "frequency_words", "places", "size_words"]
+
+Block = Mapping[str, Any]
+
+# Standard deviations from which a number is clearly not 0.
+_CLEAR = 3.0
+# Joints, legs or links that a sentence names.
+_MOST_PARTS = 3
+# A part below this share of the largest one is not named.
+_LEAST_SHARE = 0.1
+# Angles at which the largest value of a sum of harmonics is sought.
+_ANGLES = 720
+_A_TURN = " times a turn"
+_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
+
+
+class Finding(NamedTuple):
+    """An effect of the verdict in words.
+
+    Attributes:
+        effect: its name.
+        text: what is wrong, where and how large, without a full stop.
+        look: the part to look at, as a sentence.
+    """
+
+    effect: str
+    text: str
+    look: str
+
+
+def findings(results: Block) -> list[Finding]:
+    """One for each effect of the verdict, the largest first.
+
+    Args:
+        results: as in `diagnosis.json`.
+    """
+    by_name = {e["name"]: e for e in results["effects"]}
+    found = []
+    for name in results["verdict"]["effects"]:
+        words, parameters = words_of(name), by_name.get(name, {}).get("parameters", {})
+        sizes = _waves(parameters) if name == "transmission" else _sizes(parameters)
+        named = [part for part in sizes if part]
+        shown = [part for part in named if sizes[part][0] >= _LEAST_SHARE * max(sizes[p][0] for p in named)]
+        most, more = shown[:_MOST_PARTS], len(shown) > _MOST_PARTS
+        text = words.short if name != OUTLIER else f"{len(results['rows_set_aside'])} {words.short}"
+        if most:
+            text += f" of {places(shown)}: {'largest in ' if more else ''}"
+            alone = len(shown) == 1
+            text += "; ".join(sizes[part][1] if alone else f"{part} {sizes[part][1]}" for part in most)
+        elif "" in sizes:
+            text += f": {sizes[''][1].removeprefix(f'{words.short} ')}"
+        lag = parameters.get("lag", {}).get("value")
+        text += f" (settling in {size_words(lag, 's')})" if lag else ""
+        like = [
+            n for n in by_name.get(name, {}).get("indistinguishable_from", ()) if n not in results["verdict"]["effects"]
+        ]
+        if like:
+            text += f" (or {listed([words_of(n).short for n in like], 'or')}: these rows do not distinguish them)"
+        found.append(Finding(name, text, words.look.format(where=places(most) if most else "the machine")))
+    return found
+
+
+def clear_parameters(parameters: Block) -> dict[str, Block]:
+    """The coefficients that are clearly not 0, those that are largest against their standard deviations first."""
+    clear = {n: b for n, b in parameters.items() if b["sd"] and abs(b["value"]) > _CLEAR * b["sd"]}
+    return dict(sorted(clear.items(), key=lambda item: -abs(item[1]["value"]) / item[1]["sd"]))
+
+
+def places(parts: Sequence[str]) -> str:
+    """`joints 1 and 2`, `legs 1 to 6`, `joint 2 and leg 3`."""
+    kinds: dict[str, list[str]] = {}
+    for part in parts:
+        kind, _, number = part.partition(" ")
+        kinds.setdefault(kind, []).append(number)
+    return listed([f"{kind}{'s' if len(n) > 1 else ''} {_numbers(sorted(n, key=_order))}" for kind, n in kinds.items()])
+
+
+def size_words(value: float, unit: str, digits: int = 3) -> str:
+    """A number with a unit that a technician reads: `-7.23 mm`, `2.87 µrad/(N·m)`, `-0.62 %`, `25.6 min`."""
+    if unit == "1":
+        return f"{number_text(100 * value, digits)} %"
+    if unit == "s" and abs(value) >= 120:
+        return f"{number_text(value / 60, digits)} min"
+    if unit in ("m/s", "rad/s"):
+        scale, shown = display_unit(unit[:-2], 3600 * value)
+        return f"{number_text(3600 * value / scale, digits)} {shown}/h"
+    if unit == "s" and abs(value) < 1:
+        return f"{number_text(1e3 * value, digits)} ms"
+    if unit in ("m", "rad"):
+        scale, shown = display_unit(unit, value)
+        return f"{number_text(value / scale, digits)} {shown}"
+    if unit.startswith(("m/", "rad/", "1/K")):
+        scale, prefix = next((p for p in _PREFIXES if abs(value) >= p[0]), _PREFIXES[-1])
+        shown = "m/m/K" if unit == "1/K" else unit
+        return f"{number_text(value / scale, digits)} {prefix}{unit_text(shown)}"
+    return f"{number_text(value, digits)} {unit_text(unit)}"
+
+
+def frequency_words(frequency: float, unit: str) -> str:
+    """`5 times a turn` of a turning joint, `every 5.2 mm` of a sliding one."""
+    if unit == "1":
+        return f"{frequency:.3g}{_A_TURN}"
+    scale, shown = display_unit("m", 2 * math.pi / frequency)
+    return f"every {number_text(2 * math.pi / frequency / scale, 3)} {shown}"
+
+
+def _sizes(parameters: Block) -> dict[str, tuple[float, str]]:
+    """Of each part its clearest number: how large it is against those of the others, and in words."""
+    chosen: dict[str, str] = {}
+    for name, block in clear_parameters(parameters).items():
+        chosen.setdefault(block.get("part") or "", name)
+    if len({parameters[name]["unit"] for name in chosen.values()}) == 1:
+        sizes = {part: abs(parameters[name]["value"]) for part, name in chosen.items()}
+    else:
+        sizes = {part: abs(parameters[name]["value"]) / parameters[name]["sd"] for part, name in chosen.items()}
+    found = {}
+    for part in sorted(chosen, key=lambda p: -sizes[p]):
+        name, number = chosen[part], part.partition(" ")[2]
+        own = "" if name in (part, f"q{number}") else f"{name.removeprefix(f'q{number} ')} "
+        found[part] = (sizes[part], f"{own}{size_words(parameters[name]['value'], parameters[name]['unit'])}")
+    return found
+
+
+def _waves(parameters: Block) -> dict[str, tuple[float, str]]:
+    """Of each joint the largest error of the harmonics that are clearly there, and these in words; largest first."""
+    clear = clear_parameters(parameters)
+    found: dict[str, tuple[float, str]] = {}
+    for joint in dict.fromkeys(name.split(" ")[0] for name in clear):
+        own = parameters.get(f"{joint} frequency")
+        if own is None:
+            continue
+        angle = np.linspace(0, 2 * np.pi, _ANGLES, endpoint=False)
+        whole, sizes = np.zeros(_ANGLES), {}
+        for k in (1, 2, 3, 4):
+            ends = [f"{joint} {wave}{'' if k == 1 else f' {k}'}" for wave in ("sin", "cos")]
+            if not any(end in clear for end in ends):
+                continue
+            sine, cosine = (parameters.get(end, {"value": 0.0})["value"] for end in ends)
+            whole += sine * np.sin(k * angle) + cosine * np.cos(k * angle)
+            sizes[k] = math.hypot(sine, cosine)
+        largest = float(np.abs(whole).max())
+        unit = next(parameters[name]["unit"] for name in clear if name.startswith(f"{joint} "))
+        there = sorted(k for k in sizes if sizes[k] >= _LEAST_SHARE * max(sizes.values()))
+        often = listed([frequency_words(k * own["value"], own["unit"]) for k in there])
+        if own["unit"] == "1":
+            often = f"{often.replace(_A_TURN, '')}{_A_TURN}"
+        found[f"joint {joint.removeprefix('q')}"] = (largest, f"±{size_words(largest, unit)}, {often}")
+    return dict(sorted(found.items(), key=lambda item: -item[1][0]))
+
+
+def _numbers(sorted_: Sequence[str]) -> str:
+    run = [str(int(sorted_[0]) + i) for i in range(len(sorted_))] if sorted_[0].isdigit() else []
+    return f"{sorted_[0]} to {sorted_[-1]}" if len(sorted_) > 2 and [*sorted_] == run else listed(sorted_)
+
+
+def _order(number: str) -> tuple[int, str]:
+    return (int(number), "") if number.isdigit() else (0, number)
