@@ -142,6 +142,18 @@ class Mechanism(nn.Module):
             (joints, self.resolve(parameters)),
         )
 
+    def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
+        """Lines to draw the machine with at one configuration: its legs or links by name, `k x 3` [m] each.
+
+        In the robot's frame. The default has none, and pictures leave the machine out.
+
+        Args:
+            pose: `p` [SI].
+            joints: `n` [SI].
+            parameters: `k` [SI], nominal when None.
+        """
+        return {}
+
     def frame(self, pose: Tensor) -> tuple[Tensor, Tensor | None]:
         """Position `... x 3` [m] and rotation matrix `... x 3 x 3` of the platform; None without orientation.
 

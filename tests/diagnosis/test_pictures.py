@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
 import torch
 from _machines import NOISE, measured, rows_of
 
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.diagnosis.page.arrays import picture_arrays
-from ccnn_torch.effects import pose_residual
+from ccnn_torch.effects import Situation, default_gravity, pose_residual, reached
+from ccnn_torch.mechanisms import load_mechanism
+
+ARM = Path(__file__).parents[1] / "effects" / "arm.yaml"
 
 
 def test_two_causes_are_drawn_against_what_drives_each() -> None:
@@ -39,3 +46,27 @@ def test_a_driver_outside_the_library_is_drawn_and_no_effect() -> None:
     assert torch.equal(arrays["signature.temperature.x"], rows.covariates["temperature"])
     # Nothing that the library has is taken off, so all of the gap is left.
     assert torch.allclose(arrays["remainder"], arrays["residual"])
+
+
+def test_an_arm_is_drawn_in_its_own_frame_wherever_the_measuring_device_stands() -> None:
+    arm = load_mechanism(str(ARM)).with_orientation("none")
+    values = arm.nominal.clone()
+    values[:6] = torch.tensor([2.0, -1.0, 0.4, 0.0, 0.0, 1.2], dtype=torch.float64)
+    joints = arm.sample_joints(60, torch.Generator().manual_seed(0))
+    away = Situation(arm, joints, {}, default_gravity(arm), values)
+    nearby = Situation(arm, joints, {}, default_gravity(arm))
+    off = torch.zeros_like(joints)
+    off[:, 1] = 4e-4
+    drawn = []
+    for rows in (away, nearby):
+        noise = torch.randn(60, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        found = diagnose_rows(
+            rows, reached(replace(rows, joints=joints + off), [])[:, :3] + 1e-6 * noise, None, ["joint_offset"]
+        )
+        drawn.append((found, picture_arrays(found)[0]))
+    (there, far), (here, near) = drawn
+    assert torch.allclose(far["place"], near["place"], atol=2e-5)
+    assert torch.allclose(far["residual"], near["residual"], atol=2e-5)
+    assert torch.equal(far["machine.link 2"], near["machine.link 2"]) and "machine.tool" in far
+    for one, other in zip(there.where["regions"], here.where["regions"], strict=True):
+        assert one["center"] == pytest.approx(other["center"], abs=1e-4) and one["rows"] == other["rows"]

@@ -184,11 +184,11 @@ def test_the_page_is_whole_and_fetches_nothing(folder: Path) -> None:
     page.feed(text)
     page.close()
     assert page.open == [] and "script" not in page.count and "link" not in page.count
-    assert page.count["svg"] == 5 == page.count["figcaption"] and page.count["table"] == 10
+    assert page.count["svg"] == 6 == page.count["figcaption"] and page.count["table"] == 10
     outside = {a for a in page.addresses if not a.startswith(("#", "data:"))}
     assert all((folder / address).is_file() for address in outside) and "diagnosis.json" in outside
     assert text.index('class="verdict"') < text.index("<svg") < text.index("What should be measured next?")
-    stems = ("gap", "probabilities", "signatures", "map", "where")
+    stems = ("machine", "gap", "probabilities", "signatures", "map", "where")
     assert {p.name for p in (folder / "plots").iterdir()} == {f"{s}.{kind}" for s in stems for kind in ("png", "svg")}
 
 
@@ -200,7 +200,7 @@ def test_a_browser_shows_all_of_the_page(folder: Path, tmp_path: Path) -> None:
         assert seen["page"] <= seen["window"], "the page is wider than the window"
         assert seen["fetched"] == 0
         assert 0 < seen["verdict"]["top"] < 200 and seen["verdict"]["height"] > 20
-        assert len(seen["figures"]) == 5 and len(seen["tables"]) == 10
+        assert len(seen["figures"]) == 6 and len(seen["tables"]) == 10
         assert all(0.5 * min(width, 600) < f["width"] <= width and f["height"] > 60 for f in seen["figures"])
         assert "these rows do not distinguish them" in seen["text"] and "&amp;" not in seen["text"]
 
@@ -243,7 +243,7 @@ def test_the_same_files_give_the_same_page_and_text_is_escaped(folder: Path, tmp
 
 def test_tensorboard_gets_the_same_figures_once(folder: Path) -> None:
     events = EventAccumulator(str(folder / "tensorboard")).Reload()
-    stems = ("gap", "probabilities", "signatures", "map", "where")
+    stems = ("machine", "gap", "probabilities", "signatures", "map", "where")
     assert [e.value for e in events.Scalars("gap/in_order")] == pytest.approx([1.13e-4])
     assert events.Scalars("gap/by_block_after")[0].value == pytest.approx(1.31e-4)
     assert events.Scalars("gap/after_network")[0].value == pytest.approx(6e-5)

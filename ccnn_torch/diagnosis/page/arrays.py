@@ -11,7 +11,8 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import held_out
-from ccnn_torch.effects import pose_residual
+from ccnn_torch.effects import Situation, pose_residual
+from ccnn_torch.mechanisms import SerialArm
 
 __all__ = ["picture_arrays"]
 
@@ -33,9 +34,10 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
 
     Returns:
         Arrays by name (`s` rows, `c` pose channels, SI): `place` `s x 3`, `joints` `s x n`, `residual` and `remainder`
-        `s x c`, `noise` `c`, `held_out` and `set_aside` `s`, `covariate.NAME` `s`, and for each effect of the verdict
-        and the driver outside the library `signature.NAME.x`, `.y` and `.fit` `s`. The remainder of each row is that
-        of a fit to other rows. And the names and units of the signatures' axes, `{NAME: {"x": {"name", "unit"}, …}}`.
+        `s x c`, all in the robot's frame; the machine's legs or links, `machine.NAME` `k x 3`; `noise` `c`, `held_out`
+        and `set_aside` `s`, `covariate.NAME` `s`, and for each effect of the verdict and the driver outside the library
+        `signature.NAME.x`, `.y` and `.fit` `s`. The remainder of each row is that of a fit to other rows. And
+        the names and units of the signatures' axes, `{NAME: {"x": {"name", "unit"}, …}}`.
     """
     analysis = diagnosis.analysis
     situation = analysis.situation
@@ -46,15 +48,18 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
     place = situation.mechanism.frame(analysis.measured)[0]
     # The analysis' own residual is about the machine with the effects.
     residual = pose_residual(situation, analysis.measured)
+    remainder = _remainder(analysis, residual, found.members, seed)
+    inside, drawn, left = _in_robot_frame(situation, torch.nan_to_num(place), residual, remainder)
     arrays = {
-        "place": torch.nan_to_num(place),
+        "place": inside,
         "joints": situation.joints,
-        "residual": residual,
-        "remainder": _remainder(analysis, residual, found.members, seed),
+        "residual": drawn,
+        "remainder": left,
         "noise": _spread(analysis, (analysis.whitening.sigma * analysis.floor**0.5)[None])[0],
         "held_out": held,
         "set_aside": 1 - held,
     }
+    arrays |= _machine(situation, inside, keep)
     arrays |= {f"covariate.{name}": value for name, value in situation.covariates.items()}
     labels: dict[str, Any] = {}
     parts = [analysis.dictionary.atoms[i].columns @ mean for i, mean in zip(found.members, found.mean, strict=True)]
@@ -75,6 +80,29 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
         arrays |= {f"signature.{name}.x": x, f"signature.{name}.y": fit + rest, f"signature.{name}.fit": fit}
         labels[name] = {"x": {"name": x_name, "unit": x_unit}, "y": y_axis}
     return {name: value.to(torch.float64) for name, value in arrays.items()}, labels
+
+
+def _in_robot_frame(
+    situation: Situation, place: Tensor, residual: Tensor, remainder: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Places `s x 3` and residuals `s x c0` in the robot's frame, wherever the measuring device stands."""
+    arm = situation.mechanism
+    if not isinstance(arm, SerialArm):
+        return place, residual, remainder
+    vectors = torch.stack([residual, remainder], 1).reshape(len(place), -1, 3)
+    place, vectors = arm.in_own_base(place, vectors, situation.parameters)
+    residual, remainder = vectors.reshape(len(place), 2, -1).unbind(1)
+    return place, residual, remainder
+
+
+def _machine(situation: Situation, place: Tensor, keep: Tensor) -> dict[str, Tensor]:
+    """The machine's legs or links, `machine.NAME` `k x 3` [m], in the row next to the middle of all."""
+    here = place[keep]
+    row = int(keep[(here - here.median(0).values).square().sum(-1).argmin()])
+    parameters = situation.parameters
+    values = None if parameters is None else parameters.expand(len(place), -1)[row]
+    lines = situation.mechanism.skeleton(situation.pose[row], situation.joints[row], values)
+    return {f"machine.{name}": line for name, line in lines.items()}
 
 
 def _spread(analysis: Analysis, values: Tensor) -> Tensor:

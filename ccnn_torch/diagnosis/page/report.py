@@ -25,6 +25,7 @@ from ccnn_torch.diagnosis.page.data import (
     used_rows,
 )
 from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
+from ccnn_torch.diagnosis.page.figure_machine import machine_plot
 from ccnn_torch.diagnosis.page.figure_signature import signature_plot
 from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
 from ccnn_torch.diagnosis.page.first_screen import (
@@ -87,8 +88,9 @@ def write_diagnosis_report(
         folder: where to write; with `diagnosis.json`, `diagnosis.safetensors` and `diagnosis_pictures.json`.
         results: the content of `diagnosis.json`, which is read when None.
         arrays: what is drawn in the figures (`s` rows in the order of the file, `c` pose channels, float64, SI):
-            `place` `s x 3`, `joints` `s x n`, `residual` and `remainder` `s x c`, `held_out` and `set_aside` `s`, and
-            `signature.EFFECT.x`, `.y` and `.fit` `s`; written to the folder first, or read from it when None.
+            `place` `s x 3`, `joints` `s x n`, `residual` and `remainder` `s x c`, `held_out` and `set_aside` `s`, the
+            machine's legs or links `machine.NAME` `k x 3`, and `signature.EFFECT.x`, `.y` and `.fit` `s`; written to
+            the folder first, or read from it when None.
         labels: names and units of the signatures' axes, `{EFFECT: {"x": {"name", "unit"}, "y": …}}`, and under `about`
             what `About` holds; written or read like the arrays.
         tensorboard: whether to write event files, which cost a second.
@@ -192,6 +194,7 @@ def _print_tables(results: Block, console: Console, about: About) -> None:
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
     effects = list(results["verdict"]["effects"])
     plots = (
+        machine_plot(arrays, effects),
         gap_plot(results),
         probability_plot(results),
         signature_plot(signatures_of(arrays, labels, effects), arrays, effects),

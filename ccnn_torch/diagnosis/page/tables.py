@@ -152,6 +152,8 @@ def parameter_table(results: Block, most: int = 24) -> Table | None:
             scale, unit = display_unit(block["unit"], max(abs(value), sd or 0.0) or 1.0)
             interval = "–" if sd is None else _interval(value, sd, scale)
             numbers = (number_text(value / scale, 4), number_text(_over(sd, scale), 2), interval)
+            # Of a turning joint: whole numbers a turn.
+            unit = "times a turn" if name.endswith(" frequency") and block["unit"] == "1" else unit
             rows.append((f"{effect}: {name}", *numbers, unit))
             sizes.append(abs(value) / sd if sd else math.inf)
     if not rows:

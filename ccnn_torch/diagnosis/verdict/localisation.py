@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, draws
+from ccnn_torch.mechanisms import SerialArm
 
 __all__ = ["localise"]
 
@@ -125,10 +126,17 @@ def _split(rows: _Parts, member: Tensor) -> _Parts:
 
 
 def _regions(analysis: Analysis, keep: Tensor) -> tuple[list[dict[str, Any]], Tensor]:
-    """Boxes of the workspace and which rows are in them, `s x k`: the two lengths that vary most, cut at quantiles."""
-    coordinates = analysis.situation.mechanism.pose
+    """Boxes of the workspace and which rows are in them, `s x k`: the two lengths that vary most, cut at quantiles.
+
+    In the robot's frame: that of an arm's base, wherever the measuring device stands.
+    """
+    situation = analysis.situation
+    coordinates = situation.mechanism.pose
     lengths = [i for i, c in enumerate(coordinates) if c.unit == "m"] or list(range(len(coordinates)))
-    pose = analysis.situation.pose[keep]
+    pose = situation.pose
+    if isinstance(situation.mechanism, SerialArm):
+        pose = situation.mechanism.in_own_base(pose[:, :3], pose[:, None, :3], situation.parameters)[0]
+    pose = pose[keep]
     varying = sorted(lengths, key=lambda i: -float(pose[:, i].std()))[:2]
     cuts = 3 if len(keep) >= _MANY and len(varying) == 2 else 2
     cell = torch.zeros(len(keep), dtype=torch.int64)

@@ -61,6 +61,14 @@ class _Parallelograms(Mechanism):
             high=high,
         )
 
+    def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
+        """Base to drive to platform of each leg; see `Mechanism.skeleton`."""
+        legs = self.resolve(parameters).reshape(3, -1)
+        away = _outward(legs[:, 1])
+        foot, end = legs[:, :1] * away, self._drives(joints, legs)
+        corners = torch.stack([foot, end, pose + legs[:, -3:-2] * away, pose.expand(3, 3)], -2)
+        return {f"leg {i + 1}": leg for i, leg in enumerate(corners)}
+
     def _centres(self, joints: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """The three points, `... x 3 x 3` [m], and the lengths of the rods, `... x 3` [m]."""
         legs = values.reshape(*values.shape[:-1], 3, -1)

@@ -118,6 +118,12 @@ class FiveBar(Mechanism):
         above: Tensor = across[..., 0] * to_tool[..., 1] - across[..., 1] * to_tool[..., 0] > 0
         return torch.isfinite(joints).all(-1) & above
 
+    def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
+        """Crank and coupler of each leg; see `Mechanism.skeleton`."""
+        values = self.resolve(parameters)
+        corners = torch.stack([_geometry(values)[2], self._elbows(joints, values), pose.expand(2, 2)], -2)
+        return {f"leg {i + 1}": torch.nn.functional.pad(leg, (0, 1)) for i, leg in enumerate(corners)}
+
     def _elbows(self, joints: Tensor, values: Tensor) -> Tensor:
         """Ends of the cranks, `... x 2 x 2` [m]: leg, then x and y."""
         crank, _, foot, gain, offset = _geometry(values)

@@ -60,15 +60,30 @@ class MachineTool(Mechanism):
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Eq. 18: |c_i - u_i d_i| = l with d_i the guideway's direction; the smaller root, NaN where it is not real."""
-        l_e, l_b, z_0, l, gamma, u_0, alpha, beta = self._legs(self.resolve(parameters))
+        values = self.resolve(parameters)
+        foot, along, joint = self._points(pose, values)
+        l, u_0 = self._legs(values)[3], self._legs(values)[5]
+        c = joint - foot
+        middle = (c * along).sum(-1)
+        return middle - torch.sqrt(middle**2 - (c**2).sum(-1) + l**2) - u_0
+
+    def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
+        """Guideway, leg and platform of each leg; see `Mechanism.skeleton`."""
+        values = self.resolve(parameters)
+        foot, along, joint = self._points(pose, values)
+        carriage = foot + (joints + self._legs(values)[5])[:, None] * along
+        centre = self.frame(pose)[0]
+        return {f"leg {i + 1}": torch.stack([foot[i], carriage[i], joint[i], centre]) for i in range(3)}
+
+    def _points(self, pose: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Of each leg the foot and the direction of its guideway, and its joint on the platform, `... x 3 x 3`."""
+        l_e, l_b, z_0, _, gamma, _, alpha, beta = self._legs(values)
         position, rotation = self.frame(pose)
         joint = stack_last(l_e * torch.cos(beta), l_e * torch.sin(beta), z_0)
         foot = stack_last(l_b * torch.cos(alpha), l_b * torch.sin(alpha), torch.zeros_like(l_b))
         slide = torch.cos(gamma)
         along = stack_last(-slide * torch.cos(alpha), -slide * torch.sin(alpha), torch.sin(gamma))
-        c = position[..., None, :] + (rotation[..., None, :, :] @ joint[..., None])[..., 0] - foot
-        middle = (c * along).sum(-1)
-        return middle - torch.sqrt(middle**2 - (c**2).sum(-1) + l**2) - u_0
+        return foot, along, position[..., None, :] + (rotation[..., None, :, :] @ joint[..., None])[..., 0]
 
     def _legs(self, values: Tensor) -> tuple[Tensor, ...]:
         """l_e, l_b, z_0, l, gamma, u_0, alpha, beta of the legs, `... x 3` each (the common ones `... x 1`)."""

@@ -191,6 +191,22 @@ class SerialArm(Mechanism):
         distance: Tensor = torch.linalg.vector_norm(pose[..., :3] - values[..., :3], dim=-1)
         return distance <= self.reach
 
+    def in_own_base(self, position: Tensor, vectors: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """A measured position `... x 3` [m] and vectors `... x v x 3` in the arm's own base, without the base frame."""
+        values = self.resolve(parameters)
+        turn = rotation_vector_to_matrix(values[..., 3:6])
+        inside: Tensor = ((position - values[..., :3])[..., None, :] @ turn)[..., 0, :]
+        return inside, vectors @ turn
+
+    def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
+        """The links between the frames; see `Mechanism.skeleton`."""
+        values = self.resolve(parameters)
+        frames = self.link_frames(joints, values)
+        rotation, flange = frames[-1]
+        points = [*(place for _, place in frames), flange + rotation @ values[..., -6:-3]]
+        links = {f"link {i + 1}": torch.stack(points[i : i + 2]) for i in range(len(points) - 2)}
+        return links | {"tool": torch.stack(points[-2:])}
+
     def flange(self, joints: Tensor, parameters: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Flange in the arm's own base, without base and tool frame: rotation `... x 3 x 3`, position `... x 3` [m]."""
         return self.link_frames(joints, self.resolve(parameters))[-1]

@@ -115,6 +115,14 @@ class Stewart(Mechanism):
         same: Tensor = here * home > 0
         return same
 
+    def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
+        """The legs, and the outlines of base and platform; see `Mechanism.skeleton`."""
+        values = self.resolve(parameters)
+        base = values.reshape(6, 8)[:, :3]
+        platform = pose[:3] + self._legs(pose, values).arm
+        legs = {f"leg {i + 1}": torch.stack([base[i], platform[i]]) for i in range(6)}
+        return legs | {"base": torch.cat([base, base[:1]]), "platform": torch.cat([platform, platform[:1]])}
+
     def _legs(self, pose: Tensor, values: Tensor) -> _Legs:
         legs = values.reshape(*values.shape[:-1], 6, 8)
         rotation = rotation_vector_to_matrix(pose[..., 3:])

@@ -72,6 +72,16 @@ class Tripod(Mechanism):
         pose = super().forward_kinematics(joints, parameters, guess)
         return torch.where(self.reachable(pose.detach(), parameters)[..., None], pose, torch.nan)
 
+    def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
+        """From the carriage of each leg to its joint on the platform; see `Mechanism.skeleton`."""
+        _, radius, offset = self._legs(self.resolve(parameters))
+        centre, rotation = self.frame(pose)
+        assert rotation is not None
+        # Legs 1 and 2 run along x, leg 3 along y.
+        side = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=pose.dtype)
+        carriage, on_platform = side * (joints + offset)[:, None], centre + (side * radius[:, None]) @ rotation.mT
+        return {f"leg {i + 1}": torch.stack([carriage[i], on_platform[i], centre]) for i in range(3)}
+
     def frame(self, pose: Tensor) -> tuple[Tensor, Tensor | None]:
         """Centre of the platform (0, y, z) and its rotation about -y by phi."""
         y, z, phi = pose.unbind(-1)

@@ -1,0 +1,64 @@
+"""The picture of the machine with its errors as arrows, before and after on one scale."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from diagnosis_cases import one_effect, with_rotation
+from matplotlib.figure import Figure
+from matplotlib.quiver import Quiver
+
+from ccnn_torch.diagnosis.page.figure_machine import machine_plot
+
+
+def _arrays() -> dict[str, np.ndarray]:
+    arrays = {name: value.numpy() for name, value in one_effect()[1].items()}
+    arrays["machine.leg 1"] = np.array([[-0.2, 0.0, 0.0], [-0.3, 0.2, 0.0], [0.0, 0.3, 0.0]])
+    arrays["machine.leg 2"] = arrays["machine.leg 1"] * [-1, 1, 1]
+    return arrays
+
+
+def _arrows(figure: Figure) -> list[Quiver]:
+    return [artist for axes in figure.axes for artist in axes.collections if isinstance(artist, Quiver)]
+
+
+def test_arrows_are_the_residuals_before_and_after_on_the_scale_that_is_stated() -> None:
+    arrays = _arrays()
+    plot = machine_plot(arrays, ["compliance"])
+    assert plot is not None
+    machine, before, after = plot.figure.axes
+    stated = re.search(r"(\d+) times as large on both sides", plot.caption)
+    assert stated is not None and f"(arrows {stated[1]} ×)" in before.artists[0].text.get_text()
+    rows = np.flatnonzero(arrays["set_aside"] < 0.5)
+    for arrows, name in zip(_arrows(plot.figure), ("residual", "remainder"), strict=True):
+        which = [int(np.argmin(np.abs(1e3 * arrays["place"][rows, 0] - x))) for x in arrows.XY[:, 0]]
+        assert len(which) == 160 and np.allclose(
+            np.stack([arrows.U, arrows.V], -1), 1e3 * float(stated[1]) * arrays[name][rows[which]][:, :2]
+        )
+    assert before.get_xlim() == after.get_xlim() and before.get_ylim() == after.get_ylim()
+    assert [axes.get_xlabel() for axes in plot.figure.axes] == ["x [mm]"] * 3 and before.get_ylabel() == "y [mm]"
+    assert len(machine.lines) == 2 and [text.get_text() for text in machine.texts] == ["1", "2"]
+    assert "With compliance in it" in after.get_title(loc="left")
+
+
+def test_the_plane_is_that_of_the_largest_extent() -> None:
+    arrays = {name: value.numpy() for name, value in one_effect()[1].items()}
+    arrays["place"] = arrays["place"][:, [0, 2, 1]]
+    plot = machine_plot(arrays, ["compliance", "backlash"])
+    assert plot is not None and len(plot.figure.axes) == 2
+    assert plot.figure.axes[0].get_ylabel() == "z [mm]"
+    assert "With the 2 effects in it" in plot.figure.axes[1].get_title(loc="left")
+
+
+@pytest.mark.parametrize("change", ["still", "line", "missing"])
+def test_what_spans_no_plane_has_no_picture(change: str) -> None:
+    arrays = {name: value.numpy() for name, value in with_rotation()[1].items()}
+    if change == "still":
+        arrays["residual"][:, :3] = 0
+    elif change == "line":
+        arrays["place"][:, 1:] = 0
+    else:
+        del arrays["remainder"]
+    assert machine_plot(arrays, []) is None
