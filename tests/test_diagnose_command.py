@@ -261,9 +261,19 @@ def test_the_command_on_the_screen_puts_the_effect_in_a_compensator(
     assert correct[:3] == ["ccnn", "compensate", "found_compensator/model.onnx"]
     page = Path("found/report.html").read_text(encoding="utf-8")
     assert "What is wrong" in page and "effects=from:found/diagnosis.json" in page
-    # Effects that a compensator cannot hold are left to the network, with the reason.
-    code, shown, _ = cli("diagnose", *words, "--effects", "drift", "--out", "drifted")
-    assert code == 0 and "effects=from" not in shown
+
+
+def test_effects_that_a_compensator_cannot_hold_are_left_to_its_network(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = ("--effect", "drift", "--rows", "80", "--noise", "5e-6", "--out", "r.csv", "--quiet")
+    assert cli("simulate", "--mechanism", "five_bar", *made)[0] == 0
+    words = ("--records", "r.csv", "--mechanism", "five_bar", "--noise", "5e-6", "--no-network", "--out", "found")
+    code, shown, _ = cli("diagnose", *words)
+    assert code == 0 and "What is wrong: Drift of joints 1 and 2" in shown
+    assert "leave the gap to a network and correct targets (effects, drift: needs the time of each row" in shown
+    assert "  ccnn run records=r.csv mechanism=five_bar out=found_compensator\n" in shown
 
 
 def test_a_terminal_shows_the_steps_and_the_time_left(rows: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,3 +8,4 @@ from ccnn_torch.diagnosis.from_records import diagnose as diagnose
 from ccnn_torch.diagnosis.from_records import noise_of as noise_of
 from ccnn_torch.diagnosis.from_records import situation_of as situation_of
 from ccnn_torch.diagnosis.result import Diagnosis as Diagnosis
+from ccnn_torch.diagnosis.verdict.findings import findings as findings

@@ -143,9 +143,7 @@ class Mechanism(nn.Module):
         )
 
     def skeleton(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> dict[str, Tensor]:
-        """Lines to draw the machine with at one configuration: its legs or links by name, `k x 3` [m] each.
-
-        In the robot's frame. The default has none, and pictures leave the machine out.
+        """Its legs or links at one configuration as lines by name, `k x 3` [m] in the robot's frame; default: none.
 
         Args:
             pose: `p` [SI].

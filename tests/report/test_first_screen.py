@@ -36,6 +36,7 @@ def test_every_effect_has_words_and_a_part_to_look_at() -> None:
         assert words.cause and words.short and words.look.endswith(".")
         assert "{" not in words.look.format(where="joint 2")
     assert len({words_of(name).look for name in EFFECTS}) == len(EFFECTS)
+    assert not [name for name in EFFECTS if words_of(name).cause == f"the effect {name}"]
 
 
 def test_a_harmonic_error_is_told_by_joint_amplitude_and_times_a_turn() -> None:
@@ -118,13 +119,20 @@ def test_what_to_do_now_names_files_columns_and_commands() -> None:
         "2 poses to tell joint_offset from geometry apart: runs/d/next_measurements.csv. "
         "Record as well: speed1[rad/s] (would show latency)."
     )
+    results = indistinguishable()[0]
+    results["next_measurements"][0]["separates"] = ["backlash"]
+    assert _told(results)["Measure next"].startswith("2 poses to see whether backlash acts: next_measurements.csv.")
+    results["noise"] = "estimated"
+    assert "the noise estimated at 21.0 µm" in _told(results)["What it removes"]
+    assert "the noise is not known" in _told(results)["How sure"]
     assert "or geometry error or base frame off: these rows do not distinguish them" in told["What is wrong"].text
 
 
 def test_nothing_bad_rows_and_what_is_outside_are_said() -> None:
     assert _told(none()[0])["What is wrong"].startswith("Nothing: model and machine differ by no more than the noise")
     assert "What it removes" not in _told(none()[0])
-    assert _told(outlier()[0])["What is wrong"] == "2 bad rows."
+    bad = _told(outlier()[0])
+    assert bad["What is wrong"] == "2 bad rows." and not {"Where", "What it removes"} & set(bad)
     wrong = _told(outside()[0])["What is wrong"]
     assert wrong.endswith("A rest that follows the temperature, which no effect of the library describes.")
 

@@ -39,7 +39,9 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
         sentence = "These lines put the effects and a network on what they leave in a compensator and correct targets."
         covariates = _outlasting(named, situation) or covariates
     except InputError as reason:
-        sentence = f"These lines leave the gap to a network and correct targets ({reason})."
+        # What is wrong without the file and the remedy, which the lines are themselves.
+        why = str(reason).removeprefix(f"{path}: ").partition(";")[0]
+        sentence = f"These lines leave the gap to a network and correct targets ({why})."
     if covariates is not None:
         keys["covariates"] = f"[{','.join(covariates)}]"
     keys["out"] = f"{typed_path(str(path.parent))}_compensator"

@@ -95,15 +95,16 @@ def _sure(results: Block) -> str:
 def _removed(results: Block) -> str:
     """The gap before and after: on rows at random, and where nothing was measured."""
     verdict, gap, far = results["verdict"], results["gap"], results.get("by_block")
-    if not verdict["effects"] or gap["before"] is None or gap["after"] is None:
+    if not verdict["effects"] or verdict["effects"] == [OUTLIER] or gap["before"] is None or gap["after"] is None:
         return ""
     text = f"{size_text(gap['before'], gap)} → {size_text(gap['after'], gap)} on rows at random"
     if far is not None:
         before, after = (size_text(far[key], far) for key in ("before", "after"))
         text += f", {before} → {after} where nothing was measured (by block)"
-    elif verdict["effects"] != [OUTLIER]:
+    else:
         text += "; not known where nothing was measured"
-    floor = f"; the noise is {size_text(gap['noise_floor'], gap)}" if gap["noise_floor"] else ""
+    known = "estimated at" if results.get("noise") == "estimated" else "is"
+    floor = f"; the noise {known} {size_text(gap['noise_floor'], gap)}" if gap["noise_floor"] else ""
     network = results.get("network") or {}
     if network.get("gap_after") is not None and network["gain_ci95"][0] > 0:
         floor += f"; with a network on the rest {size_text(network['gap_after'], network)}"
@@ -117,6 +118,7 @@ def _measure(results: Block, about: About) -> str:
     if wanted:
         rivals = list(dict.fromkeys(name for entry in wanted for name in entry["separates"]))
         aim = f"to tell {listed(rivals, 'from')} apart" if rivals else "to sharpen the numbers"
+        aim = f"to see whether {rivals[0]} acts" if len(rivals) == 1 else aim
         path = f"{about.folder}/{NEXT}" if about.folder else NEXT
         said.append(f"{len(wanted)} poses {aim}: {path}.")
     missing = results.get("missing_covariates")

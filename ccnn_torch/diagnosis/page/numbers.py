@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ccnn_torch.diagnosis.verdict.findings import clear_parameters, frequency_words, size_words
-from ccnn_torch.display import display_unit
+from ccnn_torch.display import display_unit, unit_text
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.report.table import Table
 
@@ -74,7 +74,7 @@ def _whole(value: float, unit: str, sd: float) -> str:
     if unit == "m":
         scale, shown = display_unit("m", 1.0)
         return f"{value / scale:.{_decimals(sd / scale)}f} {shown}"
-    text = f"{value:.{_decimals(sd)}f} {unit}".removesuffix(" 1")
+    text = f"{value:.{_decimals(sd)}f} {unit_text(unit)}".removesuffix(" 1")
     degrees = math.degrees(1.0)
     return f"{text} = {value * degrees:.{_decimals(sd * degrees)}f}°" if unit == "rad" else text
 

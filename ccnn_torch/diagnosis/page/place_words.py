@@ -10,6 +10,7 @@ from ccnn_torch.diagnosis.page.data import About
 from ccnn_torch.diagnosis.page.localisation import regime_words
 from ccnn_torch.diagnosis.verdict.findings import places
 from ccnn_torch.diagnosis.verdict.text import listed
+from ccnn_torch.effects import OUTLIER
 
 __all__ = ["where_words"]
 
@@ -29,13 +30,13 @@ _SMALL = 0.5
 
 
 def where_words(results: Block, about: About) -> list[str]:
-    """Up to three sentences without a full stop; none where the verdict is that there is no gap.
+    """Up to three sentences without a full stop; none where there is no gap beside the noise and bad rows.
 
     Args:
         results: as in `diagnosis.json`.
         about: for the units of covariates.
     """
-    if results["verdict"]["none"]:
+    if results["verdict"]["none"] or results["verdict"]["effects"] == [OUTLIER]:
         return []
     said = []
     joints = sorted(results["where"]["joints"].items(), key=lambda item: -item[1])
