@@ -14,7 +14,8 @@ from ccnn_torch.diagnosis.evidence.dictionary import covariance
 from ccnn_torch.diagnosis.residual.distance import distance, size_of
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import Gap
-from ccnn_torch.diagnosis.verdict.judgement import IMPLAUSIBLE, Judgement
+from ccnn_torch.diagnosis.verdict.judgement import Judgement
+from ccnn_torch.diagnosis.verdict.plausible import implausible_size
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Situation
 
@@ -168,7 +169,7 @@ def _of_nothing_gained(analysis: Analysis, judgement: Judgement, together: Gap) 
 
 def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """Causes of the verdict that would have to be hundreds of times as large as in any machine."""
-    said = []
+    said, most = [], implausible_size(analysis)
     for i, mean in zip(judgement.found.members, judgement.found.mean, strict=True):
         atom = analysis.dictionary.atoms[i]
         coefficients = atom.coefficients(analysis.situation)
@@ -176,7 +177,7 @@ def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
             continue
         size = torch.where(torch.tensor([c.secondary for c in coefficients]), 0.0, mean.abs())
         worst = int(size.argmax())
-        if float(size[worst]) > IMPLAUSIBLE:
+        if float(size[worst]) > most:
             said.append(
                 Caution(
                     f"{atom.name} would have to be {float(size[worst]):.0f} times as large as is plausible "

@@ -10,7 +10,17 @@ from torch import Tensor
 
 from ccnn_torch.effects import Situation
 
-__all__ = ["LEAST_FREE", "LEAST_NOISE", "MAD", "NO_NOISE", "Whitening", "moving_channels", "reweighted"]
+__all__ = [
+    "LEAST_FREE",
+    "LEAST_NOISE",
+    "MAD",
+    "NO_NOISE",
+    "Whitening",
+    "moving_channels",
+    "renewed",
+    "reweighted",
+    "without_frames",
+]
 
 # Degrees of freedom of the row weights (Student t), and beyond how many times its noise a row is set aside.
 _DEGREES = 4.0
@@ -93,3 +103,38 @@ def reweighted(white: Whitening, left: Tensor, usable: Tensor, free: float) -> W
     weight = (_DEGREES + c) / (_DEGREES + size) if heavy else torch.ones_like(size)
     weight = torch.where(aside, torch.zeros_like(weight), weight)
     return replace(white, weight=weight)
+
+
+def without_frames(white: Whitening, left: Tensor, fitted: Tensor) -> Tensor:
+    """What is left of the rows when frames are fitted to it, `s x c0` [m, rad].
+
+    Args:
+        white: noise and weights.
+        left: `s x c0` [m, rad].
+        fitted: what the frames can do, `s x c0 x r`.
+    """
+    if not fitted.shape[-1]:
+        return left
+    keep = white.keep()
+    x, y = white(fitted)[keep].flatten(0, 1), white(torch.nan_to_num(left))[keep].flatten()
+    found: Tensor = left - fitted @ torch.linalg.lstsq(x, y, driver="gelsd").solution
+    return found
+
+
+def renewed(white: Whitening, left: Tensor, residual: Tensor, free: float, is_given: bool, usable: Tensor) -> Whitening:
+    """Noise and weights from what a fit leaves.
+
+    Args:
+        white: before.
+        left: of the fit, `s x c0` [m, rad].
+        residual: what was fitted, `s x c0` [m, rad].
+        free: share of the values that the fit leaves free.
+        is_given: whether the noise was given, and only weights are new.
+        usable: rows that may count, `s`.
+    """
+    left, counted = left[:, white.channels], (white.weight > 0) & usable
+    if not is_given:
+        spread = left[counted].abs().median(0).values * MAD / max(free, LEAST_FREE) ** 0.5
+        rms = residual[counted][:, white.channels].abs().median(0).values * MAD
+        white = replace(white, sigma=torch.maximum(spread, LEAST_NOISE * rms).clamp_min(NO_NOISE))
+    return reweighted(white, left, usable, free)

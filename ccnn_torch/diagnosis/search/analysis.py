@@ -27,15 +27,7 @@ from ccnn_torch.diagnosis.residual.correlation import INDEPENDENT, Correlation
 from ccnn_torch.diagnosis.residual.linearisation import remainder, tangent
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.rows import frame_columns, near_singular
-from ccnn_torch.diagnosis.residual.whitening import (
-    LEAST_FREE,
-    LEAST_NOISE,
-    MAD,
-    NO_NOISE,
-    Whitening,
-    moving_channels,
-    reweighted,
-)
+from ccnn_torch.diagnosis.residual.whitening import Whitening, moving_channels, renewed, without_frames
 from ccnn_torch.diagnosis.search.beam import search
 from ccnn_torch.diagnosis.search.convergence import (
     discrepancy_is_active,
@@ -83,6 +75,7 @@ class Analysis:
         floor: mean square of the noise in the units of `y`: 1 where it was given, else that of the richest fit or,
             where that is far less, of the most probable set.
         instrument: standard deviation of the noise that the records show without a model, `c0` [m, rad], or None.
+        fitted: what frames that are fitted to the rows do about the machine with the set's effects, `s x c0 x r`.
         idle: effects that change no pose in these rows, and were no candidates.
         correlation: of the noise between the rows that count.
         shared: columns of all atoms and `y` before what rows share was taken out of them; None where that is nothing.
@@ -97,6 +90,7 @@ class Analysis:
     found: list[FittedSet]
     near_singular: Tensor
     floor: float
+    fitted: Tensor
     idle: tuple[str, ...] = ()
     correlation: Correlation = INDEPENDENT
     shared: tuple[Tensor, Tensor] | None = None
@@ -181,7 +175,7 @@ def analyse(
         if before is not None:
             old, sought = result.whitening, act if act == before else None
             if not has_new_effects(result.dictionary, result.found, best, before, result.gap) and is_converged(
-                result.dictionary, result.y, best, old, white, left
+                result.dictionary, result.y, best, old, white, without_frames(result.whitening, left, result.fitted)
             ):
                 if torch.equal(white.keep(), old.keep()):
                     break
@@ -195,7 +189,7 @@ def analyse(
         before = act
         result = _search_about_set(rows, fixed, result, acting, white, left, shapes, local)
     at_step("searching the effects", 0.8)
-    result = _with_shared_noise(rows, fixed.rich, result)
+    result = _with_shared_noise(rows._replace(fitted=result.fitted), fixed.rich, result)
     if instrument is not None and noise is None and result.correlation.target is None:
         result = _above_instrument(result, instrument)
     shown = {e.name for e in fixed.effects}
@@ -271,6 +265,7 @@ def _search_about_set(
         there, target, ok = situation, rows.residual, usable
     target = torch.where(ok[:, None], target, 0.0)
     white = white if bool((ok == usable).all()) else _renewed(result, rows.noise, ok)
+    rows = rows._replace(fitted=frame_columns(there, ok))
     atoms = candidates_about_set(
         situation,
         there,
@@ -364,6 +359,7 @@ def _searched(
         found,
         rows.near,
         floor,
+        rows.fitted,
         correlation=correlation,
         shared=shared,
     )
@@ -376,18 +372,11 @@ def _drawn(rows: Tensor, channels: int) -> Tensor:
 
 
 def _renewed(result: Analysis, noise: Tensor | None, usable: Tensor) -> Whitening:
-    """Noise and weights from what the most probable set of all leaves."""
-    best, white = result.found[0], result.whitening
-    raw = result.residual
+    """Noise and weights from what the most probable set of all and the frames beside it leave."""
+    best = result.found[0]
+    left = result.residual
     for i, mean in zip(best.members, best.mean, strict=True):
-        raw = raw - result.dictionary.atoms[i].columns @ mean
-    raw = raw[:, white.channels]
+        left = left - result.dictionary.atoms[i].columns @ mean
     free = 1 - best.effective / max(result.dictionary.grams.values, 1.0)
-    if noise is None:
-        rows = (white.weight > 0) & usable
-        spread = raw[rows].abs().median(0).values * MAD / max(free, LEAST_FREE) ** 0.5
-        rms = result.residual[rows][:, white.channels].abs().median(0).values * MAD
-        white = Whitening(
-            white.channels, torch.maximum(spread, LEAST_NOISE * rms).clamp_min(NO_NOISE), white.weight, white.known
-        )
-    return reweighted(white, raw, usable, free)
+    left = without_frames(result.whitening, left, result.fitted)
+    return renewed(result.whitening, left, result.residual, free, noise is not None, usable)

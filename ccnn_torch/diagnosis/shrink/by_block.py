@@ -40,20 +40,19 @@ def by_block(made: Blocks, residual: Tensor) -> dict[str, Any] | None:
     atoms = analysis.dictionary.atoms
     members = [i for i in judgement.found.members if atoms[i].name in judgement.names]
     white, keep = analysis.whitening, analysis.whitening.keep()
-    frames = frame_columns(analysis.situation, white.weight > 0)
-    number = cut(analysis.situation.joints[keep], frames[keep])
+    framed, fresh = white(analysis.fitted)[keep], white(frame_columns(analysis.situation, white.weight > 0))[keep]
+    number = cut(analysis.situation.joints[keep], fresh)
     if not members or not bool(torch.bincount(number, minlength=_BLOCKS).all()):
         return None
     columns = torch.cat([white(atoms[i].columns) for i in members], -1)[keep]
-    framed = white(frames)[keep]
     widths = [atoms[i].columns.shape[-1] for i in members]
     groups = torch.split(torch.arange(sum(widths)), widths)
     nominal, target = white(residual)[keep], white(analysis.residual)[keep]
     before, left, uncertain = nominal.clone(), target.clone(), torch.zeros_like(target)
     for k in range(_BLOCKS):
         there = number == k
+        before[there] = nominal[there] - fresh[there] @ _frames(fresh[~there])(nominal[~there])
         alone = _frames(framed[~there])
-        before[there] = nominal[there] - framed[there] @ alone(nominal[~there])
         x, y = columns[~there], target[~there]
         # Frames are as large as they have to be: what they can do is no evidence.
         apart, rest = x - framed[~there] @ alone(x), y - framed[~there] @ alone(y)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from ccnn_torch.diagnosis.evidence.dictionary import FittedSet
 from ccnn_torch.diagnosis.search.analysis import Analysis
@@ -23,9 +23,11 @@ __all__ = [
     "unexplained",
 ]
 
-# As `FORM`, of a discrepancy term beside library effects, and of library effects beside a discrepancy term, which
-# stands for whatever was not thought of. Exact effects leave no more than the second order.
+# As `FORM`, of a discrepancy term beside library effects; of effects whose form is exact, which leave no more than the
+# second order; and of library effects beside a discrepancy term, which stands for whatever was not thought of.
 FORM_DISCREPANCY, FORM_EXACT, _BESIDE_CATCH_ALL = 0.006, 1e-4, 0.1
+# Beside such a term the library is known to lack something, which can look like 4 % of the gap's RMS of anything.
+_SLIGHT = 0.0016
 # A library effect whose own part is more than this share of the gap is no form of other ones, however well these could
 # do without it.
 _CARRIES = 0.5
@@ -88,14 +90,7 @@ def _with_less(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...]
     if len(found.members) < 2:
         return found
     shares = _net(analysis, found, tried)
-    # Library effects are a form of the discrepancy term beside them only where that carries much more than they do.
-    wild = max((share for i, (share, _) in shares.items() if atoms[i].is_discrepancy), default=0.0)
-    beside = min(_BESIDE_CATCH_ALL, wild / 2)
-    limits = {}
-    for i in found.members:
-        wide = FORM_DISCREPANCY if atoms[i].is_discrepancy else FORM
-        form = FORM_EXACT if is_exact(analysis, [m for m in found.members if m != i]) else wide
-        limits[i] = form if atoms[i].is_discrepancy else max(form, beside)
+    limits = {i: _form(analysis, found, i, shares) for i in found.members}
     alone = not any(atoms[i].is_discrepancy for i in found.members)
     large = _CARRIES * analysis.gap
     carries = {i for i, e in zip(found.members, found.energy, strict=True) if alone and e > large}
@@ -120,6 +115,24 @@ def _with_less(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...]
     # A discrepancy term can replace much of the library, so it is the first to go; else what is missed least.
     least = max(idle, key=lambda i: (atoms[i].is_discrepancy, tried[shares[i][1]].log_posterior))
     return tried[shares[least][1]]
+
+
+def _form(
+    analysis: Analysis, found: FittedSet, member: int, shares: Mapping[int, tuple[float, tuple[int, ...]]]
+) -> float:
+    """Share of the gap's energy up to which a member may be no more than the form of the others: each of these leaves
+    a share of what it does itself, and a discrepancy term one of what nothing else does."""
+    atoms = analysis.dictionary.atoms
+    wide = FORM_DISCREPANCY if atoms[member].is_discrepancy else FORM
+    form, wild = 0.0, 0.0
+    for i, energy in zip(found.members, found.energy, strict=True):
+        if i == member:
+            continue
+        if atoms[i].is_discrepancy:
+            wild = max(_BESIDE_CATCH_ALL * shares[i][0], _SLIGHT)
+        else:
+            form += (FORM_EXACT if is_exact(analysis, [i]) else wide) * min(energy / analysis.gap, 1.0)
+    return min(form, wide) + wild
 
 
 def is_known(analysis: Analysis) -> bool:

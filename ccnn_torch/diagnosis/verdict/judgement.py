@@ -22,8 +22,9 @@ from ccnn_torch.diagnosis.verdict.essential import (
     smallest,
     unexplained,
 )
+from ccnn_torch.diagnosis.verdict.plausible import implausible_size
 
-__all__ = ["IMPLAUSIBLE", "Judgement", "judge", "without_names"]
+__all__ = ["Judgement", "judge", "without_names"]
 
 # What a claim is worth where a name carries less than this share of the gap, or where there are three names or more:
 # the textbook forms of effects are too rough to be surer.
@@ -40,9 +41,6 @@ _MAIN, _MENDED = 0.5, 15.0
 _LEAST_EXPLAINED = 0.5
 # Log odds that a cause of another form may lose for its sizes.
 _FAR_FETCHED = 20.0
-IMPLAUSIBLE = 250.0
-"""Plausible sizes that no cause has: sealed machines whose gap was 30 times the noise had up to 185; a unit mistaken
-makes 1000."""
 # Odds up to which the data do not distinguish one name from another.
 _ODDS = math.log(20.0)
 # Log odds against the most probable set beyond which sets are not considered.
@@ -189,14 +187,14 @@ def _little(analysis: Analysis) -> bool:
 def _borrowed(analysis: Analysis, found: FittedSet, tried: dict[tuple[int, ...], FittedSet]) -> frozenset[str]:
     """Names of a set that rest on what other effects do as well, or on what should only correct their form, or that
     would be of a size beside others that no cause has."""
-    grams, names = analysis.dictionary.grams, set()
+    grams, names, most = analysis.dictionary.grams, set(), implausible_size(analysis)
     for i, mean in zip(found.members, found.mean, strict=True):
         atom, group = analysis.dictionary.atoms[i], analysis.dictionary.groups[i]
         if atom.is_discrepancy:
             continue
         coefficients = atom.coefficients(analysis.situation)
         main_sizes = [abs(float(v)) for c, v in zip(coefficients, mean, strict=True) if not c.secondary]
-        if len(found.members) > 1 and max(main_sizes, default=0.0) > IMPLAUSIBLE:
+        if len(found.members) > 1 and max(main_sizes, default=0.0) > most:
             names.add(atom.name)
             continue
         if not any(c.borrowed or c.doubtful or c.mends for c in coefficients):
