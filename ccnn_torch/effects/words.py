@@ -30,7 +30,7 @@ _WORDS = {
     "geometry": Words(
         "an error of the geometry",
         "geometry error",
-        "The values were fitted together: enter all that the report lists, not single ones.",
+        "The values were fitted together: enter all of diagnosis.json, not single ones.",
         "Mounting and lengths of {where}, where a value is off by more than its tolerance.",
     ),
     "joint_offset": Words(

@@ -49,7 +49,7 @@ def numbers_table(results: Block, most: int) -> Table | None:
     if all(row[3] == "–" for row in rows):
         columns, cells = columns[:3], [row[:3] for row in rows]
     if left_out:
-        notes.append(f"{left_out} more that are clearly not 0 are in report.html and diagnosis.json.")
+        notes.append(f"{left_out} more that are clearly not 0 are in diagnosis.json.")
     return Table("Numbers to enter", columns, tuple(cells), " ".join(notes))
 
 
