@@ -60,3 +60,23 @@ def test_script_takes_whole_goals_in_order(tmp_path: Path, monkeypatch: pytest.M
     assert len(chosen) == 21 and (np.diff(chosen) > 0).all()
     assert set(np.flatnonzero(np.isin(goal, goal[chosen]))) == set(chosen)
     assert set((tmp_path / "some.csv").read_text().splitlines()) <= set((tmp_path / "all.csv").read_text().splitlines())
+
+
+def test_directions_are_those_of_the_way_to_each_pose(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location("add_directions", DATA / "add_directions.py")
+    assert spec is not None and spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    # Rows of two sets, mixed; a joint that stands still keeps its direction.
+    columns = {
+        "set[1]": [1, 0, 0, 0, 1],
+        "step[1]": [0, 2, 0, 1, 1],
+        "q1[deg]": [9, 3, 5, 3, 7],
+        "q2[deg]": [1, 2, 3, 4, 2],
+    }
+    write_table(tmp_path / "all.csv", {**columns, **{f"{axis}[mm]": [0, 1, 2, 3, 4] for axis in "xyz"}})
+    script.add_directions(tmp_path / "all.csv", tmp_path / "some.csv")
+    made = read_table(tmp_path / "some.csv")
+    assert made.raw("x").tolist() == [2, 3, 1, 0, 4]
+    assert made.raw("direction1").tolist() == [1, -1, -1, 1, -1]
+    assert made.raw("direction2").tolist() == [1, 1, -1, 1, 1]
