@@ -238,9 +238,8 @@ def test_bad_input_is_one_sentence(cli: Cli, folder: Path, tmp_path: Path) -> No
 
 def test_identified_geometry_alone_says_what_to_do(tmp_path: Path) -> None:
     bar = load_mechanism("five_bar")
-    values = dict(zip((p.name for p in bar.geometry), bar.nominal.tolist(), strict=True))
-    units = {p.name: p.unit for p in bar.geometry}
-    lines = [f"  {k}: {{value: {v!r}, nominal: {v!r}, unit: {units[k]}}}" for k, v in values.items()]
+    rows = zip(bar.geometry, bar.nominal.tolist(), strict=True)
+    lines = [f"  {p.name}: {{value: {v!r}, nominal: {v!r}, unit: {json.dumps(p.unit)}}}" for p, v in rows]
     (tmp_path / "identified.yaml").write_text("\n".join(["mechanism: five_bar", "keys: {}", "parameters:", *lines]))
-    with pytest.raises(InputError, match="geometry=identify"):
+    with pytest.raises(InputError, match="identified geometry alone"):
         export_model(tmp_path / "identified.yaml", "c99", tmp_path / "out")

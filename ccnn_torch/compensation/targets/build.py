@@ -34,6 +34,8 @@ __all__ = ["Builder"]
 _COMMUTATIVE = frozenset({"add", "mul", "min", "max", "eq", "and", "or"})
 # Finite where what they take is: an argument is in a cage around the domain, where nothing overflows.
 _FINITE = frozenset({"add", "sub", "mul", "neg", "abs", "min", "max", "exp", "sin", "cos", "tanh", "atan", "floor"})
+# Rounding of a multiple.
+_SAME = 1e-13
 
 
 class Builder:
@@ -48,6 +50,8 @@ class Builder:
         self._steps: list[Let | Loop] = []
         self._sizes: dict[int, int] = {}
         self._starts: list[int] = []
+        # Of what is multiplied the factors that a sine or cosine was taken of, without multiples of others.
+        self._angles: dict[int, list[float]] = {}
         self._tables: dict[int, Array] = {}
         self._next = 0
 
@@ -204,6 +208,8 @@ class Builder:
             return first
         if op == "div" and b is not None and b != 0.0 and 1e-300 < abs(1 / b) < 1e300:
             return self.apply("mul", first, self.constant(1 / b))
+        if op in ("sin", "cos"):
+            return self._of_multiple(op, first)
         if op in ("min", "max") and first == second:
             return first
         if op == "select" and a is not None:
@@ -230,6 +236,47 @@ class Builder:
                     if inner is not None:
                         return self.apply("mul", self.constant(factor * inner), q)
         return None
+
+    def _of_multiple(self, op: str, angle: int) -> int | None:
+        """Sine or cosine of a whole multiple of an angle, by the angles' sums: harmonics of a gear are dozens."""
+        node, factor, part = self._nodes[angle], 1.0, angle
+        if node.op == "mul":
+            for x, y in (node.args, node.args[::-1]):
+                value = self._value(x)
+                if value:
+                    factor, part = value, y
+        firsts = self._angles.setdefault(part, [])
+        for first in firsts:
+            times = round(factor / first)
+            if times >= 1 and abs(factor / first - times) <= _SAME * times:
+                return self._shifted(op, angle) if factor == first else self._harmonic(op, part, first, times)
+        firsts.append(factor)
+        return self._shifted(op, angle)
+
+    def _shifted(self, op: str, angle: int) -> int | None:
+        """sin (x - c) where sine and cosine of x are known."""
+        node = self._nodes[angle]
+        shift = self._value(node.args[1]) if node.op == "sub" else None
+        if shift is None or not self._known.keys() >= {("sin", node.args[:1]), ("cos", node.args[:1])}:
+            return None
+        own, other = (self._known[f, node.args[:1]] for f in ((op, "cos") if op == "sin" else (op, "sin")))
+        right = self.apply("mul", self.constant(math.sin(shift)), other)
+        left = self.apply("mul", self.constant(math.cos(shift)), own)
+        return self.apply("sub" if op == "sin" else "add", left, right)
+
+    def _harmonic(self, op: str, part: int, first: float, times: int) -> int:
+        """sin (a + b) = 2 cos a sin b - sin (b - a), the same of cosines, with b = a or a + 1."""
+        key = (op, part, first, times)
+        if key not in self._known and times == 0:
+            self._known[key] = self.constant(float(op == "cos"))
+        elif key not in self._known and times == 1:
+            self._known[key] = self.apply(op, self.apply("mul", self.constant(first), part))
+        elif key not in self._known:
+            a, b = times // 2, times - times // 2
+            twice = self.apply("mul", self.constant(2.0), self._harmonic("cos", part, first, a))
+            product = self.apply("mul", twice, self._harmonic(op, part, first, b))
+            self._known[key] = self.apply("sub", product, self._harmonic(op, part, first, b - a))
+        return self._known[key]
 
     def _leaf(self, ids: Tensor, shape: Sequence[int]) -> Expression:
         """How a loop reads these nodes: one of them all the time, or elements of a buffer that are evenly apart."""

@@ -20,7 +20,7 @@ from ccnn_torch.errors import MethodFailedError
 __all__ = ["program_of"]
 
 # More elements, or products, are a loop over arrays; fewer are written out, without those of zeros.
-_ELEMENTS, _PRODUCTS = 128, 512
+_ELEMENTS, _PRODUCTS = 512, 1024
 # Of a thin matrix (masks) so many.
 _PRODUCTS_THIN, _THIN = 4096, 0.5
 
