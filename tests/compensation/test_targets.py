@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from kinds import KINDS, masked
+from kinds import KINDS, masked, six_joints
 from structured_text import Instance, parse_blocks
 from torch import Tensor
 
@@ -101,6 +101,11 @@ def test_connections_that_are_dead_cost_nothing() -> None:
     (few, cheap), (many, dear) = count(0.3), count(1.0)
     assert many == 3 * 6 + 6 * 6 + 6 * 3
     assert dear - cheap >= many - few > 20
+
+
+def test_harmonics_cost_one_sine_and_cosine_a_joint() -> None:
+    few, many = (form_of(six_joints(count)).deviation.operations() for count in (2, 12))
+    assert few["sin"] == many["sin"] and few["cos"] == many["cos"]
 
 
 def test_missing_covariates_and_numbers_that_are_none(tmp_path: Path) -> None:
