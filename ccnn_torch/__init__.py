@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ccnn_torch.api import identify as identify
     from ccnn_torch.api import verify as verify
     from ccnn_torch.compensation import Compensator as Compensator
+    from ccnn_torch.compensation import export_model as export_model
     from ccnn_torch.compensation import load_model as load_model
     from ccnn_torch.compensation import save_model as save_model
     from ccnn_torch.diagnosis import diagnose as diagnose
@@ -28,6 +29,7 @@ _HOMES = {
     "Mechanism": "ccnn_torch.mechanisms",
     "calibrate": "ccnn_torch.api",
     "diagnose": "ccnn_torch.diagnosis",
+    "export_model": "ccnn_torch.compensation",
     "identify": "ccnn_torch.api",
     "joint_deviations": "ccnn_torch.pseudoerror",
     "load_mechanism": "ccnn_torch.mechanisms",

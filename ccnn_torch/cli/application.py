@@ -13,6 +13,7 @@ from ccnn_torch.cli.check import check
 from ccnn_torch.cli.compare import compare
 from ccnn_torch.cli.compensate import compensate
 from ccnn_torch.cli.diagnose import diagnose
+from ccnn_torch.cli.export import export
 from ccnn_torch.cli.identify import identify
 from ccnn_torch.cli.keys import keys
 from ccnn_torch.cli.new import new
@@ -62,6 +63,7 @@ for _command in (
     suite,
     identify,
     compensate,
+    export,
     verify,
     compare,
     plan,

@@ -26,3 +26,4 @@ from ccnn_torch.compensation.model_files.signature import new_key_pair as new_ke
 from ccnn_torch.compensation.networks import UncertainNetwork as UncertainNetwork
 from ccnn_torch.compensation.networks import network_from_description as network_from_description
 from ccnn_torch.compensation.networks import register_network as register_network
+from ccnn_torch.compensation.targets.export import export_model as export_model

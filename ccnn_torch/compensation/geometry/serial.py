@@ -18,6 +18,8 @@ __all__ = ["SerialGeometry"]
 # normal equations regular, and leaves out less than 1e-4 of what a lever of 0.1 m corrects.
 _LEAST_DAMPING = 1e-3
 _STEPS = 2
+# Cosines of a right angle and their products with lengths: rounding [1 or m], and as zeros they cost nothing.
+_NOTHING = 1e-15
 
 
 class SerialGeometry(nn.Module):
@@ -175,7 +177,7 @@ def _links(arm: SerialArm, values: Tensor) -> Tensor:
     tool = _homogeneous(rotation_vector_to_matrix(values[..., -3:]), values[..., -6:-3])
     links[..., 0, :, :] = base @ links[..., 0, :, :]
     links[..., -1, :, :] = links[..., -1, :, :] @ tool
-    return links
+    return torch.where(links.abs() < _NOTHING, 0.0, links)
 
 
 def _homogeneous(rotation: Tensor, translation: Tensor) -> Tensor:

@@ -1,0 +1,179 @@
+"""A form as C99: a header, a source, a self-test with the golden vectors, and a Makefile."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ccnn_torch.compensation.targets.c99_text import (
+    COVARIATES,
+    DECLARATIONS,
+    DRIVER,
+    GIVEN,
+    MAKEFILE,
+    SD_DECLARATION,
+    SD_DRIVER,
+    SD_TEST,
+    SELFTEST,
+    SMALLER,
+)
+from ccnn_torch.compensation.targets.form import Array, Form, Program
+from ccnn_torch.compensation.targets.golden import Golden
+from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
+
+__all__ = ["print_c99"]
+
+_NAMES = ("sqrt", "exp", "log", "sin", "cos", "tan", "tanh", "asin", "acos", "atan", "floor")
+_FUNCTIONS = {name: f"{name}{{s}}({{{{0}}}})" for name in _NAMES}
+_FUNCTIONS |= {"abs": "fabs{s}({{0}})", "atan2": "atan2{s}({{0}}, {{1}})", "pow": "pow{s}({{0}}, {{1}})"}
+_OPERATIONS = {
+    "add": "({0} + {1})",
+    "sub": "({0} - {1})",
+    "mul": "({0} * {1})",
+    "div": "({0} / {1})",
+    "neg": "(-{0})",
+    "min": "ccnn_min({0}, {1})",
+    "max": "ccnn_max({0}, {1})",
+    "lt": "({0} < {1})",
+    "le": "({0} <= {1})",
+    "eq": "({0} == {1})",
+    "and": "({0} && {1})",
+    "or": "({0} || {1})",
+    "not": "(!{0})",
+    "select": "({0} ? {1} : {2})",
+}
+
+
+def print_c99(form: Form, golden: Golden) -> dict[str, str]:
+    """Contents of the files by name."""
+    dialect = _dialect(form.dtype)
+    tables: dict[bytes, str] = {}
+    texts = [print_program(program, dialect, tables) for program in form.programs]
+    return {
+        "compensator.h": _header(form),
+        "compensator.c": _source(form, texts, dialect),
+        "selftest.c": _selftest(form, golden, dialect),
+        "Makefile": MAKEFILE,
+    }
+
+
+def _dialect(dtype: str) -> Dialect:
+    single = dtype == "float32"
+
+    def literal(value: float) -> str:
+        if np.isnan(value):
+            return "NAN"
+        if np.isinf(value):
+            return "INFINITY" if value > 0 else "-INFINITY"
+        text = f"{np.float32(within(value, dtype))!s}f" if single else repr(float(value))
+        return f"({text})" if text.startswith("-") else text
+
+    return Dialect(
+        "c99",
+        _OPERATIONS | {name: text.format(s="f" if single else "") for name, text in _FUNCTIONS.items()},
+        literal,
+        lambda name, value, truth: f"const {'int' if truth else 'ccnn_real'} {name} = {value};",
+        lambda place, value: f"{place} = {value};",
+        lambda index, count, lines: [
+            f"for (int {index} = 0; {index} < {count}; {index}++) {{",
+            *(f"    {line}" for line in lines),
+            "}",
+        ],
+        "{0}[{1}]",
+    )
+
+
+def _comment(lines: list[str]) -> str:
+    return "\n".join(["/*", *(f" * {line}".rstrip() for line in wrapped(lines)), " */"])
+
+
+def _header(form: Form) -> str:
+    sd = "" if form.spread is None else SD_DECLARATION
+    about = [
+        *form.facts,
+        "",
+        "Inputs and outputs are in SI units, in this order. Joints: " + ", ".join(form.joints) + ".",
+        "Covariates: " + (", ".join(form.covariates) or "none (give NULL)") + ".",
+        "",
+        *costs(form),
+        "No heap, no recursion, no global state; each array is of fixed size. An output may be the same array as an "
+        "input. Do not compile with -ffast-math: the check for numbers that are none would be left out.",
+    ]
+    real = "double" if form.dtype == "float64" else "float"
+    return f"""{_comment(about)}
+#ifndef CCNN_COMPENSATOR_H
+#define CCNN_COMPENSATOR_H
+
+typedef {real} ccnn_real;
+
+enum {{ CCNN_JOINTS = {len(form.joints)}, CCNN_COVARIATES = {len(form.covariates)} }};
+
+{DECLARATIONS}{sd}
+#endif
+"""
+
+
+def _arguments(program: Program) -> str:
+    outputs = [f"ccnn_real {name}_out[]" for name, ids in program.outputs.items() if ids]
+    return ", ".join([*(f"const ccnn_real {name}[]" for name in program.inputs), *outputs])
+
+
+def _function(program: Program, text: Text) -> str:
+    body = [f"    {line}" for line in text.lines]
+    before = [f"    ccnn_real {name}[{size}];" for name, size in text.buffers.items()]
+    before += ["    ccnn_real sum;"] if text.sums else []
+    joined = "\n".join(body)
+    before += [f"    (void){name};" for name in program.inputs if f"{name}[" not in joined]
+    return "\n".join([f"static void ccnn_{program.name}({_arguments(program)})", "{", *before, *body, "}"])
+
+
+def _constants(name: str, values: Array, dialect: Dialect) -> str:
+    flat = [dialect.literal(float(v)) for v in values.ravel()]
+    rows = [", ".join(flat[k : k + 4]) for k in range(0, len(flat), 4)]
+    return f"static const ccnn_real {name}[{len(flat)}] = {{\n    " + ",\n    ".join(rows) + "\n};"
+
+
+def _source(form: Form, texts: list[Text], dialect: Dialect) -> str:
+    parts = ['#include "compensator.h"', "", "#include <math.h>", "#include <stddef.h>", ""]
+    s = "f" if form.dtype == "float32" else ""
+    for name, values in {k: v for text in texts for k, v in text.tables.items()}.items():
+        parts += [_constants(name, values, dialect), ""]
+    numbers = {"ccnn_limit": form.limit * (1 + 1e-9), "ccnn_slack": form.slack}
+    numbers |= {} if form.spread is None else {"ccnn_fallback_sd": form.fallback_sd}
+    for name, values in numbers.items():
+        parts += [_constants(name, values, dialect), ""]
+    body = "\n\n".join(_function(program, text) for program, text in zip(form.programs, texts, strict=True))
+    for name, sign in (("min", "<"), ("max", ">")):
+        if f"ccnn_{name}(" in body:
+            parts += [SMALLER.format(name=name, sign=sign)]
+    m = len(form.covariates)
+    driver = DRIVER + (SD_DRIVER if form.spread is not None else "")
+    driver = driver.replace("@EPS@", dialect.literal(8 * float(np.finfo(form.dtype).eps))).replace("fabs(", f"fabs{s}(")
+    driver = driver.replace("@STEPS@", str(form.iterations)).replace("@ZERO@", dialect.literal(0.0))
+    for key, with_covariates in COVARIATES.items():
+        driver = driver.replace(key, with_covariates if m else "")
+    given = GIVEN if m else "    (void)covariates;\n"
+    return "\n".join([*parts, body, "", driver.replace("@GIVEN@", given)])
+
+
+def _selftest(form: Form, golden: Golden, dialect: Dialect) -> str:
+    outputs = golden.outputs
+    names = {"joints": golden.joints, "covariates": golden.covariates} | {
+        k: v for k, v in outputs.items() if "status" not in k
+    }
+    tables = [_constants(f"golden_{k}", v, dialect) for k, v in names.items() if v.size]
+    for k in ("status", "ideal_status"):
+        rows = _whole(outputs[k])
+        tables.append(f"static const char golden_{k}[{len(outputs[k])}] = {{\n    {rows}\n}};")
+    tables.append(_constants("tolerance", golden.tolerance, dialect))
+    covariates = "golden_covariates + k * CCNN_COVARIATES" if golden.covariates.size else "NULL"
+    sd = "" if form.spread is None else SD_TEST.replace("@RELATIVE@", dialect.literal(golden.relative))
+    s = "f" if form.dtype == "float32" else ""
+    text = SELFTEST.replace("@SD@", sd).replace("@COUNT@", str(len(golden.joints))).replace("fabs(", f"fabs{s}(")
+    text = text.replace("@COVARIATES@", covariates).replace("@ZERO@", dialect.literal(0.0))
+    text = text.replace("@EPS@", dialect.literal(4 * float(np.finfo(form.dtype).eps)))
+    return text.replace("@TABLES@", "\n\n".join(tables))
+
+
+def _whole(values: Array) -> str:
+    """Whole numbers in lines."""
+    return ",\n    ".join(", ".join(map(str, values[k : k + 30].tolist())) for k in range(0, len(values), 30))

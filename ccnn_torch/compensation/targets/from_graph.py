@@ -1,0 +1,290 @@
+"""From a traced graph of ATen operations on fixed shapes to a program."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.export import ExportedProgram
+from torch.fx import Node as GraphNode
+
+from ccnn_torch.compensation.targets.build import Builder
+from ccnn_torch.compensation.targets.form import BOOLEAN, Program
+from ccnn_torch.errors import MethodFailedError
+
+__all__ = ["program_of"]
+
+# More elements, or products, are a loop over arrays; fewer are written out, without those of zeros.
+_ELEMENTS, _PRODUCTS = 512, 1024
+# Of a thin matrix (masks) so many.
+_PRODUCTS_THIN, _THIN = 4096, 0.5
+
+_ELEMENTWISE = {
+    "add": "add", "sub": "sub", "mul": "mul", "div": "div", "neg": "neg", "abs": "abs", "exp": "exp", "log": "log",
+    "sin": "sin", "cos": "cos", "tan": "tan", "tanh": "tanh", "asin": "asin", "acos": "acos", "atan": "atan",
+    "atan2": "atan2", "sqrt": "sqrt", "floor": "floor", "minimum": "min", "maximum": "max", "lt": "lt", "le": "le",
+    "eq": "eq", "where": "select", "logical_and": "and", "bitwise_and": "and", "logical_or": "or", "bitwise_or": "or",
+    "logical_not": "not", "bitwise_not": "not",
+}  # fmt: skip
+# What arithmetic of truth values is.
+_OF_TRUTHS = {"add": "or", "mul": "and", "max": "or", "min": "and"}
+_REDUCTIONS = {"sum": "add", "amax": "max", "amin": "min", "any": "or", "all": "and"}
+# What only moves elements: torch does it on their numbers.
+_MOVES = frozenset({
+    "view", "_unsafe_view", "reshape", "permute", "t", "transpose", "expand", "slice", "select", "unsqueeze", "squeeze",
+    "alias", "clone", "flip", "cat", "stack", "index", "index_select", "split", "split_with_sizes", "unbind", "copy",
+    "diagonal", "repeat", "roll", "slice_scatter", "select_scatter", "detach", "lift_fresh_copy", "lift_fresh",
+})  # fmt: skip
+_ASKS = frozenset({"lt", "le", "gt", "ge", "eq", "ne", "isnan", "isfinite", "isinf", "where"})
+
+
+class Value:
+    """A tensor that is not known: its elements' nodes."""
+
+    def __init__(self, ids: Tensor) -> None:
+        self.ids = ids
+
+
+def program_of(exported: ExportedProgram, name: str, inputs: Sequence[str], outputs: Sequence[str | None]) -> Program:
+    """A program of a traced module whose inputs and outputs are tensors of fixed shapes.
+
+    Args:
+        exported: with its operations decomposed.
+        name: of the program.
+        inputs: names of the module's inputs.
+        outputs: names of its outputs; None for one that is left out.
+
+    Raises:
+        MethodFailedError: there is an operation that no form has.
+    """
+    graph = exported.graph
+    lowering = _Lowering(Builder(any(_name(node) in _ASKS for node in graph.nodes)))
+    constants = {**exported.state_dict, **exported.constants}
+    signature = exported.graph_signature
+    held = {**signature.inputs_to_parameters, **signature.inputs_to_buffers}
+    held |= signature.inputs_to_lifted_tensor_constants
+    known: dict[GraphNode, Any] = {}
+    given: dict[str, int] = {}
+    for node in graph.nodes:
+        if node.op == "placeholder" and node.name in held:
+            known[node] = constants[held[node.name]].detach()
+        elif node.op == "placeholder":
+            key = inputs[len(given)]
+            shape = node.meta["val"].shape
+            given[key] = lowering.builder.input(shape.numel())
+            known[node] = Value(given[key] + torch.arange(shape.numel()).reshape(shape))
+        elif node.op == "call_function":
+            args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: known[n])
+            known[node] = lowering.call(node, args, kwargs)
+    found = torch.fx.node.map_arg(graph.output_node().args[0], lambda n: known[n])
+    wanted = {key: lowering.ids(value) for key, value in zip(outputs, found, strict=True) if key is not None}
+    return lowering.builder.program(name, given, wanted)
+
+
+def _name(node: GraphNode) -> str:
+    """Of the operation, without overload; in-place forms do not occur in a traced graph."""
+    return node.target.__name__.partition(".")[0] if node.op == "call_function" else ""  # type: ignore[union-attr]
+
+
+def _shape(value: Any) -> torch.Size:
+    return value.ids.shape if isinstance(value, Value) else value.shape
+
+
+def _broadcast(*shapes: torch.Size) -> torch.Size:
+    return torch.Size(np.broadcast_shapes(*shapes))
+
+
+class _Lowering:
+    """One operation after the other into a builder."""
+
+    def __init__(self, builder: Builder) -> None:
+        self.builder = builder
+
+    def ids(self, value: Any) -> Tensor:
+        """Nodes of a value or a constant."""
+        if isinstance(value, Value):
+            return value.ids
+        return self.builder.ids(torch.as_tensor(value, dtype=torch.float64))
+
+    def call(self, node: GraphNode, args: Any, kwargs: Any) -> Any:
+        name = _name(node)
+        if name.startswith(("_assert", "sym_")):
+            # Asserted when it was traced, for these shapes.
+            return None
+        if name == "getitem":
+            return args[0][args[1]]
+        if not any(isinstance(v, Value) for v in torch.utils._pytree.tree_leaves((args, kwargs))):
+            return node.target(*args, **kwargs)  # type: ignore[operator]
+        if name in ("full_like", "zeros_like", "ones_like", "empty_like"):
+            fill = {"full_like": args[-1], "ones_like": 1.0}.get(name, 0.0)
+            return torch.full(node.meta["val"].shape, float(fill), dtype=torch.float64)
+        if name in _MOVES:
+            return self._moved(node, args, {k: v for k, v in kwargs.items() if k not in ("dtype", "memory_format")})
+        if name in _ELEMENTWISE and kwargs.get("rounding_mode") is None:
+            alpha = kwargs.get("alpha", 1)
+            scaled = args if alpha == 1 else (args[0], self.each("mul", args[1], alpha))
+            return self.each(_ELEMENTWISE[name], *scaled)
+        if name in _REDUCTIONS:
+            dims = args[1] if len(args) > 1 and args[1] is not None else [*range(args[0].ids.dim())]
+            keep = args[2] if len(args) > 2 else False
+            return self.reduced(_REDUCTIONS[name], args[0], [dims] if isinstance(dims, int) else [*dims], keep)
+        composed = getattr(self, f"_{name.strip('_')}", None)
+        if composed is None:
+            raise MethodFailedError(f"the model needs '{name}', which no target has; leave that part of it out")
+        return composed(*args, **kwargs)
+
+    def each(self, op: str, *operands: Any) -> Any:
+        """An operation on each element of operands that broadcast; numbers and constants among them."""
+        known = [torch.as_tensor(v, dtype=torch.float64) if not isinstance(v, Value) else v for v in operands]
+        shape = _broadcast(*(v.ids.shape if isinstance(v, Value) else v.shape for v in known))
+        # Truth values have no arrays: there are few of them.
+        if shape.numel() > _ELEMENTS and op not in BOOLEAN and op != "select":
+            parts = [v.ids if isinstance(v, Value) else self._table(v) for v in known]
+            return Value(self.builder.loop(op, parts, shape))
+        wide = [self.ids(v).expand(shape).flatten().tolist() for v in known]
+        if op in _OF_TRUTHS and all(map(self.builder.is_truth, (row[0] for row in wide if row))):
+            op = _OF_TRUTHS[op]
+        made = [self.builder.apply(op, *row) for row in zip(*wide, strict=True)]
+        return Value(torch.tensor(made, dtype=torch.int64).reshape(shape))
+
+    def reduced(self, op: str, value: Value, dims: list[int], keep: bool) -> Value:
+        """Sum, maximum or the like over some axes."""
+        ids = value.ids
+        dims = [d % ids.dim() for d in dims]
+        rest = [d for d in range(ids.dim()) if d not in dims]
+        rows = ids.permute(*rest, *dims).reshape(*(ids.shape[d] for d in rest), -1)
+        if ids.numel() > _ELEMENTS and op in ("add", "max"):
+            found = self.builder.loop("", [rows], rows.shape, op)
+        else:
+            made = [
+                reduce(lambda a, b: self.builder.apply(op, a, b), row)
+                for row in rows.reshape(-1, rows.shape[-1]).tolist()
+            ]
+            found = torch.tensor(made, dtype=torch.int64).reshape(rows.shape[:-1])
+        if keep:
+            found = found.reshape([1 if d in dims else n for d, n in enumerate(ids.shape)])
+        return Value(found)
+
+    def product(self, a: Any, b: Any) -> Value:
+        """`... x i x k` times `... x k x j`."""
+        products, share = _shape(a)[-2] * _shape(b).numel(), 1.0
+        for own in (a, b):
+            if isinstance(own, Tensor):
+                share = int((own != 0).sum()) / own.numel()
+                products = int(products * share)
+        if products > (_PRODUCTS_THIN if share < _THIN else _PRODUCTS):
+            left, right = (v.ids if isinstance(v, Value) else self._table(v) for v in (a, b))
+            left, right = left.unsqueeze(-2), right.mT.unsqueeze(-3)
+            return Value(self.builder.loop("mul", [left, right], _broadcast(left.shape, right.shape), "add"))
+        left, right = self.ids(a).unsqueeze(-2), self.ids(b).mT.unsqueeze(-3)
+        shape = _broadcast(left.shape, right.shape)
+        apply = self.builder.apply
+        made = [
+            reduce(lambda s, t: apply("add", s, t), [apply("mul", p, q) for p, q in zip(row, column, strict=True)])
+            for row, column in zip(
+                left.expand(shape).reshape(-1, shape[-1]).tolist(),
+                right.expand(shape).reshape(-1, shape[-1]).tolist(),
+                strict=True,
+            )
+        ]
+        return Value(torch.tensor(made, dtype=torch.int64).reshape(shape[:-1]))
+
+    def _table(self, values: Tensor) -> Tensor:
+        """Elements of a table; one number alone is none."""
+        return self.builder.ids(values) if values.numel() == 1 else self.builder.table(values)
+
+    def _moved(self, node: GraphNode, args: Any, kwargs: Any) -> Any:
+        def ids(v: Any) -> Any:
+            if isinstance(v, Value):
+                return v.ids
+            # Beside what is moved there are indices, which stay numbers.
+            return self.ids(v) if isinstance(v, Tensor) and v.is_floating_point() else v
+
+        found = node.target(*torch.utils._pytree.tree_map(ids, args), **kwargs)  # type: ignore[operator]
+        return [Value(f) for f in found] if isinstance(found, list | tuple) else Value(found)
+
+    # What is made of others.
+
+    def _mm(self, a: Any, b: Any) -> Value:
+        return self.product(a, b)
+
+    _bmm = matmul = _mm
+
+    def _mv(self, a: Any, b: Any) -> Value:
+        column = Value(b.ids.unsqueeze(-1)) if isinstance(b, Value) else b.unsqueeze(-1)
+        return Value(self.product(a, column).ids.squeeze(-1))
+
+    def _addmm(self, bias: Any, a: Any, b: Any) -> Any:
+        return self.each("add", self.product(a, b), bias)
+
+    def _to_copy(self, value: Value, **_: Any) -> Any:
+        # Truth values as numbers.
+        if all(self.builder.is_truth(i) for i in value.ids.flatten().tolist()):
+            return self.each("select", value, 1.0, 0.0)
+        return value
+
+    def _relu(self, value: Value) -> Any:
+        return self.each("max", value, 0.0)
+
+    def _sigmoid(self, value: Value) -> Any:
+        return self.each("div", 1.0, self.each("add", 1.0, self.each("exp", self.each("neg", value))))
+
+    def _reciprocal(self, value: Value) -> Any:
+        return self.each("div", 1.0, value)
+
+    def _rsqrt(self, value: Value) -> Any:
+        return self.each("div", 1.0, self.each("sqrt", value))
+
+    def _clamp(self, value: Value, least: Any = None, most: Any = None, **named: Any) -> Any:
+        least, most = named.get("min", least), named.get("max", most)
+        found = value if least is None else self.each("max", value, least)
+        return found if most is None else self.each("min", found, most)
+
+    _clamp_min = _clamp
+
+    def _clamp_max(self, value: Value, most: Any) -> Any:
+        return self._clamp(value, None, most)
+
+    def _pow(self, value: Value, exponent: Any) -> Any:
+        if exponent == 0.5:
+            return self.each("sqrt", value)
+        if isinstance(exponent, Value) or exponent != int(exponent) or not 0 <= exponent < 9:
+            return self.each("pow", value, exponent)
+        if exponent == 0:
+            return torch.ones(value.ids.shape, dtype=torch.float64)
+        return reduce(lambda a, b: self.each("mul", a, b), [value] * int(exponent))
+
+    def _mean(self, value: Value, dims: Any = None, keep: bool = False) -> Any:
+        dims = [*range(value.ids.dim())] if dims is None else [dims] if isinstance(dims, int) else [*dims]
+        count = math.prod(value.ids.shape[d] for d in dims)
+        return self.each("mul", self.reduced("add", value, dims, keep), 1.0 / count)
+
+    def _square(self, value: Value) -> Any:
+        return self.each("mul", value, value)
+
+    def _gt(self, a: Any, b: Any) -> Any:
+        return self.each("lt", b, a)
+
+    def _ge(self, a: Any, b: Any) -> Any:
+        return self.each("le", b, a)
+
+    def _ne(self, a: Any, b: Any) -> Any:
+        return self.each("not", self.each("eq", a, b))
+
+    def _isnan(self, value: Value) -> Any:
+        return self._ne(value, value)
+
+    def _isinf(self, value: Value) -> Any:
+        return self.each("eq", self.each("abs", value), math.inf)
+
+    def _isfinite(self, value: Value) -> Any:
+        return self.each("lt", self.each("abs", value), math.inf)
+
+    def _sign(self, value: Value) -> Any:
+        below = self.each("select", self.each("lt", value, 0.0), -1.0, 0.0)
+        return self.each("select", self.each("lt", 0.0, value), 1.0, below)

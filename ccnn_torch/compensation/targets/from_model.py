@@ -1,0 +1,92 @@
+"""The form of a compensator: its programs, traced for one row."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ccnn_torch.compensation.compensator import Compensator
+from ccnn_torch.compensation.contraction import Steepness, iterations_needed
+from ccnn_torch.compensation.export.to_onnx import quiet_exporter
+from ccnn_torch.compensation.targets.form import Form, Program
+from ccnn_torch.compensation.targets.from_graph import program_of
+
+__all__ = ["SINGLE_TOLERANCE", "form_of"]
+
+# Share of the limit to which single precision is right.
+SINGLE_TOLERANCE = 1e-5
+# As in the check of every other model file: what is left of command + deviation = joints, as a share of the limit.
+_SLACK = {"float64": 1e-6, "float32": SINGLE_TOLERANCE}
+# From here a number counts as infinite where single precision has no 1e300.
+_HUGE_SINGLE = 3e38
+
+
+class _Clean(nn.Module):
+    def __init__(self, compensator: Compensator) -> None:
+        super().__init__()
+        self.compensator = compensator
+
+    def forward(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Finite joints and covariates, and how many were not."""
+        return self.compensator._inputs(joints, covariates)
+
+
+class _Step(nn.Module):
+    def __init__(self, compensator: Compensator) -> None:
+        super().__init__()
+        self.compensator = compensator
+
+    def forward(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """δ, excess and standard deviation at finite commanded joints."""
+        covariates = joints[..., :0] if covariates is None else covariates
+        found = self.compensator._deviation(joints, covariates, torch.zeros_like(joints[..., :1]))
+        return found.value, found.excess, self.compensator._sd(found)
+
+
+def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) -> Form:
+    """The form of a fitted compensator.
+
+    Args:
+        compensator: in double.
+        dtype: `float64` or `float32`, in which the targets compute.
+        sd: with the standard deviation.
+
+    Raises:
+        MethodFailedError: the model has an operation that no form has.
+    """
+    compensator = copy.deepcopy(compensator)
+    iterations = compensator.iterations
+    if dtype == "float32":
+        compensator.domain.huge.fill_(_HUGE_SINGLE)
+        iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), SINGLE_TOLERANCE / 10)
+    n = len(compensator.joints)
+    point = compensator.domain.centre.unsqueeze(0)
+    example = (point[:, :n].clone(), point[:, n:].clone())[: 2 if compensator.covariates else 1]
+    names = ("joints", "covariates")[: len(example)]
+
+    def program(module: nn.Module, name: str, outputs: list[list[str | None]]) -> list[Program]:
+        with quiet_exporter(), torch.no_grad():
+            exported = torch.export.export(module, example).run_decompositions()
+        return [program_of(exported, name, names, some) for some in outputs]
+
+    kept: list[list[str | None]] = [["deviation", "excess", None], *([[None, None, "sd"]] if sd else [])]
+    (clean,) = program(_Clean(compensator), "clean", [["joints", "covariates", "strange"]])
+    deviation, *spread = program(_Step(compensator), "deviation", kept)
+    for one in spread:
+        one.name = "spread"
+    limit = compensator.limit.numpy()
+    return Form(
+        [c.header for c in compensator.joints],
+        [c.header for c in compensator.covariates],
+        iterations,
+        limit,
+        _SLACK[dtype] * np.minimum(limit, 1.0),
+        np.hypot(compensator.safe.numpy(), compensator.safe_sd.numpy()),
+        dtype,
+        clean,
+        deviation,
+        spread[0] if spread else None,
+    )

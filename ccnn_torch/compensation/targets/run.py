@@ -1,0 +1,108 @@
+"""A form run on rows of inputs in numpy: what every target must give, and the check that a form is its model's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ccnn_torch.compensation.targets.form import OPERATIONS, Array, Expression, Form, Leaf, Let, Program
+
+__all__ = ["run_form", "run_program"]
+
+# Rows at a time: a loop over a large table holds all its products of every row.
+_AT_ONCE = 64
+
+
+def run_program(program: Program, inputs: dict[str, Array], dtype: str = "float64") -> dict[str, Array]:
+    """Outputs `s x size` of inputs `s x size`."""
+    rows = len(next(iter(inputs.values())))
+    parts = [
+        _run({name: value[k : k + _AT_ONCE] for name, value in inputs.items()}, program, dtype)
+        for k in range(0, rows, _AT_ONCE)
+    ]
+    return {name: np.concatenate([part[name] for part in parts]) for name in program.outputs}
+
+
+@np.errstate(all="ignore")
+def _run(inputs: dict[str, Array], program: Program, dtype: str) -> dict[str, Array]:
+    rows = len(next(iter(inputs.values())))
+    buffers = {program.inputs[name]: value.astype(dtype) for name, value in inputs.items()}
+    buffers |= {k: np.broadcast_to(v.astype(dtype), (rows, len(v))) for k, v in program.tables.items()}
+    for k in program.buffers:
+        buffers[k] = np.empty((rows, program.sizes[k]), dtype)
+    numbers: dict[int, Array] = {}
+
+    def number(i: int) -> Array:
+        node = program.nodes[i]
+        if node.op == "const":
+            return np.full(rows, node.value, dtype)
+        if node.op == "load":
+            return buffers[node.args[0]][:, node.args[1]]
+        return numbers[i]
+
+    def array(part: Expression, shape: tuple[int, ...]) -> Array:
+        if isinstance(part, Leaf):
+            at = np.full((), part.offset)
+            for step, n in zip(part.strides, shape, strict=True):
+                at = at[..., None] + step * np.arange(n)
+            return buffers[part.buffer][:, at]
+        if isinstance(part, tuple):
+            return np.asarray(OPERATIONS[part[0]](*(array(p, shape) for p in part[1:])))
+        return number(part).reshape(-1, *[1] * len(shape))
+
+    for step in program.steps:
+        if isinstance(step, Let) and step.target is not None:
+            buffers[step.target[0]][:, step.target[1]] = number(step.node)
+        elif isinstance(step, Let):
+            node = program.nodes[step.node]
+            numbers[step.node] = np.asarray(OPERATIONS[node.op](*map(number, node.args)))
+        else:
+            found = np.broadcast_to(array(step.expression, step.shape), (rows, *step.shape))
+            if step.reduce:
+                found = found.sum(-1) if step.reduce == "add" else found.max(-1)
+            buffers[step.buffer][:] = found.reshape(rows, -1)
+    return {
+        name: np.stack([number(i) for i in ids], -1) if ids else np.zeros((rows, 0), dtype)
+        for name, ids in program.outputs.items()
+    }
+
+
+@np.errstate(all="ignore")
+def run_form(form: Form, joints: Array, covariates: Array | None) -> dict[str, Array]:
+    """What each target does: `command`, `deviation`, `ideal` and `sd` (`s x n`), `status` and `ideal_status` (`s`).
+
+    Args:
+        joints: ideal joints for the command and its `deviation` and `status`, commanded ones for the others, `s x n`.
+        covariates: `s x m`; None where they are missing.
+    """
+    n, m = len(form.joints), len(form.covariates)
+    given = np.full((len(joints), m), np.nan) if covariates is None else covariates
+    cleaned = run_program(form.clean, {"joints": joints} | ({"covariates": given} if m else {}), form.dtype)
+    q, strange = cleaned["joints"], cleaned["strange"][:, 0] > 0
+    more = {"covariates": cleaned["covariates"]} if m else {}
+
+    def deviation(at: Array) -> tuple[Array, Array]:
+        found = run_program(form.deviation, {"joints": at} | more, form.dtype)
+        return found["deviation"], found["excess"][:, 0]
+
+    first, first_excess = last, excess = deviation(q)
+    command = q
+    for _ in range(form.iterations):
+        command = q - last
+        last, excess = deviation(command)
+    eps = np.finfo(form.dtype).eps
+    trusted = np.abs(command + last - q) <= form.slack + 8 * eps * (np.abs(q) + np.abs(last))
+    good = (trusted & (np.abs(last) <= form.limit * (1 + 1e-9))).all(-1) & ~strange
+    back = (np.abs(first) <= form.limit * (1 + 1e-9)).all(-1) & ~strange
+    out = {
+        "command": np.where(good[:, None], command, q),
+        "deviation": np.where(good[:, None], last, 0),
+        "ideal": np.where(back[:, None], q + first, q),
+        "status": np.where(strange, 2, np.where(good & (excess <= 0), 0, 1)),
+        "ideal_status": np.where(strange, 2, np.where(back & (first_excess <= 0), 0, 1)),
+    }
+    if form.spread is not None:
+        sd = run_program(form.spread, {"joints": q} | more, form.dtype)["sd"]
+        finite = (np.isfinite(sd) & (sd >= 0)).all(-1) & ~strange
+        out["sd"] = np.where(finite[:, None], sd, form.fallback_sd)
+    assert all(value.shape[-1] == n for name, value in out.items() if "status" not in name)
+    return out

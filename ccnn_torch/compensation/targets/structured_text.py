@@ -1,0 +1,186 @@
+"""A form as IEC 61131-3 Structured Text: function blocks, a self-test, and how to put them into a task."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ccnn_torch.compensation.targets.form import Array, Form, Program
+from ccnn_torch.compensation.targets.golden import Golden
+from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
+from ccnn_torch.compensation.targets.structured_text_blocks import (
+    COMPENSATE,
+    IDEAL,
+    README,
+    SD,
+    SELFTEST,
+)
+from ccnn_torch.errors import MethodFailedError
+
+__all__ = ["print_structured_text"]
+
+# An argument of EXP beyond these would stop a controller; what it gives is 0 or without effect long before.
+_EXP = {"float64": 700.0, "float32": 80.0}
+# Golden vectors in the self-test: enough to find a mistake in copying, few enough for a small controller.
+_TESTED = 8
+_NAMES = ("abs", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan")
+
+
+def print_structured_text(form: Form, golden: Golden) -> dict[str, str]:
+    """Contents of the files by name."""
+    dialect = _dialect(form.dtype)
+    tables: dict[bytes, str] = {}
+    blocks = [_block(program, print_program(program, dialect, tables), form) for program in form.programs]
+    about = [*form.facts, "", *_units(form), "", *costs(form)]
+    head = "\n".join(["(*", *(f"   {line}".rstrip() for line in wrapped(about)), "*)"])
+    numbers = {"limit": form.limit * (1 + 1e-9), "slack": form.slack}
+    main = [
+        _filled(COMPENSATE, form, numbers),
+        _filled(IDEAL, form, {"limit": numbers["limit"]}),
+        *([] if form.spread is None else [_filled(SD, form, {"fallback_sd": form.fallback_sd})]),
+    ]
+    return {
+        "compensator.st": "\n\n".join([head, *blocks, *main]) + "\n",
+        "selftest.st": _selftest(form, golden) + "\n",
+        "README.md": README.format(real=_real(form)),
+    }
+
+
+def _real(form: Form) -> str:
+    return "LREAL" if form.dtype == "float64" else "REAL"
+
+
+def _literal(value: float, dtype: str) -> str:
+    if math.isnan(value):
+        raise MethodFailedError("st has no constant that is no number, which this model needs; export it as c99")
+    # It has no infinity: what is as large as no number is stands for it.
+    value = within(value, dtype) if math.isfinite(value) else math.copysign(float(np.finfo(dtype).max), value)
+    mantissa, _, exponent = (repr(value) if dtype == "float64" else str(np.float32(value))).partition("e")
+    mantissa = mantissa if "." in mantissa else f"{mantissa}.0"
+    sign, mantissa = ("-", mantissa[1:]) if mantissa.startswith("-") else ("", mantissa)
+    text = ("REAL#" if dtype == "float32" else "") + sign + mantissa + (f"E{int(exponent)}" if exponent else "")
+    return f"({text})" if text.startswith("-") else text
+
+
+def _dialect(dtype: str) -> Dialect:
+    def literal(value: float) -> str:
+        return _literal(value, dtype)
+
+    most = literal(_EXP[dtype])
+    exp = f"EXP(LIMIT({literal(-_EXP[dtype])}, {{0}}, {most}))"
+    one, two = literal(1.0), literal(2.0)
+    twice = exp.format(f"{two} * {{0}}")
+    operations = {name: f"{name.upper()}({{0}})" for name in _NAMES} | {
+        "add": "({0} + {1})",
+        "sub": "({0} - {1})",
+        "mul": "({0} * {1})",
+        "div": "({0} / {1})",
+        "neg": "(-{0})",
+        "min": "MIN({0}, {1})",
+        "max": "MAX({0}, {1})",
+        "exp": exp,
+        "log": "LN({0})",
+        "pow": "EXPT({0}, {1})",
+        "tanh": f"({one} - {two} / ({one} + {twice}))",
+        "lt": "({0} < {1})",
+        "le": "({0} <= {1})",
+        "eq": "({0} = {1})",
+        "and": "({0} AND {1})",
+        "or": "({0} OR {1})",
+        "not": "(NOT {0})",
+        "select": "SEL({0}, {2}, {1})",
+    }
+    return Dialect(
+        "st",
+        operations,
+        literal,
+        lambda name, value, truth: f"{name} := {value};",
+        lambda place, value: f"{place} := {value};",
+        lambda index, count, lines: [
+            f"FOR {index} := 0 TO {count - 1} DO",
+            *(f"    {line}" for line in lines),
+            "END_FOR",
+        ],
+        "{0}[{1}]",
+    )
+
+
+def _units(form: Form) -> list[str]:
+    return [
+        "Inputs and outputs are in SI units, in this order. Joints: " + ", ".join(form.joints) + ".",
+        "Covariates: " + (", ".join(form.covariates) or "none; leave the input as it is") + ".",
+        "Status 0: the command is inside the domain of the training rows. 1: outside, where the deviation fades into "
+        "the safe one, or the model broke its limit, and then command = joints. 2: an input is not finite, and then "
+        "command = joints, with the middle of the domain for what is no number and its edge for infinity.",
+    ]
+
+
+def _array(name: str, size: int, real: str) -> str:
+    return f"    {name} : ARRAY[0..{max(size, 1) - 1}] OF {real};"
+
+
+def _table(name: str, values: Array, form: Form) -> str:
+    flat = [_literal(float(v), form.dtype).strip("()") for v in values.ravel()]
+    rows = ",\n        ".join(", ".join(flat[k : k + 4]) for k in range(0, len(flat), 4))
+    return f"    {name} : ARRAY[0..{len(flat) - 1}] OF {_real(form)} := [\n        {rows}];"
+
+
+def _section(kind: str, lines: list[str]) -> list[str]:
+    return [kind, *lines, "END_VAR"] if lines else []
+
+
+def _block(program: Program, text: Text, form: Form) -> str:
+    """A program as a function block of arrays."""
+    real = _real(form)
+    names = {truth: [name for name, kind in text.numbers.items() if kind == truth] for truth in (False, True)}
+    variables = [_array(name, size, real) for name, size in text.buffers.items()]
+    for truth, kind in ((False, real), (True, "BOOL")):
+        rows = [names[truth][k : k + 12] for k in range(0, len(names[truth]), 12)]
+        variables += [f"    {', '.join(row)} : {kind};" for row in rows]
+    variables += [f"    {', '.join(f'i{d}' for d in range(text.indices))} : DINT;"] if text.indices else []
+    variables += [f"    sum : {real};"] if text.sums else []
+    return "\n".join(
+        [
+            f"FUNCTION_BLOCK CCNN_{program.name.capitalize()}_",
+            *_section("VAR_INPUT", [_array(name, program.sizes[b], real) for name, b in program.inputs.items()]),
+            *_section("VAR_OUTPUT", [_array(f"{k}_out", len(ids), real) for k, ids in program.outputs.items() if ids]),
+            *_section("VAR CONSTANT", [_table(name, values, form) for name, values in text.tables.items()]),
+            *_section("VAR", variables),
+            *text.lines,
+            "END_FUNCTION_BLOCK",
+        ]
+    )
+
+
+def _filled(template: str, form: Form, constants: dict[str, Array]) -> str:
+    """A block around the programs, with its names, sizes and numbers."""
+    real, m = _real(form), len(form.covariates)
+    found = (
+        template.replace("@N@", str(len(form.joints) - 1)).replace("@M@", str(max(m, 1) - 1)).replace("@REAL@", real)
+    )
+    found = found.replace("@CONSTANTS@", "\n".join(_table(name, values, form) for name, values in constants.items()))
+    found = found.replace("@GIVEN@", ", covariates := covariates" if m else "").replace("@STEPS@", str(form.iterations))
+    found = found.replace("@X@", ", covariates := clean.covariates_out" if m else "")
+    eps = _literal(8 * float(np.finfo(form.dtype).eps), form.dtype)
+    return found.replace("@EPS@", eps).replace("@ZERO@", _literal(0.0, form.dtype))
+
+
+def _selftest(form: Form, golden: Golden) -> str:
+    """Some golden vectors as a function block: finite ones, half of them at the edges of the domain."""
+    finite = np.flatnonzero((np.abs(np.hstack([golden.joints, golden.covariates])) < 1e30).all(-1))
+    rows = finite[np.linspace(0, len(finite) - 1, _TESTED).astype(int)]
+    tables = {name: golden.outputs[name][rows] for name in ("command", "deviation")}
+    tables = {"joints": golden.joints[rows], **tables, "tolerance": golden.tolerance}
+    if form.covariates:
+        tables["covariates"] = golden.covariates[rows]
+    constants = "\n".join(_table(f"golden_{name}", values, form) for name, values in tables.items())
+    codes = ", ".join(map(str, golden.outputs["status"][rows].tolist()))
+    constants += f"\n    golden_status : ARRAY[0..{_TESTED - 1}] OF INT := [{codes}];"
+    n, m, eps = len(form.joints), len(form.covariates), 4 * float(np.finfo(form.dtype).eps)
+    given = f"\n    FOR j := 0 TO {m - 1} DO\n        x[j] := golden_covariates[{m} * k + j];\n    END_FOR" if m else ""
+    found = SELFTEST.replace("@LAST@", str(_TESTED - 1)).replace("@N@", str(n - 1)).replace("@COUNT@", str(n))
+    found = found.replace("@CONSTANTS@", constants).replace("@REAL@", _real(form)).replace("@SETX@", given)
+    found = found.replace("@M@", str(max(m, 1) - 1)).replace("@X@", ", covariates := x" if m else "")
+    found = found.replace("@XVAR@", f"\n    x : ARRAY[0..{max(m, 1) - 1}] OF {_real(form)};" if m else "")
+    return found.replace("@EPS@", _literal(eps, form.dtype))

@@ -1,0 +1,149 @@
+"""A small compensator of every kind that the project can make, quickly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from stand_ins import arm_compensator, tripod_compensator, tripod_joints
+from test_geometry import TAMED, six_joint_arm, small_network, tripod_with_errors
+from test_geometry import arm_compensator as geometry_of_an_arm
+from test_learned_models import LEARNERS
+from torch import Tensor
+
+from ccnn_torch.compensation import Care, Compensator, expand_effects, fit_compensator, fit_geometry_module
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect
+from ccnn_torch.effects.covariates import draw_covariates
+from ccnn_torch.evolution.harmonics import Harmonics
+from ccnn_torch.evolution.masked_network import MaskedNetwork
+from ccnn_torch.evolution.waves import Waves
+from ccnn_torch.learners import TrainingData
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.training import Scaling, train
+
+ARM = str(Path(__file__).parent.parent / "effects" / "arm.yaml")
+
+
+def learned(name: str) -> Compensator:
+    """A learner on 60 rows of the tripod."""
+    joints = tripod_joints(60)
+    generator = torch.Generator().manual_seed(4)
+    deviations = 1e-4 * torch.sin(8 * joints) + 1e-5 * torch.randn(joints.shape, generator=generator).double()
+    rows = torch.ones(1, len(joints), dtype=torch.float64)
+    scaling = Scaling.fit(joints[None], deviations[None], rows, torch.zeros(3, dtype=torch.bool))
+    data = TrainingData(
+        scaling.features(joints[None]), scaling.standardise(deviations[None]), rows, torch.arange(1000, 1001)
+    )
+    learner = LEARNERS[name]()
+    train(learner, data)
+    names = [Coordinate(f"q{i}", "m") for i in (1, 2, 3)]
+    return fit_compensator(learner.network(0), scaling.repeat(0), joints, deviations, names)
+
+
+def masks(sizes: Sequence[int], density: float, seed: int, extra: int = 0) -> tuple[list[Tensor], list[Tensor]]:
+    """Connections and weights of a network; `extra` columns of the last layer are for periodic nodes."""
+    generator = torch.Generator().manual_seed(seed)
+    found, weights = [], []
+    for k, (i, o) in enumerate(pairwise(sizes)):
+        width = i + (extra if k == len(sizes) - 2 else 0)
+        found.append(torch.rand(o, width, generator=generator) < density)
+        weights.append(torch.randn(o, width + 1, generator=generator, dtype=torch.float64))
+    return found, weights
+
+
+def masked(density: float = 0.4) -> Compensator:
+    """The tripod's network of the paper's size, with connections left out."""
+    joints = tripod_joints()
+    network = MaskedNetwork(*masks([3, 6, 6, 3], density, 5))
+    blank = torch.ones(1, len(joints), dtype=torch.float64)
+    scaling = Scaling.fit(joints[None], torch.zeros_like(joints)[None], blank, torch.zeros(3, dtype=torch.bool))
+    one = scaling.repeat(0)
+    one.deviation.fill_(1e-4)
+    with torch.no_grad():
+        deviations = one.restore(network(one.features(joints)))
+    return fit_compensator(network, one, joints, deviations, [Coordinate(f"q{i}", "m") for i in (1, 2, 3)])
+
+
+def six_joints(harmonics: int = 6) -> Compensator:
+    """An arm with identified links; masked network, periodic nodes and harmonics of its gears on what they leave."""
+    arm, identified, joints = six_joint_arm()
+    geometry = fit_geometry_module(arm, arm.nominal, identified, joints, 0.1, *TAMED)
+    generator = torch.Generator().manual_seed(8)
+    blank, turning = torch.ones(1, len(joints), dtype=torch.float64), torch.ones(6, dtype=torch.bool)
+    scaling = Scaling.fit(joints[None], torch.zeros_like(joints)[None], blank, turning, angles=True).repeat(0)
+    scaling.deviation.fill_(1e-6)
+    waves = Waves(torch.tensor([12, 14]), torch.tensor([3.0, 5.0], dtype=torch.float64))
+
+    def draw(*shape: int) -> Tensor:
+        return 0.3 * torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    step, amplitude = scaling.angle_step, draw(6, 2 * harmonics)
+    gears = Harmonics(step, amplitude, draw(6, 2 * harmonics, 3), torch.eye(6, dtype=torch.float64))
+    own_masks, weights = masks([18, 8, 6], 0.4, 2, extra=4)
+    network = MaskedNetwork(own_masks, weights, draw(6, 2, 13), 1 + draw(6).abs(), waves, 18, gears)
+    with torch.no_grad():
+        deviations = scaling.restore(network(scaling.features(joints)))
+    return fit_compensator(network, scaling, joints, deviations, arm.joints, geometry=geometry)
+
+
+def expanded() -> Compensator:
+    """Identified geometry of a parallel machine, as a polynomial."""
+    tripod, identified, joints = tripod_with_errors()
+    module = fit_geometry_module(tripod, tripod.nominal, identified, joints)
+    network, scaling, deviations = small_network(joints, 2e-5)
+    return fit_compensator(network, scaling, joints, deviations, tripod.joints, geometry=module)
+
+
+def with_effects(name: str, effects: Sequence[str]) -> Compensator:
+    """Physical effects of a machine, with their covariates, and a network beside them."""
+    mechanism, generator = load_mechanism(name), torch.Generator().manual_seed(2)
+    joints = mechanism.sample_joints(2000, generator)
+    joints = joints[mechanism.condition_number(joints, 0.3) < 8][:80]
+    middle = joints.mean(0)
+    joints = joints[(joints - middle).norm(dim=-1).argsort()][:60]
+    covariates = draw_covariates(mechanism, joints, generator)
+    del covariates["time"]
+    situation = Situation(mechanism, joints, covariates, default_gravity(mechanism))
+    acting = []
+    for effect in map(make_effect, effects):
+        shape = [s.grid[len(s.grid) // 2] if s.usual is None else s.usual for s in effect.shapes(situation)]
+        sizes = [0.0 if c.secondary else 0.05 * c.scale for c in effect.coefficients(situation)]
+        acting.append(Acting(effect, *(torch.tensor(v, dtype=torch.float64) for v in (shape, sizes))))
+    module = expand_effects(situation, acting, [*covariates], 0.1, Care(0.3, 1e-2, 3.0, 6.0))
+    inputs = torch.cat([joints, *(v.unsqueeze(-1) for v in covariates.values())], -1)
+    network, scaling, deviations = small_network(inputs, 1e-6)
+    n = len(mechanism.joints)
+    scaling.mean, scaling.deviation = scaling.mean[:n], scaling.deviation[:n]
+    units = {"temperature": "K"}
+    return fit_compensator(
+        _First(network, n), scaling, inputs, deviations[:, :n], mechanism.joints,
+        [Coordinate(key, units.get(key, "1")) for key in covariates], effects=module,
+    )  # fmt: skip
+
+
+class _First(torch.nn.Module):
+    """The first outputs of a network."""
+
+    def __init__(self, network: torch.nn.Module, count: int) -> None:
+        super().__init__()
+        self.network, self.count = network, count
+
+    def forward(self, features: Tensor) -> Tensor:
+        return self.network(features)[..., : self.count]
+
+
+KINDS: dict[str, Callable[[], Compensator]] = {
+    "tripod": tripod_compensator,
+    "covariates": arm_compensator,
+    "masked": masked,
+    "sliding arm": lambda: geometry_of_an_arm()[0],
+    "six joints": six_joints,
+    "expanded geometry": expanded,
+    "effects of an arm": lambda: with_effects(ARM, ("compliance",)),
+    "effects of a five-bar": lambda: with_effects("five_bar", ("compliance", "backlash")),
+    "effects of a tripod": lambda: with_effects("tripod", ("frame",)),
+    **{name: (lambda name=name: learned(name)) for name in LEARNERS},
+}

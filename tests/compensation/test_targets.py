@@ -1,0 +1,250 @@
+"""`ccnn export`: the form of every kind of model, its C99 and Structured Text, against the eager model."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from kinds import KINDS, masked, six_joints
+from structured_text import Instance, parse_blocks
+from torch import Tensor
+
+from ccnn_torch import export_model
+from ccnn_torch.compensation import Compensator
+from ccnn_torch.compensation.targets import from_graph
+from ccnn_torch.compensation.targets.c99 import print_c99
+from ccnn_torch.compensation.targets.form import Form
+from ccnn_torch.compensation.targets.from_model import form_of
+from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal
+from ccnn_torch.compensation.targets.run import run_form
+from ccnn_torch.compensation.targets.structured_text import print_structured_text
+from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.mechanisms import load_mechanism
+
+Cli = Callable[..., tuple[int, str, str]]
+COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+STRICT = ["-O1", "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror"]
+
+
+def made(compensator: Compensator, dtype: str = "float64", sd: bool = True) -> tuple[Form, Golden]:
+    form = form_of(compensator, dtype, sd)
+    return form, golden_vectors(compensator, form)
+
+
+def compiled(form: Form, golden: Golden, folder: Path) -> str:
+    """Write, compile and run the self-test; on a machine without a compiler the form itself has been run before."""
+    for name, content in print_c99(form, golden).items():
+        (folder / name).write_text(content)
+    if COMPILER is None:
+        return f"0 of {len(golden.joints)} vectors failed"
+    sources = [str(folder / name) for name in ("selftest.c", "compensator.c")]
+    subprocess.run([COMPILER, *STRICT, "-o", str(folder / "selftest"), *sources, "-lm"], check=True)
+    return subprocess.run([str(folder / "selftest")], capture_output=True, text=True).stdout
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_model_gives_its_numbers_in_c(kind: str, tmp_path: Path) -> None:
+    compensator = KINDS[kind]()
+    form, golden = made(compensator)
+    worst = require_equal(form, golden)
+    assert {*worst} == {"command", "deviation", "ideal", "status", "ideal_status", "sd"}
+    assert len(golden.joints) > 1100 and {*golden.outputs["status"].tolist()} == {0, 1, 2}
+    assert f"0 of {len(golden.joints)} vectors failed" in compiled(form, golden, tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["tripod", "covariates", "masked", "grnn", "gp", "expanded geometry"])
+def test_single_precision_is_right_to_its_share_of_the_limit(kind: str, tmp_path: Path) -> None:
+    form, golden = made(KINDS[kind](), "float32")
+    require_equal(form, golden)
+    assert f"0 of {len(golden.joints)} vectors failed" in compiled(form, golden, tmp_path)
+    source = (tmp_path / "compensator.c").read_text()
+    # No number is computed in double in between.
+    assert "double" not in source and not re.search(r"\d\.\d+(e-?\d+)?[^\df.e]", source)
+
+
+def test_single_precision_does_not_hold_the_links_of_an_arm() -> None:
+    # A length of 1 m is rounded by more of the limit than single precision may be off.
+    with pytest.raises(MethodFailedError, match="single precision does not hold this model"):
+        require_equal(*made(KINDS["sliding arm"](), "float32", sd=False))
+
+
+def test_the_code_has_no_heap_no_recursion_and_no_state(tmp_path: Path) -> None:
+    for name, content in print_c99(*made(KINDS["grnn"]())).items():
+        (tmp_path / name).write_text(content)
+    source = (tmp_path / "compensator.c").read_text()
+    assert not re.search(r"\b(malloc|calloc|free|goto|while|printf)\b", source)
+    outside = [line for line in source.splitlines() if line.startswith("static") and "(" not in line]
+    assert outside and all(line.startswith("static const ccnn_real") for line in outside)
+    for function in re.findall(r"^static void (\w+)\(", source, re.MULTILINE):
+        body = source.split(f"static void {function}(")[1].split("\n}\n")[0]
+        assert not re.search(r"ccnn_(?!min|max|real)\w*\(", body.partition("{")[2])
+    header = (tmp_path / "compensator.h").read_text()
+    assert "Operations of one command" in header and "Tables: " in header
+
+
+def test_connections_that_are_dead_cost_nothing() -> None:
+    def count(density: float) -> tuple[int, int]:
+        compensator = masked(density)
+        layers: list[Any] = list(compensator.network.layers)  # type: ignore[arg-type, union-attr]
+        alive = sum(int((layer.weight != 0).sum()) for layer in layers)
+        return alive, form_of(compensator).deviation.operations()["mul"]
+
+    (few, cheap), (many, dear) = count(0.3), count(1.0)
+    assert many == 3 * 6 + 6 * 6 + 6 * 3
+    assert dear - cheap >= many - few > 20
+
+
+def test_harmonics_cost_one_sine_and_cosine_a_joint() -> None:
+    few, many = (form_of(six_joints(count)).deviation.operations() for count in (2, 12))
+    assert few["sin"] == many["sin"] and few["cos"] == many["cos"]
+
+
+def test_missing_covariates_and_numbers_that_are_none(tmp_path: Path) -> None:
+    compensator = KINDS["covariates"]()
+    form, golden = made(compensator)
+    point = compensator.domain.centre.numpy()[None]
+    found = run_form(form, point[:, :2], None)
+    assert found["status"] == 2 and found["ideal_status"] == 2
+    assert (found["command"] == point[:, :2]).all() and (found["deviation"] == 0).all()
+    compiled(form, golden, tmp_path)
+    if COMPILER is None:
+        return
+    library = tmp_path / "c.so"
+    subprocess.run(
+        [COMPILER, *STRICT, "-fPIC", "-shared", "-o", str(library), str(tmp_path / "compensator.c"), "-lm"], check=True
+    )
+    function = ctypes.CDLL(str(library)).ccnn_compensate
+    given, command, deviation = (np.array(v) for v in (point[0, :2], [7.0, 7.0], [7.0, 7.0]))
+    pointers = [v.ctypes.data_as(ctypes.c_void_p) for v in (given, command, deviation)]
+    assert function(pointers[0], None, *pointers[1:]) == 2
+    assert (command == given).all() and (deviation == 0).all()
+    # An output may be the same array as the input.
+    more = np.array(point[0, 2:])
+    assert function(pointers[0], more.ctypes.data_as(ctypes.c_void_p), pointers[0], pointers[2]) == 0
+    with torch.no_grad():
+        wanted = compensator(torch.from_numpy(point[:, :2]), torch.from_numpy(point[:, 2:]))[0].numpy()
+    np.testing.assert_allclose(given, wanted[0], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "kind, dtype, arrays", [("masked", "float64", False), ("covariates", "float32", False), ("tripod", "float64", True)]
+)
+def test_structured_text_is_parsed_and_gives_the_numbers(
+    kind: str, dtype: str, arrays: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if arrays:
+        # As in a large model, whose parser would take minutes.
+        monkeypatch.setattr(from_graph, "_ELEMENTS", 4)
+        monkeypatch.setattr(from_graph, "_PRODUCTS", 4)
+    form, golden = made(KINDS[kind](), dtype, sd=dtype == "float32")
+    files = print_structured_text(form, golden)
+    assert (" DO" in files["compensator.st"].partition("CCNN_Compensate")[0]) == arrays
+    blocks = parse_blocks(files["compensator.st"] + files["selftest.st"])
+    rows, more = len(golden.joints), {"covariates": golden.covariates.T} if form.covariates else {}
+    with np.errstate(all="ignore"):
+        compensate, ideal = (Instance(blocks, name, rows) for name in ("CCNN_Compensate", "CCNN_Ideal"))
+        compensate(joints=golden.joints.T, **more)
+        ideal(command=golden.joints.T, **more)
+        found = {name: compensate.values[name].T for name in ("command", "deviation", "status")}
+        found |= {"ideal": ideal.values["joints"].T, "ideal_status": ideal.values["status"]}
+        if form.spread is not None:
+            spread = Instance(blocks, "CCNN_DeviationSd", rows)
+            spread(command=golden.joints.T, **more)
+            found["sd"] = spread.values["sd"].T
+        test = Instance(blocks, "CCNN_SelfTest", 1)
+        test()
+    assert {k: v for k, v in golden.errors(found).items() if v > 1} == {}
+    assert bool(test.values["passed"][0]) and test.values["failed"][0] == 0
+    assert "status" in blocks["ccnn_compensate"].declarations[1].items[-1].variables[0].variable.name
+
+
+class Odd(torch.nn.Module):
+    def __init__(self, inner: torch.nn.Module, strange: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.inner, self.strange = inner, strange
+
+    def forward(self, features: Tensor) -> Tensor:
+        return self.inner(features) + 1e-9 * self.strange(features)
+
+
+def test_what_a_target_lacks_is_said() -> None:
+    compensator = KINDS["tripod"]()
+    inner = compensator.network
+    compensator.network = Odd(inner, torch.special.bessel_j0)
+    with pytest.raises(MethodFailedError, match="'special_bessel_j0', which no target has"):
+        form_of(compensator)
+    compensator.network = Odd(inner, torch.floor)
+    form, golden = made(compensator, sd=False)
+    assert "floor(" in print_c99(form, golden)["compensator.c"]
+    with pytest.raises(MethodFailedError, match="st has no 'floor'"):
+        print_structured_text(form, golden)
+
+
+def test_a_wrong_form_is_not_written() -> None:
+    compensator = KINDS["tripod"]()
+    form, _ = made(compensator)
+    with torch.no_grad():
+        compensator.safe.add_(1e-6)
+    with pytest.raises(MethodFailedError, match="is not the model's"):
+        require_equal(form, golden_vectors(compensator, form))
+
+
+@pytest.mark.parametrize("to", ["c99", "st"])
+def test_the_command_writes_files_that_say_what_they_are(cli: Cli, folder: Path, tmp_path: Path, to: str) -> None:
+    out = tmp_path / "a" / "b"
+    code, told, err = cli("export", folder / "model.safetensors", "--to", to, "--out", out)
+    assert (code, err) == (0, "") and str(out) in told
+    names = {"c99": ["Makefile", "compensator.c", "compensator.h", "selftest.c"]}
+    names["st"] = ["README.md", "compensator.st", "selftest.st"]
+    assert sorted(p.name for p in out.iterdir()) == names[to]
+    card = json.loads((folder / "card.json").read_text())
+    text = (out / names[to][-2]).read_text()
+    assert card["files"]["model.safetensors"] in text and "q1[m], q2[m], q3[m]" in text
+    # The same again, byte for byte.
+    again = export_model(folder / "model.safetensors", to, tmp_path / "again")
+    assert all(path.read_bytes() == (out / name).read_bytes() for name, path in again.items())
+    if to == "c99" and COMPILER is not None and shutil.which("make") is not None:
+        told = subprocess.run(["make", "-s", "test"], cwd=out, check=True, capture_output=True, text=True).stdout
+        assert told.startswith("0 of ")
+
+
+def test_bad_input_is_one_sentence(cli: Cli, folder: Path, tmp_path: Path) -> None:
+    model, out = folder / "model.safetensors", tmp_path / "out"
+    (tmp_path / "no.safetensors").write_bytes(b"nothing")
+    (tmp_path / "file").write_text("a file")
+    shutil.copy(model, tmp_path / "model.safetensors")
+    shutil.copy(folder / "card.json", tmp_path / "card.json")
+    forged = bytearray(model.read_bytes())
+    forged[-1] ^= 1
+    (tmp_path / "model.safetensors").write_bytes(forged)
+    for words, said in (
+        ([model, "--to", "c9", "--out", out], "no target 'c9' (did you mean 'c99'?); there are c99, st"),
+        ([model, "--to", "c99", "--dtype", "float16", "--out", out], "no dtype 'float16'"),
+        ([tmp_path / "none.safetensors", "--to", "c99", "--out", out], "none.safetensors"),
+        ([tmp_path / "no.safetensors", "--to", "c99", "--out", out], "no.safetensors"),
+        ([tmp_path / "model.safetensors", "--to", "st", "--out", out], "model.safetensors"),
+        ([folder / "model.onnx", "--to", "c99", "--out", out], "give the .safetensors beside it"),
+        ([model, "--to", "c99", "--out", tmp_path / "file"], "file"),
+        ([model, "--to", "c99"], "--out"),
+    ):
+        code, told, err = cli("export", *words)
+        assert code == 2 and told == "" and len(err.strip().splitlines()) == 1 and said in err, words
+    assert not out.exists()
+
+
+def test_identified_geometry_alone_says_what_to_do(tmp_path: Path) -> None:
+    bar = load_mechanism("five_bar")
+    rows = zip(bar.geometry, bar.nominal.tolist(), strict=True)
+    lines = [f"  {p.name}: {{value: {v!r}, nominal: {v!r}, unit: {json.dumps(p.unit)}}}" for p, v in rows]
+    (tmp_path / "identified.yaml").write_text("\n".join(["mechanism: five_bar", "keys: {}", "parameters:", *lines]))
+    with pytest.raises(InputError, match="identified geometry alone"):
+        export_model(tmp_path / "identified.yaml", "c99", tmp_path / "out")
