@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,6 @@ from ccnn_torch.diagnosis.page.data import (
     signatures_of,
     used_rows,
 )
-from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
-from ccnn_torch.diagnosis.page.figure_signature import signature_plot
-from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
 from ccnn_torch.diagnosis.page.localisation import aside_table, next_table, region_table, where_table, write_next_csv
 from ccnn_torch.diagnosis.page.tables import (
     confusable_table,
@@ -39,10 +36,12 @@ from ccnn_torch.diagnosis.page.tensorboard import write_diagnosis_events
 from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, unseen_text, verdict_text
 from ccnn_torch.display import count_text
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.report.figures.style import Plot, inline_svg, save_figure
 from ccnn_torch.report.html import InlineFigure, render, trusted
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
+
+if TYPE_CHECKING:
+    from ccnn_torch.report.figures.style import Plot
 
 __all__ = ["NEXT", "Section", "diagnosis_markdown", "print_diagnosis", "write_diagnosis_report"]
 
@@ -92,6 +91,8 @@ def write_diagnosis_report(
     Raises:
         InputError: a file is not there or damaged.
     """
+    from ccnn_torch.report.figures.style import inline_svg, save_figure
+
     folder = Path(folder)
     results = read_json(folder / _RESULT) if results is None else results
     if arrays is not None:
@@ -162,6 +163,11 @@ def print_diagnosis(results: Block, console: Console, about: About | None = None
 
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
+    # Here, so that `ccnn check` and the verdict on the terminal do not wait for matplotlib.
+    from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
+    from ccnn_torch.diagnosis.page.figure_signature import signature_plot
+    from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
+
     effects = list(results["verdict"]["effects"])
     plots = (
         gap_plot(results),
