@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -231,3 +233,19 @@ def test_columns_by_another_name_are_said(cli: Cli, rows: Path, tmp_path: Path) 
     # One that was asked for is there for effects of one's own.
     code, shown, told = cli("check", *words[:4], "covariates=[time,temperature,load_*,direction*,force_x]")
     assert code == 0 and "not evaluated" not in shown, told
+
+
+def test_nothing_slow_is_loaded_that_a_diagnosis_does_not_need(rows: Path, tmp_path: Path) -> None:
+    arm = Path(__file__).parent.parent / "experiments" / "data"
+    watched = "{'torch._dynamo', 'sympy', 'scipy', 'pint', 'roma', 'gpytorch', 'torch.utils.tensorboard'}"
+    program = f"""
+import sys
+from ccnn_torch.cli.application import app
+def run(*words): app(words, standalone_mode=False)
+run("check", "--records", {str(arm / "ur10_b_500.csv")!r}, "--mechanism", {str(arm / "ur10.yaml")!r}, "--quiet")
+print("matplotlib" in sys.modules)
+run("diagnose", "--records", {str(rows)!r}, "--mechanism", "five_bar", "--out", {str(tmp_path / "found")!r}, "--quiet")
+print(sorted({watched} & set(sys.modules)), "matplotlib" in sys.modules)
+"""
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert told.splitlines() == ["False", "[] True"]
