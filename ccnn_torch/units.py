@@ -7,6 +7,7 @@ So two units count as convertible here only when their base units agree *with th
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from dataclasses import dataclass
 from functools import cache
@@ -141,6 +142,8 @@ def si_unit_of(unit: str, where: str = "") -> str:
     Raises:
         InputError: the unit is not known; `where` opens the sentence.
     """
+    if unit in _USUAL:
+        return _USUAL[unit][0]
     try:
         return _canonical(_lookup(unit).base)
     except _UnknownUnit as reason:
@@ -164,8 +167,9 @@ def to_si(
         InputError: unknown unit, or one of another dimension (an angle and a plain number differ).
     """
     array = np.asarray(values, dtype=np.float64)
-    if unit == si_unit and unit in _SI:
-        return array.copy()
+    usual, factor = _USUAL.get(unit, ("", 1.0))
+    if usual and si_unit in (None, usual):
+        return array + _CELSIUS if unit == "degC" else array * factor
     found = si_unit_of(unit, where)
     if si_unit is not None and _lookup(unit).base != _lookup(si_unit).base:
         kind = f", {_KINDS[found]}," if found in _KINDS else ""
@@ -184,8 +188,17 @@ def from_si(values: ArrayLike, si_unit: str, unit: str) -> NDArray[np.float64]:
     return np.asarray(_registry().Quantity(array, names[0]).to(names[1]).magnitude, dtype=np.float64)
 
 
-# Units that are SI already need no registry, whose making takes half a second.
-_SI = frozenset(("m", "rad", "s", "K", "N", "N*m", "1", "m/s", "rad/s"))
+# Usual units with their SI unit and pint's own factor: pint's registry takes half a second to make.
+_USUAL = {unit: (unit, 1.0) for unit in ("m", "rad", "s", "K", "N", "N*m", "1", "m/s", "rad/s")} | {
+    "mm": ("m", 1e-3),
+    "um": ("m", 1e-6),
+    "deg": ("rad", math.pi / 180),
+    "mrad": ("rad", 1e-3),
+    "urad": ("rad", 1e-6),
+    "ms": ("s", 1e-3),
+    "degC": ("K", 1.0),
+}
+_CELSIUS = 273.15
 
 
 @cache

@@ -6,6 +6,8 @@ import io
 import json
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -298,3 +300,19 @@ def test_a_terminal_shows_the_steps_and_the_time_left(rows: Path, monkeypatch: p
     with step_bar(TO_VERDICT, quiet=False) as tell:
         tell("by block", 0.5, "half")
     assert quiet.getvalue() == ""
+
+
+def test_nothing_slow_is_loaded_that_a_diagnosis_does_not_need(rows: Path, tmp_path: Path) -> None:
+    arm = Path(__file__).parent.parent / "experiments" / "data"
+    watched = "{'torch._dynamo', 'sympy', 'scipy', 'pint', 'roma', 'gpytorch', 'torch.utils.tensorboard'}"
+    program = f"""
+import sys
+from ccnn_torch.cli.application import app
+def run(*words): app(words, standalone_mode=False)
+run("check", "--records", {str(arm / "ur10_b_500.csv")!r}, "--mechanism", {str(arm / "ur10.yaml")!r}, "--quiet")
+print("matplotlib" in sys.modules)
+run("diagnose", "--records", {str(rows)!r}, "--mechanism", "five_bar", "--out", {str(tmp_path / "found")!r}, "--quiet")
+print(sorted({watched} & set(sys.modules)), "matplotlib" in sys.modules)
+"""
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert told.splitlines() == ["False", "[] True"]

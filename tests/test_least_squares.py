@@ -6,8 +6,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
+from scipy.stats import chi
 
 from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
+from ccnn_torch.numerics.outliers import chi_quantile
 
 
 def _rosenbrock(x):
@@ -114,3 +116,22 @@ def test_jacobian_of_combinations_is_that_of_all_outputs_combined(inputs):
 
     value, whole = jacobian_of(outputs, point)
     torch.testing.assert_close(jacobian_of(outputs, point, combined)[1], combined(value) @ whole)
+
+
+def test_a_function_that_ignores_its_point_has_the_jacobian_zero() -> None:
+    point = torch.ones(4, 1, dtype=torch.float64)
+    for outputs in (1, 5):  # by rows, and by columns
+        value, slope = jacobian_of(lambda x, n=outputs: torch.full((len(x), n), 2.0, dtype=torch.float64), point)
+        assert torch.equal(slope, torch.zeros(4, outputs, 1, dtype=torch.float64)) and bool((value == 2).all())
+
+
+def test_a_jacobian_inside_the_function_is_a_constant_to_it() -> None:
+    point = torch.linspace(0.1, 1, 5, dtype=torch.float64)[:, None]
+    slope = jacobian_of(lambda x: jacobian_of(torch.sin, x)[0] + x.square(), point)[1]
+    torch.testing.assert_close(slope[..., 0], 2 * point)
+
+
+def test_quantiles_of_a_length_are_those_of_scipy() -> None:
+    for channels in (1, 2, 3, 6):
+        for probability in (0.01, 0.5, 0.99):
+            assert chi_quantile(probability, channels) == pytest.approx(chi.ppf(probability, channels), rel=1e-12)

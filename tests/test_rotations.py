@@ -47,6 +47,21 @@ def test_geodesic_angle_is_right_at_every_size(angle):
     assert float(rotations.geodesic_angle(first, second)) == pytest.approx(angle, rel=1e-6, abs=2e-16)
 
 
+def test_nearest_rotation_and_slopes_at_no_rotation():
+    noisy = torch.randn(40, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    expected = np.stack([Rotation.align_vectors(m.mT.numpy(), np.eye(3))[0].inv().as_matrix() for m in noisy])
+    found = rotations.nearest_rotation(noisy)
+    assert torch.linalg.det(found).allclose(torch.ones(40, dtype=torch.float64))
+    # Both maximise the trace of the product; compared by what they reach.
+    reached, best = ((noisy * r).sum((-1, -2)) for r in (found, torch.as_tensor(expected)))
+    assert bool((reached >= best - 1e-12).all())
+    zero = torch.zeros(3, dtype=torch.float64)
+    slope = torch.autograd.functional.jacobian(rotations.rotation_vector_to_matrix, zero)
+    torch.testing.assert_close(slope.permute(2, 0, 1), rotations.skew(torch.eye(3, dtype=torch.float64)))
+    back = torch.autograd.functional.jacobian(rotations.matrix_to_rotation_vector, torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(torch.einsum("kij,ijl->kl", back, slope), torch.eye(3, dtype=torch.float64))
+
+
 def test_skew_vee_and_wrap():
     a, b = torch.randn(2, 5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     product = (rotations.skew(a) @ b[..., None])[..., 0]

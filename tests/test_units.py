@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pint
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import constants
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.units import from_si, parse_header, si_unit_of, to_si
+from ccnn_torch.units import _USUAL, _canonical, _lookup, from_si, parse_header, si_unit_of, to_si
 
 FACTORS = {
     "mm": ("m", 1e-3),
@@ -42,6 +43,14 @@ FACTORS = {
     "%": ("1", 1e-2),
     "1": ("1", 1.0),
 }
+
+
+def test_usual_units_are_those_of_pint_to_the_last_digit() -> None:
+    values, registry = np.random.default_rng(0).normal(size=100), pint.UnitRegistry()
+    for unit, (si_unit, _) in _USUAL.items():
+        expected = registry.Quantity(values, unit).to_base_units().magnitude
+        assert np.array_equal(to_si(values, unit), expected), unit
+        assert si_unit == _canonical(_lookup(unit).base)
 
 
 @pytest.mark.parametrize("unit", FACTORS)

@@ -9,6 +9,7 @@ import typer
 
 from ccnn_torch.cli.completion import complete_mechanism
 from ccnn_torch.cli.diagnose_options import configured
+from ccnn_torch.cli.loading import loading
 from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
 
 __all__ = ["check"]
@@ -43,11 +44,12 @@ def check(
 
     ccnn check --records measured.csv --mechanism my_simulator.py:PRESS
     """
-    from ccnn_torch.diagnosis.job import run_check
-    from ccnn_torch.diagnosis.outputs import write_check
-    from ccnn_torch.diagnosis.page.check import check_table, check_text
-    from ccnn_torch.report.screen import say, stdout, with_status
-    from ccnn_torch.report.table import print_table
+    with loading():
+        from ccnn_torch.diagnosis.job import run_check
+        from ccnn_torch.diagnosis.outputs import write_check
+        from ccnn_torch.diagnosis.page.check import check_table, check_text
+        from ccnn_torch.report.screen import say, stdout, with_status
+        from ccnn_torch.report.table import print_table
 
     with if_stopped(NOTHING_WRITTEN):
         wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)

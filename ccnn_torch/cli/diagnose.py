@@ -9,6 +9,7 @@ import typer
 
 from ccnn_torch.cli.completion import complete_mechanism
 from ccnn_torch.cli.diagnose_options import configured
+from ccnn_torch.cli.loading import loading
 
 __all__ = ["diagnose"]
 
@@ -55,6 +56,7 @@ def diagnose(
 
     ccnn diagnose --records measured.csv --mechanism my_simulator.py:PRESS --out runs/press
     """
-    from ccnn_torch.diagnosis.job import run_diagnosis
+    with loading():
+        from ccnn_torch.diagnosis.job import run_diagnosis
 
     run_diagnosis(configured(overrides, records, mechanism, noise, effects, config, seed, out, network), quiet, details)

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.problems.parameters import match_parameters
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import to_si
 
-__all__ = ["ANGLE_ARM", "Size", "prior_sizes", "size", "sizes_by_name", "sizes_of_pose"]
+__all__ = ["ANGLE_ARM", "Size", "size", "sizes_by_name", "sizes_of_pose"]
 
 ANGLE_ARM = 0.3
 """Distance of the points that determine orientation [m]: the noise of an angle is that of a length over this."""
@@ -41,23 +40,6 @@ def size(value: Size, unit: str | None, key: str) -> float:
         return amount
     hint = f"write e.g. {_WRITTEN.get(unit or '', 'a number')}, or a number in SI"
     return float(to_si(amount, match["unit"], unit, key, hint=hint))
-
-
-def prior_sizes(given: Mapping[str, Size], geometry: Sequence[Parameter], key: str) -> dict[str, float]:
-    """Standard deviation of each prior [SI] by its name or pattern; a text has the unit of what it fits.
-
-    Raises:
-        InputError: a pattern that fits nothing, an entry that is no size, or a unit of another kind than that of a
-            parameter that it fits.
-    """
-    units = {p.name: p.unit for p in geometry}
-    found = {}
-    for pattern, value in given.items():
-        fits = match_parameters(geometry, [pattern], key.partition(".")[2])
-        kinds = list(dict.fromkeys(units[p.name] for p in geometry if p.name in fits))
-        # Converted for every unit that the pattern matches, so that no mismatch is missed.
-        found[pattern] = max(size(value, unit, f"{key}.{pattern}") for unit in kinds)
-    return found
 
 
 def sizes_by_name(

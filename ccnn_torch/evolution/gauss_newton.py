@@ -4,7 +4,7 @@ The derivative of output k with respect to weight (a, b) of layer l is a product
 node a and what flows in from node b. The sum over samples of its outer products is therefore one matrix product of
 `samples x a a'` with `samples x b b'` for each pair of layers: the derivative of every sample and output with respect
 to every weight is never laid out, which saves a factor of the number of outputs in work and in memory. Within one layer
-both factors are symmetric, so that each pair of nodes and each pair of signals is multiplied once.
+both factors are symmetric, so that each pair of nodes is multiplied once, and each pair of signals where they are few.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ from torch import Tensor
 from ccnn_torch.evolution.waves import Waves, wave_inputs
 
 __all__ = ["Linearised", "Network", "dense_jacobian", "linearise", "network_of", "residual"]
+
+# Signals a node from which the products of `_within` are made node by node, measured on one core.
+_MANY_SIGNALS = 4
 
 
 @dataclass(frozen=True)
@@ -238,18 +241,23 @@ def _within(back: Tensor, flow: Tensor, kept: Tensor, apart: bool) -> Tensor:
         kept: which weights, `b x k` in the flat order `out x in`.
         apart: whether every node has a channel of its own (the output's nodes, judged as they are).
     """
-    node, signal = kept // flow.shape[-1], kept % flow.shape[-1]
-    first, second, place = _pairs(flow.shape[-1], flow.device)
-    signals = flow[..., first] * flow[..., second]
-    column = place[signal.unsqueeze(-1), signal.unsqueeze(-2)]
+    ins = flow.shape[-1]
+    node, signal = kept // ins, kept % ins
     if apart:
-        squares = back.diagonal(dim1=-2, dim2=-1).square()
-        row = node.unsqueeze(-1).expand_as(column)
-        same = node.unsqueeze(-1) == node.unsqueeze(-2)
-        return _picked(squares.mT @ signals, row, column) * same
-    above, beside, node_place = _pairs(back.shape[-1], back.device)
-    nodes = (back.mT @ back)[..., above, beside]
-    return _picked(nodes.mT @ signals, node_place[node.unsqueeze(-1), node.unsqueeze(-2)], column)
+        nodes, row = back.diagonal(dim1=-2, dim2=-1).square(), node.unsqueeze(-1)
+    else:
+        above, beside, place = _pairs(back.shape[-1], back.device)
+        nodes, row = (back.mT @ back)[..., above, beside], place[node.unsqueeze(-1), node.unsqueeze(-2)]
+    if ins >= _MANY_SIGNALS * back.shape[-1]:
+        # Many signals to few nodes: one product for each pair of nodes is quicker than laying out all pairs of signals.
+        table = ((flow.mT.unsqueeze(1) * nodes.mT.unsqueeze(2)) @ flow.unsqueeze(1)).flatten(2)
+        column = (signal * ins).unsqueeze(-1) + signal.unsqueeze(-2)
+    else:
+        first, second, place = _pairs(ins, flow.device)
+        table = nodes.mT @ (flow[..., first] * flow[..., second])
+        column = place[signal.unsqueeze(-1), signal.unsqueeze(-2)]
+    picked = _picked(table, row.expand_as(column), column)
+    return picked * (node.unsqueeze(-1) == node.unsqueeze(-2)) if apart else picked
 
 
 def _between(back: Tensor, flow: Tensor, kept: Tensor, back_2: Tensor, flow_2: Tensor, kept_2: Tensor) -> Tensor:

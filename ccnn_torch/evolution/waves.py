@@ -79,15 +79,17 @@ def find_waves(waves: Waves, residual: Tensor, inputs: Tensor, rows: Tensor, rea
     root = rows.sqrt().unsqueeze(-1)
     inputs, residual = inputs.masked_fill(~there, 0), residual.masked_fill(~there, 0) * root
     frequencies = torch.arange(_SLOWEST, _FASTEST, _SPACING, dtype=inputs.dtype, device=inputs.device)
-    candidates = torch.nonzero(readable).flatten().tolist()
     moving = _values(inputs, there)
+    candidates = torch.nonzero(readable & moving.any(0)).flatten().tolist()
     left = residual
     count = rows.sum(-1, keepdim=True)
-    enough = math.log(max(1, len(candidates)) * residual.shape[-1] * len(frequencies)) + 2
+    enough = math.log(max(1, int(readable.sum())) * residual.shape[-1] * len(frequencies)) + 2
     found = Waves(waves.source.clone(), waves.frequency.clone())
     for _ in range(passes):
         gain, source, frequency = _best(left, inputs, root, frequencies, candidates, moving)
         good = -count / 2 * torch.log1p(-gain.clamp(0, 1 - 1e-12)) > enough
+        if not bool(good.any()):
+            break
         found = _filled(found, source, frequency, good)
         left = _left(found, residual, inputs, root)
     return found

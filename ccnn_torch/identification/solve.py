@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ccnn_torch.config.sizes import prior_sizes
+from ccnn_torch.config.prior_sizes import prior_sizes
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import (
     Fit,

@@ -71,6 +71,8 @@ class Structure:
         self.evidence = torch.full_like(self.state.best_fitness, -torch.inf)
         self.passes = torch.zeros_like(self.evidence)
         self.refined = self._evolved()
+        # Whether a search found nothing in what these networks leave: the next one would not either.
+        self._searched = False
 
     def evolve(self) -> None:
         """One generation, and a refinement that is written back into the elite where one is due."""
@@ -83,6 +85,7 @@ class Structure:
     def refine(self) -> None:
         """Refine the best joined network of every member, keep it by evidence, and write it back where it is fitter."""
         everyone = torch.arange(len(self.passes), device=self.passes.device)
+        self._searched = False
         candidate, evidence = self._descend(self._evolved(), everyone)
         self.refined = choose(evidence > self.evidence, candidate, self.refined)
         self.evidence = torch.maximum(self.evidence, evidence)
@@ -96,6 +99,8 @@ class Structure:
 
     def search_waves(self) -> None:
         """Look for periodic nodes in what the kept members of a repeat leave, and refine those that got any."""
+        if self._searched:
+            return
         best = self._best()
         index = best.flatten()
         rows, model = self.rows.of(index), mapped(self.refined, lambda value: value[index])
@@ -109,6 +114,7 @@ class Structure:
         fresh = ((found.frequency != 0) & (before.frequency == 0)).repeat_interleave(each, 0)
         going = torch.nonzero(fresh.any(-1)).flatten()
         if len(going) == 0:
+            self._searched = True
             return
         source, frequency = (part.repeat_interleave(each, 0) for part in found)
         connected = model.masks[-1].clone()

@@ -10,7 +10,9 @@ __all__ = ["expand_leading", "leading_shape", "stack_last"]
 
 def leading_shape(*tensors: Tensor) -> torch.Size:
     """Common leading dims of tensors `... x d` with any last dims."""
-    shape: torch.Size = torch.broadcast_shapes(*(t.shape[:-1] for t in tensors))  # type: ignore[no-untyped-call]
+    # Not torch.broadcast_shapes, which loads sympy when first used; numpy's knows no shapes of an export.
+    leading = (t.new_empty(()).expand(t.shape[:-1]) for t in tensors)
+    shape: torch.Size = torch.broadcast_tensors(*leading)[0].shape  # type: ignore[no-untyped-call]
     return shape
 
 

@@ -41,7 +41,7 @@ def jacobian_of(
 
     One backward pass per output, or one double-backward pass (the transpose of the transpose) per input, whichever is
     fewer. Not torch's forward mode: that compiles a set of decompositions with the deprecated `torch.jit.script` when
-    first used, and takes about twice as long here.
+    first used, and takes about twice as long here. Nor `torch.func.vjp`: that loads torch's compiler, a second.
 
     Args:
         function: `... x k` -> `... x c`.
@@ -51,16 +51,31 @@ def jacobian_of(
     Returns:
         value `... x c` and Jacobian `... x c x k`, or that of the combinations, `... x r x k`.
     """
-    value, pull = torch.func.vjp(function, point.detach())[:2]
-    c, k = value.shape[-1], point.shape[-1]
-    outputs = torch.eye(c, dtype=value.dtype, device=value.device) if combined is None else combined(value.detach())
-    if outputs.shape[-2] <= 2 * k:
-        rows = [pull(e.expand_as(value))[0] for e in outputs.unbind(-2)]
-        return value.detach(), torch.stack(rows, dim=-2) if rows else value.new_zeros(*value.shape, k)
-    push = torch.func.vjp(lambda cotangent: pull(cotangent)[0], torch.zeros_like(value))[1]
-    columns = [push(e.expand_as(point))[0] for e in torch.eye(k, dtype=point.dtype, device=point.device)]
-    slope = torch.stack(columns, dim=-1)
-    return value.detach(), slope if combined is None else outputs @ slope
+    with torch.enable_grad():
+        point = point.detach().requires_grad_()
+        value = function(point)
+        c, k = value.shape[-1], point.shape[-1]
+        outputs = torch.eye(c, dtype=value.dtype, device=value.device)
+        outputs = outputs if combined is None else combined(value.detach())
+        if outputs.shape[-2] <= 2 * k:
+            rows = [_pulled(value, point, e.expand_as(value)) for e in outputs.unbind(-2)]
+            return value.detach(), torch.stack(rows, dim=-2) if rows else value.new_zeros(*value.shape, k)
+        cotangent = torch.zeros_like(value, requires_grad=True)
+        pulled = _pulled(value, point, cotangent, create_graph=True)
+        columns = [
+            _pulled(pulled, cotangent, e.expand_as(point)) for e in torch.eye(k, dtype=point.dtype, device=point.device)
+        ]
+        slope = torch.stack(columns, dim=-1)
+        return value.detach(), slope if combined is None else outputs @ slope
+
+
+def _pulled(value: Tensor, point: Tensor, cotangent: Tensor, create_graph: bool = False) -> Tensor:
+    """Derivative of the sum of `cotangent` times `value` by `point`, like `point`."""
+    if not value.requires_grad:
+        return torch.zeros_like(point)
+    # Of a sum: given the cotangent apart, torch loads its compiler's algebra to compare two shapes.
+    total = (value * cotangent).sum()
+    return torch.autograd.grad(total, point, retain_graph=True, create_graph=create_graph, materialize_grads=True)[0]
 
 
 def levenberg_marquardt(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
-from scipy.special import gammaincinv
 from torch import Tensor
 
 __all__ = ["FAR", "chi_quantile", "inlying", "residual_scale"]
@@ -15,11 +16,19 @@ cable-driven one reaches six), so that a closer bound would drop rows that are r
 # Of a residual [m]: exact rows leave rounding, in which no row is an outlier.
 _LEAST = 1e-9
 
+# A standard normal vector is never as long, and so many halvings of its half square reach the last digit.
+_LONGEST, _HALVINGS = 40.0, 100
 
+
+@cache
 def chi_quantile(probability: float, channels: int) -> float:
-    """Quantile of the length of `channels` standard normals; scipy.stats has it too, but takes long to load."""
-    length: float = float(2 * gammaincinv(channels / 2, probability)) ** 0.5
-    return length
+    """Quantile of the length of `channels` standard normals, by bisection; scipy has it, but takes long to load."""
+    order, low, high = torch.tensor([channels / 2, 0.0, _LONGEST**2 / 2], dtype=torch.float64)
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        below = torch.special.gammainc(order, middle) < probability
+        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
+    return float((low + high).sqrt())
 
 
 def residual_scale(length: Tensor, used: Tensor, channels: int, parameters: int) -> Tensor:

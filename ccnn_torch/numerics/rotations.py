@@ -1,13 +1,16 @@
-"""Rotations: the few maps this package needs, thin over roma, float64, any leading batch dims.
+"""Rotations: the few maps this package needs, float64, any leading batch dims.
 
 Warning:
     Quaternions are (w, x, y, z) here and (x, y, z, w) in roma; Euler angles are intrinsic Z-Y'-X'' (yaw, pitch, roll).
     Eq. 2 of the pseudoerror paper (Zhang and Gao 2012) mixes its angle names; this is the proper ZYX matrix.
 
-roma is imported by the functions that call it: it loads torch's compiler, which takes a second.
+roma is imported by the functions that call it: it loads torch's compiler, which takes a second. What every diagnosis of
+an arm needs is written out.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
@@ -27,24 +30,29 @@ __all__ = [
     "wrap_angle",
 ]
 
-# Below this angle roma takes the first-order matrix; its default 1e-6 would cost 5e-13 of accuracy.
+# Below this angle the series' first terms are exact to rounding.
 _SMALL = 1e-9
 
 
 def rotation_vector_to_matrix(vector: Tensor) -> Tensor:
-    """vector: `... x 3` [rad]; returns `... x 3 x 3`."""
-    import roma
-
-    matrix: Tensor = roma.rotvec_to_rotmat(vector, epsilon=_SMALL)
-    return matrix
+    """vector: `... x 3` [rad]; returns `... x 3 x 3` (Rodrigues): I + sin θ/θ K + (1 - cos θ)/θ² K²."""
+    square = vector.square().sum(-1)[..., None, None]
+    small = square < _SMALL**2
+    angle = torch.where(small, 1.0, square).sqrt()
+    first = torch.where(small, 1.0, torch.sin(angle) / angle)
+    second = torch.where(small, 0.5, 2 * (torch.sin(angle / 2) / angle).square())
+    k = skew(vector)
+    return torch.eye(3, dtype=vector.dtype, device=vector.device) + first * k + second * (k @ k)
 
 
 def matrix_to_rotation_vector(matrix: Tensor) -> Tensor:
     """matrix: `... x 3 x 3`; returns the rotation vector of angle at most pi, `... x 3` [rad]."""
-    import roma
-
-    vector: Tensor = roma.rotmat_to_rotvec(matrix)
-    return vector
+    quaternion = matrix_to_quaternion(matrix)
+    scalar, vector = quaternion[..., :1], quaternion[..., 1:]
+    square = vector.square().sum(-1, keepdim=True)
+    small = square < _SMALL**2
+    sine = torch.where(small, 1.0, square).sqrt()
+    return torch.where(small, 2 / scalar, 2 * torch.atan2(sine, scalar) / sine) * vector
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
@@ -57,11 +65,22 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
 
 
 def matrix_to_quaternion(matrix: Tensor) -> Tensor:
-    """matrix: `... x 3 x 3`; returns the unit quaternion (w, x, y, z) with w >= 0, `... x 4`."""
-    import roma
-
-    quaternion: Tensor = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(matrix))
-    return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+    """matrix: `... x 3 x 3`; returns the unit quaternion (w, x, y, z) with w >= 0, `... x 4` (Markley 2008, eq. 8)."""
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
+    # 4 q qᵀ, of which the row with the largest diagonal entry is the most precise multiple of q.
+    products = torch.stack(
+        [
+            torch.stack([1 + a + e + i, h - f, c - g, d - b], -1),
+            torch.stack([h - f, 1 + a - e - i, b + d, c + g], -1),
+            torch.stack([c - g, b + d, 1 - a + e - i, f + h], -1),
+            torch.stack([d - b, c + g, f + h, 1 - a - e + i], -1),
+        ],
+        -2,
+    )
+    largest = products.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = products.gather(-2, largest[..., None, None].expand(*largest.shape, 1, 4)).squeeze(-2)
+    unit = row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
+    return torch.where(unit[..., :1] < 0, -unit, unit)
 
 
 def euler_zyx_to_matrix(angles: Tensor) -> Tensor:
@@ -82,17 +101,15 @@ def matrix_to_euler_zyx(matrix: Tensor) -> Tensor:
 
 def geodesic_angle(first: Tensor, second: Tensor) -> Tensor:
     """Angle of the rotation between two frames, `... x 3 x 3` each; returns `...` [rad], right down to 1e-9 rad."""
-    import roma
-
-    angle: Tensor = roma.rotmat_geodesic_distance(first, second)
-    return angle
+    chord: Tensor = torch.linalg.matrix_norm(second - first)
+    return 2 * torch.asin((chord / math.sqrt(8)).clamp_max(1.0))
 
 
 def nearest_rotation(matrix: Tensor) -> Tensor:
     """The rotation with the least sum of squared differences to a matrix (special Procrustes), both `... x 3 x 3`."""
-    import roma
-
-    rotation: Tensor = roma.special_procrustes(matrix)
+    left, _, right = torch.linalg.svd(matrix)
+    sign = torch.det(left @ right)[..., None, None]
+    rotation: Tensor = torch.cat([left[..., :2], left[..., 2:] * sign], -1) @ right
     return rotation
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ccnn_torch.config.sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
+from ccnn_torch.config.prior_sizes import prior_sizes
+from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import make_folder, write_whole
 from ccnn_torch.identification import ParameterChoice

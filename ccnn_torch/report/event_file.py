@@ -6,6 +6,7 @@ import io
 import itertools
 import os
 import socket
+import struct
 import time
 from pathlib import Path
 from typing import Any, Self
@@ -29,13 +30,14 @@ class EventFile:
             folder: made where it is not there.
             purge_step: TensorBoard ignores the records of older files of this folder from this step on.
         """
-        # TensorBoard takes a second to import, which only runs that write curves should pay.
-        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+        # Only runs that write curves should pay for the import; torch's own `summary` costs more than all of these.
+        from tensorboard.compat.proto import event_pb2, summary_pb2, tensor_pb2
         from tensorboard.summary.writer.record_writer import RecordWriter
-        from torch.utils.tensorboard import summary
 
-        self._event: Any = Event
-        self._summary: Any = summary
+        self._event: Any = event_pb2.Event
+        self._summary: Any = summary_pb2.Summary
+        self._metadata: Any = summary_pb2.SummaryMetadata
+        self._tensor: Any = tensor_pb2.TensorProto
         self._pending = io.BytesIO()
         self._records = RecordWriter(self._pending)
         self._file: io.FileIO | None = None
@@ -51,16 +53,20 @@ class EventFile:
         self._add(None, file_version="brain.Event:2")
         if purge_step is not None:
             self._add(None, step=purge_step, file_version="brain.Event:2")
-            self._add(None, step=purge_step, session_log=SessionLog(status=SessionLog.START))
+            self._add(None, step=purge_step, session_log={"status": event_pb2.SessionLog.START})
 
     def add_scalar(self, tag: str, number: float, step: int, walltime: float | None = None) -> None:
-        self._add(walltime, step=step, summary=self._summary.scalar(tag, number))
+        self._add_value(step, walltime, tag=tag, simple_value=number)
 
-    def add_image(self, tag: str, pixels: Any, step: int, dataformats: str) -> None:
-        self._add(None, step=step, summary=self._summary.image(tag, pixels, dataformats=dataformats))
+    def add_image(self, tag: str, png: bytes, step: int) -> None:
+        """png: content of a PNG file, whose header has the size."""
+        width, height = struct.unpack(">II", png[16:24])
+        self._add_value(step, tag=tag, image={"width": width, "height": height, "encoded_image_string": png})
 
     def add_text(self, tag: str, text: str, step: int) -> None:
-        self._add(None, step=step, summary=self._summary.text(tag, text))
+        tensor = self._tensor(dtype="DT_STRING", string_val=[text.encode()], tensor_shape={"dim": [{"size": 1}]})
+        metadata = self._metadata(plugin_data={"plugin_name": "text"})
+        self._add_value(step, tag=f"{tag}/text_summary", metadata=metadata, tensor=tensor)
 
     def flush(self) -> None:
         """Write the added records to the file, so that TensorBoard sees them."""
@@ -91,6 +97,9 @@ class EventFile:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _add_value(self, step: int, walltime: float | None = None, **content: Any) -> None:
+        self._add(walltime, step=step, summary=self._summary(value=[self._summary.Value(**content)]))
 
     def _add(self, walltime: float | None, **content: Any) -> None:
         event = self._event(wall_time=time.time() if walltime is None else walltime, **content)

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from ccnn_torch.config.sizes import prior_sizes, size, sizes_by_name, sizes_of_pose
+from ccnn_torch.config.prior_sizes import prior_sizes
+from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import (
     describe_identify_keys,

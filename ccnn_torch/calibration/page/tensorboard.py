@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from PIL import Image
 from torch import Tensor
 
 from ccnn_torch.report.event_file import EventFile
@@ -100,7 +102,9 @@ class TensorBoardCallback:
         if self._masks is not None and (step % self._masks_every == 0 or step == 1):
             for layer, mask in enumerate(self._masks(), start=1):
                 picture = np.kron(np.asarray(mask, dtype=np.uint8), np.ones((_CELL, _CELL), dtype=np.uint8)) * 255
-                self._writer.add_image(f"masks/layer_{layer}", picture, step, dataformats="HW")
+                png = io.BytesIO()
+                Image.fromarray(picture).save(png, "PNG")
+                self._writer.add_image(f"masks/layer_{layer}", png.getvalue(), step)
         self._writer.flush()
         if self._writer.failed is not None and not self._told:
             self._told = True

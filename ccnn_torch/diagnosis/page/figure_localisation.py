@@ -19,6 +19,10 @@ __all__ = ["remainder_map", "where_plot"]
 
 Array = NDArray[np.float64]
 Block = Mapping[str, Any]
+# Groups of shares that are parts of the machine; the others are conditions of the rows.
+_OF_MACHINE = ("outputs", "joints", "legs")
+# Space between two groups of bars, in bars.
+_GAP = 0.6
 
 
 @styled
@@ -84,38 +88,34 @@ def _width(values: Array | None) -> int:
 
 @styled
 def where_plot(results: Block, about: About) -> Plot | None:
-    """Shares of the gap by output, joint, leg and covariate regime, a panel for each; nothing where there is no gap."""
+    """Shares of the gap by output, joint and leg, and beside them by covariate regime; None where there is no gap."""
     if results["verdict"]["none"]:
         return None
-    groups: dict[str, list[tuple[str, float, list[float] | None]]] = {}
-    for group, part, share, interval in shares(results, about):
-        groups.setdefault(group, []).append((part, share, interval))
-    if not groups:
+    parts = list(shares(results, about))
+    machine = [part for part in parts if part[0] in _OF_MACHINE]
+    columns = [column for column in (machine, parts[len(machine) :]) if column]
+    if not columns:
         return None
-    columns = min(2, len(groups))
-    lines = [list(groups.items())[i : i + columns] for i in range(0, len(groups), columns)]
-    heights = [max(len(parts) for _, parts in line) + 1.5 for line in lines]
-    figure = Figure(figsize=(9.2, 0.3 * sum(heights) + 0.35 * len(lines) + 0.3), layout="constrained")
-    grid = figure.subplots(len(lines), columns, squeeze=False, height_ratios=heights)
-    reach = max(max(share, interval[1] if interval else 0.0) for ps in groups.values() for _, share, interval in ps)
-    for line, panels in zip(lines, grid, strict=True):
-        for axes, (group, parts) in zip(panels, line, strict=False):
-            y = np.arange(len(parts))
-            axes.barh(y, [100 * share for _, share, _ in parts], height=0.62, color=AFTER)
-            for i, (_, share, interval) in enumerate(parts):
-                end = share
-                if interval is not None:
-                    axes.hlines(i, 100 * interval[0], 100 * interval[1], color="#222222", linewidth=1.3)
-                    end = max(share, interval[1])
-                axes.text(100 * (end + 0.015 * reach), i, f"{100 * share:.0f} %", va="center", fontsize=8.5)
-            axes.set_yticks(y, [part for part, _, _ in parts])
-            axes.set_ylim(len(parts) - 0.4, -0.6)
-            axes.set_xlim(0, 115 * reach)
-            axes.set_title(f"By {group.rstrip('s') if group in ('outputs', 'joints', 'legs') else group}")
-            axes.grid(axis="y", visible=False)
-        for axes in panels[len(line) :]:
-            axes.set_axis_off()
-    for i in range(columns):
-        grid[(len(groups) - 1 - i) // columns, i].set_xlabel("share of the gap [%]")
+    lengths = [len(column) + _GAP * len({part[0] for part in column}) for column in columns]
+    figure = Figure(figsize=(4.7 * len(columns), 0.3 * max(lengths) + 0.8), layout="tight")
+    # Few axes: each costs more than its bars.
+    grid = figure.subplots(1, len(columns), squeeze=False)[0]
+    reach = max(max(share, interval[1] if interval else 0.0) for _, _, share, interval in parts)
+    for axes, column in zip(grid, columns, strict=True):
+        starts = [i > 0 and part[0] != column[i - 1][0] for i, part in enumerate(column)]
+        y = np.arange(len(column)) + _GAP * np.cumsum(starts)
+        axes.barh(y, [100 * share for _, _, share, _ in column], height=0.62, color=AFTER)
+        for at, (_, _, share, interval) in zip(y, column, strict=True):
+            end = share
+            if interval is not None:
+                axes.hlines(at, 100 * interval[0], 100 * interval[1], color="#222222", linewidth=1.3)
+                end = max(share, interval[1])
+            axes.text(100 * (end + 0.015 * reach), at, f"{100 * share:.0f} %", va="center", fontsize=8.5)
+        axes.set_yticks(y, [part for _, part, _, _ in column])
+        axes.set_ylim(max(lengths) - _GAP - 0.4, -0.6)
+        axes.set_xlim(0, 115 * reach)
+        axes.set_title("By output, joint and leg" if column is machine else "By condition")
+        axes.set_xlabel("share of the gap [%]")
+        axes.grid(axis="y", visible=False)
     caption = "Which share of the gap (of its mean square) lies where; lines are 95 % intervals where they are known."
     return Plot("where", figure, caption)

@@ -31,7 +31,7 @@ def gap_plot(results: Block) -> Plot | None:
         return None
     bars = {name: _bars(results, block, alone=name == shown[0][0]) for name, block in shown}
     heights = [len(bars[name]) + 1.6 for name, _ in shown]
-    figure = Figure(figsize=(8.4, 0.34 * sum(heights) + 0.5 * len(shown)), layout="constrained")
+    figure = Figure(figsize=(8.4, 0.34 * sum(heights) + 0.5 * len(shown)), layout="tight")
     grid = figure.subplots(len(shown), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (name, block) in zip(grid, shown, strict=True):
         scale, unit = display_unit(block["unit"], block["before"])
@@ -130,7 +130,7 @@ def probability_plot(results: Block) -> Plot | None:
             bars.append((e["name"], e["probability"], colour))
     if not bars:
         return None
-    figure = Figure(figsize=(8.4, 0.34 * len(bars) + 1.0), layout="constrained")
+    figure = Figure(figsize=(8.4, 0.34 * len(bars) + 1.0), layout="tight")
     axes = figure.subplots()
     for i, (_, probability, colour) in enumerate(bars):
         axes.barh(i, probability, height=0.62, color=colour)

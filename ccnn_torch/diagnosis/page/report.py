@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,6 @@ from ccnn_torch.diagnosis.page.data import (
     signatures_of,
     used_rows,
 )
-from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
-from ccnn_torch.diagnosis.page.figure_machine import machine_plot
-from ccnn_torch.diagnosis.page.figure_signature import signature_plot
-from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
 from ccnn_torch.diagnosis.page.first_screen import (
     ON_PAGE,
     first_screen,
@@ -49,10 +45,12 @@ from ccnn_torch.diagnosis.page.tensorboard import write_diagnosis_events
 from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, unseen_text, verdict_text
 from ccnn_torch.display import count_text
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.report.figures.style import Plot, inline_svg, save_figure
 from ccnn_torch.report.html import InlineFigure, render, trusted
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
+
+if TYPE_CHECKING:
+    from ccnn_torch.report.figures.style import Plot
 
 __all__ = ["NEXT", "Section", "diagnosis_markdown", "print_diagnosis", "write_diagnosis_report"]
 
@@ -101,6 +99,8 @@ def write_diagnosis_report(
     Raises:
         InputError: a file is not there or damaged.
     """
+    from ccnn_torch.report.figures.style import inline_svg, save_figure
+
     folder = Path(folder)
     results = read_json(folder / RESULT) if results is None else results
     if arrays is not None:
@@ -192,6 +192,12 @@ def _print_tables(results: Block, console: Console, about: About) -> None:
 
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
+    # Here, so that `ccnn check` and the verdict on the terminal do not wait for matplotlib.
+    from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
+    from ccnn_torch.diagnosis.page.figure_machine import machine_plot
+    from ccnn_torch.diagnosis.page.figure_signature import signature_plot
+    from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
+
     effects = list(results["verdict"]["effects"])
     plots = (
         machine_plot(arrays, effects),

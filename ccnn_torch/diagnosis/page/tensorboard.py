@@ -6,9 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from matplotlib.image import imread
-
 from ccnn_torch.report.event_file import EventFile
 
 __all__ = ["write_diagnosis_events"]
@@ -48,5 +45,4 @@ def write_diagnosis_events(
         for effect in results["effects"]:
             writer.add_scalar(f"probability/{effect['name']}", effect["probability"], 0)
         for name, path in pictures.items():
-            pixels = np.asarray(imread(path))
-            writer.add_image(f"diagnosis/{name}", pixels[..., :3], 0, dataformats="HWC")
+            writer.add_image(f"diagnosis/{name}", path.read_bytes(), 0)
