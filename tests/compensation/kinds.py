@@ -142,8 +142,6 @@ KINDS: dict[str, Callable[[], Compensator]] = {
     "sliding arm": lambda: geometry_of_an_arm()[0],
     "six joints": six_joints,
     "expanded geometry": expanded,
-    "effects of an arm": lambda: with_effects(ARM, ("compliance",)),
     "effects of a five-bar": lambda: with_effects("five_bar", ("compliance", "backlash")),
-    "effects of a tripod": lambda: with_effects("tripod", ("frame",)),
     **{name: (lambda name=name: learned(name)) for name in LEARNERS},
 }
