@@ -41,7 +41,7 @@ SURE = 0.95
 
 # Up to so many effects without support are named one by one.
 _FEW_TRIED = 3
-_DRIVERS = {"workspace": "the place in the workspace", "temperature": "the temperature", "time": "the time"}
+_DRIVERS = {"workspace": "the position in the workspace", "temperature": "the temperature", "time": "the time"}
 
 
 def effect_words(name: str) -> str:
