@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -14,10 +15,12 @@ from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams
 from ccnn_torch.diagnosis.evidence.single_groups import NO_COLUMNS, GroupProducts, fit_single_groups, own_products
 
-__all__ = ["Dictionary", "FittedSet", "Singles", "covariance", "dictionary_of", "singles_of"]
+__all__ = ["Dictionary", "FittedSet", "Singles", "covariance", "dictionary_of", "singles_of", "with_noise"]
 
 # Columns from which their products with all others are worth a call of their own.
 _NARROW = 128
+# Weight of a noise that is certain, in multiples of the values.
+_CERTAIN = 100.0
 
 
 @dataclass(frozen=True)
@@ -114,19 +117,27 @@ def singles_of(atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof:
         y: what they explain, whitened, `s x c`.
         noise_dof: weight of the prior of the noise, in values; 0 = it is not known.
     """
-    products = [NO_COLUMNS, *(own_products(columns, y) for columns in x)]
-    fits = fit_single_groups(products, y.square().sum(), float(y.numel()), noise_dof)
+    products = [own_products(columns, y) for columns in x]
+    found, axes = _alone(dict(enumerate(products)), atoms, y.square().sum(), float(y.numel()), noise_dof)
+    return Singles(found, [*axes.values()], products)
+
+
+def _alone(
+    products: Mapping[int, GroupProducts], atoms: Sequence[Atom], yy: Tensor, values: float, noise_dof: float
+) -> tuple[dict[tuple[int, ...], FittedSet], dict[int, Tensor]]:
+    """No atom, and each alone of those whose products are given; the principal axes of each."""
+    fits = fit_single_groups([NO_COLUMNS, *products.values()], yy, values, noise_dof)
     numbers = zip(
+        [None, *products],
         *(v.tolist() for v in (fits.log_evidence, fits.log_scale, fits.energy, fits.rss, fits.noise, fits.effective)),
         strict=True,
     )
     found: dict[tuple[int, ...], FittedSet] = {}
-    for k, (evidence, log_scale, energy, rss, noise, effective) in enumerate(numbers):
-        members = (k - 1,) if k else ()
-        prior = atoms[k - 1].log_prior if k else 0.0
+    for k, (atom, evidence, log_scale, energy, rss, noise, effective) in enumerate(numbers):
+        members = () if atom is None else (atom,)
         found[members] = FittedSet(
             members=members,
-            log_posterior=evidence + prior,
+            log_posterior=evidence + sum(atoms[i].log_prior for i in members),
             log_evidence=evidence,
             along=tuple(fits.mean[k, : len(fits.axes[k])] for _ in members),
             axes=tuple(fits.axes[k] for _ in members),
@@ -136,7 +147,30 @@ def singles_of(atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof:
             noise=noise,
             effective=effective,
         )
-    return Singles(found, [*fits.axes[1:]], products[1:])
+    return found, dict(zip(products, fits.axes[1:], strict=True))
+
+
+def with_noise(dictionary: Dictionary, variance: float) -> Dictionary:
+    """The same candidates under noise of a variance that is known, in units of which all squares then are.
+
+    Args:
+        dictionary: candidates.
+        variance: of the noise, in units of the noise so far.
+    """
+    grams, size = dictionary.grams, math.sqrt(variance)
+    grams = Grams(grams.xx / variance, grams.xy / variance, grams.yy / variance, grams.values)
+    known = _CERTAIN * grams.values
+    products = {i: GroupProducts(grams.xx[_run(g), _run(g)], grams.xy[_run(g)]) for i, g in dictionary.groups.items()}
+    alone, axes = _alone(products, dictionary.atoms, grams.yy, grams.values, known)
+    return replace(
+        dictionary,
+        columns=dictionary.columns / size,
+        grams=grams,
+        axes=axes,
+        turned=_turned(grams, dictionary.groups, axes),
+        alone=alone,
+        noise_dof=known,
+    )
 
 
 def dictionary_of(

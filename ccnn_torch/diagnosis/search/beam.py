@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from torch import Tensor
 
@@ -12,7 +12,7 @@ from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet, dictionary_of, singles_of
 from ccnn_torch.diagnosis.search.sets import promising
 
-__all__ = ["search"]
+__all__ = ["probable_sets", "search"]
 
 _MOST = 4
 # Pairs that go on to sets of three; in a quick search, which ends with pairs, the atoms that these are made of.
@@ -37,13 +37,26 @@ def search(
         quick: whether to look at pairs with the likeliest atoms only, for a start.
     """
     alone = singles_of(atoms, x, y, noise_dof)
-    tried = dict(alone.found)
-    singles = sorted((f for s, f in tried.items() if s), key=lambda f: -f.log_posterior)
-    discrepancies = {i for i, a in enumerate(atoms) if a.is_discrepancy}
-    known = [f.members[0] for f in singles if f.members[0] not in discrepancies]
-    others = _of_several_drivers([f.members[0] for f in singles if f.members[0] in discrepancies], atoms)
-    firsts, most = (known[:_LIKELIEST], 2) if quick else (known, _MOST)
-    dictionary = dictionary_of(atoms, x, y, others, alone, noise_dof, firsts if quick else None)
+    ranked = _ranked(alone.found)
+    known = [i for i in ranked if not atoms[i].is_discrepancy]
+    others = _of_several_drivers([i for i in ranked if atoms[i].is_discrepancy], atoms)
+    firsts = known[:_LIKELIEST] if quick else None
+    dictionary = dictionary_of(atoms, x, y, others, alone, noise_dof, firsts)
+    return dictionary, probable_sets(dictionary, firsts)
+
+
+def probable_sets(dictionary: Dictionary, firsts: Sequence[int] | None = None) -> list[FittedSet]:
+    """Sets of what the inner products of a dictionary are known for, by log posterior, best first.
+
+    Args:
+        dictionary: candidates.
+        firsts: atoms of which one is in every set, pairs at most; None = any, sets of up to four.
+    """
+    atoms, tried = dictionary.atoms, dict(dictionary.alone)
+    discrepancies = {i for i in dictionary.groups if atoms[i].is_discrepancy}
+    ranked = [i for i in _ranked(dictionary.alone) if i in dictionary.groups]
+    known, others = ([i for i in ranked if (i in discrepancies) == wild] for wild in (False, True))
+    firsts, most = (known, _MOST) if firsts is None else (firsts, 2)
     seen: set[tuple[int, ...]] = set()
 
     def fit_all(sets: Sequence[tuple[int, ...]]) -> None:
@@ -79,7 +92,13 @@ def search(
             break
         wide = _BEAM if size == 2 else _BEAM // 2
         fit_all([s for f in best(size, wide) for j in (*known, *others) if (s := _extended(f.members, j, atoms))])
-    return dictionary, sorted(tried.values(), key=lambda f: -f.log_posterior)
+    return sorted(tried.values(), key=lambda f: -f.log_posterior)
+
+
+def _ranked(alone: Mapping[tuple[int, ...], FittedSet]) -> list[int]:
+    """Atoms by the log posterior of each alone, best first."""
+    singles = sorted((f for s, f in alone.items() if s), key=lambda f: -f.log_posterior)
+    return [f.members[0] for f in singles]
 
 
 def _top(found: Iterable[FittedSet]) -> float:

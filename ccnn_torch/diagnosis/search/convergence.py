@@ -13,12 +13,11 @@ from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.diagnosis.search.sets import subsets_with_one_less
 
-__all__ = ["FORM", "discrepancy_is_active", "has_new_effects", "is_converged", "known_shapes", "most_probable_shapes"]
+__all__ = ["discrepancy_is_active", "has_new_effects", "is_converged", "known_shapes", "most_probable_shapes"]
 
-FORM = 0.004
-"""Share of the gap's energy that goes with a member of a set and not without it, below which a library effect beside
-others is how their form differs from the textbook."""
-
+# Share of the gap's energy that goes with effects that were added and not without them, below which they are no reason
+# to search again: they correct the form of the others.
+_ADDED = 0.004
 # A fit is settled where the noise of the channels changed among each other by less than this (logarithm), and what it
 # leaves by such a share of the noise's square.
 _SAME_NOISE, _SAME_FIT = 0.2, 0.01
@@ -68,7 +67,7 @@ def has_new_effects(
     if old == best.members:
         return False
     without = next((f for f in found if f.members == old), None)
-    return without is None or without.rss - best.rss > FORM * gap
+    return without is None or without.rss - best.rss > _ADDED * gap
 
 
 def discrepancy_is_active(dictionary: Dictionary, found: Sequence[FittedSet], best: FittedSet) -> bool:

@@ -1,0 +1,119 @@
+"""The posterior over sets of causes whose forms are not those of the textbook.
+
+A real cause differs from the effect that describes it. With y = Σ_g X_g θ_g + e + ε the form error e adds to the noise,
+in every direction of the data, a variance of Σ_g φ_g E_g: a share φ of what each effect of the set does in all rows,
+E_g = |X_g θ_g|². It grows with the rows as E_g does, so that no number of rows makes a small misfit into another cause
+(model inadequacy: Kennedy and O'Hagan 2001).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from ccnn_torch.diagnosis.candidates.atom import Atom
+from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet, with_noise
+from ccnn_torch.diagnosis.search.analysis import Analysis
+from ccnn_torch.diagnosis.search.beam import probable_sets
+from ccnn_torch.effects import EXACT
+
+__all__ = ["Posterior", "is_unexplained", "with_form_error"]
+
+# Share φ of an effect's squares that its form error adds to the noise in every direction: where the form is exact, only
+# the second order; of other effects; and of a discrepancy term, which is smooth where the cause need not be.
+_EXACT, _FORM, _SMOOTH = 1e-6, 5e-5, 3e-4
+# Directions that a form error has, so that all of it is this number times φ of the squares.
+_DIRECTIONS = 100
+# Levels of the form error, equally probable: it is known to a factor of four or so.
+_LEVELS = (1.0, 0.25, 4.0)
+# Standard deviations of the noise's mean square that a remainder must exceed in any case; and within which it is none.
+_CLEARLY, _SLIGHTLY = 5.0, 3.0
+# Log prior odds that all forms are those of the textbook, and directions in which a form error is sure to show.
+_LOG_EXACT = math.log(0.001)
+_SEEN = 6
+# The set that the error is that of, and the set that is the most probable then.
+_TURNS = 2
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Sets by their posterior probability, at one level of the form error.
+
+    Attributes:
+        dictionary: candidates under noise and form error, whose squares are in units of their variance.
+        found: sets, most probable first; members are numbered as in the analysis.
+        weight: probability of the level.
+        variance: of noise and form error, in units of the analysis' noise.
+    """
+
+    dictionary: Dictionary
+    found: list[FittedSet]
+    weight: float
+    variance: float
+
+
+def with_form_error(analysis: Analysis) -> list[Posterior]:
+    """The sets of an analysis, weighed again under the form error of the most probable one, at each of its levels, the
+    usual one first."""
+    levels = [_at_level(analysis, level) for level in _LEVELS]
+    if not _is_known(analysis):
+        return levels
+    # Whether the forms are those of the textbook is to be seen where the noise is known: the best set leaves that, and
+    # no more.
+    exact, usual = _without_discrepancies(_at_level(analysis, 0.0)), levels[0]
+    count = analysis.dictionary.grams.values
+    left, other = (_mean_square(one.found[0], one.dictionary) * one.variance / analysis.floor for one in (exact, usual))
+    shown = math.log(usual.variance / analysis.floor) + other * analysis.floor / usual.variance - left
+    misfit = max(left - 1 - _SLIGHTLY * math.sqrt(2 / count), 0.0) * count / 2
+    odds = _LOG_EXACT + _SEEN * shown / 2 - misfit
+    share = 1 / (1 + math.exp(min(-odds, 700.0)))
+    return [*(replace(one, weight=one.weight * (1 - share)) for one in levels), replace(exact, weight=share)]
+
+
+def _at_level(analysis: Analysis, level: float) -> Posterior:
+    dictionary, found = analysis.dictionary, analysis.found
+    best, variance = found[0], 1.0
+    for _ in range(_TURNS):
+        noise = max(analysis.floor, _mean_square(best, dictionary) * variance)
+        variance = max(noise + level * _form_error(best, dictionary) * variance, math.ulp(1.0))
+        dictionary = with_noise(analysis.dictionary, variance)
+        found = probable_sets(dictionary)
+        best = found[0]
+    return Posterior(dictionary, found, 1 / len(_LEVELS), variance)
+
+
+def _without_discrepancies(posterior: Posterior) -> Posterior:
+    """Sets of library effects alone: what a discrepancy term describes has no form of the textbook."""
+    atoms = posterior.dictionary.atoms
+    found = [f for f in posterior.found if not any(atoms[i].is_discrepancy for i in f.members)]
+    return replace(posterior, found=found)
+
+
+def _is_known(analysis: Analysis) -> bool:
+    """Whether the noise was given or the records show it."""
+    return analysis.whitening.known > 0 or analysis.instrument is not None
+
+
+def _form_error(found: FittedSet, dictionary: Dictionary) -> float:
+    """Variance in every direction of what the effects of a set differ by, in units of the dictionary's noise."""
+    most = float(dictionary.grams.yy)
+    return sum(
+        _share(dictionary.atoms[i]) * min(energy, most) for i, energy in zip(found.members, found.energy, strict=True)
+    )
+
+
+def is_unexplained(analysis: Analysis, found: FittedSet) -> bool:
+    """Whether a set leaves clearly more than the noise and the form errors of its effects."""
+    count = analysis.dictionary.grams.values
+    above = _mean_square(found, analysis.dictionary) - analysis.floor
+    allowed = _DIRECTIONS * _form_error(found, analysis.dictionary) / count
+    return above > max(analysis.floor * _CLEARLY * math.sqrt(2 / count), allowed)
+
+
+def _share(atom: Atom) -> float:
+    return _SMOOTH if atom.is_discrepancy else _EXACT if atom.name in EXACT else _FORM
+
+
+def _mean_square(found: FittedSet, dictionary: Dictionary) -> float:
+    """What a set leaves, in units of the dictionary's noise."""
+    return found.rss / max(dictionary.grams.values - found.effective, 1.0)
