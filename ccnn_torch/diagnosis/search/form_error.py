@@ -31,8 +31,6 @@ _CLEARLY, _SLIGHTLY = 5.0, 3.0
 # Log prior odds that all forms are those of the textbook, and directions in which a form error is sure to show.
 _LOG_EXACT = math.log(0.001)
 _SEEN = 6
-# The set that the error is that of, and the set that is the most probable then.
-_TURNS = 2
 
 
 @dataclass(frozen=True)
@@ -71,15 +69,11 @@ def with_form_error(analysis: Analysis) -> list[Posterior]:
 
 
 def _at_level(analysis: Analysis, level: float) -> Posterior:
-    dictionary, found = analysis.dictionary, analysis.found
-    best, variance = found[0], 1.0
-    for _ in range(_TURNS):
-        noise = max(analysis.floor, _mean_square(best, dictionary) * variance)
-        variance = max(noise + level * _form_error(best, dictionary) * variance, math.ulp(1.0))
-        dictionary = with_noise(analysis.dictionary, variance)
-        found = probable_sets(dictionary)
-        best = found[0]
-    return Posterior(dictionary, found, 1 / len(_LEVELS), variance)
+    best = analysis.found[0]
+    noise = max(analysis.floor, _mean_square(best, analysis.dictionary))
+    variance = max(noise + level * _form_error(best, analysis.dictionary), math.ulp(1.0))
+    dictionary = with_noise(analysis.dictionary, variance)
+    return Posterior(dictionary, probable_sets(dictionary), 1 / len(_LEVELS), variance)
 
 
 def _without_discrepancies(posterior: Posterior) -> Posterior:

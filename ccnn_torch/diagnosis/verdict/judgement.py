@@ -80,7 +80,7 @@ def judge(analysis: Analysis) -> Judgement:
     found = max([*_refitted(analysis, [chosen]), *same], key=lambda f: f.log_posterior)
     outside = driver is not None
     if not outside and is_unexplained(analysis, found):
-        outside, driver = True, _driver_of_remainder(analysis, usual, without)
+        outside, driver = True, _driver_of_remainder(analysis, leading, usual)
     if outside and _little(analysis):
         names, found = frozenset(), _empty(analysis)
     classes = {} if outside else _classes(analysis, likeliest, chosen, names)
@@ -180,10 +180,16 @@ def _energy(analysis: Analysis, found: FittedSet, name: str) -> float:
     return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.dictionary.atoms[i].name == name)
 
 
-def _driver_of_remainder(analysis: Analysis, posterior: Posterior, without: frozenset[str]) -> str | None:
-    """The driver of the most probable set that has one."""
-    named = (_named(analysis, found) for found in posterior.found)
-    return next((driver for names, driver in named if driver is not None and not names & without), None)
+def _driver_of_remainder(analysis: Analysis, leading: _Leading, posterior: Posterior) -> str | None:
+    """The most probable driver; where no probable set has one, that of the most probable set with one."""
+    share: dict[str, float] = {}
+    for _, driver, p, _ in leading:
+        if driver is not None:
+            share[driver] = share.get(driver, 0.0) + p
+    if share:
+        return max(share, key=lambda driver: share[driver])
+    drivers = (_named(analysis, found)[1] for found in posterior.found)
+    return next((driver for driver in drivers if driver is not None), None)
 
 
 def _classes(
