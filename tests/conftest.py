@@ -30,6 +30,8 @@ def pytest_collection_finish() -> None:
     """What the imports left is there to stay: the garbage collector need not look at it again and again."""
     gc.collect()
     gc.freeze()
+    # And rarely at what is new: 700 new objects, Python's own threshold, are made by one operation on tensors.
+    gc.set_threshold(50_000, 10, 10)
 
 
 # Tables of operators, which torch makes anew for each export and which stay the same: a third of an export's time.
