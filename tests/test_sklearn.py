@@ -32,7 +32,7 @@ ESTIMATORS = [CCNNRegressor, BPLMRegressor, GRNNRegressor, ENNRegressor]
 STEPPED = [kind for kind in ESTIMATORS if issubclass(kind, SteppedRegressor)]
 # Settings for the tests that need no good model.
 SMALL: dict[type[Any], dict[str, Any]] = {
-    CCNNRegressor: {"generations": 4, "population": 12, "hidden": 6},
+    CCNNRegressor: {"generations": 4, "population": 12, "hidden": 6, "refinement_iterations": 10},
     BPLMRegressor: {"iterations": 6, "restarts": 2, "hidden": 4},
     GRNNRegressor: {"iterations": 4},
     ENNRegressor: {"generations": 30, "population": 20, "density": 0.7},
