@@ -77,7 +77,7 @@ def program_of(traced: GraphModule, name: str, inputs: Sequence[str], outputs: S
         elif node.op == "call_function":
             args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: known[n])
             known[node] = lowering.call(node, args, kwargs)
-    found = torch.fx.node.map_arg(graph.output_node().args[0], lambda n: known[n])
+    found: Any = torch.fx.node.map_arg(graph.output_node().args[0], lambda n: known[n])
     wanted = {key: lowering.ids(value) for key, value in zip(outputs, found, strict=True) if key is not None}
     return lowering.builder.program(name, given, wanted)
 
