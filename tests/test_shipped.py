@@ -31,10 +31,10 @@ FLOORS = [
     ["identification/problems", "identification/solvers", "identification/identifiability", "identification/__init__"],
     ["compensation"],
     ["diagnosis"],
-    ["run_folder", "report", "config", "testing"],
+    ["engine", "run_folder", "report", "config", "testing"],
     ["simulation", "planning", "verification/promise", "identification"],
     ["diagnosis/config", "diagnosis/page", "diagnosis/outputs", "diagnosis/job"],
-    ["calibration", "sklearn", "suite", "comparison", "verification", "starter"],
+    ["calibration", "sklearn", "suite", "sweep", "comparison", "verification", "starter"],
     ["api", "cli", "__init__", "__main__"],
 ]
 
