@@ -98,5 +98,5 @@ def _split(text: str) -> list[str]:
 def _name(words: Iterable[str]) -> str:
     """A folder's name that tells the values; with a hash where it would be too long."""
     text = "_".join(words)
-    name = re.sub(r"[^\w.-]+", "-", text.replace("=", "-")).strip("-.")
+    name = re.sub(r"[^\w.]+", "-", text).strip("-.")
     return name if len(name) <= _LONGEST else f"{name[:_LONGEST]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
