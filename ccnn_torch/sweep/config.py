@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,8 +95,8 @@ def _split(text: str) -> list[str]:
     return [part.strip() for part in parts]
 
 
-def _name(words: Iterable[str]) -> str:
+def _name(words: Sequence[str]) -> str:
     """A folder's name that tells the values; with a hash where it would be too long."""
     text = "_".join(words)
-    name = re.sub(r"[^\w.]+", "-", text).strip("-.")
+    name = "_".join(re.sub(r"[^\w.]+", "-", word).strip("-.") for word in words)
     return name if len(name) <= _LONGEST else f"{name[:_LONGEST]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"

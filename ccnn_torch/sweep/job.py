@@ -18,7 +18,7 @@ from ccnn_torch.run_folder.lock import locked
 from ccnn_torch.suite.job import check_folder, finish_cases
 from ccnn_torch.sweep.config import Sweep
 
-__all__ = ["run_sweep", "sweep_rows"]
+__all__ = ["Row", "run_sweep", "sweep_rows"]
 
 _FIGURES = (
     *("best_method", "joint_mse", "joint_mse_low", "joint_mse_high", "joint_unit", "ratio_to_floor[1]"),
@@ -28,11 +28,11 @@ _SHOWN = ("best_method", "joint_mse", "position_before[m]", "position_after[m]")
 Row = dict[str, str | float | None]
 
 
-def run_sweep(sweep: Sweep, quiet: bool = False) -> Path:
+def run_sweep(sweep: Sweep, quiet: bool = False) -> tuple[Path, list[Row]]:
     """Run the jobs that are not finished yet; each is an ordinary run folder, and a second call keeps it.
 
     Returns:
-        The path of `sweep.csv`: a row for each job with its keys and figures.
+        The path of `sweep.csv`, and its rows: of each job the keys and figures.
 
     Raises:
         InputError: a job cannot be run, its folder holds another run, or the folder is in use.
@@ -56,7 +56,7 @@ def run_sweep(sweep: Sweep, quiet: bool = False) -> Path:
         for name, sentence in failed.items():
             note(f"job {name} failed: {sentence}", quiet)
         say_place(f"Everything is in {sweep.out}; curves: tensorboard --logdir {sweep.out}")
-    return path
+    return path, rows
 
 
 def sweep_rows(sweep: Sweep, results: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str]) -> Iterator[Row]:
