@@ -14,9 +14,11 @@ from ccnn_torch.config.held_out import given_records, name_given
 from ccnn_torch.identification.config import make_identify_config
 from ccnn_torch.identification.identify import Identification
 from ccnn_torch.identification.identify import identify as _identify
+from ccnn_torch.sweep.config import load_sweep
+from ccnn_torch.sweep.job import Row, run_sweep
 from ccnn_torch.verification.job import verify_model
 
-__all__ = ["calibrate", "identify", "verify"]
+__all__ = ["calibrate", "identify", "sweep", "verify"]
 
 
 def calibrate(**keys: Any) -> Calibration:
@@ -60,6 +62,26 @@ def identify(**keys: Any) -> Identification:
         return _identify(make_identify_config(**keys))
     config = make_identify_config(**{**keys, "records": name_given(given)})
     return _identify(config.model_copy(update={"records": name_given(given)}), given=given)
+
+
+def sweep(config: str | Path | None, *changes: str, out: str | Path, engine: str = "local") -> list[Row]:
+    """Run a config with every combination of some keys' values, as `ccnn sweep`.
+
+    Args:
+        config: a YAML config; None for defaults.
+        changes: `key=a,b,c` for a key that varies, `key=value` for all jobs.
+        out: folder, with `sweep.csv` and one run folder a job; finished jobs in it are kept.
+        engine: `local`, `processes`, `dask`, or the address of a Dask scheduler, `tcp://HOST:PORT`.
+
+    Returns:
+        A row for each job: its name, its keys, the best method and its figures in SI; `failed` has the reason of a job
+        without figures.
+
+    Raises:
+        InputError: a key or value cannot be used, or the folder holds other runs.
+        MethodFailedError: not a single job could be run.
+    """
+    return run_sweep(load_sweep(config, [*changes, f"engine={engine}"], out), quiet=True)[1]
 
 
 def verify(

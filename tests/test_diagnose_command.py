@@ -6,6 +6,7 @@ import io
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,16 +21,23 @@ from ccnn_torch.diagnosis.progress import TO_VERDICT, watched
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import load_schema
 from ccnn_torch.report.screen import step_bar
+from ccnn_torch.simulation.job import simulate_records
+from ccnn_torch.simulation.outputs import write_simulated
 
 Cli = Callable[..., tuple[int, str, str]]
 
 
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("simulated") / "rows.csv"
+    write_simulated(path, simulate_records("five_bar", ["backlash"], 80, 1e-5, seed=4))
+    return path
+
+
 @pytest.fixture
-def rows(cli: Cli, tmp_path: Path) -> Path:
+def rows(simulated: Path, tmp_path: Path) -> Path:
     """Records of a five-bar with play, beside a config that names them by a relative path."""
-    words = ("--mechanism", "five_bar", "--effect", "backlash", "--rows", "80", "--noise", "1e-5", "--seed", "4")
-    code, _, told = cli("simulate", *words, "--out", tmp_path / "rows.csv", "--quiet")
-    assert code == 0, told
+    shutil.copy(simulated, tmp_path / "rows.csv")
     (tmp_path / "config.yaml").write_text("records: rows.csv\nmechanism: five_bar\nnoise: 10um\n", encoding="utf-8")
     return tmp_path / "rows.csv"
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.evolution.gauss_newton import dense_jacobian, linearise, network_of, residual
 from ccnn_torch.evolution.refinement import (
+    Refined,
     RefinementSettings,
     RefinementState,
     finish_refinement,
@@ -271,3 +272,24 @@ def test_a_metric_judges_errors_where_they_are_felt() -> None:
     refined = refine(masks, weights, x, truth + felt_noise + wrong * blind, rows, row_metric=metric)
     error = plain_forward(masks, refined.weights, x) - truth
     assert float(error.square().mean().sqrt()) < 0.05
+
+
+def test_a_descent_ends_where_its_evidence_does_and_keeps_the_highest() -> None:
+    """Precisions that are estimated anew may take a network past its best; iterations after that are not made."""
+    generator = torch.Generator().manual_seed(3)
+    inputs = 2 * torch.rand(2, 60, 2, generator=generator, dtype=torch.float64) - 1
+    targets = torch.sin(2 * inputs[..., :1]) + 0.1 * torch.randn(2, 60, 1, generator=generator, dtype=torch.float64)
+    masks = [torch.ones(2, 6, 2, dtype=torch.bool), torch.ones(2, 1, 6, dtype=torch.bool)]
+    weights = [torch.randn(2, 6, 3, generator=generator).double(), torch.randn(2, 1, 7, generator=generator).double()]
+    rows = torch.ones(2, 60, dtype=torch.float64)
+
+    def refined(iterations: int, patience: int) -> Refined:
+        settings = RefinementSettings(iterations=iterations, tolerance=0, patience=patience)
+        return refine(masks, weights, inputs, targets, rows, settings)
+
+    early, late = refined(200, 6), refined(200, 1000)
+    assert early.iterations < 60 and late.iterations == 200
+    # No more is lost than six iterations of less than 1 nat could have brought, and what was found is kept.
+    assert bool((early.log_evidence > late.log_evidence - 6).all())
+    path = torch.stack([refined(n, 1000).log_evidence for n in range(6, 31, 4)])
+    assert bool((path[1:] >= path[:-1] - 1e-9).all())

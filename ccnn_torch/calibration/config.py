@@ -24,6 +24,7 @@ from ccnn_torch.config.tree import (
     config_from_options,
     written,
 )
+from ccnn_torch.engine import Engine
 from ccnn_torch.learners.bp_lm import BPLMSettings
 from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.enn import ENNSettings
@@ -164,6 +165,23 @@ class RunConfig(_Part):
         min_length=1,
         description=f"learners: a list of {', '.join(METHODS)}; all = these; auto = the best of auto.methods "
         "by cross-validation; null = ccnn, and where geometry=auto compared a learner, what that comparison prefers",
+    )
+    engine: Engine = Field(
+        default="local",
+        description="where blocks of repeats run: local, processes, dask (a cluster on this machine), or a scheduler's "
+        "address, tcp://HOST:8786",
+    )
+    block: int | None = Field(
+        default=None,
+        ge=1,
+        description="repeats of one job, a run of its own in blocks/; null = with engine=local as many as "
+        "max_bytes hold, else 1",
+    )
+    max_bytes: int | None = Field(
+        default=None,
+        ge=1,
+        description="memory in bytes that a run may take; more repeats than it holds run in blocks, one by one; "
+        "null = a quarter of what is free",
     )
     device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?|mps)$", description="cpu, cuda, cuda:N or mps")
     covariates: Names | None = Field(

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from ccnn_torch.calibration.blocks import blocks_of, write_blocks
 from ccnn_torch.calibration.calibrate import Calibration, calibrate, makers
 from ccnn_torch.calibration.config import RunConfig, dump_config, load_config
 from ccnn_torch.calibration.learning.progress import HeldOut, ProgressBar
@@ -13,9 +14,12 @@ from ccnn_torch.calibration.outputs import write_outputs
 from ccnn_torch.calibration.page.tables import print_tables
 from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback
 from ccnn_torch.calibration.result import plan_of
+from ccnn_torch.calibration.rows.memory import TooManyRepeatsError
 from ccnn_torch.calibration.rows.prepare import Prepared, prepare
 from ccnn_torch.calibration.statistics import share_unit
-from ccnn_torch.errors import WriteError
+from ccnn_torch.engine import Job, run_jobs
+from ccnn_torch.errors import InputError, MethodFailedError, WriteError
+from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.screen import note, say_place, stdout
 from ccnn_torch.run_folder.folder import RunFolder, kept_for
 from ccnn_torch.run_folder.resume import facts_of, refuse_changes
@@ -36,7 +40,7 @@ def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> Ru
         WriteError: a file cannot be written; what was computed until then is kept.
     """
     makers(config)
-    prepared = prepare(config)
+    config, prepared = _prepared(config)
     with RunFolder.fresh(config.out, config.name) as folder:
         folder.write("config.yaml", dump_config(config, folder.path))
         _run(config, prepared, folder, quiet, tables)
@@ -60,11 +64,54 @@ def resume_run(path: Path, quiet: bool = False, tables: bool = True) -> RunFolde
     with RunFolder.existing(path) as folder:
         config = load_config(folder.config, [])
         refuse_changes(folder.checkpoints, facts_of(config), folder.config)
-        _run(config, prepare(config), folder, quiet, tables)
+        _run(*_prepared(config), folder, quiet, tables)
     return folder
 
 
-def _run(config: RunConfig, prepared: Prepared, folder: RunFolder, quiet: bool, tables: bool) -> None:
+def _prepared(config: RunConfig) -> tuple[RunConfig, Prepared | None]:
+    """The rows of a run; None where its repeats run in blocks, as the config then says."""
+    if config.block is None and config.engine != "local" and config.repeats > 1:
+        config = config.model_copy(update={"block": 1})
+    if config.block is not None and config.repeats > 1:
+        return config, None
+    try:
+        return config, prepare(config)
+    except TooManyRepeatsError as found:
+        return config.model_copy(update={"block": found.block, "max_bytes": found.limit}), None
+
+
+def _run_block(config: RunConfig) -> str:
+    """Start or resume the run of a block."""
+    folder = RunFolder(Path(str(config.out)))
+    if folder.config.is_file():
+        resume_run(folder.path, quiet=True, tables=False)
+    else:
+        start_run(config, quiet=True, tables=False)
+    return f"repeats of seeds {config.seed} to {config.seed + config.repeats - 1}"
+
+
+def _run_blocks(config: RunConfig, folder: RunFolder, quiet: bool, tables: bool) -> None:
+    """Run the blocks that are not finished yet, and put their figures together."""
+    with kept_for(f"ccnn run --resume {folder.path}"):
+        blocks = blocks_of(config, folder)
+        jobs = [Job(block.name, block.folder.results, partial(_run_block, block.config)) for block in blocks]
+        failed = run_jobs(jobs, config.engine, partial(note, quiet=quiet))
+        for name, problem in failed.items():
+            kind = InputError if problem.input else MethodFailedError
+            raise kind(
+                f"block {name}: {problem.text}; {len(blocks) - len(failed)} of {len(blocks)} blocks are finished and "
+                f"kept, and ccnn run --resume {folder.path} resumes from them"
+            )
+        write_blocks(config, folder, blocks, lambda block: resume_run(block.folder.path, quiet=True, tables=False))
+    if tables and not quiet:
+        print_tables(read_json(folder.results), stdout)
+        say_place(f"Everything is in {folder.path}")
+
+
+def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet: bool, tables: bool) -> None:
+    if prepared is None:
+        _run_blocks(config, folder, quiet, tables)
+        return
     for sentence in prepared.notes:
         note(sentence, quiet)
     folder = replace(folder, facts=facts_of(config, prepared.data_hash))

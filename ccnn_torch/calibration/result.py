@@ -91,6 +91,7 @@ def assemble(
         methods[name] = {
             "test": errors,
             "ratio_to_floor": ratio_to_floor(errors, floor),
+            "score": spread(outcome.fitted.score),
             "seconds": spread([each] * len(dataset.seeds)),
             **_certainty(outcome, dataset, test, inside, joints),
             "converged": _spread_or_none(outcome.fitted.converged),

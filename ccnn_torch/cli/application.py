@@ -24,6 +24,7 @@ from ccnn_torch.cli.run import run
 from ccnn_torch.cli.sign import sign
 from ccnn_torch.cli.simulate import simulate
 from ccnn_torch.cli.suite import suite
+from ccnn_torch.cli.sweep import sweep
 from ccnn_torch.cli.verify import verify
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError, MethodFailedError
@@ -62,6 +63,7 @@ for _command in (
     new,
     run,
     suite,
+    sweep,
     identify,
     compensate,
     export,

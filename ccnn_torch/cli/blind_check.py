@@ -25,6 +25,13 @@ def blind_check(
     source: Annotated[
         str, typer.Option(help="Who made the cases: blind, semi_real, multibody or adversarial.")
     ] = "blind",
+    engine: Annotated[
+        str | None,
+        typer.Option(
+            help="Where cases are diagnosed: local, processes, dask, or a scheduler as tcp://HOST:8786; "
+            "by default local, and processes with --source."
+        ),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no tables.")] = False,
 ) -> None:
     """Diagnose simulated machines of undisclosed cause, then count how often the diagnosis was right.
@@ -55,12 +62,18 @@ def blind_check(
     from ccnn_validation.blind.machines import MACHINES
 
     from ccnn_torch.diagnosis import diagnose
+    from ccnn_torch.engine import check_engine
+    from ccnn_torch.errors import InputError
 
+    try:
+        check_engine(engine or "local")
+    except ValueError as problem:
+        raise InputError(f"--engine: {problem}") from None
     if source != "blind":
         from ccnn_validation.sources.run import run_source
 
         with if_stopped(f"interrupted; finished cases are kept in {out}, and the same command resumes from them"):
-            run_source(source, cases, out, seed, quiet=quiet)
+            run_source(source, cases, out, seed, engine or "processes", quiet=quiet)
         return
     with if_stopped(f"interrupted; finished cases are kept in {out}, and the same command resumes from them"):
         run_blind_check(
@@ -70,5 +83,6 @@ def blind_check(
             seed=seed,
             machines=MACHINES if mechanism is None else tuple(mechanism.split(",")),
             kinds=tuple(kinds.split(",")),
+            engine=engine or "local",
             quiet=quiet,
         )

@@ -54,6 +54,8 @@ __all__ = [
 _PRECISION_RANGE = (1e-8, 1e12)
 _DAMPING_RANGE = (1e-12, 1e12)
 _VAGUE = 1e-4
+# A rise of the log evidence that is worth an iteration: odds of less than 3 to 1 choose nothing.
+_NATS = 1.0
 
 
 def refine(
@@ -86,13 +88,29 @@ def refine(
     Leading dimensions of all arguments broadcast against each other.
     """
     problem = pose_refinement(masks, weights, inputs, targets, row_weights, settings, row_metric, waves)
-    state = start = start_refinement(problem, weights, waves)
+    state = best = start = start_refinement(problem, weights, waves)
+    highest = torch.full_like(state.damping, -torch.inf)
+    stale = torch.zeros_like(state.calm)
     for _ in range(problem.settings.iterations):
-        going = torch.nonzero(~state.done).flatten()
+        going = torch.nonzero(~state.done & (stale < problem.settings.patience)).flatten()
         if len(going) == 0:
             break
         # Networks do not know of each other, so that those which are done need not be worked on for the others' sake.
-        state = put_part(state, going, step_refinement(part_of_problem(problem, going), part_of_state(state, going)))
+        part, now = part_of_problem(problem, going), part_of_state(state, going)
+        known = second_order(part, now)
+        if problem.settings.bayesian and int(state.iteration) > problem.settings.warm_up:
+            evidence = log_evidence(part, now, known)
+            risen = evidence > highest[going]
+            best = put_part(best, going[risen], part_of_state(now, torch.nonzero(risen).flatten()))
+            much = evidence > highest[going] + _NATS
+            stale = stale.index_copy(0, going, torch.where(much, 0, stale[going] + 1))
+            highest = highest.index_copy(0, going, torch.where(risen, evidence, highest[going]))
+        state = put_part(state, going, step_refinement(part, now, known))
+    if problem.settings.bayesian and bool((highest > -torch.inf).any()):
+        # The last one has not been judged; re-estimated precisions may have taken it downhill.
+        last = log_evidence(problem, state)
+        worse = torch.nonzero(~(last >= highest) & (highest > -torch.inf)).flatten()
+        state = replace(put_part(state, worse, part_of_state(best, worse)), iteration=state.iteration)
     worse = ~(_objective(problem, state, state.weights) <= _objective(problem, state, start.weights))
     state = replace(state, weights=torch.where(worse.unsqueeze(-1), start.weights, state.weights))
     return finish_refinement(problem, state)
@@ -213,15 +231,8 @@ def step_refinement(
 
 def finish_refinement(problem: RefinementProblem, state: RefinementState, known: SecondOrder | None = None) -> Refined:
     """Weights in their layers and what is known of the fit; `known` as in `step_refinement`."""
-    _, matrix = known or second_order(problem, state)
+    evidence = log_evidence(problem, state, known)
     objective = _objective(problem, state, state.weights)
-    root, _ = torch.linalg.cholesky_ex(matrix)
-    log_determinant = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    active = problem.network.active
-    counted = active & (problem.groups != state.prior.shape[-1] - 1)
-    log_prior = (state.prior.log()[:, problem.groups] * counted).sum(-1)
-    log_noise = (state.noise.log() * _row_count(problem).unsqueeze(-1)).sum(-1)
-    evidence = (log_prior + log_noise - log_determinant) / 2 - objective
     squares = _squares(problem, state.weights)
     leading = problem.leading
     return Refined(
@@ -237,6 +248,18 @@ def finish_refinement(problem: RefinementProblem, state: RefinementState, known:
         log_evidence=evidence.reshape(leading),
         iterations=int(state.iteration),
     )
+
+
+def log_evidence(problem: RefinementProblem, state: RefinementState, known: SecondOrder | None = None) -> Tensor:
+    """Log evidence of the weights' prior and the noise (Laplace's approximation), but for a constant: `b` [nat]."""
+    _, matrix = known or second_order(problem, state)
+    root, _ = torch.linalg.cholesky_ex(matrix)
+    log_determinant = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    counted = problem.network.active & (problem.groups != state.prior.shape[-1] - 1)
+    log_prior = (state.prior.log()[:, problem.groups] * counted).sum(-1)
+    log_noise = (state.noise.log() * _row_count(problem).unsqueeze(-1)).sum(-1)
+    evidence: Tensor = (log_prior + log_noise - log_determinant) / 2 - _objective(problem, state, state.weights)
+    return evidence
 
 
 def second_order(problem: RefinementProblem, state: RefinementState) -> SecondOrder:

@@ -45,7 +45,9 @@ class RefinementSettings:
         damping: first damping, relative to the diagonal of H.
         trials: dampings tried in an iteration before it is given up.
         tolerance: a network whose objective falls by less than this share in each of three iterations running is done;
-            0 = all iterations are made.
+            0 = the objective ends none.
+        patience: where `bayesian`, iterations without a rise of the log evidence by 1 nat after which a network is
+            done; it ends with the weights and precisions of the highest evidence.
     """
 
     iterations: int = 50
@@ -60,6 +62,7 @@ class RefinementSettings:
     damping: float = 1e-2
     trials: int = 6
     tolerance: float = 1e-5
+    patience: int = 6
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.config.overrides import apply_overrides, resolve_paths
 from ccnn_torch.config.tree import validated
+from ccnn_torch.engine import Engine
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import read_yaml
 
 __all__ = ["Suite", "SuiteFile", "load_suite"]
 
 # Keys of the suite itself, where they come from the command line.
-_OWN = ("name", "out")
+_OWN = ("name", "out", "engine")
 
 # Both take longer than many cases; a suite is for the comparison.
 _DEFAULTS = {"save_models": False, "save_report": False}
@@ -34,6 +35,9 @@ class SuiteFile(BaseModel):
 
     name: str = Field(default="suite", min_length=1, description="name of the suite; default: the file's name")
     out: str | None = Field(default=None, description="folder to write; default runs/NAME")
+    engine: Engine = Field(
+        default="local", description="where the cases run: local, processes, dask, or a scheduler as tcp://HOST:8786"
+    )
     base: dict[str, Any] = Field(default_factory=dict, description="keys that all cases share, as in a config of a run")
     cases: list[dict[str, Any]] = Field(
         default=[],
@@ -54,6 +58,7 @@ class Suite:
     name: str
     out: Path
     cases: dict[str, RunConfig]
+    engine: str = "local"
 
 
 def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
@@ -83,7 +88,7 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
         resolve_paths(case, Path(os.path.realpath(path.parent)))
         changed = apply_overrides(case, others, Path.cwd())
         cases[name] = validated(RunConfig, case | {"out": str(out / name)}, f"{path}, case '{name}'", changed)
-    return Suite(file.name, out, cases)
+    return Suite(file.name, out, cases, file.engine)
 
 
 def _name(keys: Mapping[str, Any], where: str, taken: Iterable[str]) -> str:

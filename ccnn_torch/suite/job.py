@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ccnn_torch.calibration.calibrate import makers
 from ccnn_torch.calibration.config import RunConfig, load_config
 from ccnn_torch.calibration.job import resume_run, start_run
+from ccnn_torch.engine import Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.report.json_files import read_json
@@ -19,7 +22,7 @@ from ccnn_torch.suite.config import Suite
 from ccnn_torch.suite.page import compare, write_suite
 from ccnn_torch.suite.tables import case_line, print_suite
 
-__all__ = ["run_suite"]
+__all__ = ["check_folder", "finish_cases", "run_suite"]
 
 
 def run_suite(suite: Suite, quiet: bool = False) -> Path:
@@ -36,29 +39,41 @@ def run_suite(suite: Suite, quiet: bool = False) -> Path:
     """
     for config in suite.cases.values():
         makers(config)
-        _check_folder(config)
+        check_folder(config)
     with locked(suite.out):
         # The cases have locks of their own.
         sweep(suite.out, below=False)
         return _run_cases(suite, quiet)
 
 
+def finish_cases(
+    cases: Mapping[str, RunConfig], engine: str, quiet: bool
+) -> tuple[dict[str, Mapping[str, Any]], dict[str, str]]:
+    """Results of the cases, and a sentence for each whose methods all failed.
+
+    Raises:
+        InputError: a case cannot be run; the others are finished by then.
+        MethodFailedError: not a single case could be run.
+    """
+    here = engine == "local"
+    # On a cluster, and in another process, paths that start here mean nothing.
+    configs = {name: c.model_copy(update={"out": os.path.abspath(str(c.out))}) for name, c in cases.items()}
+    jobs = [
+        Job(name, RunFolder(Path(str(config.out))).results, partial(_finish, config, quiet or not here))
+        for name, config in configs.items()
+    ]
+    failed = run_jobs(jobs, engine, partial(note, quiet=quiet))
+    for name, problem in failed.items():
+        if problem.input:
+            raise InputError(f"case '{name}': {problem.text}")
+    if len(failed) == len(cases):
+        raise MethodFailedError("; ".join(f"case '{name}': {problem.text}" for name, problem in failed.items()))
+    results: dict[str, Mapping[str, Any]] = {job.name: read_json(job.result) for job in jobs if job.name not in failed}
+    return results, {name: problem.text for name, problem in failed.items()}
+
+
 def _run_cases(suite: Suite, quiet: bool) -> Path:
-    results: dict[str, Mapping[str, Any]] = {}
-    failed: dict[str, str] = {}
-    for number, (name, config) in enumerate(suite.cases.items(), 1):
-        note(f"[{number}/{len(suite.cases)}] {name}", quiet)
-        try:
-            results[name] = read_json(_finish(config, quiet).results)
-        except InputError as problem:
-            raise InputError(f"case '{name}': {problem}") from None
-        except MethodFailedError as problem:
-            failed[name] = str(problem)
-            note(f"    {problem}", quiet)
-            continue
-        note(f"    {case_line(results[name])}", quiet)
-    if not results:
-        raise MethodFailedError("; ".join(f"case '{name}': {sentence}" for name, sentence in failed.items()))
+    results, failed = finish_cases(suite.cases, suite.engine, quiet)
     about = {name: _about(config) for name, config in suite.cases.items()}
     comparison = compare(suite.name, results, about, failed)
     if not quiet:
@@ -70,16 +85,18 @@ def _run_cases(suite: Suite, quiet: bool) -> Path:
     return path
 
 
-def _finish(config: RunConfig, quiet: bool) -> RunFolder:
-    """The finished run of a case: kept, resumed, or started."""
+def _finish(config: RunConfig, quiet: bool) -> str:
+    """Resume or start the run of a case; returns a line about its errors."""
     assert config.out is not None
     folder = RunFolder(Path(config.out))
     if folder.config.is_file():
-        return resume_run(folder.path, quiet=quiet, tables=False)
-    return start_run(config, quiet=quiet, tables=False)
+        folder = resume_run(folder.path, quiet=quiet, tables=False)
+    else:
+        folder = start_run(config, quiet=quiet, tables=False)
+    return case_line(read_json(folder.results))
 
 
-def _check_folder(config: RunConfig) -> None:
+def check_folder(config: RunConfig) -> None:
     """Refuse the folder of a case that was run with other keys."""
     assert config.out is not None
     folder = RunFolder(Path(config.out))

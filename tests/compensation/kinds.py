@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import torch
-from stand_ins import arm_compensator, tripod_compensator, tripod_joints
+from stand_ins import Sigmoids, arm_compensator, tripod_compensator, tripod_joints
 from test_geometry import TAMED, six_joint_arm, small_network, tripod_with_errors
 from test_geometry import arm_compensator as geometry_of_an_arm
 from test_learned_models import LEARNERS
@@ -67,10 +67,10 @@ def masked(density: float = 0.4) -> Compensator:
     return fit_compensator(network, one, joints, deviations, [Coordinate(f"q{i}", "m") for i in (1, 2, 3)])
 
 
-def six_joints(harmonics: int = 6) -> Compensator:
+def six_joints(harmonics: int = 6, links: bool = True) -> Compensator:
     """An arm with identified links; masked network, periodic nodes and harmonics of its gears on what they leave."""
     arm, identified, joints = six_joint_arm()
-    geometry = fit_geometry_module(arm, arm.nominal, identified, joints, 0.1, *TAMED)
+    geometry = fit_geometry_module(arm, arm.nominal, identified, joints, 0.1, *TAMED) if links else None
     generator = torch.Generator().manual_seed(8)
     blank, turning = torch.ones(1, len(joints), dtype=torch.float64), torch.ones(6, dtype=torch.bool)
     scaling = Scaling.fit(joints[None], torch.zeros_like(joints)[None], blank, turning, angles=True).repeat(0)
@@ -87,6 +87,21 @@ def six_joints(harmonics: int = 6) -> Compensator:
     with torch.no_grad():
         deviations = scaling.restore(network(scaling.features(joints)))
     return fit_compensator(network, scaling, joints, deviations, arm.joints, geometry=geometry)
+
+
+def little(joints: int, covariates: int, nodes: int, turning: bool) -> Compensator:
+    """A few nodes: a parser of Structured Text takes a second for twenty lines."""
+    generator, width = torch.Generator().manual_seed(6), joints + covariates
+    inputs = torch.rand(100, width, generator=generator, dtype=torch.float64) + 0.5
+    periodic = torch.tensor([turning] * joints + [False] * covariates)
+    blank, still = torch.ones(1, 100, dtype=torch.float64), torch.zeros(1, 100, joints, dtype=torch.float64)
+    scaling = Scaling.fit(inputs[None], still, blank, periodic).repeat(0)
+    scaling.deviation.fill_(1e-3)
+    network = Sigmoids([width + turning * joints, nodes, joints], seed=7, gain=0.5)
+    with torch.no_grad():
+        deviations = scaling.restore(network(scaling.features(inputs)))
+    names = [Coordinate(f"q{i + 1}", "rad") for i in range(joints)]
+    return fit_compensator(network, scaling, inputs, deviations, names, [Coordinate("time", "s")] * covariates)
 
 
 def expanded() -> Compensator:

@@ -165,9 +165,8 @@ def test_the_deviation_runs_in_onnx_in_double(kind: str) -> None:
     module: torch.nn.Module = SerialGeometry(arm, arm.nominal, identified, *TAMED)
     if kind == "expansion":
         module = expand_geometry(lambda q: 1e-3 * q * q.roll(1, -1), joints)
-    batch = torch.export.Dim("batch")
     with quiet_exporter():
-        program = torch.export.export(module, (joints[:3],), dynamic_shapes=({0: batch},))
+        program = torch.export.export(module, (joints,))
         model = to_onnx(program, None, ("deviation",), 20, "{}")
     check_graph(model)
     session = open_onnx(model.SerializeToString())

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.export import ExportedProgram
+from torch.fx import GraphModule
 from torch.fx import Node as GraphNode
 
 from ccnn_torch.compensation.targets.build import Builder
@@ -50,11 +50,11 @@ class Value:
         self.ids = ids
 
 
-def program_of(exported: ExportedProgram, name: str, inputs: Sequence[str], outputs: Sequence[str | None]) -> Program:
+def program_of(traced: GraphModule, name: str, inputs: Sequence[str], outputs: Sequence[str | None]) -> Program:
     """A program of a traced module whose inputs and outputs are tensors of fixed shapes.
 
     Args:
-        exported: with its operations decomposed.
+        traced: with its operations decomposed; parameters and buffers are attributes.
         name: of the program.
         inputs: names of the module's inputs.
         outputs: names of its outputs; None for one that is left out.
@@ -62,17 +62,13 @@ def program_of(exported: ExportedProgram, name: str, inputs: Sequence[str], outp
     Raises:
         MethodFailedError: there is an operation that no form has.
     """
-    graph = exported.graph
+    graph = traced.graph
     lowering = _Lowering(Builder(any(_name(node) in _ASKS for node in graph.nodes)))
-    constants = {**exported.state_dict, **exported.constants}
-    signature = exported.graph_signature
-    held = {**signature.inputs_to_parameters, **signature.inputs_to_buffers}
-    held |= signature.inputs_to_lifted_tensor_constants
     known: dict[GraphNode, Any] = {}
     given: dict[str, int] = {}
     for node in graph.nodes:
-        if node.op == "placeholder" and node.name in held:
-            known[node] = constants[held[node.name]].detach()
+        if node.op == "get_attr":
+            known[node] = getattr(traced, str(node.target)).detach()
         elif node.op == "placeholder":
             key = inputs[len(given)]
             shape = node.meta["val"].shape
@@ -81,7 +77,7 @@ def program_of(exported: ExportedProgram, name: str, inputs: Sequence[str], outp
         elif node.op == "call_function":
             args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: known[n])
             known[node] = lowering.call(node, args, kwargs)
-    found = torch.fx.node.map_arg(graph.output_node().args[0], lambda n: known[n])
+    found: Any = torch.fx.node.map_arg(graph.output_node().args[0], lambda n: known[n])
     wanted = {key: lowering.ids(value) for key, value in zip(outputs, found, strict=True) if key is not None}
     return lowering.builder.program(name, given, wanted)
 

@@ -7,6 +7,9 @@ import copy
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch._decomp import core_aten_decompositions
+from torch._ops import OpOverload
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.contraction import Steepness, iterations_needed
@@ -67,10 +70,18 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     example = (point[:, :n].clone(), point[:, n:].clone())[: 2 if compensator.covariates else 1]
     names = ("joints", "covariates")[: len(example)]
 
+    # Into elementary operations, as torch.export decomposes them.
+    table = {op: rule for op, rule in core_aten_decompositions().materialize().items() if isinstance(op, OpOverload)}
+
     def program(module: nn.Module, name: str, outputs: list[list[str | None]]) -> list[Program]:
+        # In a quarter of the time that torch.export needs, whose checks of shapes and guards have no use here.
+        def pure(*given: Tensor) -> tuple[Tensor, ...]:
+            found: tuple[Tensor, ...] = module(*given)
+            return found
+
         with quiet_exporter(), torch.no_grad():
-            exported = torch.export.export(module, example).run_decompositions()
-        return [program_of(exported, name, names, some) for some in outputs]
+            traced = make_fx(torch.func.functionalize(pure), table)(*example)
+        return [program_of(traced, name, names, some) for some in outputs]
 
     kept: list[list[str | None]] = [["deviation", "excess", None], *([[None, None, "sd"]] if sd else [])]
     (clean,) = program(_Clean(compensator), "clean", [["joints", "covariates", "strange"]])

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ccnn_torch.compensation.targets.form import OPERATIONS, Array, Expression, Form, Leaf, Let, Program
 
 __all__ = ["run_form", "run_program"]
 
-# Rows at a time: a loop over a large table holds all its products of every row.
-_AT_ONCE = 64
+# Numbers at a time: a loop over a large table holds all its products of every row.
+_AT_ONCE = 1 << 18
 
 
 def run_program(program: Program, inputs: dict[str, Array], dtype: str = "float64") -> dict[str, Array]:
     """Outputs `s x size` of inputs `s x size`."""
     rows = len(next(iter(inputs.values())))
+    largest = max((math.prod(step.shape) for step in program.steps if not isinstance(step, Let)), default=1)
+    some = max(1, _AT_ONCE // largest)
     parts = [
-        _run({name: value[k : k + _AT_ONCE] for name, value in inputs.items()}, program, dtype)
-        for k in range(0, rows, _AT_ONCE)
+        _run({name: value[k : k + some] for name, value in inputs.items()}, program, dtype)
+        for k in range(0, rows, some)
     ]
     return {name: np.concatenate([part[name] for part in parts]) for name in program.outputs}
 

@@ -6,10 +6,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 from ccnn_torch.effects import EFFECTS, Effect, make_effect
+from ccnn_torch.engine import Job, run_jobs
 from ccnn_torch.errors import CcnnError, InputError, MethodFailedError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
@@ -56,6 +58,7 @@ def run_blind_check(
     seed: int = 0,
     machines: Sequence[str] = MACHINES,
     kinds: Sequence[str] = tuple(KINDS),
+    engine: str = "local",
     quiet: bool = False,
 ) -> Path:
     """Generate, seal, diagnose, open, diagnose without the effect that was there, and count.
@@ -69,6 +72,7 @@ def run_blind_check(
         seed: of the cases.
         machines: simulators, of `plan.SIMULATORS`.
         kinds: of `plan.KINDS`.
+        engine: where the cases are diagnosed: `local`, `processes`, `dask`, or a scheduler's address.
 
     Returns:
         The path of `blind.json`.
@@ -78,27 +82,27 @@ def run_blind_check(
         MethodFailedError: the generating process failed.
     """
     plan_cases(cases, seed, machines, kinds)
-    folder = BlindFolder(Path(out))
+    folder = BlindFolder(Path(out).absolute())
     settings = {"cases": cases, "seed": seed, "machines": list(machines), "kinds": list(kinds)}
     with locked(folder.path), kept_for("the same command"):
         sweep(folder.path)
-        return _checked(folder, settings, diagnose, quiet)
+        return _checked(folder, settings, diagnose, engine, quiet)
 
 
-def _checked(folder: BlindFolder, settings: dict[str, Any], diagnose: Diagnoser, quiet: bool) -> Path:
+def _checked(folder: BlindFolder, settings: dict[str, Any], diagnose: Diagnoser, engine: str, quiet: bool) -> Path:
     _settle(folder, settings)
     if not folder.seal.is_file():
         note(f"generating {settings['cases']} sealed cases in a process of their own", quiet)
         _generator("write", folder)
     public_cases = read_json(folder.public)["cases"]
-    _diagnose_all(folder, public_cases, diagnose, None, quiet)
+    _diagnose_all(folder, public_cases, diagnose, None, engine, quiet)
     if not folder.truth.is_file():
         note("opening the seal", quiet)
         _generator("open", folder)
     truth = read_json(folder.truth)["cases"]
     absent = {c["number"]: c["causes"][0] for c in truth if c["kind"] == "single" and c["causes"][0] in EFFECTS}
     without = {number: [name for name in EFFECTS if name != cause] for number, cause in absent.items()}
-    _diagnose_all(folder, [t for t in public_cases if t["number"] in absent], diagnose, without, quiet)
+    _diagnose_all(folder, [t for t in public_cases if t["number"] in absent], diagnose, without, engine, quiet)
     if not folder.judged.is_file():
         note("judging", quiet)
         _generator("judge", folder)
@@ -141,24 +145,43 @@ def _diagnose_all(
     public_cases: Sequence[Mapping[str, Any]],
     diagnose: Diagnoser,
     without: Mapping[int, Sequence[str]] | None,
+    engine: str,
     quiet: bool,
 ) -> None:
     """Diagnose the cases without a diagnosis."""
-    machines: dict[str, Mechanism] = {}
     withheld = without is not None
-    left = [case for case in public_cases if not folder.diagnosis(case["number"], withheld).is_file()]
-    for position, case in enumerate(left, 1):
-        number, name = case["number"], case["machine"]
-        if name not in machines:
-            machines[name] = load_mechanism(str(folder.machine(name)))
-        began = time.perf_counter()
-        answer: dict[str, Any]
-        try:
-            records = load_records(folder.records(number), machines[name], learns=False)
-            effects = None if without is None else [make_effect(effect) for effect in without[number]]
-            answer = dict(diagnose(records, machines[name], noise=case["noise"], effects=effects).to_json())
-        except CcnnError as problem:
-            answer = {"failed": str(problem)}
-        answer["seconds"] = time.perf_counter() - began
-        write_json(folder.diagnosis(number, withheld), answer)
-        note(f"[{position}/{len(left)}] {case_line(name, answer, withheld)}", quiet)
+    machines: dict[str, Mechanism] = {}
+    jobs = [
+        Job(
+            f"case {case['number']}",
+            folder.diagnosis(case["number"], withheld),
+            partial(_diagnosed, folder, case, diagnose, None if without is None else without[case["number"]], machines),
+        )
+        for case in public_cases
+    ]
+    for name, problem in run_jobs(jobs, engine, partial(note, quiet=quiet)).items():
+        raise MethodFailedError(f"{name}: {problem.text}; the same command resumes from the other cases")
+
+
+def _diagnosed(
+    folder: BlindFolder,
+    case: Mapping[str, Any],
+    diagnose: Diagnoser,
+    library: Sequence[str] | None,
+    machines: dict[str, Mechanism],
+) -> str:
+    """Diagnose a case and write the answer; machines that were read before are kept in `machines`."""
+    number, name = case["number"], case["machine"]
+    if name not in machines:
+        machines[name] = load_mechanism(str(folder.machine(name)))
+    began = time.perf_counter()
+    answer: dict[str, Any]
+    try:
+        records = load_records(folder.records(number), machines[name], learns=False)
+        effects = None if library is None else [make_effect(effect) for effect in library]
+        answer = dict(diagnose(records, machines[name], noise=case["noise"], effects=effects).to_json())
+    except CcnnError as problem:
+        answer = {"failed": str(problem)}
+    answer["seconds"] = time.perf_counter() - began
+    write_json(folder.diagnosis(number, library is not None), answer)
+    return case_line(name, answer, library is not None)

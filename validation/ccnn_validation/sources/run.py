@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import importlib
-import os
 import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
@@ -18,7 +16,8 @@ from numpy.typing import NDArray
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose
 from ccnn_torch.diagnosis.residual.linearisation import remainder
-from ccnn_torch.errors import CcnnError, InputError
+from ccnn_torch.engine import Job, run_jobs
+from ccnn_torch.errors import CcnnError, InputError, MethodFailedError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import load_records, write_table
@@ -50,7 +49,7 @@ def source_of(name: str) -> Source:
 
 
 def run_source(
-    name: str, cases: int, out: Path, seed: int = 0, processes: int | None = None, quiet: bool = False
+    name: str, cases: int, out: Path, seed: int = 0, engine: str = "processes", quiet: bool = False
 ) -> list[dict[str, Any]]:
     """Diagnose and judge the cases of a source, and write its figures; finished cases are kept.
 
@@ -59,7 +58,7 @@ def run_source(
         cases: their number, rounded up to as many for each family.
         out: folder to write, with one file for each case.
         seed: of the first case of each family; the others follow.
-        processes: how many at once; as many as there are processors when None.
+        engine: where they are diagnosed: `local`, `processes`, `dask`, or a scheduler's address.
 
     Raises:
         InputError: an unknown source, no case, a folder in use, or data that the source reads is not there.
@@ -68,14 +67,14 @@ def run_source(
     if cases < 1:
         raise InputError(f"--cases: generate at least 1 case, not {cases}")
     seeds = range(seed, seed + -(-cases // len(source.FAMILIES)))
+    out = out.absolute()
     with locked(out), kept_for("the same command"):
         tasks = [
             (name, family, number, out / f"{family}-{number}.json") for number in seeds for family in source.FAMILIES
         ]
-        left = [task for task in tasks if not task[3].is_file()]
-        line = ""
-        for position, line in enumerate(_lines(left, processes or os.cpu_count() or 1), 1):
-            note(f"[{position}/{len(left)}] {line}", quiet)
+        jobs = [Job(f"{task[1]} {task[2]}", task[3], partial(_one, task)) for task in tasks]
+        failed = run_jobs(jobs, engine, partial(note, quiet=quiet))
+        line = next((f"{name}: {problem.text}" for name, problem in failed.items()), "")
         every = [dict(read_json(task[3])) for task in tasks if task[3].is_file()]
         found = [case for case in every if "skipped" not in case]
         if not found:
@@ -88,23 +87,13 @@ def run_source(
     return found
 
 
-def _lines(tasks: Sequence[_Task], processes: int) -> Iterator[str]:
-    """A line for each task as it is done."""
-    if processes == 1:
-        yield from map(_one, tasks)
-        return
-    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        yield from pool.map(_one, tasks)
-
-
 def _one(task: _Task) -> str:
-    torch.set_num_threads(1)
     name, family, seed, path = task
     try:
         case = source_of(name).make(family, seed)
     except InputError as problem:
         # Not kept: the data may be there the next time.
-        return f"{family} {seed}: skipped, {problem}"
+        raise MethodFailedError(f"skipped, {problem}") from None
     began = time.perf_counter()
     answer = diagnosed(case, case.columns)
     seconds = time.perf_counter() - began
@@ -115,7 +104,7 @@ def _one(task: _Task) -> str:
     )
     if any(names and names <= already for names in truth.accepted):
         write_json(path, {"skipped": f"{family}: the name is in the verdict on the rows without the cause"})
-        return f"{family} {seed}: skipped, the machine has the cause already"
+        return "skipped, the machine has the cause already"
     found = {
         "source": name,
         "family": family,
@@ -134,7 +123,7 @@ def _one(task: _Task) -> str:
         "cautions": answer.get("cautions"),
     }
     write_json(path, found)
-    return f"{family} {seed}: {'right' if found['right'] else 'WRONG'} {found.get('names')} {found.get('drivers')}"
+    return f"{'right' if found['right'] else 'WRONG'} {found.get('names')} {found.get('drivers')}"
 
 
 def diagnosed(case: SourceCase, columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:

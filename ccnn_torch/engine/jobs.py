@@ -1,0 +1,142 @@
+"""Run jobs that write a result file each, wherever the engine has its processes.
+
+A job is done when its result file is there, and by nothing else: what a worker took with it, and what a scheduler
+forgot, is run again. Every job runs with one thread of torch in every engine, since sums in another order have other
+last digits: the figures are then the same, bit for bit.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from ccnn_torch.engine.engine import open_engine
+from ccnn_torch.errors import CcnnError, InputError
+
+__all__ = ["Failure", "Job", "run_jobs"]
+
+# How often a job is tried whose worker is lost, and seconds between, twice as many each time.
+_TRIES, _PAUSE = 3, 2.0
+# What may go wrong in a worker beside a sentence of ours; it is told by its name, and the other jobs go on.
+_FAILURES = (ArithmeticError, LookupError, OSError, RuntimeError, TypeError, ValueError, MemoryError, AttributeError)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One job.
+
+    Attributes:
+        name: how it is called on the screen.
+        result: the file that it writes last; on a cluster all machines see it under this path.
+        call: does it, and returns a line to show; it goes to other processes, as a `partial` of a module's function.
+    """
+
+    name: str
+    result: Path
+    call: Callable[[], str]
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a job has no result, in one sentence; `input`: because of what the user gave."""
+
+    text: str
+    input: bool = False
+    final: bool = False
+
+
+def run_jobs(jobs: Sequence[Job], engine: str, tell: Callable[[str], None]) -> dict[str, Failure]:
+    """Run the jobs whose result file is not there; a failure keeps no other job from its result.
+
+    Args:
+        jobs: of different names.
+        engine: `local`, `processes`, `dask` or a scheduler's address.
+        tell: gets a line for each job that ends.
+
+    Returns:
+        What failed, by the job's name; the others have their result file.
+
+    Raises:
+        InputError: the engine is not to be had.
+    """
+    left = [job for job in jobs if not job.result.is_file()]
+    failed: dict[str, Failure] = {}
+    total = len(left)
+    ended = 0
+    for attempt in range(_TRIES):
+        if attempt:
+            tell(f"{len(left)} of {total} jobs are tried again")
+            time.sleep(_PAUSE * attempt)
+            left = [job for job in left if not job.result.is_file()]
+        again = []
+        for job, told in _ended(left, engine):
+            last = isinstance(told, str) or told.final or attempt == _TRIES - 1
+            ended += last
+            tell(f"[{ended}/{total}] {job.name}: {told if isinstance(told, str) else told.text}")
+            if isinstance(told, Failure):
+                failed[job.name] = told
+            if not last:
+                again.append(job)
+        left = again
+        if not left:
+            break
+    # By the files: a worker that was given up for lost may have ended after all.
+    lost = {job.name for job in jobs if not job.result.is_file()}
+    return {name: problem for name, problem in failed.items() if name in lost}
+
+
+def _ended(jobs: Sequence[Job], engine: str) -> Iterator[tuple[Job, str | Failure]]:
+    """Jobs as they end."""
+    if engine == "local":
+        for job in jobs:
+            yield job, _here(job)
+    elif jobs:
+        with open_engine(engine) as executor:
+            yield from _elsewhere(jobs, executor)
+
+
+def _elsewhere(jobs: Sequence[Job], executor: Executor) -> Iterator[tuple[Job, str | Failure]]:
+    futures: dict[Future[str | Failure], Job] = {executor.submit(_there, job): job for job in jobs}
+    for future in as_completed(futures):
+        told: str | Failure
+        try:
+            told = future.result()
+        except (CancelledError, BrokenExecutor, *_FAILURES) as problem:
+            told = Failure(f"its worker was lost ({type(problem).__name__})")
+        yield futures[future], told
+
+
+def _here(job: Job) -> str | Failure:
+    """Do a job in this process; to do it again would give the same."""
+    with _one_thread():
+        try:
+            text = job.call()
+        except CcnnError as problem:
+            return Failure(str(problem), isinstance(problem, InputError), final=True)
+    return text if job.result.is_file() else Failure(f"it ended without {job.result}", final=True)
+
+
+def _there(job: Job) -> str | Failure:
+    """Do a job in a worker, which goes on to the next one whatever happens."""
+    try:
+        told = _here(job)
+    except _FAILURES as problem:
+        return Failure(f"{type(problem).__name__}: {problem}")
+    # A folder may be in use by a worker that was given up for lost: such a refusal is not the last word.
+    return replace(told, final=False) if isinstance(told, Failure) and told.input else told
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,182 @@
+"""`ccnn sweep`, and runs whose repeats are in blocks: the same figures, resumed where they were stopped."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+from ccnn_torch import api
+from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.job import resume_run, start_run
+from ccnn_torch.calibration.rows import memory
+from ccnn_torch.compensation import load_model
+from ccnn_torch.errors import InputError
+from ccnn_torch.report.json_files import load_schema
+from ccnn_torch.sweep.config import load_sweep
+
+Cli = Callable[..., tuple[int, str, str]]
+QUICK = {"hidden": [3], "restarts": 1, "iterations": 4}
+
+
+def config_file(folder: Path) -> Path:
+    path = folder / "c.yaml"
+    path.write_text("case: tripod\nmethods: [constant]\nsave_models: false\nsave_report: false\n")
+    return path
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "sweep.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_combination_is_a_run_and_a_row(cli: Cli, tmp_path: Path) -> None:
+    path, out = config_file(tmp_path), tmp_path / "out"
+    words = ("sweep", path, "seed=0,1", "split.test=0.2,0.4", "repeats=2", "--out", out)
+    code, shown, told = cli(*words)
+    assert code == 0, told
+    assert "seed-0_split.test-0.2" in shown and f"tensorboard --logdir {out}" in shown
+    rows = rows_of(out)
+    assert [(row["seed"], row["split.test"]) for row in rows] == [
+        ("0", "0.2"),
+        ("0", "0.4"),
+        ("1", "0.2"),
+        ("1", "0.4"),
+    ]
+    for row in rows:
+        results = json.loads((out / row["job"] / "results.json").read_text())
+        assert results["seed"] == int(row["seed"]) and results["repeats"] == 2 and row["failed"] == ""
+        assert float(row["joint_mse"]) == results["methods"]["constant"]["test"]["all"]["mse"]["median"]
+        assert float(row["position_after[m]"]) == results["pose"]["position"]["after"]["rms"]["median"]
+    # What is finished is kept; a value more is a job more.
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("results.json")}
+    (out / rows[0]["job"] / "results.json").unlink()
+    assert cli(*words[:2], "seed=0,1,5", *words[3:], "--quiet")[0] == 0
+    assert len(rows_of(out)) == 6
+    kept = {p: p.stat().st_mtime_ns for p in before if p.parent.name != rows[0]["job"]}
+    assert kept == {p: before[p] for p in kept}
+    code, _, told = cli(*words[:3], "split.test=0.2,0.4", "repeats=3", "--out", out)
+    assert code == 2 and "holds a run that differs in repeats" in told
+
+
+def test_a_job_that_fails_is_a_row_too(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from ccnn_torch.errors import MethodFailedError\nfrom ccnn_torch.learners.constant import Constant\n"
+        "class Never(Constant):\n    def start(self, data):\n        raise MethodFailedError('no')\n"
+    )
+    config = config_file(tmp_path)
+    rows = api.sweep(config, f"methods=constant,{tmp_path / 'mine.py'}:Never", out=tmp_path / "out")
+    assert rows[0]["failed"] is None and rows[0]["best_method"] == "constant"
+    assert rows[1]["failed"] == "Never: no" and rows[1]["joint_mse"] is None
+    with pytest.raises(InputError, match="engine: is 'cloud'; write local"):
+        api.sweep(config, "seed=0,1", out=tmp_path / "other", engine="cloud")
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        (["seed=1"], "name a key that varies"),
+        (["seed=0,,1"], "a value is empty"),
+        (["seed=0,1", "seed=2,3"], "seed is varied twice"),
+        (["seed=0,0"], "is there twice"),
+        (["seed=0,x"], "job seed=x: "),
+        (["split.tst=0.1,0.2"], "split.tst"),
+    ],
+)
+def test_what_is_wrong_is_one_sentence(tmp_path: Path, changes: list[str], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as told:
+        load_sweep(config_file(tmp_path), changes, tmp_path / "out")
+    assert "\n" not in str(told.value)
+
+
+def test_lists_are_one_value(tmp_path: Path) -> None:
+    sweep = load_sweep(config_file(tmp_path), ["ccnn.hidden=[4],[6,6]", "methods=[gp,ccnn],'constant'"], tmp_path)
+    assert [job.ccnn.hidden for job in sweep.jobs.values()] == [(4,), (4,), (6, 6), (6, 6)]
+    assert [job.methods for job in sweep.jobs.values()][:2] == [["gp", "ccnn"], ["constant"]]
+    assert list(sweep.jobs)[3] == "ccnn.hidden-6-6_methods-constant"
+
+
+def without_times(path: Path) -> dict[str, Any]:
+    results: dict[str, Any] = json.loads(path.read_text())
+    for block in results["methods"].values():
+        del block["seconds"]
+    for key in ("reach", "notes", "model"):
+        results.pop(key, None)
+    return results
+
+
+def assert_near(one: Any, other: Any) -> None:
+    """Equal but for the last digits: of more repeats side by side, sums are taken in another order."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+    if isinstance(one, dict | list):
+        assert len(one) == len(other)
+        for a, b in zip(*((v.values() if isinstance(v, dict) else v) for v in (one, other)), strict=True):
+            assert_near(a, b)
+    else:
+        assert one == (pytest.approx(other, rel=1e-9) if isinstance(one, float) else other)
+
+
+def test_blocks_of_repeats_give_the_figures_of_all_at_once(tmp_path: Path) -> None:
+    keys: dict[str, Any] = {"case": "tripod", "methods": ["bp_lm"], "bp_lm": QUICK, "repeats": 5, "seed": 3}
+    keys |= {"save_report": False}
+    whole = start_run(make_config(**keys, save_models=False, out=str(tmp_path / "whole")), quiet=True)
+    parts = start_run(make_config(**keys, block=2, out=str(tmp_path / "parts")), quiet=True)
+    one, other = without_times(whole.results), without_times(parts.results)
+    jsonschema.validate(json.loads(parts.results.read_text()), load_schema("results"))
+    assert {p.name for p in (parts.path / "blocks").iterdir()} == {"0", "2", "4"}
+    for results in (one, other):
+        del results["data_sha256"], results["name"]
+    assert_near(one, other)
+    for key, spread in other["constant"]["test"]["all"].items():
+        assert spread["values"] == one["constant"]["test"]["all"][key]["values"]
+    # The model is that of the best repeat of all.
+    scores = one["methods"][one["best_method"]]["score"]["values"]
+    card = json.loads((parts.path / "card.json").read_text())
+    assert card["seed"] == 3 + scores.index(min(scores)) and card["method"] == one["best_method"]
+    assert load_model(parts.path / "model.onnx").joints
+    # A block that is lost is run again, to the same.
+    (parts.path / "results.json").unlink()
+    shutil.rmtree(parts.path / "blocks" / "2")
+    resume_run(parts.path, quiet=True)
+    again = without_times(parts.results)
+    assert {key: again[key] for key in other} == other
+    with pytest.raises(InputError, match="methods=auto chooses a method for all repeats together"):
+        start_run(
+            make_config(case="tripod", methods=["auto"], repeats=2, block=1, out=str(tmp_path / "auto")), quiet=True
+        )
+
+
+def test_repeats_that_memory_does_not_hold_run_in_blocks_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys: dict[str, Any] = {"case": "tripod", "methods": ["constant", "bp_lm"], "bp_lm": QUICK}
+    keys |= {"save_models": False, "save_report": False}
+    each = memory.memory_of_run(make_config(**keys), 125, 3)
+    out = start_run(make_config(**keys, repeats=5, max_bytes=2 * each, out=str(tmp_path / "run")), quiet=True).path
+    assert {p.name for p in (out / "blocks").iterdir()} == {"0", "2", "4"}
+    results = json.loads((out / "results.json").read_text())
+    assert len(results["constant"]["test"]["all"]["mse"]["values"]) == 5
+    best = results["methods"][results["best_method"]]
+    assert best["score"]["median"] == min(block["score"]["median"] for block in results["methods"].values())
+    assert results["pose"]["position"]["after"]["rms"] == best["pose"]["position"]["rms"]
+    # What is free is a quarter's limit: three repeats at once of ten.
+    monkeypatch.setattr(memory, "free_memory", lambda: 12 * each)
+    with pytest.raises(memory.TooManyRepeatsError) as told:
+        memory.check_memory(make_config(**keys, repeats=10), 125, 3)
+    assert told.value.block == 3
+    assert memory.check_memory(make_config(**keys, repeats=3), 125, 3) == []
+    # One repeat may take what is free, and is told when it is near.
+    monkeypatch.setattr(memory, "free_memory", lambda: each + 1)
+    assert "stopped by the system" in memory.check_memory(make_config(**keys), 125, 3)[0]
+    for given in ({"max_bytes": each - 1}, {"repeats": 1000, "max_bytes": each}):
+        needed = f"{each * given.get('repeats', 1):,} bytes"
+        with pytest.raises(InputError, match=needed) as refused:
+            start_run(make_config(**keys, **given, out=str(tmp_path / "no")), quiet=True)
+        assert not isinstance(refused.value, memory.TooManyRepeatsError) and not (tmp_path / "no").exists()
