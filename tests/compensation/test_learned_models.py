@@ -72,7 +72,7 @@ def test_a_trained_model_goes_into_files_and_back(name: str, tmp_path: Path) -> 
     wanted = _Variance(network)(features).detach()
     assert torch.equal(again(features), network(features))
     assert torch.equal(_Variance(again)(features), wanted)
-    model = to_onnx(_Variance(network).eval(), (features,), ["variance"], 20, "{}")
+    model = to_onnx(_Variance(network), {"features": features}, ["variance"], 20)
     session = onnxruntime.InferenceSession(model.SerializeToString())
     (found,) = session.run(None, {entry.name: features.numpy() for entry in session.get_inputs()})
     assert found.dtype == np.float64

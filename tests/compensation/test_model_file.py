@@ -32,7 +32,6 @@ from ccnn_torch.compensation import (
     save_model,
 )
 from ccnn_torch.compensation.export.export import probe_points, verify
-from ccnn_torch.compensation.export.to_onnx import to_onnx
 from ccnn_torch.compensation.model_files.onnx_session import OUTPUTS
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
@@ -238,15 +237,6 @@ def test_an_export_that_differs_is_not_written(tripod: Compensator) -> None:
 
     with pytest.raises(MethodFailedError, match="output 'deviation' is not the model's"):
         verify(tripod, off, "test")
-
-
-def test_an_opset_that_the_exporter_does_not_write_is_noticed() -> None:
-    class Clamped(torch.nn.Module):
-        def forward(self, joints: torch.Tensor) -> torch.Tensor:
-            return torch.clamp(joints, -torch.ones(3), torch.ones(3))
-
-    with pytest.raises(MethodFailedError, match="instead of 13"):
-        to_onnx(Clamped(), (torch.zeros(1, 3),), ["out"], 13, "{}")
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.contraction import Steepness, iterations_needed
-from ccnn_torch.compensation.export.to_onnx import quiet_exporter
+from ccnn_torch.compensation.export.pt2 import quiet_exporter
 from ccnn_torch.compensation.targets.form import Form, Program
 from ccnn_torch.compensation.targets.from_graph import program_of
 
