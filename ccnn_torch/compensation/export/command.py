@@ -33,7 +33,7 @@ class _Step:
         caged = inputs if self.caged_once else domain.cage(inputs)
         features = own.scaling.features(caged)
         raw = own.scaling.restore(own.network(features))
-        # In units of the limit, and with a column of ones that becomes the weight: δ is then a linear form of one array.
+        # In units of the limit, with a column of ones that becomes the weight: δ is a linear form of one array then.
         unit = torch.where(own.limit > 0, own.limit, torch.ones_like(own.limit))
         limited = torch.clamp(torch.cat([raw / unit, torch.ones_like(strange)], -1), -1.0, 1.0)
         away = (caged - domain.centre) @ domain._axes - domain.middle

@@ -68,9 +68,10 @@ def export_onnx(compensator: Compensator, metadata: str) -> bytes:
 def export_float32(compensator: Compensator, metadata: str) -> bytes:
     """Single precision, one row, opset 17, for engines with a narrow operator list: a verified ONNX file.
 
-    Gemm, Sigmoid and elementwise operators only (Concat with covariates; sine and cosine with periodic inputs). A joint of 1 m has a step of 1e-7 m in single precision, about the size of the corrections, so the file
-    gives deviations and the controller does the sums in its own precision: command = joints - `deviation`; the way
-    back is ideal = joints + `back_deviation`. `guard` and `back_guard` are 1 inside the domain and fall to 0 outside.
+    Gemm, Sigmoid and elementwise operators only (Concat with covariates; sine and cosine with periodic inputs). A
+    joint of 1 m has a step of 1e-7 m in single precision, about the size of the corrections, so the file gives
+    deviations and the controller does the sums in its own precision: command = joints - `deviation`; the way back is
+    ideal = joints + `back_deviation`. `guard` and `back_guard` are 1 inside the domain and fall to 0 outside.
 
     Raises:
         MethodFailedError: the file is not right to 1e-5 of the limit, or the model holds physical effects or the links
@@ -156,5 +157,3 @@ def probe_points(compensator: Compensator, count: int = 256) -> tuple[Tensor, Te
     points = torch.cat([spread, *rows])
     n = len(compensator.joints)
     return points[:, :n].contiguous(), points[:, n:].contiguous() if compensator.covariates else None
-
-

@@ -8,7 +8,7 @@ needs its numbers: scalings, layers and differences in between cost nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -65,13 +65,17 @@ class Graph:
     def constant(self, value: Any) -> str:
         """Name of an initializer."""
         array = value.detach().numpy() if isinstance(value, Tensor) else np.asarray(value)
-        array = np.asarray(array.astype(self._dtype) if array.dtype.kind == "f" else array, order="C")
+        with np.errstate(over="ignore"):
+            # What single precision cannot hold is infinite there.
+            array = np.asarray(array.astype(self._dtype) if array.dtype.kind == "f" else array, order="C")
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
             self._constants[key] = numpy_helper.from_array(array, f"c{len(self._constants)}")
         return str(self._constants[key].name)
 
-    def node(self, op: str, inputs: Sequence[str], shape: Sequence[int], real: Sequence[int], **attributes: Any) -> Value:
+    def node(
+        self, op: str, inputs: Sequence[str], shape: Sequence[int], real: Sequence[int], **attributes: Any
+    ) -> Value:
         """One node; the one before where there is an equal one."""
         key = (op, *inputs, repr(sorted(attributes.items())))
         if key not in self._known:
@@ -98,7 +102,9 @@ class Graph:
             made = Value(shape, first, shape)
             for name in rest:
                 made = self.node("Add" if sums[name] > 0 else "Sub", [made.name, name], shape, shape)
-            return self.node("Add", [made.name, self.constant(value.offset)], shape, shape) if value.offset.any() else made
+            return (
+                self.node("Add", [made.name, self.constant(value.offset)], shape, shape) if value.offset.any() else made
+            )
         last = ""
         # In the order in which they were made: what does not change from step to step comes first, and is made once.
         for name in sorted(value.terms, key=self._order):
@@ -145,9 +151,7 @@ class Graph:
         if form is None or form.offset is None or matrix.dim() != 2:
             return None
         if any(len(m) * matrix.shape[1] > _LARGEST for m in form.terms.values()):
-            form = self.linear(self.solid(form))
-            if form is None or form.offset is None or matrix.numel() > _LARGEST:
-                return None
+            return None
         terms = {name: m @ matrix for name, m in form.terms.items()}
         return Value((self.rows, matrix.shape[1]), terms=terms, offset=form.offset @ matrix)
 
@@ -175,20 +179,13 @@ class Graph:
         other = self.linear(b)
         if other is None or other.offset is None:
             return None
-        if form.shape[1] != other.shape[1]:
-            if 1 not in (form.shape[1], other.shape[1]):
-                return None
-            wide = max(form.shape[1], other.shape[1])
-            form, other = (
-                Value((self.rows, wide), terms={k: m.expand(-1, wide) for k, m in f.terms.items()}, offset=f.offset.expand(wide))
-                for f in (form, other)
-                if f.offset is not None
-            )
-        assert form.offset is not None and other.offset is not None
-        terms = dict(form.terms)
+        wide = max(form.shape[1], other.shape[1])
+        if not {form.shape[1], other.shape[1]} <= {1, wide}:
+            return None
+        terms = {name: matrix.expand(-1, wide) for name, matrix in form.terms.items()}
         for name, matrix in other.terms.items():
-            terms[name] = terms[name] + matrix if name in terms else matrix
-        return Value(form.shape, terms=terms, offset=form.offset + other.offset)
+            terms[name] = terms[name] + matrix if name in terms else matrix.expand(-1, wide)
+        return Value((self.rows, wide), terms=terms, offset=form.offset + other.offset)
 
     def beside(self, parts: Sequence[Any]) -> Value | None:
         """Linear forms and constants side by side; None where one is neither."""
@@ -205,12 +202,12 @@ class Graph:
             at += len(offset)
         return Value((self.rows, wide), terms=terms, offset=torch.cat([offset for _, offset in kept]))
 
-    def model(self, outputs: dict[str, Value], batch: str | int, name: str) -> onnx.ModelProto:
+    def model(self, outputs: Mapping[str, Value | Tensor], batch: str | int, name: str) -> onnx.ModelProto:
         """The graph with its outputs, the named ones, in order."""
         found, renamed = [], {}
         fixed = {i.name for i in self._inputs} | {c.name for c in self._constants.values()}
         for key, value in outputs.items():
-            solid = self.full(value)
+            solid = self.full(value) if isinstance(value, Value) else self.filled(value)
             own = solid.name
             if own in fixed or own in renamed:
                 own = self.node("Identity", [own], solid.shape, solid.real, doc_string=key).name
@@ -239,7 +236,9 @@ class Graph:
         if tensor.numel() == 1:
             return tensor.reshape(())
         flat = tensor.reshape(-1)
-        return flat if like.shape[-1] in (1, len(flat)) and tensor.dim() <= 2 and tensor.shape[-1] == len(flat) else None
+        return (
+            flat if like.shape[-1] in (1, len(flat)) and tensor.dim() <= 2 and tensor.shape[-1] == len(flat) else None
+        )
 
     def _fixed(self, constant: Any) -> Value | None:
         tensor = torch.as_tensor(constant, dtype=torch.float64)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import io
 import logging
 import warnings
@@ -12,7 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.fx import Node
+from torch.fx import Graph, Node
 from torch.fx import config as fx_config
 
 from ccnn_torch.compensation.compensator import Compensator
@@ -22,8 +21,8 @@ from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY, OUTPU
 __all__ = ["export_pt2", "quiet_exporter"]
 
 
-class _Graph(nn.Module):
-    """Both directions as named outputs; what is traced."""
+class _Step(nn.Module):
+    """One evaluation at joints - start, and what both directions take from it; what is traced."""
 
     def __init__(self, compensator: Compensator) -> None:
         super().__init__()
@@ -31,7 +30,13 @@ class _Graph(nn.Module):
 
     def forward(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, ...]:
         """joints: `s x n` [SI]; covariates: `s x m` [SI], or None where there are none. Returns `OUTPUTS`."""
-        return tuple(self.compensator.solve(joints, covariates))
+        own = self.compensator
+        joints, covariates, strange = own._inputs(joints, covariates)
+        # The deviation of the step before.
+        command = joints - torch.zeros_like(joints)
+        found = own._deviation(command, covariates, strange)
+        back, inside = joints + found.value, found.excess.squeeze(-1) <= 0
+        return command, found.value, found.inside, back, inside, own._sd(found)
 
 
 def export_pt2(compensator: Compensator, metadata: str) -> bytes:
@@ -45,18 +50,13 @@ def export_pt2(compensator: Compensator, metadata: str) -> bytes:
     points = compensator.domain.centre.repeat(3, 1)
     example = (points[:, :n].contiguous(), points[:, n:].contiguous())[: 2 if compensator.covariates else 1]
     shapes = {name: {0: batch} for name, _ in zip(("joints", "covariates"), example, strict=False)}
-    traced = copy.copy(compensator)
-    # Further steps are copies of the first.
-    traced.iterations = 1
     with quiet_exporter():
-        program = torch.export.export(_Graph(traced), example, dynamic_shapes=shapes)
+        program = torch.export.export(_Step(compensator), example, dynamic_shapes=shapes)
     for node in program.graph.nodes:
         # Where in the source a step came from: paths of the machine that wrote the file.
         for key in ("stack_trace", "source_fn_stack", "nn_module_stack", "from_node", "torch_fn"):
             node.meta.pop(key, None)
-    outputs: Any = program.graph.output_node().args[0]
-    found = dict(zip(OUTPUTS, outputs, strict=True))
-    _unroll(program, found["ideal"].args[1], found["deviation"], compensator.iterations)
+    _unroll(program, compensator.iterations)
     module = program.module()
 
     def run(joints: Array, covariates: Array | None) -> dict[str, Array]:
@@ -72,52 +72,39 @@ def export_pt2(compensator: Compensator, metadata: str) -> bytes:
     return stream.getvalue()
 
 
-def _unroll(program: torch.export.ExportedProgram, start: Node, end: Node, times: int) -> None:
-    """Make a program with one step one of several, in place.
-
-    Args:
-        program: it computes `end` from `start` by one step.
-        start, end: nodes.
-        times: steps wanted, at least 1.
-    """
+def _unroll(program: torch.export.ExportedProgram, times: int) -> None:
+    """Put further steps after the one that was traced, in place; the way back stays with the first."""
     graph = program.graph
-    nodes = [node for node in graph.nodes if node.op not in ("placeholder", "output")]
-    before, step, _ = _parts([node.all_input_nodes for node in nodes], [[node] for node in nodes], start, end)
-    first = nodes[step[0]]
-    for k in before:
-        if k > step[0]:
-            first.prepend(nodes[k])
-    value = start
-    for _ in range(1, times):
-        renamed: dict[Node, Node] = {start: value}
-        with graph.inserting_before(first):
-            for k in step:
-                renamed[nodes[k]] = graph.node_copy(nodes[k], lambda n, known=renamed: known.get(n, n))
-        value = renamed[end]
-    for k in step:
-        nodes[k].replace_input_with(start, value)
+    output = graph.output_node()
+    outputs: Any = output.args[0]
+    start = outputs[0].args[1]
+    way_back = outputs[3:5]
+    step = _between(graph, start, [node for node in outputs if node not in way_back])
+    known: dict[Node, Node] = {start: start}
+    value = outputs[1]
+    with graph.inserting_before(output):
+        for _ in range(times):
+            known = {start: known.get(value, value)}
+            for node in step:
+                known[node] = graph.node_copy(node, lambda n, known=known: known.get(n, n))
+    output.args = (tuple(known.get(n, n) if n not in way_back else n for n in outputs),)
+    for spec, node in zip(program.graph_signature.output_specs, output.args[0], strict=True):
+        spec.arg.name = node.name
     graph.lint()
     program.graph_module.recompile()
 
 
-def _parts(
-    inputs: Sequence[Sequence[Any]], outputs: Sequence[Sequence[Any]], start: Any, end: Any
-) -> tuple[list[int], list[int], list[int]]:
-    """Nodes, in order, that the step needs; that lie between start and end; and all others."""
-    behind = {start}
-    for taken, made in zip(inputs, outputs, strict=True):
-        if not behind.isdisjoint(taken):
-            behind.update(made)
-    ahead = {end}
-    for taken, made in zip(reversed(inputs), reversed(outputs), strict=True):
-        if not ahead.isdisjoint(made):
-            ahead.update(taken)
-    parts: tuple[list[int], list[int], list[int]] = ([], [], [])
-    for k, made in enumerate(outputs):
-        needed = not ahead.isdisjoint(made)
-        parts[2 if not needed else 1 if start not in made and not behind.isdisjoint(made) else 0].append(k)
-    assert parts[1], "the end does not come from the start"
-    return parts
+def _between(graph: Graph, start: Node, ends: Sequence[Node]) -> list[Node]:
+    """Nodes, in order, that lie between start and the ends."""
+    behind, ahead = {start}, {*ends}
+    nodes = [node for node in graph.nodes if node.op not in ("placeholder", "output")]
+    for node in nodes:
+        if not behind.isdisjoint(node.all_input_nodes):
+            behind.add(node)
+    for node in reversed(nodes):
+        if node in ahead:
+            ahead.update(node.all_input_nodes)
+    return [node for node in nodes if node is not start and node in behind and node in ahead]
 
 
 @contextmanager

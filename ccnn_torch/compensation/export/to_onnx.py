@@ -45,7 +45,9 @@ def rows_apart_from(module: torch.nn.Module) -> int:
     return next(p for p in _PRIMES if not any(n and n % p == 0 for n in lengths))
 
 
-def to_onnx(module: torch.nn.Module, inputs: Mapping[str, Tensor], outputs: Sequence[str], opset: int) -> onnx.ModelProto:
+def to_onnx(
+    module: torch.nn.Module, inputs: Mapping[str, Tensor], outputs: Sequence[str], opset: int
+) -> onnx.ModelProto:
     """A module of its own as an ONNX graph in double; command paths are made by `command_graph`.
 
     Args:
@@ -115,6 +117,10 @@ def _call(graph: Graph, node: Node, args: Any, kwargs: Any) -> Any:
     return written(graph, *args, **{k: v for k, v in kwargs.items() if k not in ("dtype", "memory_format")})
 
 
+def _rank(value: Value) -> int:
+    return len(value.shape)
+
+
 def _shape(value: Any) -> tuple[int, ...]:
     return tuple(value.shape) if isinstance(value, Value | Tensor) else ()
 
@@ -167,10 +173,10 @@ def _reduced(graph: Graph, op: str, value: Value, dim: Any = None, keepdim: bool
     rank = len(solid.shape)
     axes = sorted(d % rank for d in (range(rank) if dim is None else [dim] if isinstance(dim, int) else dim))
     shape = [1 if k in axes else n for k, n in enumerate(solid.shape) if keepdim or k not in axes]
-    inputs, more = [solid.name], {"axes": axes}
     if op == "ReduceSum" or graph.opset >= 18:
-        inputs, more = [*inputs, graph.constant(np.array(axes, np.int64))], {}
-    return graph.node(op, inputs, shape, shape, keepdims=int(keepdim), **more)
+        names = [solid.name, graph.constant(np.array(axes, np.int64))]
+        return graph.node(op, names, shape, shape, keepdims=int(keepdim))
+    return graph.node(op, [solid.name], shape, shape, keepdims=int(keepdim), axes=axes)
 
 
 def _matmul(graph: Graph, a: Any, b: Any) -> Value:
@@ -178,7 +184,7 @@ def _matmul(graph: Graph, a: Any, b: Any) -> Value:
         form = graph.times(a, b)
         if form is not None:
             return form
-    shape = torch.broadcast_shapes(_shape(a)[:-2], _shape(b)[:-2]) if min(len(_shape(a)), len(_shape(b))) > 1 else ()
+    shape = np.broadcast_shapes(_shape(a)[:-2], _shape(b)[:-2]) if min(len(_shape(a)), len(_shape(b))) > 1 else ()
     left, right = (graph.full(v) if isinstance(v, Value) else v for v in (a, b))
     whole = (*shape, *_shape(a)[-2:-1], *_shape(b)[-1:]) if len(_shape(b)) > 1 else _shape(a)[:-1]
     names = [v.name if isinstance(v, Value) else graph.constant(graph.thin(v)) for v in (left, right)]
@@ -292,16 +298,15 @@ def _stacked(graph: Graph, parts: Sequence[Any], dim: int = 0) -> Value:
     return _joined(graph, apart, dim)
 
 
-def _expanded(graph: Graph, value: Any, shape: Sequence[int], **_: Any) -> Any:
+def _expanded(graph: Graph, value: Any, shape: Sequence[int]) -> Any:
     if isinstance(value, Tensor):
         return value.expand(*shape)
     solid = graph.solid(value)
     more = len(shape) - len(solid.shape)
     wanted = tuple(solid.shape[k - more] if n == -1 else n for k, n in enumerate(shape))
-    if more:
-        # A reshape, so that names and shapes agree in rank.
-        for _ in range(more):
-            solid = _unsqueezed(graph, solid, 0)
+    for _ in range(more):
+        # So that names and shapes agree in rank.
+        solid = _unsqueezed(graph, solid, 0)
     return Value(wanted, solid.name, solid.real)
 
 
@@ -381,15 +386,17 @@ _OTHERS: dict[str, Callable[..., Any]] = {
     "rsub": lambda g, a, b: _binary(g, "sub", b, a),
     "square": lambda g, v: _each(g, "Mul", v, v),
     "rsqrt": lambda g, v: _each(g, "Reciprocal", _each(g, "Sqrt", v)),
-    "pow": _power, "clamp": _clamped, "clamp_min": _clamped, "clamp_max": lambda g, v, most: _clamped(g, v, None, most),
-    "where": _where, "ne": _not_equal, "isfinite": _finite, "nan_to_num": _numbered, "isnan": lambda g, v: _not_equal(g, v, v),
+    "pow": _power, "clamp": _clamped, "clamp_min": _clamped,
+    "clamp_max": lambda g, v, most: _clamped(g, v, None, most), "where": _where, "ne": _not_equal,
+    "isfinite": _finite, "nan_to_num": _numbered, "isnan": lambda g, v: _not_equal(g, v, v),
     "all": _every, "any": _any, "to": _cast, "_to_copy": _cast,
     "reshape": _reshaped, "view": _reshaped, "_unsafe_view": _reshaped,
-    "flatten": lambda g, v, a=0, b=-1: _reshaped(g, v, [*v.shape[:a % len(v.shape)], -1, *v.shape[b % len(v.shape) + 1:]]),
-    "unflatten": lambda g, v, d, sizes: _reshaped(g, v, [*v.shape[:d % len(v.shape)], *sizes, *v.shape[d % len(v.shape) + 1:]]),
+    "flatten": lambda g, v, a=0, b=-1: _reshaped(g, v, [*v.shape[: a % _rank(v)], -1, *v.shape[b % _rank(v) + 1 :]]),
+    "unflatten": lambda g, v, d, n: _reshaped(g, v, [*v.shape[: d % _rank(v)], *n, *v.shape[d % _rank(v) + 1 :]]),
     "unsqueeze": _unsqueezed, "squeeze": _squeezed, "permute": _permuted, "transpose": _transposed, "mT": _transposed,
-    "t": _transposed, "select": _selected, "slice": _sliced, "index": _indexed, "index_select": _picked, "flip": _flipped,
-    "cat": _joined, "stack": _stacked, "expand": _expanded, "expand_as": lambda g, a, b: _expanded(g, a, _shape(b)),
+    "t": _transposed, "select": _selected, "slice": _sliced, "index": _indexed, "index_select": _picked,
+    "flip": _flipped, "cat": _joined, "stack": _stacked, "expand": _expanded,
+    "expand_as": lambda g, a, b: _expanded(g, a, _shape(b)),
     "broadcast_tensors": _broadcast, "split": _split, "split_with_sizes": _split,
     "unbind": lambda g, v, dim=0: [_selected(g, v, dim, k) for k in range(v.shape[dim])],
 }  # fmt: skip
