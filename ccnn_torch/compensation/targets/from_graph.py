@@ -267,6 +267,14 @@ class _Lowering:
     def _square(self, value: Value) -> Any:
         return self.each("mul", value, value)
 
+    def _hypot(self, a: Any, b: Any) -> Any:
+        return self.each("sqrt", self.each("add", self.each("mul", a, a), self.each("mul", b, b)))
+
+    def _linalg_vector_norm(self, value: Value, order: Any = 2, dims: Any = None, keep: bool = False) -> Any:
+        assert order == 2, "lengths are Euclidean"
+        dims = [*range(value.ids.dim())] if dims is None else [dims] if isinstance(dims, int) else [*dims]
+        return self.each("sqrt", self.reduced("add", self._square(value), dims, keep))
+
     def _gt(self, a: Any, b: Any) -> Any:
         return self.each("lt", b, a)
 

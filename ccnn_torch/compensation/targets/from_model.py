@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from ccnn_torch.compensation.export.pt2 import quiet_exporter
 from ccnn_torch.compensation.targets.form import Form, Program
 from ccnn_torch.compensation.targets.from_graph import program_of
 
-__all__ = ["SINGLE_TOLERANCE", "form_of"]
+__all__ = ["SINGLE_TOLERANCE", "form_of", "traced_program"]
 
 # Share of the limit to which single precision is right.
 SINGLE_TOLERANCE = 1e-5
@@ -67,14 +68,9 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     example = (point[:, :n].clone(), point[:, n:].clone())[: 2 if compensator.covariates else 1]
     names = ("joints", "covariates")[: len(example)]
 
-    def program(module: nn.Module, name: str, outputs: list[list[str | None]]) -> list[Program]:
-        with quiet_exporter(), torch.no_grad():
-            exported = torch.export.export(module, example).run_decompositions()
-        return [program_of(exported, name, names, some) for some in outputs]
-
     kept: list[list[str | None]] = [["deviation", "excess", None], *([[None, None, "sd"]] if sd else [])]
-    (clean,) = program(_Clean(compensator), "clean", [["joints", "covariates", "strange"]])
-    deviation, *spread = program(_Step(compensator), "deviation", kept)
+    (clean,) = _programs(_Clean(compensator), example, "clean", names, [["joints", "covariates", "strange"]])
+    deviation, *spread = _programs(_Step(compensator), example, "deviation", names, kept)
     for one in spread:
         one.name = "spread"
     limit = compensator.limit.numpy()
@@ -90,3 +86,26 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
         deviation,
         spread[0] if spread else None,
     )
+
+
+def traced_program(
+    module: nn.Module, example: tuple[Tensor, ...], name: str, inputs: Sequence[str], outputs: list[str | None]
+) -> Program:
+    """A module as a program, traced for one row.
+
+    Raises:
+        MethodFailedError: it has an operation that no form has.
+    """
+    return _programs(module, example, name, inputs, [outputs])[0]
+
+
+def _programs(
+    module: nn.Module,
+    example: tuple[Tensor, ...],
+    name: str,
+    inputs: Sequence[str],
+    outputs: list[list[str | None]],
+) -> list[Program]:
+    with quiet_exporter(), torch.no_grad():
+        exported = torch.export.export(module, example).run_decompositions()
+    return [program_of(exported, name, inputs, some) for some in outputs]
