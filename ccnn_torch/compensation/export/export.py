@@ -136,7 +136,7 @@ def verify(compensator: Compensator, run: Any, form: str) -> None:
             if not good:
                 raise MethodFailedError(
                     f"the {form} export's output '{name}' is not the model's to {share:.0e} of the limit; export with "
-                    "other versions of torch, onnxscript or onnxruntime (tested ones: see the model card)"
+                    "other versions of torch or onnxruntime (tested ones: see the model card)"
                 )
 
 

@@ -113,10 +113,7 @@ def quiet_exporter() -> Iterator[None]:
 
     Nor do they look up where in the source a step came from: no file holds it, and it takes a tenth of the time.
     """
-    loggers = [
-        logging.getLogger(name)
-        for name in ("torch", "torch.onnx", "torch.export", "torch.__trace", "onnxscript", "onnx_ir")
-    ]
+    loggers = [logging.getLogger(name) for name in ("torch", "torch.onnx", "torch.export", "torch.__trace")]
     levels = [logger.level for logger in loggers]
     # Older versions of torch lack the switch, and setting it changes nothing.
     traces = getattr(fx_config, "do_not_emit_stack_traces", False)
