@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.export import ExportedProgram
+from torch.fx import GraphModule
 from torch.fx import Node as GraphNode
 
 from ccnn_torch.compensation.targets.build import Builder
@@ -50,29 +50,25 @@ class Value:
         self.ids = ids
 
 
-def program_of(exported: ExportedProgram, name: str, inputs: Sequence[str], outputs: Sequence[str | None]) -> Program:
-    """A program of a traced module whose inputs and outputs are tensors of fixed shapes.
+def program_of(traced: GraphModule, name: str, inputs: Sequence[str], outputs: Sequence[str | None]) -> Program:
+    """A program of a traced function whose inputs and outputs are tensors of fixed shapes.
 
     Args:
-        exported: with its operations decomposed.
+        traced: with its operations decomposed.
         name: of the program.
-        inputs: names of the module's inputs.
+        inputs: names of the function's inputs.
         outputs: names of its outputs; None for one that is left out.
 
     Raises:
         MethodFailedError: there is an operation that no form has.
     """
-    graph = exported.graph
+    graph = traced.graph
     lowering = _Lowering(Builder(any(_name(node) in _ASKS for node in graph.nodes)))
-    constants = {**exported.state_dict, **exported.constants}
-    signature = exported.graph_signature
-    held = {**signature.inputs_to_parameters, **signature.inputs_to_buffers}
-    held |= signature.inputs_to_lifted_tensor_constants
     known: dict[GraphNode, Any] = {}
     given: dict[str, int] = {}
     for node in graph.nodes:
-        if node.op == "placeholder" and node.name in held:
-            known[node] = constants[held[node.name]].detach()
+        if node.op == "get_attr":
+            known[node] = getattr(traced, node.target).detach()
         elif node.op == "placeholder":
             key = inputs[len(given)]
             shape = node.meta["val"].shape
@@ -82,6 +78,7 @@ def program_of(exported: ExportedProgram, name: str, inputs: Sequence[str], outp
             args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: known[n])
             known[node] = lowering.call(node, args, kwargs)
     found = torch.fx.node.map_arg(graph.output_node().args[0], lambda n: known[n])
+    found = found if isinstance(found, list | tuple) else [found]
     wanted = {key: lowering.ids(value) for key, value in zip(outputs, found, strict=True) if key is not None}
     return lowering.builder.program(name, given, wanted)
 
@@ -120,8 +117,8 @@ class _Lowering:
             return args[0][args[1]]
         if not any(isinstance(v, Value) for v in torch.utils._pytree.tree_leaves((args, kwargs))):
             return node.target(*args, **kwargs)  # type: ignore[operator]
-        if name in ("full_like", "zeros_like", "ones_like", "empty_like"):
-            fill = {"full_like": args[-1], "ones_like": 1.0}.get(name, 0.0)
+        if name in ("full_like", "zeros_like", "ones_like", "empty_like", "new_zeros", "new_ones", "new_full"):
+            fill = {"full_like": args[-1], "new_full": args[-1], "ones_like": 1.0, "new_ones": 1.0}.get(name, 0.0)
             return torch.full(node.meta["val"].shape, float(fill), dtype=torch.float64)
         if name in _MOVES:
             return self._moved(node, args, {k: v for k, v in kwargs.items() if k not in ("dtype", "memory_format")})
@@ -264,6 +261,9 @@ class _Lowering:
         count = math.prod(value.ids.shape[d] for d in dims)
         return self.each("mul", self.reduced("add", value, dims, keep), 1.0 / count)
 
+    def _rsub(self, a: Any, b: Any) -> Any:
+        return self.each("sub", b, a)
+
     def _square(self, value: Value) -> Any:
         return self.each("mul", value, value)
 
@@ -283,6 +283,13 @@ class _Lowering:
 
     def _ne(self, a: Any, b: Any) -> Any:
         return self.each("not", self.each("eq", a, b))
+
+    def _nan_to_num(self, value: Value, nan: Any = None, posinf: Any = None, neginf: Any = None) -> Any:
+        most = torch.finfo(torch.float64).max
+        found = self.each("select", self._isnan(value), nan or 0.0, value)
+        for edge, to, usual in ((math.inf, posinf, most), (-math.inf, neginf, -most)):
+            found = self.each("select", self.each("eq", found, edge), usual if to is None else to, found)
+        return found
 
     def _isnan(self, value: Value) -> Any:
         return self._ne(value, value)

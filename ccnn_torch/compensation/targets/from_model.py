@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.contraction import Steepness, iterations_needed
-from ccnn_torch.compensation.export.pt2 import quiet_exporter
 from ccnn_torch.compensation.targets.form import Form, Program
 from ccnn_torch.compensation.targets.from_graph import program_of
 
@@ -106,6 +106,7 @@ def _programs(
     inputs: Sequence[str],
     outputs: list[list[str | None]],
 ) -> list[Program]:
-    with quiet_exporter(), torch.no_grad():
-        exported = torch.export.export(module, example).run_decompositions()
-    return [program_of(exported, name, inputs, some) for some in outputs]
+    # By running it: operations on one row, those that mutate as ones that do not.
+    with torch.no_grad():
+        traced = make_fx(torch.func.functionalize(lambda *given: module(*given)), tracing_mode="real")(*example)
+    return [program_of(traced, name, inputs, some) for some in outputs]
