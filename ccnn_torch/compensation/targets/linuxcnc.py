@@ -120,7 +120,9 @@ def _fields(mechanism: Mechanism) -> dict[str, str]:
 
 def _axes(mechanism: Mechanism) -> str:
     if isinstance(mechanism, SerialArm):
-        return "X, Y, Z in the base frame" + (", A, B, C: roll, pitch, yaw" if mechanism.orientation != "none" else "")
+        return "X, Y, Z in the frame in which the machine was measured" + (
+            ", A, B, C: roll, pitch, yaw" if mechanism.orientation != "none" else ""
+        )
     if _is_vector(mechanism):
         return "X, Y, Z, and A, B, C: roll, pitch, yaw of the platform"
     return ", ".join(f"{field.removeprefix('tran.').upper()} = {name}" for name, field in _fields(mechanism).items())

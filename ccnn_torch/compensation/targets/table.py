@@ -69,6 +69,7 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[
     if mechanism is not None and [c.name for c in mechanism.pose] == ["x", "y", "z"]:
         tables["klipper_mesh.cfg"], sentence = _mesh(compensator, mechanism)
         told.append(sentence)
+    told += [text for form, text in _FORMS.items() if any(name.startswith(form) for name in tables)]
     middle = compensator.domain.centre[n:].tolist()
     at = ", ".join(f"{c.name} = {v:.6g} {c.unit}" for c, v in zip(compensator.covariates, middle, strict=True))
     return tables | {"README.md": README.format(told="\n\n".join(told), at=f" Covariates stand at {at}." if at else "")}
@@ -80,12 +81,14 @@ Deviation: what the machine adds to a commanded joint, so subtract it.{at}
 Errors are over random points of the domain of the training rows.
 
 {told}
-
-`linuxcnc_JOINT.comp`: `COMP_FILE` of its `[JOINT_N]`, with `COMP_FILE_TYPE = 1` (nominal, forward trim, reverse trim).
-`heidenhain_JOINT.com`: columns AXISPOS, BACKLASH and the axis, in the form of the manufacturer's manuals, with the
-deviation as it is; it was not tried on a control, so check its sign with one point.
-`klipper_mesh.cfg`: a saved profile of `[bed_mesh]` for the section SAVE_CONFIG of printer.cfg.
 """
+_FORMS = {
+    "linuxcnc": "`linuxcnc_JOINT.comp`: `COMP_FILE` of its `[JOINT_N]`, with `COMP_FILE_TYPE = 1` (nominal, forward "
+    "trim, reverse trim).",
+    "heidenhain": "`heidenhain_JOINT.com`: columns AXISPOS, BACKLASH and the axis, in the form of the manufacturer's "
+    "manuals, with the deviation as it is; it was not tried on a control, so check its sign with one point.",
+    "klipper": "`klipper_mesh.cfg` is a saved profile of `[bed_mesh]` for the section SAVE_CONFIG of printer.cfg.",
+}
 
 
 def _deviation(compensator: Compensator, joints: Array) -> Array:
