@@ -225,7 +225,8 @@ class Graph:
                 names[:] = [renamed.get(n, n) for n in names]
         constants = [c for c in self._constants.values() if c.name in needed]
         graph = helper.make_graph(nodes[::-1], name, self._inputs, found, constants)
-        return helper.make_model(graph, opset_imports=[helper.make_opsetid("", self.opset)], ir_version=10)
+        opsets = [helper.make_opsetid("", self.opset)]
+        return helper.make_model(graph, opset_imports=opsets, ir_version=helper.find_min_ir_version_for(opsets))
 
     def _order(self, name: str) -> int:
         return int(name[1:]) if name[0] == "v" and name[1:].isdigit() else -1

@@ -18,7 +18,7 @@ from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.export.export import verify
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY, OUTPUTS, Array
 
-__all__ = ["export_pt2", "quiet_exporter"]
+__all__ = ["export_pt2"]
 
 
 class _Step(nn.Module):
@@ -50,7 +50,7 @@ def export_pt2(compensator: Compensator, metadata: str) -> bytes:
     points = compensator.domain.centre.repeat(3, 1)
     example = (points[:, :n].contiguous(), points[:, n:].contiguous())[: 2 if compensator.covariates else 1]
     shapes = {name: {0: batch} for name, _ in zip(("joints", "covariates"), example, strict=False)}
-    with quiet_exporter():
+    with _quiet():
         program = torch.export.export(_Step(compensator), example, dynamic_shapes=shapes)
     for node in program.graph.nodes:
         # Where in the source a step came from: paths of the machine that wrote the file.
@@ -67,7 +67,7 @@ def export_pt2(compensator: Compensator, metadata: str) -> bytes:
     verify(compensator, run, ".pt2")
     program.example_inputs = None
     stream = io.BytesIO()
-    with quiet_exporter():
+    with _quiet():
         torch.export.save(program, stream, extra_files={METADATA_KEY: metadata})
     return stream.getvalue()
 
@@ -108,10 +108,10 @@ def _between(graph: Graph, start: Node, ends: Sequence[Node]) -> list[Node]:
 
 
 @contextmanager
-def quiet_exporter() -> Iterator[None]:
-    """Keep the exporters' progress, warnings and log lines from the user, here only.
+def _quiet() -> Iterator[None]:
+    """Keep the exporter's progress, warnings and log lines from the user, here only.
 
-    Nor do they look up where in the source a step came from: no file holds it, and it takes a tenth of the time.
+    Nor does it look up where in the source a step came from: no file holds it, and it takes a tenth of the time.
     """
     loggers = [logging.getLogger(name) for name in ("torch", "torch.onnx", "torch.export", "torch.__trace")]
     levels = [logger.level for logger in loggers]
