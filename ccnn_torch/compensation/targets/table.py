@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.errors import MethodFailedError
@@ -109,6 +108,9 @@ def _inside(compensator: Compensator, joints: Array) -> Array:
 
 
 def _between(lines: list[Array], values: Array, points: Array) -> Array:
+    # It takes a second to load, which commands that write no table need not wait for.
+    from scipy.interpolate import RegularGridInterpolator
+
     return np.asarray(RegularGridInterpolator(lines, values)(points))
 
 
