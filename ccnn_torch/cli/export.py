@@ -1,4 +1,4 @@
-"""`ccnn export`: a model as source code of a controller."""
+"""`ccnn export`: a model for a controller or a simulator."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ __all__ = ["export"]
 
 
 def export(
-    model: Annotated[Path, typer.Argument(help="A .safetensors file with its card.")],
-    to: Annotated[str, typer.Option(help="c99, or st (IEC 61131-3 Structured Text).")],
+    model: Annotated[Path, typer.Argument(help="A .safetensors file with its card, or an identified.yaml.")],
+    to: Annotated[str, typer.Option(help="c99, st (IEC 61131-3 Structured Text), linuxcnc, onnx, urdf or table.")],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
     dtype: Annotated[str, typer.Option(help="float64 or float32, in which the controller computes.")] = "float64",
     sd: Annotated[bool, typer.Option("--sd", help="Add a function for the deviation's standard deviation.")] = False,
@@ -26,13 +26,17 @@ def export(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
 ) -> None:
-    """Write a model as source code of a controller: both directions, with domain, limit and fallback inside.
+    """Write a model for a controller: both directions, with domain, limit and fallback inside; or for a simulator.
 
     c99 writes compensator.h, compensator.c, selftest.c and a Makefile: make test builds them without warnings and
     compares more than a thousand golden vectors. The code has no heap, no recursion and no global state, and does
     the same operations in each call. st writes compensator.st, selftest.st and a README.md for TwinCAT and CODESYS.
+    linuxcnc writes ccnnkins.comp, the machine's kinematics with the compensation around them, for halcompile; of an
+    identified.yaml the kinematics with the identified parameters. onnx writes model.onnx with master and card. urdf
+    writes an arm with its identified links as URDF, MuJoCo model and DH table. table writes the deviation over a grid,
+    tables of single axes and a mesh where they suffice, and how far off each of them is.
 
-    Every target returns the same codes: 0 inside the domain; 1 outside, or where the model broke its limit; 2 where an
+    Source code returns the same codes: 0 inside the domain; 1 outside, or where the model broke its limit; 2 where an
     input is not finite, and then command = joints. Before a file is written its operations are compared with the
     model: in float64 to 1e-12 of the limit (1e-9 with a Gaussian process, an arm's links or physical effects), in
     float32 to 1e-5.
@@ -44,12 +48,17 @@ def export(
     ccnn export runs/ur10/model.safetensors --to st --out plc
 
     ccnn export checkpoints/tripod/model.safetensors --to c99 --dtype float32 --sd --out microcontroller
+
+    ccnn export checkpoints/tripod/model.safetensors --to linuxcnc --out kins
+
+    ccnn export runs/arm/identified.yaml --to urdf --out robot
     """
     with if_stopped(NOTHING_WRITTEN):
         from ccnn_torch.compensation import export_model
 
         files = export_model(model, to, out, dtype, sd, public_key, allow_code)
     if not quiet:
-        typer.echo(f"{out}: {', '.join(files)} written; their operations give the model's numbers.")
+        proven = "; their operations give the model's numbers" if to in ("c99", "st", "linuxcnc", "onnx") else ""
+        typer.echo(f"{out}: {', '.join(files)} written{proven}.")
         if to == "c99":
             typer.echo(f"Compile them and compare golden vectors: make -C {out} test")

@@ -162,6 +162,15 @@ class Compensator(nn.Module):
         joints, covariates, strange = self._inputs(joints, covariates)
         return self._sd(self._deviation(joints, covariates, strange))
 
+    def sd_of(self, weight: Tensor, features: Tensor) -> Tensor:
+        """`sd` where the guard's weight, `... x 1` [1], and the network's features, `... x i` [1], are known."""
+        scale = self.scaling.deviation * self.sd_scale
+        variance = scale * scale
+        if isinstance(self.network, UncertainNetwork):
+            variance = variance * self.network.variance(features)
+        outside = (1 - weight) * self.safe_sd
+        return torch.sqrt(weight * weight * variance + outside * outside)
+
     def back(self, command: Tensor, covariates: Tensor | None = None) -> Tensor:
         """Ideal joints of a command (or of the joints fed back), `... x n` [SI]; arguments and errors as `forward`."""
         command, covariates, strange = self._inputs(command, covariates)
@@ -266,13 +275,7 @@ class Compensator(nn.Module):
 
     def _sd(self, deviation: _Deviation) -> Tensor:
         """Of a newly measured δ, where this one was found."""
-        weight = deviation.weight
-        scale = self.scaling.deviation * self.sd_scale
-        variance = scale * scale
-        if isinstance(self.network, UncertainNetwork):
-            variance = variance * self.network.variance(deviation.features)
-        outside = (1 - weight) * self.safe_sd
-        return torch.sqrt(weight * weight * variance + outside * outside)
+        return self.sd_of(deviation.weight, deviation.features)
 
     def _limited(self, deviation: Tensor) -> Tensor:
         return torch.minimum(torch.maximum(deviation, -self.limit), self.limit)

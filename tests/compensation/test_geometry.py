@@ -20,7 +20,7 @@ from ccnn_torch.compensation import (
     save_model,
     settled_damping,
 )
-from ccnn_torch.compensation.export.to_onnx import quiet_exporter, to_onnx
+from ccnn_torch.compensation.export.to_onnx import to_onnx
 from ccnn_torch.compensation.geometry import identified as _geometry
 from ccnn_torch.compensation.geometry.expanded import ExpandedGeometry, expand_geometry
 from ccnn_torch.compensation.geometry.serial import SerialGeometry
@@ -165,9 +165,7 @@ def test_the_deviation_runs_in_onnx_in_double(kind: str) -> None:
     module: torch.nn.Module = SerialGeometry(arm, arm.nominal, identified, *TAMED)
     if kind == "expansion":
         module = expand_geometry(lambda q: 1e-3 * q * q.roll(1, -1), joints)
-    with quiet_exporter():
-        program = torch.export.export(module, (joints,))
-        model = to_onnx(program, None, ("deviation",), 20, "{}")
+    model = to_onnx(module, {"joints": joints}, ["deviation"], 20)
     check_graph(model)
     session = open_onnx(model.SerializeToString())
     (found,) = session.run(None, {session.get_inputs()[0].name: joints.numpy()})

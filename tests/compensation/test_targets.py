@@ -73,7 +73,7 @@ def test_single_precision_is_right_to_its_share_of_the_limit(kind: str, tmp_path
 
 def test_single_precision_does_not_hold_the_links_of_an_arm() -> None:
     # A length of 1 m is rounded by more of the limit than single precision may be off.
-    with pytest.raises(MethodFailedError, match="single precision does not hold this model"):
+    with pytest.raises(MethodFailedError, match="computes the arm's links: a length of 1 m is rounded"):
         require_equal(*made(KINDS["sliding arm"](), "float32", sd=False))
 
 

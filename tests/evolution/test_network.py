@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import naive_network as naive
 import onnxruntime
 import pytest
@@ -12,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from ccnn_torch.compensation.export.to_onnx import to_onnx
 from ccnn_torch.evolution import Genome, MaskedNetwork, alive_nodes, decode, forward, prune
 from ccnn_torch.evolution.network import average, fed_nodes
 
@@ -121,16 +120,14 @@ def test_building_a_network_leaves_the_global_random_state_alone() -> None:
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 @pytest.mark.parametrize("density", [0.5, 0.0])
-def test_exports_to_onnx_and_torch_export_with_any_batch(tmp_path: Path, density: float) -> None:
+def test_exports_to_onnx_and_torch_export_with_any_batch(density: float) -> None:
     masks, weights = parts(naive.random_layers([3, 6, 6, 3], (), density, True, torch.Generator().manual_seed(8)))
     network = MaskedNetwork(masks, weights).eval()
     example = torch.linspace(-1, 1, 12, dtype=torch.float64).view(4, 3)
     shapes = ({0: torch.export.Dim("batch")},)
-    path = tmp_path / "network.onnx"
-    torch.onnx.export(network, (example,), path, dynamo=True, external_data=False, dynamic_shapes=shapes, verbose=False)
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    model = to_onnx(network, {"inputs": example}, ["output"], 20)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     program = torch.export.export(network, (example,), dynamic_shapes=shapes).module()
     for rows in (4, 1, 9):
         inputs = torch.linspace(-3, 2, 3 * rows, dtype=torch.float64).view(rows, 3)

@@ -1,45 +1,32 @@
-"""The compensator as ONNX and as `.pt2`: whole graphs, verified against the eager model when they are made.
+"""The compensator as ONNX: printed node by node, and verified against the eager model when it is made.
 
 In double, ONNX Runtime has kernels for Gemm, Sigmoid, Tanh, Exp, Sin, Cos, Min, Max, Where, comparisons and arithmetic,
-and none for Tan, Asin, Acos, Atan, Softplus, Elu, Gelu and Erf: a network made of those cannot be exported. The
-exporter rounds a number that is a literal in the code (0.01 * x) to single precision: one that is not exact there has
-to be a buffer.
+and none for Tan, Asin, Acos, Atan, Softplus, Elu, Gelu and Erf: a network made of those cannot be exported.
 """
 
 from __future__ import annotations
 
 import copy
-import io
 from typing import Any
 
 import numpy as np
 import torch
 from onnxruntime.capi.onnxruntime_pybind11_state import NotImplemented as NoKernel
-from torch import Tensor, nn
+from torch import Tensor
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.contraction import TOLERANCE, Steepness, iterations_needed
-from ccnn_torch.compensation.export.to_onnx import quiet_exporter, to_onnx
-from ccnn_torch.compensation.export.unroll import unroll_onnx, unroll_program
+from ccnn_torch.compensation.export.command import command_graph
 from ccnn_torch.compensation.geometry.serial import SerialGeometry
 from ccnn_torch.compensation.model_files.onnx_session import (
-    METADATA_KEY,
     OUTPUTS,
-    Array,
     check_graph,
     open_onnx,
     run_onnx,
 )
 from ccnn_torch.errors import MethodFailedError
 
-__all__ = [
-    "export_float32",
-    "export_onnx",
-    "export_pt2",
-    "probe_points",
-    "trace",
-    "verify",
-]
+__all__ = ["export_float32", "export_onnx", "probe_points", "verify"]
 
 _OPSET = 20
 _OPSET_FLOAT32 = 17
@@ -49,64 +36,21 @@ _TOLERANCE_FLOAT32 = 1e-5
 _OUTPUTS_FLOAT32 = ("deviation", "guard", "back_deviation", "back_guard")
 
 
-class _Single(nn.Module):
-    """What is traced for narrow engines."""
-
-    def __init__(self, compensator: Compensator) -> None:
-        super().__init__()
-        self.compensator = compensator
-
-    def forward(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, ...]:
-        """joints: `1 x n` [SI]; covariates: `1 x m` [SI], or None where there are none."""
-        return self.compensator.guarded(joints, covariates)
-
-
-class _Graph(nn.Module):
-    """Both directions as named outputs; what is traced."""
-
-    def __init__(self, compensator: Compensator) -> None:
-        super().__init__()
-        self.compensator = compensator
-
-    def forward(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, ...]:
-        """joints: `s x n` [SI]; covariates: `s x m` [SI], or None where there are none. Returns `OUTPUTS`."""
-        return tuple(self.compensator.solve(joints, covariates))
-
-
-def trace(compensator: Compensator) -> torch.export.ExportedProgram:
-    """The compensator in float64 as one graph, with one step of its fixed point, batch dynamic, for both file forms.
+def export_onnx(compensator: Compensator, metadata: str) -> bytes:
+    """The compensator in float64 as a verified ONNX file without external data, for any number of rows.
 
     Inputs `joints` (`s x n`, ideal, SI) and, where there are any, `covariates` (`s x m`, SI). Outputs `command`,
     `deviation`, `inside_domain`, for the way back `ideal` and `ideal_inside_domain`: the ideal joints, were the input a
     command; and `deviation_sd`.
-    """
-    batch = torch.export.Dim("batch")
-    n = len(compensator.joints)
-    points = compensator.domain.centre.repeat(3, 1)
-    example = (points[:, :n].contiguous(), points[:, n:].contiguous())[: 2 if compensator.covariates else 1]
-    shapes = {name: {0: batch} for name, _ in zip(("joints", "covariates"), example, strict=False)}
-    with quiet_exporter():
-        program = torch.export.export(_Graph(_one_step(compensator)), example, dynamic_shapes=shapes)
-    for node in program.graph.nodes:
-        # Where in the source a step came from: paths of the machine that wrote the file.
-        for key in ("stack_trace", "source_fn_stack", "nn_module_stack", "from_node", "torch_fn"):
-            node.meta.pop(key, None)
-    return program
-
-
-def export_onnx(compensator: Compensator, program: torch.export.ExportedProgram, metadata: str) -> bytes:
-    """The traced compensator as a verified ONNX file without external data.
 
     Args:
-        program: out of `trace`.
+        compensator: fitted.
         metadata: JSON to carry in the file.
 
     Raises:
         MethodFailedError: the file does not give the eager model's numbers, see `verify`, or cannot be run.
     """
-    model = to_onnx(program, None, OUTPUTS, _OPSET, metadata, _plain(compensator))
-    ideal = next(node for node in model.graph.node if "ideal" in node.output)
-    unroll_onnx(model, ideal.input[1], "deviation", compensator.iterations)
+    model = command_graph(compensator, _OPSET, metadata, OUTPUTS)
     # What is read back must not be refused.
     check_graph(model)
     content: bytes = model.SerializeToString(deterministic=True)
@@ -121,38 +65,13 @@ def export_onnx(compensator: Compensator, program: torch.export.ExportedProgram,
     return content
 
 
-def export_pt2(compensator: Compensator, program: torch.export.ExportedProgram, metadata: str) -> bytes:
-    """The traced compensator as a verified `torch.export` file; arguments and errors as `export_onnx`.
-
-    Nothing in the file is pickled: it carries no example inputs, which are the one thing torch would pickle here. What
-    is verified is the program that is written, since opening such a file can run code that it contains. All steps of
-    the fixed point are put into the program itself, which no other form can be made of afterwards.
-    """
-    outputs: Any = program.graph.output_node().args[0]
-    found = dict(zip(OUTPUTS, outputs, strict=True))
-    unroll_program(program, found["ideal"].args[1], found["deviation"], compensator.iterations)
-    module = program.module()
-
-    def run(joints: Array, covariates: Array | None) -> dict[str, Array]:
-        inputs = [torch.tensor(v) for v in (joints, covariates) if v is not None]
-        with torch.no_grad():
-            return {name: value.numpy() for name, value in zip(OUTPUTS, module(*inputs), strict=True)}
-
-    verify(compensator, run, ".pt2")
-    program.example_inputs = None
-    stream = io.BytesIO()
-    with quiet_exporter():
-        torch.export.save(program, stream, extra_files={METADATA_KEY: metadata})
-    return stream.getvalue()
-
-
 def export_float32(compensator: Compensator, metadata: str) -> bytes:
     """Single precision, one row, opset 17, for engines with a narrow operator list: a verified ONNX file.
 
-    MatMul, Sigmoid and elementwise operators only (Concat with covariates; sine, cosine and Gather with periodic
-    inputs). A joint of 1 m has a step of 1e-7 m in single precision, about the size of the corrections, so the file
-    gives deviations and the controller does the sums in its own precision: command = joints - `deviation`; the way
-    back is ideal = joints + `back_deviation`. `guard` and `back_guard` are 1 inside the domain and fall to 0 outside.
+    Gemm, Sigmoid and elementwise operators only (Concat with covariates; sine and cosine with periodic inputs). A
+    joint of 1 m has a step of 1e-7 m in single precision, about the size of the corrections, so the file gives
+    deviations and the controller does the sums in its own precision: command = joints - `deviation`; the way back is
+    ideal = joints + `back_deviation`. `guard` and `back_guard` are 1 inside the domain and fall to 0 outside.
 
     Raises:
         MethodFailedError: the file is not right to 1e-5 of the limit, or the model holds physical effects or the links
@@ -161,14 +80,11 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     if compensator.effects is not None or isinstance(compensator.geometry, SerialGeometry):
         what = "links of the arm" if compensator.effects is None else "physical effects"
         raise MethodFailedError(f"the {what} need double precision; use the float64 file")
-    twin = copy.deepcopy(compensator)
+    twin = copy.copy(compensator)
     twin.iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), _TOLERANCE_FLOAT32 / 10)
-    twin = twin.float()
     joints, covariates = probe_points(compensator)
     given = [v.float() for v in (joints, covariates) if v is not None]
-    example = tuple(v[:1] for v in given)
-    model = to_onnx(_Single(_one_step(twin)), example, _OUTPUTS_FLOAT32, _OPSET_FLOAT32, metadata, _plain(compensator))
-    unroll_onnx(model, "back_deviation", "deviation", twin.iterations)
+    model = command_graph(twin, _OPSET_FLOAT32, metadata, _OUTPUTS_FLOAT32, "float32")
     content: bytes = model.SerializeToString(deterministic=True)
     session = open_onnx(content)
     with torch.no_grad():
@@ -220,7 +136,7 @@ def verify(compensator: Compensator, run: Any, form: str) -> None:
             if not good:
                 raise MethodFailedError(
                     f"the {form} export's output '{name}' is not the model's to {share:.0e} of the limit; export with "
-                    "other versions of torch, onnxscript or onnxruntime (tested ones: see the model card)"
+                    "other versions of torch or onnxruntime (tested ones: see the model card)"
                 )
 
 
@@ -241,15 +157,3 @@ def probe_points(compensator: Compensator, count: int = 256) -> tuple[Tensor, Te
     points = torch.cat([spread, *rows])
     n = len(compensator.joints)
     return points[:, :n].contiguous(), points[:, n:].contiguous() if compensator.covariates else None
-
-
-def _one_step(compensator: Compensator) -> Compensator:
-    """What is traced, since further steps are copies of the first."""
-    traced = copy.copy(compensator)
-    traced.iterations = 1
-    return traced
-
-
-def _plain(compensator: Compensator) -> bool:
-    """Whether the graph is small enough for the exporter to look for patterns in it."""
-    return compensator.geometry is None and compensator.effects is None

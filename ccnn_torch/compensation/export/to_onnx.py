@@ -1,100 +1,77 @@
-"""A torch module as an ONNX graph, without what depends on the machine that writes it."""
+"""A torch function as nodes of an ONNX graph: traced once by running it, and written as often as it is called."""
 
 from __future__ import annotations
 
-import io
-import logging
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+import math
+from collections.abc import Callable, Mapping, Sequence
+from itertools import count
+from typing import Any
 
 import onnx
 import torch
-from torch import Tensor, nn
-from torch.fx import config as fx_config
+from torch import Tensor
+from torch.fx import Node
+from torch.fx.experimental.proxy_tensor import make_fx
 
-from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
-from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.compensation.export.graph import Graph
+from ccnn_torch.compensation.export.operations import write_operation
 
-__all__ = ["quiet_exporter", "to_onnx"]
+__all__ = ["Traced", "rows_apart_from", "to_onnx"]
+
+# Rows of an example, or a few more.
+_LEAST = 61
+
+
+def rows_apart_from(module: torch.nn.Module) -> int:
+    """How many rows an example has, so that a length is a multiple of them only where it grows with the batch."""
+    tensors = [*module.state_dict().values(), *module.buffers()]
+    lengths = {n for tensor in tensors for n in tensor.shape if n}
+    primes = (p for p in count(_LEAST) if all(p % d for d in range(2, math.isqrt(p) + 1)))
+    return next(p for p in primes if all(n % p for n in lengths))
 
 
 def to_onnx(
-    module: nn.Module | torch.export.ExportedProgram,
-    example: tuple[Tensor, ...] | None,
-    outputs: Sequence[str],
-    opset: int,
-    metadata: str,
-    optimize: bool = True,
+    module: torch.nn.Module, inputs: Mapping[str, Tensor], outputs: Sequence[str], opset: int
 ) -> onnx.ModelProto:
-    """Export a module with its example inputs or a traced one, and leave out what depends on the machine.
+    """A module of its own as an ONNX graph in double; command paths are made by `command_graph`.
 
     Args:
-        optimize: let the exporter look for patterns, which takes minutes for the unrolled links of an arm and which
-            ONNX Runtime does again when it loads the file.
+        module: takes tensors `s x w`, returns tensors of as many rows.
+        inputs: name -> a row for an example, `1 x w` or more.
+        outputs: names.
+        opset: of ONNX.
 
     Raises:
-        MethodFailedError: the exporter silently wrote another opset.
+        MethodFailedError: there is an operation that no file has.
     """
-    with quiet_exporter():
-        program = torch.onnx.export(
-            module,
-            () if example is None else example,
-            output_names=list(outputs),
-            opset_version=opset,
-            dynamo=True,
-            external_data=False,
-            verbose=False,
-            optimize=optimize,
-        )
-    assert program is not None
-    model = program.model_proto
-    written = {entry.domain: entry.version for entry in model.opset_import}
-    if written.get("") != opset:
-        raise MethodFailedError(
-            f"the exporter wrote ONNX opset {written.get('')} instead of {opset}; use a tested version of onnxscript"
-        )
-    for part in (model.graph, *model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output):
-        part.ClearField("doc_string")
-        part.ClearField("metadata_props")
-    for tensor in model.graph.initializer:
-        tensor.ClearField("doc_string")
-    for part in (*model.graph.input, *model.graph.output):
-        for size in part.type.tensor_type.shape.dim:
-            if size.dim_param:
-                size.dim_param = "batch"
-    # Inside, a length may be a multiple of the batch, and ONNX Runtime reuses memory of what bears the same name.
-    for part in model.graph.value_info:
-        for size in part.type.tensor_type.shape.dim:
-            size.ClearField("dim_param")
-    model.graph.name = "compensator"
-    model.ClearField("doc_string")
-    model.ClearField("metadata_props")
-    model.metadata_props.add(key=METADATA_KEY, value=metadata)
-    return model
+    rows = rows_apart_from(module)
+    graph = Graph(rows, opset)
+    given = [graph.input(name, row.shape[1], "batch") for name, row in inputs.items()]
+    found = Traced(module, *(row[:1].repeat(rows, 1) for row in inputs.values()))(graph, *given)
+    return graph.model(dict(zip(outputs, found, strict=True)), "batch", "module")
 
 
-@contextmanager
-def quiet_exporter() -> Iterator[None]:
-    """Keep the exporters' progress, warnings and log lines from the user, here only.
+class Traced:
+    """A function of tensors whose first axis is the batch."""
 
-    Nor do they look up where in the source a step came from: no file holds it, and it takes a tenth of the time.
-    """
-    loggers = [
-        logging.getLogger(name)
-        for name in ("torch", "torch.onnx", "torch.export", "torch.__trace", "onnxscript", "onnx_ir")
-    ]
-    levels = [logger.level for logger in loggers]
-    # Older versions of torch lack the switch, and setting it changes nothing.
-    traces = getattr(fx_config, "do_not_emit_stack_traces", False)
-    try:
-        fx_config.do_not_emit_stack_traces = True
-        for logger in loggers:
-            logger.setLevel(logging.CRITICAL)
-        with warnings.catch_warnings(), redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        fx_config.do_not_emit_stack_traces = traces
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+    def __init__(self, function: Callable[..., Any], *example: Tensor) -> None:
+        with torch.no_grad():
+            self._module = make_fx(lambda *given: function(*given), tracing_mode="real", pre_dispatch=True)(*example)
+
+    def __call__(self, graph: Graph, *inputs: Any) -> list[Any]:
+        """Write it into a graph; inputs and outputs are values or constants.
+
+        Raises:
+            MethodFailedError: there is an operation that no file has.
+        """
+        given, known = iter(inputs), dict[Node, Any]()
+        for node in self._module.graph.nodes:
+            if node.op == "placeholder":
+                known[node] = next(given)
+            elif node.op == "get_attr":
+                known[node] = getattr(self._module, node.target)
+            elif node.op == "call_function":
+                args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: known[n])
+                known[node] = write_operation(graph, node, args, kwargs)
+        found = torch.fx.node.map_arg(self._module.graph.output_node().args[0], lambda n: known[n])
+        return list(found) if isinstance(found, list | tuple) else [found]

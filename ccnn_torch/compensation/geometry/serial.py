@@ -105,6 +105,12 @@ class SerialGeometry(nn.Module):
         own = (self.nominal[index, 0], self.identified[index, 0])
         return SerialGeometry(self._arm[0], *own, self.rotation_weight, self.damping)
 
+    def identified_arm(self) -> SerialArm:
+        """The arm with the identified parameters as its nominal ones."""
+        arm = SerialArm(**self._arm[0].recipe["keys"])
+        arm.set_parameters(dict(zip((p.name for p in arm.geometry), self.identified.tolist(), strict=True)))
+        return arm
+
     def describe(self) -> dict[str, Any]:
         """Everything `from_description` needs."""
         return {

@@ -40,7 +40,7 @@ _KNOWN = (FORMAT, FORMAT_GEOMETRY, FORMAT_EFFECTS)
 _FORMATS = "ccnn_torch compensator "
 
 _REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
-_PACKAGES = ("torch", "onnx", "onnxscript", "onnxruntime", "safetensors", "numpy")
+_PACKAGES = ("torch", "onnx", "onnxruntime", "safetensors", "numpy")
 
 
 def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, Any]:

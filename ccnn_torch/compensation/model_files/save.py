@@ -11,7 +11,8 @@ from typing import Any
 from safetensors.torch import save
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.export.export import export_float32, export_onnx, export_pt2, trace
+from ccnn_torch.compensation.export.export import export_float32, export_onnx
+from ccnn_torch.compensation.export.pt2 import export_pt2
 from ccnn_torch.compensation.model_files.metadata import facts_of, to_json
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
 from ccnn_torch.errors import InputError, MethodFailedError
@@ -66,12 +67,9 @@ def save_model(
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in compensator.state_dict().items()}
     contents = {"safetensors": save(tensors, metadata={METADATA_KEY: text})}
     notes = []
-    if "onnx" in forms or "pt2" in forms:
-        program = trace(compensator)
-        # In this order: writing a .pt2 takes the example inputs out of the program.
-        for form, export in (("onnx", export_onnx), ("pt2", export_pt2)):
-            if form in forms:
-                contents[form] = export(compensator, program, text)
+    for form, export in (("onnx", export_onnx), ("pt2", export_pt2)):
+        if form in forms:
+            contents[form] = export(compensator, text)
     if "float32.onnx" in forms:
         try:
             contents["float32.onnx"] = export_float32(compensator, text)

@@ -20,7 +20,7 @@ from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
 
-__all__ = ["print_c99"]
+__all__ = ["c_constants", "c_dialect", "c_function", "print_c99"]
 
 _NAMES = ("sqrt", "exp", "log", "sin", "cos", "tan", "tanh", "asin", "acos", "atan", "floor")
 _FUNCTIONS = {name: f"{name}{{s}}({{{{0}}}})" for name in _NAMES}
@@ -45,7 +45,7 @@ _OPERATIONS = {
 
 def print_c99(form: Form, golden: Golden) -> dict[str, str]:
     """Contents of the files by name."""
-    dialect = _dialect(form.dtype)
+    dialect = c_dialect(form.dtype)
     tables: dict[bytes, str] = {}
     texts = [print_program(program, dialect, tables) for program in form.programs]
     return {
@@ -56,7 +56,8 @@ def print_c99(form: Form, golden: Golden) -> dict[str, str]:
     }
 
 
-def _dialect(dtype: str) -> Dialect:
+def c_dialect(dtype: str) -> Dialect:
+    """How C is written in double or single precision."""
     single = dtype == "float32"
 
     def literal(value: float) -> str:
@@ -117,7 +118,8 @@ def _arguments(program: Program) -> str:
     return ", ".join([*(f"const ccnn_real {name}[]" for name in program.inputs), *outputs])
 
 
-def _function(program: Program, text: Text) -> str:
+def c_function(program: Program, text: Text) -> str:
+    """A program as a static function of arrays."""
     body = [f"    {line}" for line in text.lines]
     before = [f"    ccnn_real {name}[{size}];" for name, size in text.buffers.items()]
     before += ["    ccnn_real sum;"] if text.sums else []
@@ -126,7 +128,8 @@ def _function(program: Program, text: Text) -> str:
     return "\n".join([f"static void ccnn_{program.name}({_arguments(program)})", "{", *before, *body, "}"])
 
 
-def _constants(name: str, values: Array, dialect: Dialect) -> str:
+def c_constants(name: str, values: Array, dialect: Dialect) -> str:
+    """A table."""
     flat = [dialect.literal(float(v)) for v in values.ravel()]
     rows = [", ".join(flat[k : k + 4]) for k in range(0, len(flat), 4)]
     return f"static const ccnn_real {name}[{len(flat)}] = {{\n    " + ",\n    ".join(rows) + "\n};"
@@ -136,12 +139,12 @@ def _source(form: Form, texts: list[Text], dialect: Dialect) -> str:
     parts = ['#include "compensator.h"', "", "#include <math.h>", "#include <stddef.h>", ""]
     s = "f" if form.dtype == "float32" else ""
     for name, values in {k: v for text in texts for k, v in text.tables.items()}.items():
-        parts += [_constants(name, values, dialect), ""]
+        parts += [c_constants(name, values, dialect), ""]
     numbers = {"ccnn_limit": form.limit * (1 + 1e-9), "ccnn_slack": form.slack}
     numbers |= {} if form.spread is None else {"ccnn_fallback_sd": form.fallback_sd}
     for name, values in numbers.items():
-        parts += [_constants(name, values, dialect), ""]
-    body = "\n\n".join(_function(program, text) for program, text in zip(form.programs, texts, strict=True))
+        parts += [c_constants(name, values, dialect), ""]
+    body = "\n\n".join(c_function(program, text) for program, text in zip(form.programs, texts, strict=True))
     for name, sign in (("min", "<"), ("max", ">")):
         if f"ccnn_{name}(" in body:
             parts += [SMALLER.format(name=name, sign=sign)]
@@ -160,11 +163,11 @@ def _selftest(form: Form, golden: Golden, dialect: Dialect) -> str:
     names = {"joints": golden.joints, "covariates": golden.covariates} | {
         k: v for k, v in outputs.items() if "status" not in k
     }
-    tables = [_constants(f"golden_{k}", v, dialect) for k, v in names.items() if v.size]
+    tables = [c_constants(f"golden_{k}", v, dialect) for k, v in names.items() if v.size]
     for k in ("status", "ideal_status"):
         rows = _whole(outputs[k])
         tables.append(f"static const char golden_{k}[{len(outputs[k])}] = {{\n    {rows}\n}};")
-    tables.append(_constants("tolerance", golden.tolerance, dialect))
+    tables.append(c_constants("tolerance", golden.tolerance, dialect))
     covariates = "golden_covariates + k * CCNN_COVARIATES" if golden.covariates.size else "NULL"
     sd = "" if form.spread is None else SD_TEST.replace("@RELATIVE@", dialect.literal(golden.relative))
     s = "f" if form.dtype == "float32" else ""

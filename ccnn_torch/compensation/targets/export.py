@@ -2,25 +2,110 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
-from ccnn_torch.compensation.model_files.identified import load_compensation
+from ccnn_torch.compensation.compensator import Compensator
+from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry, load_compensation
 from ccnn_torch.compensation.model_files.load import LoadedModel
+from ccnn_torch.compensation.model_files.save import save_model
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
 from ccnn_torch.compensation.targets.from_model import form_of
 from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal
+from ccnn_torch.compensation.targets.linuxcnc import print_linuxcnc
+from ccnn_torch.compensation.targets.robot import print_robot
 from ccnn_torch.compensation.targets.structured_text import print_structured_text
+from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.files.write import write_whole
+from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 from ccnn_torch.spelling import nearest
 from ccnn_torch.version import __version__
 
 __all__ = ["DTYPES", "TARGETS", "export_model"]
 
-TARGETS: dict[str, Callable[[Form, Golden], dict[str, str]]] = {"c99": print_c99, "st": print_structured_text}
 DTYPES = ("float64", "float32")
+
+
+@dataclass(frozen=True)
+class _Order:
+    """What is to be exported, and how; the parts that targets need are made when they ask."""
+
+    path: Path
+    model: LoadedModel | IdentifiedGeometry
+    dtype: str
+    sd: bool
+    allow_code: bool
+
+    def compensator(self) -> Compensator:
+        if not isinstance(self.model, LoadedModel):
+            raise ModelFileError(
+                f"{self.path}: identified geometry alone is solved by iteration until it converges, which this target "
+                "cannot; export it as linuxcnc or urdf, or train with it (ccnn run … geometry=identify) and export "
+                "that model.safetensors"
+            )
+        if self.model.compensator is None:
+            raise ModelFileError(f"{self.path}: an export is made of the master; give the .safetensors beside it")
+        return self.model.compensator
+
+    def proven(self) -> tuple[Form, Golden]:
+        compensator = self.compensator()
+        form = form_of(compensator, self.dtype, self.sd)
+        form.facts = [f"Compensation of the joints of {self.source()}."]
+        golden = golden_vectors(compensator, form)
+        require_equal(form, golden)
+        return form, golden
+
+    def source(self) -> str:
+        name, file = self.model.facts["mechanism"].get("name") or "a machine", self.path.name
+        told = f"{name}, written by ccnn_torch {__version__} from {file}"
+        if isinstance(self.model, LoadedModel):
+            return f"{told}, SHA-256 {self.model.card['files'][file]}"
+        return told
+
+    def mechanism(self) -> Mechanism:
+        if isinstance(self.model, IdentifiedGeometry):
+            return self.model.identified
+        described = self.model.facts["mechanism"]
+        if "spec" not in described:
+            raise ModelFileError(f"{self.path}: this target needs the machine's kinematics, which the model lacks")
+        return mechanism_from_description(described, self.allow_code)
+
+
+def _linuxcnc(order: _Order) -> dict[str, str]:
+    parts = None if isinstance(order.model, IdentifiedGeometry) else order.proven()
+    return print_linuxcnc(parts, order.mechanism(), order.source())
+
+
+def _onnx(order: _Order) -> dict[str, bytes]:
+    compensator = order.compensator()
+    assert isinstance(order.model, LoadedModel)
+    fields = {key: order.model.facts[key] for key in ("mechanism", "metrics", "data_sha256", "seed")}
+    made = Path(tempfile.mkdtemp())
+    try:
+        paths = save_model(made, compensator, fields, forms=("onnx", "float32.onnx"))
+        return {path.name: path.read_bytes() for path in paths.values()}
+    finally:
+        shutil.rmtree(made)
+
+
+def _table(order: _Order) -> dict[str, str]:
+    known = "spec" in order.model.facts["mechanism"]
+    return print_tables(order.compensator(), order.mechanism() if known else None)
+
+
+TARGETS: dict[str, Callable[[_Order], dict[str, str] | dict[str, bytes]]] = {
+    "c99": lambda order: print_c99(*order.proven()),
+    "st": lambda order: print_structured_text(*order.proven()),
+    "linuxcnc": _linuxcnc,
+    "onnx": _onnx,
+    "urdf": lambda order: print_robot(order.model),
+    "table": _table,
+}
 
 
 def export_model(
@@ -32,11 +117,12 @@ def export_model(
     public_key: str | Path | None = None,
     allow_code: bool = False,
 ) -> dict[str, Path]:
-    """Write a model as source code of a controller.
+    """Write a model as source code, table or file of a controller or simulator.
 
     Args:
-        path: a .safetensors file.
-        to: `c99` or `st` (IEC 61131-3 Structured Text).
+        path: a .safetensors file; for `linuxcnc` and `urdf` an identified.yaml, too.
+        to: `c99`, `st` (IEC 61131-3 Structured Text), `linuxcnc` (kinematics component), `onnx`, `urdf` (with MuJoCo
+            model and DH table), or `table` (error tables).
         out: folder; made where it is not there.
         dtype: `float64` or `float32`, in which the controller computes.
         sd: with a function for the standard deviation of the deviation.
@@ -57,23 +143,10 @@ def export_model(
             hint = f" (did you mean '{near}'?)" if near else ""
             raise InputError(f"there is no {what} '{value}'{hint}; there are {', '.join(known)}")
     model = load_compensation(path, public_key=public_key, allow_code=allow_code)
-    if not isinstance(model, LoadedModel):
-        raise ModelFileError(
-            f"{path}: identified geometry alone is solved by iteration until it converges, which a controller cannot; "
-            "train with it (ccnn run … geometry=identify) and export that model.safetensors"
-        )
-    if model.compensator is None:
-        raise ModelFileError(f"{path}: an export is made of the master; give the .safetensors beside it")
-    form = form_of(model.compensator, dtype, sd)
-    form.facts = [
-        f"Compensation of the joints of {model.facts['mechanism'].get('name') or 'a machine'}, "
-        f"written by ccnn_torch {__version__} from {Path(path).name}, SHA-256 {model.card['files'][Path(path).name]}."
-    ]
-    golden = golden_vectors(model.compensator, form)
-    require_equal(form, golden)
+    order = _Order(Path(path), model, dtype, sd, allow_code)
     folder = Path(out)
     # Printed before anything is written: a target may find that it lacks an operation.
-    contents = TARGETS[to](form, golden)
+    contents = TARGETS[to](order)
     for name, content in contents.items():
         write_whole(folder / name, content)
     return {name: folder / name for name in contents}

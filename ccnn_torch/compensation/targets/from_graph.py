@@ -51,12 +51,12 @@ class Value:
 
 
 def program_of(traced: GraphModule, name: str, inputs: Sequence[str], outputs: Sequence[str | None]) -> Program:
-    """A program of a traced module whose inputs and outputs are tensors of fixed shapes.
+    """A program of a traced function whose inputs and outputs are tensors of fixed shapes.
 
     Args:
-        traced: with its operations decomposed; parameters and buffers are attributes.
+        traced: with its operations decomposed.
         name: of the program.
-        inputs: names of the module's inputs.
+        inputs: names of the function's inputs.
         outputs: names of its outputs; None for one that is left out.
 
     Raises:
@@ -68,7 +68,7 @@ def program_of(traced: GraphModule, name: str, inputs: Sequence[str], outputs: S
     given: dict[str, int] = {}
     for node in graph.nodes:
         if node.op == "get_attr":
-            known[node] = getattr(traced, str(node.target)).detach()
+            known[node] = getattr(traced, node.target).detach()
         elif node.op == "placeholder":
             key = inputs[len(given)]
             shape = node.meta["val"].shape
@@ -77,7 +77,8 @@ def program_of(traced: GraphModule, name: str, inputs: Sequence[str], outputs: S
         elif node.op == "call_function":
             args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: known[n])
             known[node] = lowering.call(node, args, kwargs)
-    found: Any = torch.fx.node.map_arg(graph.output_node().args[0], lambda n: known[n])
+    found = torch.fx.node.map_arg(graph.output_node().args[0], lambda n: known[n])
+    found = found if isinstance(found, list | tuple) else [found]
     wanted = {key: lowering.ids(value) for key, value in zip(outputs, found, strict=True) if key is not None}
     return lowering.builder.program(name, given, wanted)
 
@@ -116,8 +117,8 @@ class _Lowering:
             return args[0][args[1]]
         if not any(isinstance(v, Value) for v in torch.utils._pytree.tree_leaves((args, kwargs))):
             return node.target(*args, **kwargs)  # type: ignore[operator]
-        if name in ("full_like", "zeros_like", "ones_like", "empty_like"):
-            fill = {"full_like": args[-1], "ones_like": 1.0}.get(name, 0.0)
+        if name in ("full_like", "zeros_like", "ones_like", "empty_like", "new_zeros", "new_ones", "new_full"):
+            fill = {"full_like": args[-1], "new_full": args[-1], "ones_like": 1.0, "new_ones": 1.0}.get(name, 0.0)
             return torch.full(node.meta["val"].shape, float(fill), dtype=torch.float64)
         if name in _MOVES:
             return self._moved(node, args, {k: v for k, v in kwargs.items() if k not in ("dtype", "memory_format")})
@@ -260,8 +261,19 @@ class _Lowering:
         count = math.prod(value.ids.shape[d] for d in dims)
         return self.each("mul", self.reduced("add", value, dims, keep), 1.0 / count)
 
+    def _rsub(self, a: Any, b: Any) -> Any:
+        return self.each("sub", b, a)
+
     def _square(self, value: Value) -> Any:
         return self.each("mul", value, value)
+
+    def _hypot(self, a: Any, b: Any) -> Any:
+        return self.each("sqrt", self.each("add", self.each("mul", a, a), self.each("mul", b, b)))
+
+    def _linalg_vector_norm(self, value: Value, order: Any = 2, dims: Any = None, keep: bool = False) -> Any:
+        assert order == 2, "lengths are Euclidean"
+        dims = [*range(value.ids.dim())] if dims is None else [dims] if isinstance(dims, int) else [*dims]
+        return self.each("sqrt", self.reduced("add", self._square(value), dims, keep))
 
     def _gt(self, a: Any, b: Any) -> Any:
         return self.each("lt", b, a)
@@ -271,6 +283,13 @@ class _Lowering:
 
     def _ne(self, a: Any, b: Any) -> Any:
         return self.each("not", self.each("eq", a, b))
+
+    def _nan_to_num(self, value: Value, nan: Any = None, posinf: Any = None, neginf: Any = None) -> Any:
+        most = torch.finfo(torch.float64).max
+        found = self.each("select", self._isnan(value), nan or 0.0, value)
+        for edge, to, usual in ((math.inf, posinf, most), (-math.inf, neginf, -most)):
+            found = self.each("select", self.each("eq", found, edge), usual if to is None else to, found)
+        return found
 
     def _isnan(self, value: Value) -> Any:
         return self._ne(value, value)

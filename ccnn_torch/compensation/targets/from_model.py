@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch._decomp import core_aten_decompositions
-from torch._ops import OpOverload
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.contraction import Steepness, iterations_needed
-from ccnn_torch.compensation.export.to_onnx import quiet_exporter
 from ccnn_torch.compensation.targets.form import Form, Program
 from ccnn_torch.compensation.targets.from_graph import program_of
 
-__all__ = ["SINGLE_TOLERANCE", "form_of"]
+__all__ = ["SINGLE_TOLERANCE", "form_of", "traced_program"]
 
 # Share of the limit to which single precision is right.
 SINGLE_TOLERANCE = 1e-5
@@ -70,22 +68,9 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     example = (point[:, :n].clone(), point[:, n:].clone())[: 2 if compensator.covariates else 1]
     names = ("joints", "covariates")[: len(example)]
 
-    # Into elementary operations, as torch.export decomposes them.
-    table = {op: rule for op, rule in core_aten_decompositions().materialize().items() if isinstance(op, OpOverload)}
-
-    def program(module: nn.Module, name: str, outputs: list[list[str | None]]) -> list[Program]:
-        # In a quarter of the time that torch.export needs, whose checks of shapes and guards have no use here.
-        def pure(*given: Tensor) -> tuple[Tensor, ...]:
-            found: tuple[Tensor, ...] = module(*given)
-            return found
-
-        with quiet_exporter(), torch.no_grad():
-            traced = make_fx(torch.func.functionalize(pure), table)(*example)
-        return [program_of(traced, name, names, some) for some in outputs]
-
     kept: list[list[str | None]] = [["deviation", "excess", None], *([[None, None, "sd"]] if sd else [])]
-    (clean,) = program(_Clean(compensator), "clean", [["joints", "covariates", "strange"]])
-    deviation, *spread = program(_Step(compensator), "deviation", kept)
+    (clean,) = _programs(_Clean(compensator), example, "clean", names, [["joints", "covariates", "strange"]])
+    deviation, *spread = _programs(_Step(compensator), example, "deviation", names, kept)
     for one in spread:
         one.name = "spread"
     limit = compensator.limit.numpy()
@@ -101,3 +86,27 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
         deviation,
         spread[0] if spread else None,
     )
+
+
+def traced_program(
+    module: nn.Module, example: tuple[Tensor, ...], name: str, inputs: Sequence[str], outputs: list[str | None]
+) -> Program:
+    """A module as a program, traced for one row.
+
+    Raises:
+        MethodFailedError: it has an operation that no form has.
+    """
+    return _programs(module, example, name, inputs, [outputs])[0]
+
+
+def _programs(
+    module: nn.Module,
+    example: tuple[Tensor, ...],
+    name: str,
+    inputs: Sequence[str],
+    outputs: list[list[str | None]],
+) -> list[Program]:
+    # By running it: operations on one row, those that mutate as ones that do not.
+    with torch.no_grad():
+        traced = make_fx(torch.func.functionalize(lambda *given: module(*given)), tracing_mode="real")(*example)
+    return [program_of(traced, name, inputs, some) for some in outputs]

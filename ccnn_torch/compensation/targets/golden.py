@@ -11,6 +11,7 @@ from torch import Tensor
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.contraction import TOLERANCE
 from ccnn_torch.compensation.export.export import probe_points
+from ccnn_torch.compensation.geometry.serial import SerialGeometry
 from ccnn_torch.compensation.targets.form import Array, Form
 from ccnn_torch.compensation.targets.from_model import SINGLE_TOLERANCE
 from ccnn_torch.compensation.targets.run import run_form
@@ -35,6 +36,7 @@ class Golden:
         outputs: as `run_form` gives them.
         tolerance: of deviation and of ideal - joints, `n` [SI].
         relative: of the standard deviation [1].
+        hard: why single precision may not hold the model.
     """
 
     joints: Array
@@ -42,6 +44,7 @@ class Golden:
     outputs: dict[str, Array]
     tolerance: Array
     relative: float
+    hard: str
 
     def errors(self, found: dict[str, Array]) -> dict[str, float]:
         """Largest difference of each output, in units of what is allowed: above 1 is wrong."""
@@ -88,7 +91,7 @@ def golden_vectors(compensator: Compensator, form: Form) -> Golden:
     share = max(TOLERANCE, *(float(getattr(part, "export_tolerance", TOLERANCE)) for part in parts))
     share = SINGLE_TOLERANCE if form.dtype == "float32" else share
     values = given.numpy()
-    return Golden(values[:, :n], values[:, n:], outputs, share * form.limit, 10 * share)
+    return Golden(values[:, :n], values[:, n:], outputs, share * form.limit, 10 * share, _hard(compensator))
 
 
 def require_equal(form: Form, golden: Golden) -> dict[str, float]:
@@ -102,7 +105,7 @@ def require_equal(form: Form, golden: Golden) -> dict[str, float]:
     if wrong and form.dtype == "float32":
         raise MethodFailedError(
             f"single precision does not hold this model: its output '{wrong[0]}' is off by more than "
-            f"{SINGLE_TOLERANCE:g} of the limit; export it in float64"
+            f"{SINGLE_TOLERANCE:g} of the limit ({golden.hard}); export it in float64"
         )
     if wrong:
         raise MethodFailedError(
@@ -110,6 +113,18 @@ def require_equal(form: Form, golden: Golden) -> dict[str, float]:
             "of the limit; report the model and the versions of torch and numpy"
         )
     return worst
+
+
+def _hard(compensator: Compensator) -> str:
+    """Which part of a model single precision rounds by more than a small share of its limit, most likely."""
+    step, limit = float(np.finfo("float32").eps), float(compensator.limit.max())
+    if isinstance(compensator.geometry, SerialGeometry):
+        return f"it computes the arm's links: a length of 1 m is rounded to {step:.1g} m, and the limit is {limit:.1g}"
+    if compensator.effects is not None:
+        return "its physical effects are polynomials of many terms, which cancel"
+    if getattr(compensator.network, "export_tolerance", TOLERANCE) > TOLERANCE:
+        return "its network is a sum of many terms, which cancel"
+    return f"a joint of 1 m or rad is rounded to {step:.1g}, and the limit is {limit:.1g}"
 
 
 def _split(rows: Tensor, n: int) -> tuple[Tensor, Tensor | None]:

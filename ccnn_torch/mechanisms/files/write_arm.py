@@ -14,9 +14,9 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.machines.link_frames import compose
 from ccnn_torch.mechanisms.machines.serial import SerialArm
-from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
 
-__all__ = ["dh_text", "urdf_text"]
+__all__ = ["dh_text", "mjcf_text", "urdf_text"]
 
 _CONVENTIONS = {
     "standard": "standard Denavit-Hartenberg; link i = Rz(q_i + theta_i) * Tz(d_i) * Tx(a_i) * Rx(alpha_i)",
@@ -69,6 +69,48 @@ def urdf_text(arm: SerialArm) -> str:
     from ours in its last digit. Limits are those that joints are sampled from; URDF wants an effort and a speed, which
     a calibration does not know and which are written as 0.
     """
+    origins, last = _chain(arm)
+    root = Element("robot", name=arm.name)
+    names = ["base_link", *(f"link{i + 1}" for i in range(len(origins))), "tool"]
+    for name in names:
+        SubElement(root, "link", name=name)
+    for i, origin in enumerate(origins):
+        kind = "revolute" if bool(arm.revolute[i]) else "prismatic"
+        joint = _joint(root, arm.joints[i].name, kind, names[i], names[i + 1], origin)
+        SubElement(joint, "axis", xyz=_numbers(arm.axes[i] * arm.signs[i]))
+        low, high = arm.limits[i].tolist()
+        SubElement(joint, "limit", lower=repr(low), upper=repr(high), effort="0", velocity="0")
+    _joint(root, "tool_frame", "fixed", names[-2], names[-1], last)
+    ElementTree.indent(root)
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def mjcf_text(arm: SerialArm) -> str:
+    """The arm's nominal parameters as a MuJoCo model: nested bodies, joints without friction, a site `tool`.
+
+    MuJoCo wants masses, which a calibration does not know: each link has 1 kg and 0.01 kg m², without gravity.
+    """
+    origins, last = _chain(arm)
+    root = Element("mujoco", model=arm.name)
+    SubElement(root, "compiler", angle="radian", autolimits="true")
+    SubElement(root, "option", gravity="0 0 0")
+    body = SubElement(root, "worldbody")
+    for i, origin in enumerate(origins):
+        body = SubElement(body, "body", {"name": f"link{i + 1}", **_placed(origin)})
+        SubElement(body, "inertial", pos="0 0 0", mass="1", diaginertia="0.01 0.01 0.01")
+        kind = "hinge" if bool(arm.revolute[i]) else "slide"
+        axis, limits = _numbers(arm.axes[i] * arm.signs[i]), _numbers(arm.limits[i])
+        SubElement(body, "joint", name=arm.joints[i].name, type=kind, axis=axis, range=limits)
+    SubElement(body, "site", {"name": "tool", **_placed(last)})
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+_Frame = tuple[Tensor, Tensor]
+
+
+def _chain(arm: SerialArm) -> tuple[list[_Frame], _Frame]:
+    """Fixed transforms before each joint's motion, base included, and behind the last, tool included."""
     n = len(arm.joints)
     values = arm.nominal
     links = values[6:-6].reshape(n, -1)
@@ -81,19 +123,15 @@ def urdf_text(arm: SerialArm) -> str:
         origins, last = [base, *fixed[:-1]], compose(fixed[-1], tool)
     else:
         origins, last = [compose(base, fixed[0]), *fixed[1:]], tool
-    root = Element("robot", name=arm.name)
-    names = ["base_link", *(f"link{i + 1}" for i in range(n)), "tool"]
-    for name in names:
-        SubElement(root, "link", name=name)
-    for i, origin in enumerate(origins):
-        kind = "revolute" if bool(arm.revolute[i]) else "prismatic"
-        joint = _joint(root, arm.joints[i].name, kind, names[i], names[i + 1], origin)
-        SubElement(joint, "axis", xyz=_numbers(arm.axes[i] * arm.signs[i]))
-        low, high = arm.limits[i].tolist()
-        SubElement(joint, "limit", lower=repr(low), upper=repr(high), effort="0", velocity="0")
-    _joint(root, "tool_frame", "fixed", names[-2], names[-1], last)
-    ElementTree.indent(root)
-    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+    return origins, last
+
+
+def _placed(frame: _Frame) -> dict[str, str]:
+    turn = matrix_to_rotation_vector(frame[0])
+    half = torch.linalg.vector_norm(turn) / 2
+    # sin(x) / x, also at 0.
+    quaternion = torch.cat([torch.cos(half)[None], turn / 2 * torch.sinc(half / torch.pi)])
+    return {"pos": _numbers(frame[1]), "quat": _numbers(quaternion)}
 
 
 def _joint(root: Element, name: str, kind: str, parent: str, child: str, origin: tuple[Tensor, Tensor]) -> Element:

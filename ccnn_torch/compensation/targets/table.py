@@ -1,0 +1,179 @@
+"""Error tables for controllers that take nothing else, each with how far its interpolation is from the model."""
+
+from __future__ import annotations
+
+import csv
+import io
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ccnn_torch.compensation.compensator import Compensator
+from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.mechanisms import Mechanism
+
+__all__ = ["print_tables"]
+
+Array = NDArray[Any]
+
+# Points of the whole grid at most, and along one axis (LinuxCNC takes 256).
+_MOST, _ALONG = 20_000, 64
+_CHECKED = 2000
+# What one axis alone must explain of its own deviation, by RMS, so that its table is worth having.
+_SUFFICES = 0.2
+_MESH = 9
+_NAMES = {"m": ("mm", 1e3), "rad": ("deg", 180 / np.pi)}
+
+
+def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[str, str]:
+    """Contents of the files by name: the grid, tables of single axes, a mesh, and what each leaves.
+
+    Args:
+        compensator: fitted; its covariates stand at the middle of the domain.
+        mechanism: nominal, for the mesh; None where it is not known.
+
+    Raises:
+        MethodFailedError: a grid of so many joints would have less than three points along each.
+    """
+    joints, n = compensator.joints, len(compensator.joints)
+    count = min(_ALONG, int(_MOST ** (1 / n)))
+    if count < 3:
+        raise MethodFailedError(f"a table over {n} joints would be too coarse; export the model as c99 or st")
+    low, high = (v[:n].numpy() for v in (compensator.domain.low, compensator.domain.high))
+    lines = [np.linspace(a, b, count) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
+    values = _deviation(compensator, grid.reshape(-1, n)).reshape(grid.shape)
+    checked = _inside(compensator, low + (high - low) * np.random.default_rng(0).random((_CHECKED, n)))
+    truth = _deviation(compensator, checked)
+    tables = {"table.csv": _csv(compensator, grid.reshape(-1, n), values.reshape(-1, n))}
+    told = [_said("table.csv", "all joints, linear between the points", truth, _between(lines, values, checked))]
+    rows = []
+    for j, joint in enumerate(joints):
+        name, scale = _NAMES.get(joint.unit, (joint.unit, 1.0))
+        line = np.linspace(low[j], high[j], _ALONG)
+        own = np.array([truth[near, j].mean() for near in _bins(checked[:, j], line)])
+        left = truth[:, j] - np.interp(checked[:, j], line, own)
+        share = _rms(left) / max(_rms(truth[:, j]), 1e-300)
+        rows.append(
+            f"| {joint.name} | {_rms(truth[:, j]) * scale:.3g} {name} | {_rms(left) * scale:.3g} {name} | "
+            f"{np.abs(left).max() * scale:.3g} {name} | {'yes' if share <= _SUFFICES else 'no: c99, st or table.csv'} |"
+        )
+        if share <= _SUFFICES:
+            tables[f"linuxcnc_{joint.name}.comp"] = _screw(line * scale, own * scale)
+            tables[f"heidenhain_{joint.name}.com"] = _heidenhain(joint.name, name, line * scale, own * scale)
+    axes = "| joint | deviation, RMS | left by its own table, RMS | at most | one axis suffices |\n"
+    told.append(axes + "| --- | --- | --- | --- | --- |\n" + "\n".join(rows))
+    if mechanism is not None and [c.name for c in mechanism.pose] == ["x", "y", "z"]:
+        tables["klipper_mesh.cfg"], sentence = _mesh(compensator, mechanism)
+        told.append(sentence)
+    told += [text for form, text in _FORMS.items() if any(name.startswith(form) for name in tables)]
+    middle = compensator.domain.centre[n:].tolist()
+    at = ", ".join(f"{c.name} = {v:.6g} {c.unit}" for c, v in zip(compensator.covariates, middle, strict=True))
+    return tables | {"README.md": README.format(told="\n\n".join(told), at=f" Covariates stand at {at}." if at else "")}
+
+
+README = """# Error tables
+
+Deviation: what the machine adds to a commanded joint, so subtract it.{at}
+Errors are over random points of the domain of the training rows.
+
+{told}
+"""
+_FORMS = {
+    "linuxcnc": "`linuxcnc_JOINT.comp`: `COMP_FILE` of its `[JOINT_N]`, with `COMP_FILE_TYPE = 1` (nominal, forward "
+    "trim, reverse trim).",
+    "heidenhain": "`heidenhain_JOINT.com`: columns AXISPOS, BACKLASH and the axis, in the form of the manufacturer's "
+    "manuals, with the deviation as it is; it was not tried on a control, so check its sign with one point.",
+    "klipper": "`klipper_mesh.cfg` is a saved profile of `[bed_mesh]` for the section SAVE_CONFIG of printer.cfg.",
+}
+
+
+def _deviation(compensator: Compensator, joints: Array) -> Array:
+    covariates = compensator.domain.centre[joints.shape[1] :].repeat(len(joints), 1)
+    with torch.no_grad():
+        found: Array = compensator.deviation(
+            torch.from_numpy(joints), covariates if covariates.shape[1] else None
+        ).numpy()
+    return found
+
+
+def _inside(compensator: Compensator, joints: Array) -> Array:
+    """Those in the domain; all where too few are."""
+    covariates = compensator.domain.centre[joints.shape[1] :].repeat(len(joints), 1)
+    inputs = torch.cat([torch.from_numpy(joints), covariates], -1)
+    inside = (compensator.domain.excess(compensator.domain.cage(inputs)) <= 0).squeeze(-1).numpy()
+    return joints[inside] if inside.sum() > 50 else joints
+
+
+def _between(lines: list[Array], values: Array, points: Array) -> Array:
+    # It takes a second to load, which commands that write no table need not wait for.
+    from scipy.interpolate import RegularGridInterpolator
+
+    return np.asarray(RegularGridInterpolator(lines, values)(points))
+
+
+def _bins(at: Array, line: Array) -> list[Array]:
+    """For each point of a line the rows nearest to it, at least twenty."""
+    order = [np.argsort(np.abs(at - x), kind="stable") for x in line]
+    half = (line[1] - line[0]) / 2
+    return [o[: max(20, int((np.abs(at - x) <= half).sum()))] for o, x in zip(order, line, strict=True)]
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _said(name: str, what: str, truth: Array, found: Array) -> str:
+    off = np.abs(found - truth)
+    return (
+        f"`{name}`: {what}. RMS deviation {_rms(truth):.3g}; the table is off by {_rms(off):.3g} (RMS), "
+        f"{off.max():.3g} at most [SI]."
+    )
+
+
+def _csv(compensator: Compensator, grid: Array, values: Array) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([c.header for c in compensator.joints] + [f"deviation_{c.header}" for c in compensator.joints])
+    writer.writerows([repr(float(v)) for v in row] for row in np.hstack([grid, values]))
+    return text.getvalue()
+
+
+def _screw(line: Array, own: Array) -> str:
+    """Nominal position and what is added to it, forward and back."""
+    return "".join(f"{x:.6f} {-d:.6f} {-d:.6f}\n" for x, d in zip(line, own, strict=True))
+
+
+def _heidenhain(joint: str, unit: str, line: Array, own: Array) -> str:
+    head = f"BEGIN {joint.upper()}.COM {unit.upper()}\n{'NR':<4}{'AXISPOS':>14}{'BACKLASH':>12}{joint.upper():>12}\n"
+    rows = [f"{k:<4}{x:>+14.4f}{0:>+12.4f}{d:>+12.5f}\n" for k, (x, d) in enumerate(zip(line, own, strict=True))]
+    return head + "".join(rows) + "[END]\n"
+
+
+def _mesh(compensator: Compensator, mechanism: Mechanism) -> tuple[str, str]:
+    """What is added to z over x and y in the middle of the heights [mm], and a sentence on what a mesh leaves."""
+    (x0, y0, z0), (x1, y1, z1) = (v.tolist() for v in mechanism.bounds)
+    xs, ys = np.linspace(x0, x1, _MESH), np.linspace(y0, y1, _MESH)
+    gap = _missed(compensator, mechanism, xs, ys, (z0 + z1) / 2)
+    other = _missed(compensator, mechanism, xs, ys, z0)
+    points = "\n".join("    " + ", ".join(f"{-v * 1e3:.6f}" for v in row) for row in gap[..., 2])
+    keys = {"x_count": _MESH, "y_count": _MESH, "mesh_x_pps": 2, "mesh_y_pps": 2, "algo": "bicubic", "tension": 0.2}
+    keys |= {"min_x": x0 * 1e3, "max_x": x1 * 1e3, "min_y": y0 * 1e3, "max_y": y1 * 1e3}
+    text = f"[bed_mesh ccnn]\nversion = 1\npoints =\n{points}\n" + "".join(f"{k} = {v}\n" for k, v in keys.items())
+    aside, change = _rms(gap[..., :2]) * 1e3, _rms(other[..., 2] - gap[..., 2]) * 1e3
+    return text, (
+        f"`klipper_mesh.cfg`: error of z over x and y at z = {(z0 + z1) / 2 * 1e3:.6g} mm. It leaves those of x and y "
+        f"({aside:.3g} mm RMS), and at z = {z0 * 1e3:.6g} mm the error of z is another by {change:.3g} mm RMS."
+    )
+
+
+def _missed(compensator: Compensator, mechanism: Mechanism, xs: Array, ys: Array, z: float) -> Array:
+    """Position error of the uncompensated machine, `y x x x 3` [m]; 0 where it cannot go."""
+    pose = torch.tensor([[x, y, z] for y in ys for x in xs], dtype=torch.float64)
+    joints = mechanism.solve_inverse(pose)
+    reached = mechanism.forward_kinematics(
+        joints + torch.from_numpy(_deviation(compensator, joints.nan_to_num().numpy()))
+    )
+    return (reached - pose).nan_to_num().numpy().reshape(len(ys), len(xs), 3)
