@@ -1,0 +1,169 @@
+"""From fitted sets to a verdict on each axis: tempered posterior, classes, and what is outside the library.
+
+Evidence counts every sample as new information about one right model. The model is never right, so that log odds are
+tempered by how evenly the stretches of the logs bear them: where the difference of two models' log likelihoods, summed
+over the stretches, is D with a variance V, a normal variable with that mean and variance has log odds 2 D^2 / V, and these
+equal D where the model is right. The smaller of both counts.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.motion.drivers import driver_columns
+from ccnn_torch.motion.fit import Fit, sensitivities
+from ccnn_torch.motion.problem import Problem, Whitening
+from ccnn_torch.motion.search import CROWD, Search, log_posterior
+
+__all__ = ["AxisVerdict", "judge_axes"]
+
+# Log prior odds of a driver.
+_OUTSIDE = math.log(0.001)
+# Log odds below which one effect can stand in the place of another.
+_LIKE = math.log(20.0)
+# A driver is part of the cause where it takes away this share of the mean square that the best set leaves, unwhitened.
+_SHARE = 0.1
+# Claims are never surer.
+_MOST = 0.995
+
+
+class AxisVerdict(NamedTuple):
+    """The verdict on one axis.
+
+    Attributes:
+        best: the most probable set, without members that do nothing.
+        probability: of the set, its members standing for their classes.
+        marginal: probability of each effect that was fitted, by its number.
+        classes: of each member the effects that can stand in its place.
+        driver: what the residual follows outside the library; None where nothing is needed.
+    """
+
+    best: Fit
+    probability: float
+    marginal: dict[int, float]
+    classes: dict[int, tuple[int, ...]]
+    driver: str | None
+
+
+def judge_axes(found: Search) -> list[AxisVerdict]:
+    """The verdict on each axis."""
+    verdicts = []
+    outside = _outside(found)
+    for i, fits in enumerate(found.found):
+        best = fits[0]
+        odds = {f.members: _odds(best, f) for f in fits}
+        weight = {m: math.exp(-value) for m, value in odds.items()}
+        driver, against = outside[i]
+        extra = math.exp(min(against, 50.0))
+        total = sum(weight.values()) + extra
+        classes = {m: _class(found.problem, best, m, odds) for m in best.members}
+        same = sum(w for members, w in weight.items() if _same(members, best.members, classes))
+        marginal = {
+            e: sum(w for members, w in weight.items() if e in members) / sum(weight.values())
+            for e in {e for f in fits for e in f.members}
+        }
+        wild = extra / total > 0.5
+        probability = extra / total if wild else same / total
+        verdicts.append(AxisVerdict(best, min(probability, _MOST), marginal, classes, driver if wild else None))
+    return verdicts
+
+
+def _odds(best: Fit, other: Fit) -> float:
+    """Tempered log odds of the best set against another, at least 0."""
+    evidence = best.log_evidence - other.log_evidence
+    prior = log_posterior(best) - log_posterior(other) - evidence
+    gained = 0.5 * (other.squares - best.squares) / best.noise
+    return max(evidence * (_temper(gained) if evidence > 0 else 1.0) + prior, 0.0)
+
+
+def _temper(gained: Tensor) -> float:
+    """Share of log odds that counts; gained: difference of log likelihoods by stretch."""
+    whole = float(gained.sum())
+    if whole <= 0 or len(gained) < 3:
+        return 1.0
+    variance = float(len(gained) * gained.var())
+    return min(1.0, 2 * whole / max(variance, 1e-300))
+
+
+def _class(problem: Problem, best: Fit, member: int, odds: dict[tuple[int, ...], float]) -> tuple[int, ...]:
+    """Effects that can stand in the place of a member."""
+    rest = set(best.members) - {member}
+    like = []
+    for members, value in odds.items():
+        new = set(members) - rest
+        if rest <= set(members) and len(new) == 1 and member not in new and value < _LIKE:
+            like.append((value, new.pop()))
+    return tuple(e for _, e in sorted(like))
+
+
+def _same(members: tuple[int, ...], best: tuple[int, ...], classes: dict[int, tuple[int, ...]]) -> bool:
+    """Whether a set is the best one, members of classes exchanged."""
+    if len(members) != len(best):
+        return False
+    left = set(members)
+    for m in best:
+        one = next((e for e in (m, *classes[m]) if e in left), None)
+        if one is None:
+            return False
+        left.remove(one)
+    return True
+
+
+def _outside(found: Search) -> list[tuple[str | None, float]]:
+    """Of each axis the driver that explains most beside the best set, and its tempered log odds."""
+    problem = found.problem
+    best = [fits[0] for fits in found.found]
+    specs = [f.spec for f in best]
+    groups = driver_columns(problem, specs)
+    wide = max(len(s.flat) for s in specs)
+    active = torch.full((1, len(specs), wide), -1)
+    for i, s in enumerate(specs):
+        active[0, i, : len(s.flat)] = torch.tensor(s.flat, dtype=torch.int64)
+    theta = torch.stack([s.theta for s in specs])[None]
+    residual, own = sensitivities(problem, found.whitening, theta, active)
+    plain = problem.residual(theta)[0]
+    values = float(problem.judged.sum())
+    blocks = problem.judged.shape
+    answers: list[tuple[str | None, float]] = []
+    for i, s in enumerate(specs):
+        m = len(s.flat)
+        base, y = own[i, 0, :m], residual[i, 0] + s.theta[list(s.flat)] @ own[i, 0, :m]
+        starts, begin = [], 0
+        for group in s.active:
+            starts.append(torch.arange(begin, begin + len(group)))
+            begin += len(group)
+        top: tuple[str | None, float] = (None, -math.inf)
+        for name, columns in groups.items():
+            white = problem.whitened(columns[i][:, None], _one(found, i))[0]
+            x = torch.cat([base, white])
+            grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
+            wild = torch.arange(m, len(x))
+            fit = fit_sets(grams, [starts, [*starts, wild]], 0.0)
+            mean = fit.mean[1]
+            left = y - mean @ x
+            after = left.square().unflatten(-1, blocks).sum(-1)
+            before = best[i].squares
+            count = len(s.members)
+            prior = _OUTSIDE + (CROWD if count >= 2 else 0.0)
+            odds = float(fit.log_evidence[1] - fit.log_evidence[0])
+            odds = odds * (_temper(0.5 * (before - after) / best[i].noise) if odds > 0 else 1.0) + prior
+            # What it takes away of the position itself, not of its whitened form.
+            taken = plain[i] - (mean[m:, None, None] * columns[i]).sum(0)
+            judged = problem.data.judged
+            share = 1 - float(taken[judged].square().sum() / plain[i][judged].square().sum().clamp_min(1e-300))
+            if share < _SHARE:
+                odds = min(odds, _OUTSIDE)
+            if odds > top[1]:
+                top = (name, odds)
+        answers.append(top)
+    return answers
+
+
+def _one(found: Search, axis: int) -> Whitening:
+    """The whitening of one axis."""
+    return Whitening(found.whitening.coefficients[axis : axis + 1])
