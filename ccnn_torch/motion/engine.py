@@ -215,8 +215,14 @@ def _facts(data: Stretches, i: int, nominal: Nominal, followed: Tensor, supply: 
         acceleration=nearly(rise[judged[:, 1:]]) or 1.0,
         error=nearly((followed[i] - data.position[i])[judged]) or 1e-6,
         supply=float(supply[judged].abs().max()) if "supply" in data.beside else 0.0,
-        temperature=float(warm[judged].max()),
+        temperature=_within_runs(data, warm),
     )
+
+
+def _within_runs(data: Stretches, warm: Tensor) -> float:
+    """The largest change of the temperature in one run: between runs other things change as well."""
+    own = [warm[data.run == run][data.judged[data.run == run]] for run in data.run.unique()]
+    return max(float(v.max() - v.min()) for v in own)
 
 
 def _none(library: Library) -> Spec:

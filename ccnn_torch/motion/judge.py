@@ -1,9 +1,10 @@
 """From fitted sets to a verdict on each axis: tempered posterior, classes, and what is outside the library.
 
 Evidence counts every sample as new information about one right model. The model is never right, so that log odds are
-tempered by how evenly the stretches of the logs bear them: where the difference of two models' log likelihoods, summed
-over the stretches, is D with a variance V, a normal variable with that mean and variance has log odds 2 D^2 / V, and these
-equal D where the model is right. The smaller of both counts.
+tempered by the stretches of the logs. Of a difference of log likelihoods, D over all stretches, those stretches that speak
+against it, d < 0, show how far chance reaches: a normal variable with the mean D and twice their sum of squares as its
+variance has log odds D^2 / sum(d^2). And no stretch alone bears a verdict: odds are at most twice those without the
+stretch that speaks most for it. The smallest of the three counts.
 """
 
 from __future__ import annotations
@@ -78,16 +79,17 @@ def _odds(best: Fit, other: Fit) -> float:
     evidence = best.log_evidence - other.log_evidence
     prior = log_posterior(best) - log_posterior(other) - evidence
     gained = 0.5 * (other.squares - best.squares) / best.noise
-    return max(evidence * (_temper(gained) if evidence > 0 else 1.0) + prior, 0.0)
+    return max(_tempered(evidence, gained) + prior, 0.0)
 
 
-def _temper(gained: Tensor) -> float:
-    """Share of log odds that counts; gained: difference of log likelihoods by stretch."""
+def _tempered(evidence: float, gained: Tensor) -> float:
+    """The log odds that count; gained: difference of log likelihoods by stretch."""
     whole = float(gained.sum())
-    if whole <= 0 or len(gained) < 3:
-        return 1.0
-    variance = float(len(gained) * gained.var())
-    return min(1.0, 2 * whole / max(variance, 1e-300))
+    if evidence <= 0 or whole <= 0 or len(gained) < 3:
+        return evidence
+    against = float(gained.clamp_max(0).square().sum())
+    rest = whole - float(gained.max())
+    return max(min(evidence, whole**2 / max(against, 1e-300), 2 * rest), 0.0)
 
 
 def _class(problem: Problem, best: Fit, member: int, odds: dict[tuple[int, ...], float]) -> tuple[int, ...]:
@@ -151,7 +153,7 @@ def _outside(found: Search) -> list[tuple[str | None, float]]:
             count = len(s.members)
             prior = _OUTSIDE + (CROWD if count >= 2 else 0.0)
             odds = float(fit.log_evidence[1] - fit.log_evidence[0])
-            odds = odds * (_temper(0.5 * (before - after) / best[i].noise) if odds > 0 else 1.0) + prior
+            odds = _tempered(odds, 0.5 * (before - after) / best[i].noise) + prior
             # What it takes away of the position itself, not of its whitened form.
             taken = plain[i] - (mean[m:, None, None] * columns[i]).sum(0)
             judged = problem.data.judged

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ccnn_torch.motion.fit import Fit, sensitivities
 from ccnn_torch.motion.judge import AxisVerdict
+from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem, Whitening
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.stretches import Stretches
@@ -96,7 +97,8 @@ def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[d
         middle, amplitude = float(position.mean()), 0.5 * float(position.max() - position.min())
         if not amplitude:
             continue
-        rivals = _rivals(found.found[i], verdict)
+        # Two effects that do the same to this model are told apart by no motion.
+        rivals = [f for f in _rivals(found.found[i], verdict) if not _alike(library, i, verdict.best, f)]
         for motion in motions(middle, amplitude, library.facts[i].speed, library.facts[i].unit):
             problem = _problem_of(found.problem, i, motion)
             whitening = Whitening(found.whitening.coefficients[i : i + 1])
@@ -136,6 +138,15 @@ def _rivals(fits: Sequence[Fit], verdict: AxisVerdict) -> list[Fit]:
             wanted = tuple(sorted({*verdict.best.members} - {member} | {other}))
             found += [f for f in fits if f.members == wanted]
     return found[:_RIVALS]
+
+
+def _alike(library: Library, axis: int, best: Fit, rival: Fit) -> bool:
+    """Whether two sets act on the same parameters of the axis."""
+    acts = [
+        sorted(act for member in f.members for j in library.places[member] for act in library.numbers[axis][j].acts)
+        for f in (best, rival)
+    ]
+    return acts[0] == acts[1]
 
 
 def _apart(names: Sequence[str], best: Fit, rival: Fit) -> list[str]:

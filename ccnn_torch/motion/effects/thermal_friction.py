@@ -1,4 +1,4 @@
-"""Friction that changes with the temperature: grease and seals."""
+"""Dry friction that changes with the temperature (grease, seals): seen beside dry friction that is known or found."""
 
 from __future__ import annotations
 
@@ -19,10 +19,7 @@ class _ThermalFriction:
         return "" if axis.temperature >= _LEAST else f"a column temperature[degC] that changes by {_LEAST:.0f} K"
 
     def numbers(self, axis: Facts) -> tuple[Number, ...]:
-        return (
-            Number("coulomb", "torque", 0.02, (add("coulomb"),)),
-            Number("change", "1/K", 0.02, (add("thermal"),), -0.5),
-        )
+        return (Number("change", "1/K", 0.02, (add("thermal"),), -0.5),)
 
     def shapes(self, axis: Facts) -> tuple[Mapping[str, float], ...]:
         return ({},)
