@@ -178,15 +178,18 @@ class _Rule:
         mass = a["inertia"] / h
         motor = gain * (u - q)
         free = mass * v
+        load = np.minimum(np.maximum(motor, -limit), limit) if self.has["weakness"] else motor
         if self.heavy:
-            free = free - self.weight * np.sin(q + self.hang)
+            pull = self.weight * np.sin(q + self.hang)
+            free = free - pull
+            load = motor + pull
         if self.waves:
             free = free - self.wave * np.sin(a["cogging_order"] * q + self.phase)
         friction = dry
         if self.has["stribeck"]:
             friction = friction + a["stribeck"] * np.exp(-np.square(v / a["stribeck_speed"]))
         if self.has["load_friction"]:
-            friction = friction + a["load_friction"] * np.minimum(np.abs(motor), limit)
+            friction = friction + a["load_friction"] * np.abs(load)
         light = np.maximum(mass + a["viscous"], _TINY)
         speed = self.solved(free + motor, friction, light + gain * h)
         if self.has["weakness"]:

@@ -27,7 +27,8 @@ _DAMPING, _LESS, _MORE = 1e-3, 0.2, 10.0
 _FARTHEST = 5.0
 # Simulated values that are held in memory at a time.
 _VALUES = 3e7
-_GAINED = 1e-5
+# Half deviance for each value that a step must gain for another one to be made.
+_GAINED = 1e-4
 
 
 class Spec(NamedTuple):

@@ -24,6 +24,8 @@ _UNITS, _SLACK = {np.degrees(1.0): ("degrees", "radians"), 1000.0: ("mm", "m")},
 _SHORTEST, _FEWEST, _LAGS = 1.0, 100, 8.0
 # Lags that are tried, as a share of the log.
 _LONGEST_LAG = 0.25
+# Correlation from which a position is the delayed command.
+_ALIKE = 0.9
 
 
 def refuse_mistakes(logs: Sequence[Log]) -> None:
@@ -64,14 +66,16 @@ def refuse_mistakes(logs: Sequence[Log]) -> None:
 
 def lag_of(log: Log, joint: int) -> float:
     """The time shift at which a position is most like its command [s]; 0 where it does not move."""
-    command, position = log.command[:, joint], log.position[:, joint]
+    command, position = log.command[log.on, joint], log.position[log.on, joint]
     if len(command) < 3 or not np.ptp(command) or not np.ptp(position):
         return 0.0
     step = float(np.median(np.diff(log.time)))
     c, q = command - command.mean(), position - position.mean()
     size = 1 << (2 * len(c) - 1).bit_length()
     like = np.fft.irfft(np.fft.rfft(q, size) * np.conj(np.fft.rfft(c, size)), size)[: max(int(_LONGEST_LAG * len(c)), 1)]
-    return int(np.argmax(like)) * step
+    best = int(np.argmax(like))
+    # A position that is not the command at all lags behind it by nothing.
+    return best * step if like[best] > _ALIKE * np.linalg.norm(c) * np.linalg.norm(q) else 0.0
 
 
 def _refuse_units(names: str, command: Array, position: Array) -> None:

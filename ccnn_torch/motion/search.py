@@ -27,10 +27,10 @@ _BEAM, _FITTED, _MOST = 2, 4, 9
 # Log posterior that a level must bring.
 _GAINED = 1.0
 # Sets that are fitted anew under another noise.
-_KEPT = 10
+_KEPT = 6
 # Difference quotients of the screen, for numbers that begin at 0 [plausible sizes].
 _STEP = 0.1
-_LONG, _SHORT = 10, 5
+_LONG, _SHORT, _FEW = 8, 5, 3
 
 
 class Search(NamedTuple):
@@ -66,7 +66,6 @@ def search(problem: Problem) -> Search:
     pool = _Pool(problem, fitted_whitening(problem.pooled(rich), problem.judged))
     pool.again(plain)
     pool.forward()
-    pool.neighbours()
     # The noise of what is left by what is most probable now.
     theta = torch.stack([f.spec.theta for f in pool.best()])[None]
     left = problem.residual(theta)[0]
@@ -112,7 +111,7 @@ class _Pool:
         """Fit the most probable sets of another pool under this noise, and every effect alone."""
         ranked = other.ranked()
         self.fit([[f.spec for f in fits[:_KEPT] if len(f.members) > 1] for fits in ranked], _LONG)
-        self.fit([[f.spec for f in fits if len(f.members) == 1] for fits in ranked], _SHORT)
+        self.fit([[f.spec for f in fits if len(f.members) == 1] for fits in ranked], _FEW)
 
     def forward(self) -> None:
         """Add effects one after the other, as long as that brings evidence."""
