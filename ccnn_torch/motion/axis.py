@@ -43,6 +43,7 @@ ABSENT: dict[str, float] = {
     "offset": 0.0,
     "supply": 0.0,
     "play": 0.0,
+    "play_loaded": 0.0,
     "flexibility": 0.0,
     "flexible_damping": 0.1,
 }
@@ -51,6 +52,8 @@ ABSENT: dict[str, float] = {
 Array = NDArray[np.float64]
 _GAMMA = 1 - 1 / math.sqrt(2)
 _TINY = 1e-9
+# Share of its usual size at which a load presses a play to one side altogether.
+_CROSSED = 0.15
 # rad/s or m/s: no axis is faster, and no number may overflow.
 _FASTEST = 1e4
 # Steps longer than this, in units of the axis' own time constant, are divided.
@@ -123,7 +126,11 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     if np.any(a["flexibility"] > 0):
         moved = _flexed(steps, moved, a["flexibility"], a["flexible_damping"])
     if np.any(a["play"] > 0):
-        moved = _played(moved, a["play"] / 2)
+        loaded = a["play_loaded"] > 0
+        driven = _played(moved, a["play"] / 2)
+        if np.any(loaded):
+            driven = np.where(loaded, _hung(steps, moved, a), driven)
+        moved = driven
     return torch.from_numpy(moved).permute(1, 2, 0)
 
 
@@ -227,6 +234,18 @@ def _played(q: Array, half: Array) -> Array:
     for k in range(1, len(q)):
         found[k] = np.maximum(np.minimum(found[k - 1], q[k] + half), q[k] - half)
     return found
+
+
+def _hung(steps: Array, q: Array, a: Mapping[str, Array]) -> Array:
+    """The driven side of a play that its load (weight and inertia) presses to one side."""
+    speed = np.gradient(q, axis=0) / np.median(steps)
+    load = a["inertia"] * np.gradient(speed, axis=0) / np.median(steps)
+    weight, hang = _wave(a["gravity_sin"], a["gravity_cos"])
+    load = load + weight * np.sin(q + hang)
+    # The load needs some time to cross the play, so that its side is no jump of the torque's sign.
+    size = _CROSSED * np.maximum(weight, np.sqrt(np.mean(np.square(load), 0))) + _TINY
+    wanted = -a["play"] / 2 * np.clip(load / size, -1, 1)
+    return q + wanted
 
 
 def _flexed(steps: Array, motor: Array, flexibility: Array, damping: Array) -> Array:

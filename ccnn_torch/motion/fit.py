@@ -62,6 +62,7 @@ class Fit(NamedTuple):
         squares: of the whitened residual by stretch, `b`.
         rss: their sum.
         effective: number of coefficients that the data determine.
+        left: mean square of the residual itself [rad^2 or m^2].
     """
 
     spec: Spec
@@ -72,6 +73,7 @@ class Fit(NamedTuple):
     squares: Tensor
     rss: float
     effective: float
+    left: float
 
     @property
     def members(self) -> tuple[int, ...]:
@@ -176,6 +178,9 @@ def _fit_lot(
         residual, columns = sensitivities(problem, whitening, theta, active, chosen)
         if bool(((cost - best) < _GAINED * values).all()):
             break
+    # Here, since the whitened residual does not tell it.
+    plain = problem.pooled(problem.residual(theta, chosen))
+    left = (plain.square() * judged).sum((-1, -2)) / values
     squares = residual.square().unflatten(-1, judged.shape).sum(-1)
     found = []
     for a, row in enumerate(specs):
@@ -183,13 +188,15 @@ def _fit_lot(
         for b, spec in enumerate(row):
             mine = spec._replace(theta=theta[a, b])
             x = columns[b, a, : len(spec.flat)]
-            fits.append(evidence_of(mine, residual[b, a], x, squares[b, a], values))
+            fits.append(evidence_of(mine, residual[b, a], x, squares[b, a], values, float(left[a, b])))
         found.append(fits)
     return found
 
 
-def evidence_of(spec: Spec, residual: Tensor, columns: Tensor, squares: Tensor, values: float) -> Fit:
-    """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`."""
+def evidence_of(
+    spec: Spec, residual: Tensor, columns: Tensor, squares: Tensor, values: float, left: float = 0.0
+) -> Fit:
+    """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`, the rest as of `Fit`."""
     own = spec.theta[list(spec.flat)]
     y = residual + own @ columns
     grams = grams_of(columns.mT[:, None, :], y[:, None])._replace(values=values)
@@ -209,6 +216,7 @@ def evidence_of(spec: Spec, residual: Tensor, columns: Tensor, squares: Tensor, 
         squares,
         float(residual.square().sum()),
         float(fit.effective[0]),
+        left,
     )
 
 

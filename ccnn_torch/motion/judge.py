@@ -18,7 +18,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
 from ccnn_torch.motion.drivers import driver_columns
 from ccnn_torch.motion.fit import Fit, sensitivities
-from ccnn_torch.motion.problem import Problem, Whitening
+from ccnn_torch.motion.problem import Whitening
 from ccnn_torch.motion.search import CROWD, Search, log_posterior
 
 __all__ = ["AxisVerdict", "judge_axes"]
@@ -29,6 +29,8 @@ _OUTSIDE = math.log(0.001)
 _LIKE = math.log(20.0)
 # A driver is part of the cause where it takes away this share of the mean square that the best set leaves, unwhitened.
 _SHARE = 0.1
+# An effect without which the mean square grows by less than this share of the gap's only corrects the form of others.
+_FORM = 0.01
 # Claims are never surer.
 _MOST = 0.995
 
@@ -58,19 +60,27 @@ def judge_axes(found: Search) -> list[AxisVerdict]:
     for i, fits in enumerate(found.found):
         best = fits[0]
         odds = {f.members: _odds(best, f) for f in fits}
+        by_members = {f.members: f for f in fits}
+        named = _essential(best, by_members)
         weight = {m: math.exp(-value) for m, value in odds.items()}
         driver, against = outside[i]
         extra = math.exp(min(against, 50.0))
         total = sum(weight.values()) + extra
-        classes = {m: _class(found.problem, best, m, odds) for m in best.members}
-        same = sum(w for members, w in weight.items() if _same(members, best.members, classes))
+        classes = {m: _class(best, m, odds) for m in best.members}
+        gap = by_members[()].left
+        same = sum(
+            w
+            for members, w in weight.items()
+            if _holds(members, named.members, classes)
+            and (len(members) == len(named.members) or named.left - by_members[members].left < _FORM * gap)
+        )
         marginal = {
             e: sum(w for members, w in weight.items() if e in members) / sum(weight.values())
             for e in {e for f in fits for e in f.members}
         }
         wild = extra / total > 0.5
         probability = extra / total if wild else same / total
-        verdicts.append(AxisVerdict(best, min(probability, _MOST), marginal, classes, driver if wild else None))
+        verdicts.append(AxisVerdict(named, min(probability, _MOST), marginal, {m: classes[m] for m in named.members}, driver if wild else None))
     return verdicts
 
 
@@ -92,7 +102,7 @@ def _tempered(evidence: float, gained: Tensor) -> float:
     return max(min(evidence, whole**2 / max(against, 1e-300), 2 * rest), 0.0)
 
 
-def _class(problem: Problem, best: Fit, member: int, odds: dict[tuple[int, ...], float]) -> tuple[int, ...]:
+def _class(best: Fit, member: int, odds: dict[tuple[int, ...], float]) -> tuple[int, ...]:
     """Effects that can stand in the place of a member."""
     rest = set(best.members) - {member}
     like = []
@@ -103,12 +113,22 @@ def _class(problem: Problem, best: Fit, member: int, odds: dict[tuple[int, ...],
     return tuple(e for _, e in sorted(like))
 
 
-def _same(members: tuple[int, ...], best: tuple[int, ...], classes: dict[int, tuple[int, ...]]) -> bool:
-    """Whether a set is the best one, members of classes exchanged."""
-    if len(members) != len(best):
-        return False
+def _essential(best: Fit, fits: dict[tuple[int, ...], Fit]) -> Fit:
+    """The set without members that only correct the form of others, the least first."""
+    gap = fits[()].left
+    while best.members:
+        rest = [tuple(m for m in best.members if m != e) for e in best.members]
+        least = min((fits[r] for r in rest if r in fits), key=lambda f: f.left)
+        if least.left - best.left > _FORM * gap:
+            break
+        best = least
+    return best
+
+
+def _holds(members: tuple[int, ...], named: tuple[int, ...], classes: dict[int, tuple[int, ...]]) -> bool:
+    """Whether a set has every named effect, or one of its class in its place."""
     left = set(members)
-    for m in best:
+    for m in named:
         one = next((e for e in (m, *classes[m]) if e in left), None)
         if one is None:
             return False

@@ -10,7 +10,7 @@ from ccnn_torch.motion.library import Library
 
 __all__ = ["parameters_of", "unit_of"]
 
-_SHAPE_UNITS = {"cogging_order": "1", "flexible_damping": "1"}
+_SHAPE_UNITS = {"cogging_order": "1", "flexible_damping": "1", "play_loaded": "1"}
 # A limit that is so far away is none.
 _TINY = 1e-9
 

@@ -72,6 +72,7 @@ def search(problem: Problem) -> Search:
     final = _Pool(problem, fitted_whitening(problem.pooled(left), problem.judged))
     final.again(pool)
     final.neighbours()
+    final.reduced()
     return Search(problem, final.whitening, tuple(tuple(p) for p in final.ranked()), rich)
 
 
@@ -150,6 +151,24 @@ class _Pool:
             self.fit(self.screened(bases, 2), _LONG)
             if all(a.members == b.members for a, b in zip(before, self.best(), strict=True)):
                 return
+
+    def reduced(self) -> None:
+        """The most probable set of each axis without its least members, one after the other, down to none."""
+        now = [f.spec for f in self.best()]
+        while any(s.members for s in now):
+            less = [
+                [o for k in range(len(s.members)) if (o := without(s, k)).members not in self.found[i]]
+                for i, s in enumerate(now)
+            ]
+            self.fit(less, _SHORT)
+            now = [
+                min(
+                    (self.found[i][without(s, k).members] for k in range(len(s.members))), key=lambda f: f.left
+                ).spec
+                if s.members
+                else s
+                for i, s in enumerate(now)
+            ]
 
     def screened(self, bases: Sequence[Sequence[Fit]], most: int = _FITTED) -> list[list[Spec]]:
         """For each base the effects that promise most, by what a difference quotient of each explains."""

@@ -41,7 +41,9 @@ def make(family: str, seed: int) -> SourceCase:
 def _pendulum(family: str, generator: np.random.Generator) -> SourceCase:
     nominal = drawn_axis(generator)
     commands = [_motion(k, generator, 1.2) for k in range(_RUNS)]
-    real, told, push, voltage, drift = _changed(family, nominal, generator)
+    # The largest torque of the nominal machine on these motions: a limit has to be below it to act.
+    most = max(_torque(nominal, command) for command in commands)
+    real, told, push, voltage, drift = _changed(family, nominal, generator, most)
     columns: dict[str, list[Array]] = {"time[s]": [], "run[1]": [], "command1[rad]": [], "q1[rad]": []}
     if voltage is not None:
         columns["supply[V]"] = []
@@ -72,7 +74,7 @@ def _pendulum(family: str, generator: np.random.Generator) -> SourceCase:
 
 
 def _changed(
-    family: str, nominal: Axis, generator: np.random.Generator
+    family: str, nominal: Axis, generator: np.random.Generator, most: float
 ) -> tuple[Axis, Told, Pushed | None, Callable[[Array], Array] | None, Callable[[Array, int], Array]]:
     """The real machine, what its controller is told, a torque that is applied, the supply, and the encoder's drift."""
     real, pushes = nominal, []
@@ -112,7 +114,7 @@ def _changed(
         elif cause == "speed_limit":
             told = _then(told, _slow(generator.uniform(1.0, 3.0)))
         elif cause == "saturation":
-            real = replace(real, force=generator.uniform(0.3, 0.6) * kp)
+            real = replace(real, force=generator.uniform(0.35, 0.6) * most)
         elif cause == "supply":
             low = generator.uniform(0.5, 0.75)
             voltage = lambda time, low=low: _VOLTS * (low + (1 - low) * 0.5 * (1 + np.cos(2 * np.pi * time / 6.3)))  # noqa: E731
@@ -126,6 +128,14 @@ def _changed(
             pushes.append(_brake(0.05 * size * kp, generator.uniform(2.0, 4.0), generator.uniform(5.0, 7.0)))
     push = (lambda t, q, v: sum(p(t, q, v) for p in pushes)) if pushes else None
     return real, told, push, voltage, drift
+
+
+def _torque(nominal: Axis, command: Callable[[Array], Array]) -> float:
+    """The largest torque of the motor on a motion [N m], jumps left out."""
+    time = np.arange(0, _SECONDS, 1 / _RATE)
+    asked = command(time)
+    q = _simulated(pendulum_xml(nominal), time, asked[:, None], None, None, nominal)[:, 0]
+    return float(nominal.kp * np.quantile(np.abs(asked - q), 0.99))
 
 
 def _then(first: Told, second: Told) -> Told:
