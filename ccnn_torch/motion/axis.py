@@ -26,6 +26,7 @@ __all__ = ["ABSENT", "Drive", "delayed", "simulate_axes"]
 ABSENT: dict[str, float] = {
     "gain": 1.0,
     "inertia": 0.0,
+    "load": 0.0,
     "viscous": 0.0,
     "coulomb": 0.0,
     "load_friction": 0.0,
@@ -52,8 +53,6 @@ ABSENT: dict[str, float] = {
 Array = NDArray[np.float64]
 _GAMMA = 1 - 1 / math.sqrt(2)
 _TINY = 1e-9
-# Share of its usual size at which a load presses a play to one side altogether.
-_CROSSED = 0.15
 # rad/s or m/s: no axis is faster, and no number may overflow.
 _FASTEST = 1e4
 # Steps longer than this, in units of the axis' own time constant, are divided.
@@ -124,7 +123,7 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
         commands = _limited(steps, commands, 1 / np.maximum(a["slowness"], _TINY))
     moved = _moved(drive, steps, commands, a)
     if np.any(a["flexibility"] > 0):
-        moved = _flexed(steps, moved, a["flexibility"], a["flexible_damping"])
+        moved = _flexed(steps, moved, a)
     if np.any(a["play"] > 0):
         loaded = a["play_loaded"] > 0
         driven = _played(moved, a["play"] / 2)
@@ -236,31 +235,51 @@ def _played(q: Array, half: Array) -> Array:
     return found
 
 
-def _hung(steps: Array, q: Array, a: Mapping[str, Array]) -> Array:
-    """The driven side of a play that its load (weight and inertia) presses to one side."""
-    speed = np.gradient(q, axis=0) / np.median(steps)
-    load = a["inertia"] * np.gradient(speed, axis=0) / np.median(steps)
+def _falling(a: Mapping[str, Array]) -> tuple[Array, Array]:
+    """Size and phase of the acceleration by which the weight turns the far side of a joint back [rad/s^2].
+
+    The inertia there is that of the load, or where it is not known all of the axis'.
+    """
     weight, hang = _wave(a["gravity_sin"], a["gravity_cos"])
-    load = load + weight * np.sin(q + hang)
-    # The load needs some time to cross the play, so that its side is no jump of the torque's sign.
-    size = _CROSSED * np.maximum(weight, np.sqrt(np.mean(np.square(load), 0))) + _TINY
-    wanted = -a["play"] / 2 * np.clip(load / size, -1, 1)
-    return q + wanted
+    inertia = np.where(a["load"] > 0, a["load"], a["inertia"])
+    return np.where(inertia > 0, weight / np.maximum(inertia, _TINY), 0.0), hang
 
 
-def _flexed(steps: Array, motor: Array, flexibility: Array, damping: Array) -> Array:
+def _hung(steps: Array, q: Array, a: Mapping[str, Array]) -> Array:
+    """The driven side of a play that falls freely between its ends, and does not bounce there."""
+    fall, hang = _falling(a)
+    half = a["play"] / 2
+    found = q.copy()
+    x, v = q[0] - half * np.sign(np.sin(q[0] + hang)), np.zeros_like(q[0])
+    found[0] = x
+    for k in range(len(steps)):
+        h = steps[k]
+        v = v - h * fall * np.sin(x + hang)
+        free = x + h * v
+        low, high = q[k + 1] - half, q[k + 1] + half
+        held = np.minimum(np.maximum(free, low), high)
+        v = np.where(held == free, v, (q[k + 1] - q[k]) / h)
+        x = held
+        found[k + 1] = x
+    return found
+
+
+def _flexed(steps: Array, motor: Array, a: Mapping[str, Array]) -> Array:
     """The far side of a spring that is driven by the motor's position: inertia over stiffness [s^2] and damping ratio.
 
-    Implicit as in `_Rule`; a spring that is stiffer than the steps can show follows the motor.
+    Implicit as in `_Rule`; a spring that is stiffer than the steps can show follows the motor. Its weight makes it sag.
     """
-    x, v = motor[0], np.zeros_like(motor[0])
+    flexibility, damping = a["flexibility"], a["flexible_damping"]
+    fall, hang = _falling(a)
+    sag = flexibility * fall
+    x, v = motor[0] - sag * np.sin(motor[0] + hang), np.zeros_like(motor[0])
     drag = 2 * damping * np.sqrt(np.maximum(flexibility, 0))
     ahead = (1 - _GAMMA) / _GAMMA
     found = motor.copy()
 
     def stage(x: Array, v: Array, m: Array, rate: Array, h: Array) -> tuple[Array, Array]:
         mass = flexibility / h
-        speed = (mass * v + (m - x) + drag * rate) / (mass + drag + h)
+        speed = (mass * v + (m - x) - sag * np.sin(x + hang) + drag * rate) / (mass + drag + h)
         return x + h * speed, speed
 
     for k in range(len(steps)):

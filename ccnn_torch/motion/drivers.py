@@ -20,6 +20,8 @@ DRIVERS = ("speed", "acceleration", "reversal", "position", "torque", "time", "t
 _KNOTS, _TIMES = 7, 5
 # Time constants of what fades after a reversal [s].
 _FADING = (0.03, 0.1, 0.3)
+# Share of the mean speed at which a direction is settled.
+_SOFT = 0.1
 # Changes of the temperature below this show nothing [K].
 _WARMER = 5.0
 # Quantiles between which the knots lie.
@@ -47,12 +49,19 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> dict[str, Tensor]:
         "reversal": _fading(speed, data.time),
         "position": _hats(moved, data.judged),
         "torque": _hats(error, data.judged),
-        "time": _over_time(problem),
+        # What comes and goes with time, and friction that does.
+        "time": torch.cat([(over := _over_time(problem)), over * _direction(speed)[:, None]], 1),
     }
     if float(problem.warm.abs().max()) >= _WARMER:
         warm = (problem.warm / problem.warm.abs().max()).expand(len(moved), -1, -1)
         found["temperature"] = torch.stack([warm, warm * torch.sign(speed)], 1)
     return {name: size * columns for name, columns in found.items() if name in DRIVERS}
+
+
+def _direction(speed: Tensor) -> Tensor:
+    """The sign of the speed, soft near standstill."""
+    size = speed.abs().mean((-1, -2), keepdim=True)
+    return torch.tanh(speed / (_SOFT * size).clamp_min(1e-12))
 
 
 def _slope(values: Tensor, step: Tensor) -> Tensor:

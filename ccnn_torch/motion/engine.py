@@ -123,7 +123,7 @@ def diagnose_motion(
     none = [_none(library) for _ in verdicts]
     whole = [v.best.spec for v in verdicts]
     names = _in_order(problem, verdicts)
-    steps = [[_only(s, [library.names.index(m) for m in names[: k + 1]]) for s in whole] for k in range(len(names))]
+    steps = [[_only(library, s, [library.names.index(m) for m in names[: k + 1]]) for s in whole] for k in range(len(names))]
     sets = [none, *steps, *singles.values()]
     residuals = held_out(problem, found.whitening, sets)
     spread = Spread(problem, seed)
@@ -229,10 +229,10 @@ def _none(library: Library) -> Spec:
     return Spec((), torch.zeros(library.size, dtype=torch.float64), (), 0.0)
 
 
-def _only(spec: Spec, members: Sequence[int]) -> Spec:
+def _only(library: Library, spec: Spec, members: Sequence[int]) -> Spec:
     """The set with these members alone."""
     while extra := [k for k, m in enumerate(spec.members) if m not in members]:
-        spec = without(spec, extra[0])
+        spec = without(library, spec, extra[0])
     return spec
 
 
@@ -259,7 +259,7 @@ def _in_order(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
     there = list(dict.fromkeys(m for v in verdicts for m in v.best.members))
     if not there:
         return []
-    specs = [[_only(v.best.spec, [m for m in there if m != e]) for v in verdicts] for e in there]
+    specs = [[_only(problem.library, v.best.spec, [m for m in there if m != e]) for v in verdicts] for e in there]
     left = problem.residual(torch.stack([torch.stack([s.theta for s in row]) for row in specs]))
     size = (left.square() * problem.data.judged).sum((1, 2, 3))
     return [names[there[k]] for k in torch.argsort(size, descending=True).tolist()]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
-from ccnn_torch.motion.library import Variant
+from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening
 
 __all__ = ["Fit", "Spec", "evidence_of", "fit_many", "sensitivities", "started"]
@@ -39,12 +39,18 @@ class Spec(NamedTuple):
         theta: all numbers, `k`; those of other effects 0.
         active: places that are fitted, effect by effect.
         log_prior: of the variants.
+        free: places of shapes that are refined beside them; what they cost is in the variants' prior.
     """
 
     members: tuple[int, ...]
     theta: Tensor
     active: tuple[tuple[int, ...], ...]
     log_prior: float
+    free: tuple[int, ...] = ()
+
+    @property
+    def moved(self) -> tuple[int, ...]:
+        return (*self.flat, *self.free)
 
     @property
     def flat(self) -> tuple[int, ...]:
@@ -80,7 +86,7 @@ class Fit(NamedTuple):
         return self.spec.members
 
 
-def started(spec: Spec, variant: Variant, axis: int) -> Spec:
+def started(library: Library, spec: Spec, variant: Variant, axis: int) -> Spec:
     """The set with one effect more, which begins as its variant says."""
     theta = spec.theta.clone()
     theta[list(variant.active)] = variant.values[axis]
@@ -88,7 +94,8 @@ def started(spec: Spec, variant: Variant, axis: int) -> Spec:
         theta[list(variant.held)] = variant.shapes[axis]
     both = sorted([*zip(spec.members, spec.active, strict=True), (variant.effect, variant.active)])
     return Spec(
-        tuple(m for m, _ in both), theta, tuple(a for _, a in both), spec.log_prior + variant.log_prior
+        tuple(m for m, _ in both), theta, tuple(a for _, a in both), spec.log_prior + variant.log_prior,
+        (*spec.free, *variant.free(library.held)),
     )
 
 
@@ -108,7 +115,7 @@ def fit_many(
         steps: Gauss-Newton steps.
         chosen: stretches that count; all when None.
     """
-    wide = max((len(s.flat) for row in specs for s in row), default=0)
+    wide = max((len(s.moved) for row in specs for s in row), default=0)
     judged = problem.data.judged if chosen is None else problem.data.judged[chosen]
     per = problem.followed.shape[0] * judged.numel() * (wide + 2)
     lot = max(int(_VALUES / per), 1)
@@ -145,11 +152,11 @@ def _fit_lot(
 ) -> list[list[Fit]]:
     h, n = len(specs), len(specs[0])
     theta = torch.stack([torch.stack([s.theta for s in row]) for row in specs])
-    wide = max(len(s.flat) for row in specs for s in row)
+    wide = max(len(s.moved) for row in specs for s in row)
     active = torch.full((h, n, wide), -1)
     for a, row in enumerate(specs):
         for b, spec in enumerate(row):
-            active[a, b, : len(spec.flat)] = torch.tensor(spec.flat, dtype=torch.int64)
+            active[a, b, : len(spec.moved)] = torch.tensor(spec.moved, dtype=torch.int64)
     safe, real = active.clamp_min(0), (active >= 0).to(theta.dtype)
     low, high = problem.library.bounds
     damping = torch.full((h, n), _DAMPING, dtype=theta.dtype)

@@ -29,8 +29,10 @@ _OUTSIDE = math.log(0.001)
 _LIKE = math.log(20.0)
 # A driver is part of the cause where it takes away this share of the mean square that the best set leaves, unwhitened.
 _SHARE = 0.1
-# An effect without which the mean square grows by less than this share of the gap's only corrects the form of others.
-_FORM = 0.01
+# An effect without which the mean square grows by less than this share of the gap's only corrects the form of others;
+# or, since the nominal model has a form that is not right either, by the square of this share of what the position differs
+# from the command.
+_FORM, _FORM_NOMINAL = 0.01, 0.01
 # Claims are never surer.
 _MOST = 0.995
 
@@ -56,23 +58,22 @@ class AxisVerdict(NamedTuple):
 def judge_axes(found: Search) -> list[AxisVerdict]:
     """The verdict on each axis."""
     verdicts = []
-    outside = _outside(found)
     for i, fits in enumerate(found.found):
         best = fits[0]
         odds = {f.members: _odds(best, f) for f in fits}
         by_members = {f.members: f for f in fits}
-        named = _essential(best, by_members)
+        slight = _slight(found, i, by_members[()])
+        named = _essential(best, by_members, slight)
         weight = {m: math.exp(-value) for m, value in odds.items()}
-        driver, against = outside[i]
-        extra = math.exp(min(against, 50.0))
+        outside = _outside(found, i)
+        extra = math.exp(min(outside.odds, 50.0))
         total = sum(weight.values()) + extra
         classes = {m: _class(best, m, odds) for m in best.members}
-        gap = by_members[()].left
         same = sum(
             w
             for members, w in weight.items()
             if _holds(members, named.members, classes)
-            and (len(members) == len(named.members) or named.left - by_members[members].left < _FORM * gap)
+            and (len(members) == len(named.members) or named.left - by_members[members].left < slight)
         )
         marginal = {
             e: sum(w for members, w in weight.items() if e in members) / sum(weight.values())
@@ -80,7 +81,10 @@ def judge_axes(found: Search) -> list[AxisVerdict]:
         }
         wild = extra / total > 0.5
         probability = extra / total if wild else same / total
-        verdicts.append(AxisVerdict(named, min(probability, _MOST), marginal, {m: classes[m] for m in named.members}, driver if wild else None))
+        if wild:
+            named = _essential(outside.beside, by_members, slight)
+        like = {m: classes.get(m, ()) for m in named.members}
+        verdicts.append(AxisVerdict(named, min(probability, _MOST), marginal, like, outside.driver if wild else None))
     return verdicts
 
 
@@ -113,13 +117,19 @@ def _class(best: Fit, member: int, odds: dict[tuple[int, ...], float]) -> tuple[
     return tuple(e for _, e in sorted(like))
 
 
-def _essential(best: Fit, fits: dict[tuple[int, ...], Fit]) -> Fit:
+def _slight(found: Search, axis: int, nothing: Fit) -> float:
+    """Mean square [rad^2 or m^2] below which nothing is named."""
+    data = found.problem.data
+    error = (data.command[axis] - data.position[axis])[data.judged].square().mean()
+    return max(_FORM * nothing.left, _FORM_NOMINAL**2 * float(error))
+
+
+def _essential(best: Fit, fits: dict[tuple[int, ...], Fit], slight: float) -> Fit:
     """The set without members that only correct the form of others, the least first."""
-    gap = fits[()].left
     while best.members:
         rest = [tuple(m for m in best.members if m != e) for e in best.members]
         least = min((fits[r] for r in rest if r in fits), key=lambda f: f.left)
-        if least.left - best.left > _FORM * gap:
+        if least.left - best.left > slight:
             break
         best = least
     return best
@@ -136,54 +146,64 @@ def _holds(members: tuple[int, ...], named: tuple[int, ...], classes: dict[int, 
     return True
 
 
-def _outside(found: Search) -> list[tuple[str | None, float]]:
-    """Of each axis the driver that explains most beside the best set, and its tempered log odds."""
-    problem = found.problem
-    best = [fits[0] for fits in found.found]
-    specs = [f.spec for f in best]
-    groups = driver_columns(problem, specs)
-    wide = max(len(s.flat) for s in specs)
-    active = torch.full((1, len(specs), wide), -1)
-    for i, s in enumerate(specs):
-        active[0, i, : len(s.flat)] = torch.tensor(s.flat, dtype=torch.int64)
-    theta = torch.stack([s.theta for s in specs])[None]
-    residual, own = sensitivities(problem, found.whitening, theta, active)
-    plain = problem.residual(theta)[0]
-    values = float(problem.judged.sum())
-    blocks = problem.judged.shape
-    answers: list[tuple[str | None, float]] = []
-    for i, s in enumerate(specs):
-        m = len(s.flat)
-        base, y = own[i, 0, :m], residual[i, 0] + s.theta[list(s.flat)] @ own[i, 0, :m]
+class _Wild(NamedTuple):
+    """The most probable set with a driver beside it, and its tempered log odds against the best set of the library."""
+
+    driver: str | None
+    beside: Fit
+    odds: float
+
+
+def _outside(found: Search, axis: int) -> _Wild:
+    """Drivers beside the sets that lead from none to the best one: what is outside need not leave the best set as it is."""
+    problem, fits = found.problem, found.found[axis]
+    best, by_members = fits[0], {f.members: f for f in fits}
+    slight = _slight(found, axis, by_members[()])
+    values, blocks, judged = float(problem.judged.sum()), problem.judged.shape, problem.data.judged
+    top = _Wild(None, best, -math.inf)
+    for base in _chain(best, by_members):
+        specs = [base.spec if i == axis else own[0].spec for i, own in enumerate(found.found)]
+        theta = torch.stack([s.theta for s in specs])[None]
+        flat = base.spec.flat
+        m = len(flat)
+        active = torch.full((1, len(specs), m), -1)
+        active[0, axis] = torch.tensor(flat, dtype=torch.int64)
+        residual, own = sensitivities(problem, found.whitening, theta, active)
+        plain = problem.residual(theta)[0, axis]
+        x0, y = own[axis, 0], residual[axis, 0] + base.spec.theta[list(flat)] @ own[axis, 0]
         starts, begin = [], 0
-        for group in s.active:
+        for group in base.spec.active:
             starts.append(torch.arange(begin, begin + len(group)))
             begin += len(group)
-        top: tuple[str | None, float] = (None, -math.inf)
-        for name, columns in groups.items():
-            white = problem.whitened(columns[i][:, None], _one(found, i))[0]
-            x = torch.cat([base, white])
+        prior = log_posterior(base) - base.log_evidence + _OUTSIDE + (CROWD if len(base.members) >= 2 else 0.0)
+        for name, columns in driver_columns(problem, specs).items():
+            white = problem.whitened(columns[axis][:, None], _one(found, axis))[0]
+            x = torch.cat([x0, white])
             grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
-            wild = torch.arange(m, len(x))
-            fit = fit_sets(grams, [starts, [*starts, wild]], 0.0)
-            mean = fit.mean[1]
-            left = y - mean @ x
-            after = left.square().unflatten(-1, blocks).sum(-1)
-            before = best[i].squares
-            count = len(s.members)
-            prior = _OUTSIDE + (CROWD if count >= 2 else 0.0)
-            odds = float(fit.log_evidence[1] - fit.log_evidence[0])
-            odds = _tempered(odds, 0.5 * (before - after) / best[i].noise) + prior
+            fit = fit_sets(grams, [[*starts, torch.arange(m, len(x))]], 0.0)
+            mean = fit.mean[0]
+            after = (y - mean @ x).square().unflatten(-1, blocks).sum(-1)
+            gained = 0.5 * (best.squares - after) / best.noise
+            evidence = float(fit.log_evidence[0]) - best.log_evidence
+            odds = _tempered(evidence, gained) + prior - (log_posterior(best) - best.log_evidence)
             # What it takes away of the position itself, not of its whitened form.
-            taken = plain[i] - (mean[m:, None, None] * columns[i]).sum(0)
-            judged = problem.data.judged
-            share = 1 - float(taken[judged].square().sum() / plain[i][judged].square().sum().clamp_min(1e-300))
-            if share < _SHARE:
+            taken = plain - (mean[m:, None, None] * columns[axis]).sum(0)
+            before2, after2 = (float(v[judged].square().mean()) for v in (plain, taken))
+            if before2 - after2 < max(_SHARE * before2, slight):
                 odds = min(odds, _OUTSIDE)
-            if odds > top[1]:
-                top = (name, odds)
-        answers.append(top)
-    return answers
+            if odds > top.odds:
+                top = _Wild(name, base, odds)
+    return top
+
+
+def _chain(best: Fit, fits: dict[tuple[int, ...], Fit]) -> list[Fit]:
+    """The best set, it without its least member, and so on to none."""
+    found = [best]
+    while found[-1].members:
+        now = found[-1].members
+        rest = [tuple(m for m in now if m != e) for e in now]
+        found.append(min((fits[r] for r in rest if r in fits), key=lambda f: f.left))
+    return found
 
 
 def _one(found: Search, axis: int) -> Whitening:

@@ -23,6 +23,8 @@ _POSITIVE = (
 _MOST = {"load_friction": 0.9}
 # Plausible sizes: no number is larger.
 _WIDEST = 1e3
+# Shapes that a fit refines from where they begin.
+_REFINED = ("cogging_order", "stribeck_speed")
 
 
 class Variant(NamedTuple):
@@ -43,6 +45,10 @@ class Variant(NamedTuple):
     held: tuple[int, ...]
     shapes: Tensor
     log_prior: float
+
+    def free(self, held: dict[str, int]) -> tuple[int, ...]:
+        """Places of the shapes that a fit refines."""
+        return tuple(place for name, place in held.items() if name in _REFINED and place in self.held)
 
 
 class Library(NamedTuple):
@@ -84,6 +90,8 @@ class Library(NamedTuple):
                         nominal = self.facts[i].nominal.get(name, ABSENT[name])
                         low[i, j] = max(float(low[i, j]), -nominal / (factor * number.scale))
                         high[i, j] = min(float(high[i, j]), (_MOST.get(name, math.inf) - nominal) / number.scale)
+        # 0 stands for a shape that is not used.
+        low[:, list(self.held.values())] = 0.0
         return low, high
 
     @property

@@ -125,6 +125,7 @@ def _servo(keys: Mapping[str, Any], n: int) -> Nominal:
         axis = {name: own[name] / unit for name in _TORQUES if name in own}
         load, lever = own.get("mass", 0.0), own.get("length", 0.0)
         axis["inertia"] = axis.get("inertia", 0.0) + load * lever**2 / unit
+        axis["load"] = load * lever**2 / unit
         axis["gravity_sin"] = axis.get("gravity_sin", 0.0) + load * STANDARD_GRAVITY * lever / unit
         axis |= {name: own[key] for key, name in _SAME.items() if key in own}
         if own.get("stribeck_speed"):

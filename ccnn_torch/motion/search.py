@@ -140,12 +140,12 @@ class _Pool:
         for _ in range(3):
             before = self.best()
             less = [
-                [s for k in range(len(f.members)) if (s := without(f.spec, k)).members not in self.found[i]]
+                [s for k in range(len(f.members)) if (s := without(self.library, f.spec, k)).members not in self.found[i]]
                 for i, f in enumerate(before)
             ]
             self.fit(less, _LONG)
             bases = [
-                [self.found[i][without(f.spec, k).members] for k in range(len(f.members))]
+                [self.found[i][without(self.library, f.spec, k).members] for k in range(len(f.members))]
                 for i, f in enumerate(before)
             ]
             self.fit(self.screened(bases, 2), _LONG)
@@ -157,13 +157,13 @@ class _Pool:
         now = [f.spec for f in self.best()]
         while any(s.members for s in now):
             less = [
-                [o for k in range(len(s.members)) if (o := without(s, k)).members not in self.found[i]]
+                [o for k in range(len(s.members)) if (o := without(self.library, s, k)).members not in self.found[i]]
                 for i, s in enumerate(now)
             ]
             self.fit(less, _SHORT)
             now = [
                 min(
-                    (self.found[i][without(s, k).members] for k in range(len(s.members))), key=lambda f: f.left
+                    (self.found[i][without(self.library, s, k).members] for k in range(len(s.members))), key=lambda f: f.left
                 ).spec
                 if s.members
                 else s
@@ -172,7 +172,7 @@ class _Pool:
 
     def screened(self, bases: Sequence[Sequence[Fit]], most: int = _FITTED) -> list[list[Spec]]:
         """For each base the effects that promise most, by what a difference quotient of each explains."""
-        wide = max(map(len, bases))
+        library, wide = self.library, max(map(len, bases))
         spare = [b[0] if b else next(iter(self.found[i].values())) for i, b in enumerate(bases)]
         wanted: list[dict[tuple[int, ...], Spec]] = [{} for _ in bases]
         for k in range(wide):
@@ -186,7 +186,7 @@ class _Pool:
                     if variant.effect not in scores or score > scores[variant.effect][0]:
                         scores[variant.effect] = (score, variant)
                 for _, variant in sorted(scores.values(), key=lambda item: -item[0])[:most]:
-                    spec = started(fit.spec, variant, i)
+                    spec = started(library, fit.spec, variant, i)
                     if spec.members not in self.found[i]:
                         wanted[i].setdefault(spec.members, spec)
         return [list(w.values()) for w in wanted]
@@ -240,13 +240,18 @@ class _Pool:
         return found
 
 
-def without(spec: Spec, place: int) -> Spec:
+def without(library: Library, spec: Spec, place: int) -> Spec:
     """The set without one of its members."""
-    theta = spec.theta.clone()
-    theta[list(spec.active[place])] = 0.0
+    theta, effect = spec.theta.clone(), spec.members[place]
     rest = [k for k in range(len(spec.members)) if k != place]
+    held = {p for v in library.variants[effect] for p in v.held}
+    theta[[*spec.active[place], *held]] = 0.0
     return Spec(
-        tuple(spec.members[k] for k in rest), theta, tuple(spec.active[k] for k in rest), spec.log_prior
+        tuple(spec.members[k] for k in rest),
+        theta,
+        tuple(spec.active[k] for k in rest),
+        spec.log_prior,
+        tuple(p for p in spec.free if p not in held),
     )
 
 

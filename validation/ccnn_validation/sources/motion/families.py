@@ -34,6 +34,8 @@ FAMILIES = (
 _ALSO = {
     # The mass adds weight and inertia; which of both shows depends on the motion.
     "payload": ({"gravity", "inertia"}, {"gravity"}),
+    # The mean of the voltage is a lower gain; the columns tell no nominal voltage.
+    "supply": ({"supply", "servo_gain"},),
     # The friction at rest and the rest of it are one thing to a slow motion.
     "stribeck": ({"coulomb", "stribeck"},),
 }
