@@ -14,6 +14,9 @@ __all__ = ["fitted_whitening"]
 _HIGHEST = 8
 # A residual that is a constant or a ramp would give a root outside the unit circle: so much is added to the diagonal.
 _RIDGE = 1e-9
+# Poles are drawn in by this factor (bandwidth expansion of linear prediction): what a model leaves is no stationary noise,
+# and a pole at the unit circle would leave the slow half of every effect without weight.
+_WIDER = 0.9
 
 
 def fitted_whitening(residual: Tensor, judged: Tensor) -> Whitening:
@@ -44,5 +47,6 @@ def fitted_whitening(residual: Tensor, judged: Tensor) -> Whitening:
             cost = count * math.log(max(left, 1e-300)) + order * math.log(max(count, 2))
             if cost < best:
                 best, found[i] = cost, a
+    found = found * _WIDER ** torch.arange(1, high + 1, dtype=found.dtype)
     used = int((found != 0).any(0).sum())
     return Whitening(found[:, :used])
