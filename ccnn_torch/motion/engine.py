@@ -36,9 +36,9 @@ __all__ = ["MotionDiagnosis", "diagnose_motion", "problem_of"]
 _POOLED = 0.02
 # Quantile of what counts as nearly the largest.
 _NEARLY = 0.98
-# Names below this probability are accepted only where runs that were not fitted show what they take away.
-_LIKELY = 0.8
-_LARGE = 1e12
+# Names are added as long as they take the held-out gap to less than this share of itself; a verdict that loses one is
+# no surer than the second number.
+_NEARLY_LEAST, _DOUBTED = 1.02, 0.9
 
 
 @dataclass(frozen=True)
@@ -132,13 +132,16 @@ def diagnose_motion(
     total = shrink_of(spread, squares[0], squares[len(steps)], floor)
     outside = any(v.driver is not None for v in verdicts)
     probability = math.prod(v.probability for v in verdicts)
-    if names and not outside and probability < _LIKELY and (total[3] is None or total[3][0] <= 0):
-        names, steps = [], []
-        verdicts = [_emptied(found.found[i], v) for i, v in enumerate(verdicts)]
-        total = shrink_of(spread, squares[0], squares[0], floor)
+    kept = _kept(squares[: len(steps) + 1]) if names else 0
+    if kept < len(names) and not outside:
+        # A name has to take something away on runs that no fit saw.
+        verdicts = [_reduced(library, found.found[i], v, names[:kept]) for i, v in enumerate(verdicts)]
+        names, steps = names[:kept], steps[:kept]
+        probability = math.prod(v.probability for v in verdicts)
+        total = shrink_of(spread, squares[0], squares[kept], floor)
     unit = data.units[0]
     drivers = list(dict.fromkeys(v.driver for v in verdicts if v.driver))
-    after = residuals[len(steps)] if names else residuals[0]
+    after = residuals[len(names)]
     listed = _effects(problem, found, verdicts, spread, squares[0], dict(zip(singles, squares[-len(singles) :], strict=True)), floor)
     at_step("next measurements")
     wanted, proposed = next_motions(found, verdicts)
@@ -247,10 +250,24 @@ def _singles(found: Search) -> dict[str, list[Spec]]:
     }
 
 
-def _emptied(fits: Sequence[Fit], verdict: AxisVerdict) -> AxisVerdict:
-    """No cause: as probable as it is."""
-    nothing = next(f for f in fits if not f.members)
-    return AxisVerdict(nothing, 1 - max(verdict.marginal.values(), default=0.0), verdict.marginal, {}, None)
+def _kept(squares: Sequence[Tensor]) -> int:
+    """How many of the names, added one after the other, still take something away where nothing was fitted."""
+    left = [float(s.sum()) for s in squares]
+    return next(k for k, value in enumerate(left) if value <= _NEARLY_LEAST**2 * min(left))
+
+
+def _reduced(library: Library, fits: Sequence[Fit], verdict: AxisVerdict, names: Sequence[str]) -> AxisVerdict:
+    """The verdict with these names alone, as probable as what is left of it."""
+    members = tuple(m for m in verdict.best.members if library.names[m] in names)
+    best = next((f for f in fits if f.members == members), None)
+    if best is None:
+        old, spec = verdict.best, _only(library, verdict.best.spec, members)
+        place = [old.spec.flat.index(j) for j in spec.flat]
+        best = old._replace(spec=spec, mean=old.mean[place], covariance=old.covariance[place][:, place])
+    like = {m: verdict.classes[m] for m in members}
+    gone = [m for m in verdict.best.members if m not in members]
+    each = [1 - verdict.marginal.get(m, 0.0) for m in gone] + [verdict.marginal.get(m, 1.0) for m in members]
+    return AxisVerdict(best, min([verdict.probability, _DOUBTED, *each]), verdict.marginal, like, verdict.driver)
 
 
 def _in_order(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:

@@ -58,6 +58,7 @@ class AxisVerdict(NamedTuple):
 def judge_axes(found: Search) -> list[AxisVerdict]:
     """The verdict on each axis."""
     verdicts = []
+    drivers = driver_columns(found.problem, [fits[0].spec for fits in found.found])
     for i, fits in enumerate(found.found):
         best = fits[0]
         odds = {f.members: _odds(best, f) for f in fits}
@@ -65,7 +66,7 @@ def judge_axes(found: Search) -> list[AxisVerdict]:
         slight = _slight(found, i, by_members[()])
         named = _essential(best, by_members, slight)
         weight = {m: math.exp(-value) for m, value in odds.items()}
-        outside = _outside(found, i)
+        outside = _outside(found, i, drivers)
         extra = math.exp(min(outside.odds, 50.0))
         total = sum(weight.values()) + extra
         classes = {m: _class(best, m, odds) for m in best.members}
@@ -154,7 +155,7 @@ class _Wild(NamedTuple):
     odds: float
 
 
-def _outside(found: Search, axis: int) -> _Wild:
+def _outside(found: Search, axis: int, drivers: dict[str, Tensor]) -> _Wild:
     """Drivers beside the sets that lead from none to the best one: what is outside need not leave the best set as it is."""
     problem, fits = found.problem, found.found[axis]
     best, by_members = fits[0], {f.members: f for f in fits}
@@ -176,7 +177,7 @@ def _outside(found: Search, axis: int) -> _Wild:
             starts.append(torch.arange(begin, begin + len(group)))
             begin += len(group)
         prior = log_posterior(base) - base.log_evidence + _OUTSIDE + (CROWD if len(base.members) >= 2 else 0.0)
-        for name, columns in driver_columns(problem, specs).items():
+        for name, columns in drivers.items():
             white = problem.whitened(columns[axis][:, None], _one(found, axis))[0]
             x = torch.cat([x0, white])
             grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)

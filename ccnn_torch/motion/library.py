@@ -23,6 +23,8 @@ _POSITIVE = (
 _MOST = {"load_friction": 0.9}
 # Plausible sizes: no number is larger.
 _WIDEST = 1e3
+# Log odds against what is seen less often than the rest, and can take the form of nearly anything.
+_RARER = {"stribeck": math.log(0.1), "cogging": math.log(0.1)}
 # Shapes that a fit refines from where they begin.
 _REFINED = ("cogging_order", "stribeck_speed")
 
@@ -159,7 +161,7 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
     variants = []
     for e in range(len(effects)):
         count = min(len(s) for s in shapes[e])
-        variants.append(tuple(_variant(e, k, places[e], numbers, shapes[e], held, count) for k in range(count)))
+        variants.append(tuple(_variant(e, effects[e].name, k, places[e], numbers, shapes[e], held, count) for k in range(count)))
     nominal = {
         name: torch.tensor([axis.nominal.get(name, ABSENT[name]) for axis in facts], dtype=torch.float64)
         for name in ABSENT
@@ -181,6 +183,7 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
 
 def _variant(
     effect: int,
+    name: str,
     k: int,
     places: tuple[int, ...],
     numbers: list[list[Number]],
@@ -206,5 +209,5 @@ def _variant(
         torch.tensor(values, dtype=torch.float64),
         tuple(held[name] for name in own),
         torch.tensor([[s[k][name] for name in own] for s in shapes], dtype=torch.float64),
-        -math.log(count),
+        -math.log(count) + _RARER.get(name, 0.0),
     )

@@ -191,9 +191,11 @@ def _log(
     position = position.copy()
     for i, unit in enumerate(units):
         moved = np.diff(position[:, i])
-        turns = np.round(moved / _TURN)
-        wrapped = (unit == "rad") & (turns != 0) & (np.abs(moved - turns * _TURN) < _TURN_SLACK * _TURN)
-        wrapped &= np.abs(np.diff(command[:, i])) < _TURN / 2
+        # Beside what the command moves, which across a gap may be much.
+        beyond = moved - np.diff(command[:, i])
+        turns = np.round(beyond / _TURN)
+        wrapped = (unit == "rad") & (turns != 0) & (np.abs(beyond - turns * _TURN) < _TURN_SLACK * _TURN)
+        wrapped &= np.abs(moved) > _TURN / 2
         if wrapped.any():
             position[1:, i] -= _TURN * np.cumsum(np.where(wrapped, turns, 0.0))
             notes.append(f"{name}: the counter of q{i + 1} wrapped {count_text(int(wrapped.sum()), 'time')}, unwrapped")
