@@ -16,8 +16,8 @@ import torch
 from scipy.optimize import least_squares
 
 from ccnn_torch.motion import diagnose_motion, load_logs, nominal_of
-from ccnn_torch.motion.engine import problem_of
 from ccnn_torch.motion.effects import motion_effects
+from ccnn_torch.motion.engine import problem_of
 
 MASS, LENGTH, VOLTS = 0.49, 0.1, 7.4
 SPLITS = (("sin_time_square", "up_and_down"), ("sin_sin", "lift_and_drop"))
@@ -66,12 +66,17 @@ def wrong_things(full: dict[str, float], gain: int) -> dict[str, tuple[dict[str,
         "complete": (full, set()),
         "mass x 0.5": (full | {"mass": 0.5 * MASS}, {"payload", "gravity"}),
         f"gain of kp {other}": (full | {"gain": full["gain"] * other / gain}, {"servo_gain"}),
-        "no friction": ({k: v for k, v in full.items() if k not in ("coulomb", "load_friction", "stribeck")}, {"coulomb"}),
+        "no friction": (
+            {k: v for k, v in full.items() if k not in ("coulomb", "load_friction", "stribeck")},
+            {"coulomb"},
+        ),
         "no viscous": ({k: v for k, v in full.items() if k != "viscous"}, {"viscous"}),
         "no gravity": (full | {"gravity_sin": -MASS * 9.80665 * LENGTH}, {"gravity"}),
         "no torque limit": ({k: v for k, v in full.items() if k != "torque_limit"}, {"saturation"}),
-        "5 V for 7.4 V": (full | {"gain": full["gain"] * 5 / VOLTS, "torque_limit": full["torque_limit"] * 5 / VOLTS},
-                          {"supply", "servo_gain"}),
+        "5 V for 7.4 V": (
+            full | {"gain": full["gain"] * 5 / VOLTS, "torque_limit": full["torque_limit"] * 5 / VOLTS},
+            {"supply", "servo_gain"},
+        ),
         "delay of 60 ms more": (full | {"delay": full["delay"] + 0.06}, {"delay"}),
     }
 
@@ -80,7 +85,9 @@ def main() -> None:
     """Print one line for each case."""
     folder = Path(sys.argv[1])
     gains = [int(g) for g in sys.argv[2:]] or [100, 400, 800]
-    print("identified on | kp | told | named | class | driver | probability | gap before -> after on held-out motions [mrad]")
+    print(
+        "identified on | kp | told | named | class | driver | probability | gap before -> after on held-out motions [mrad]"
+    )
     for k in range(2):
         values = identified(folder, SPLITS[k], [100, 400, 800])
         print(f"# {SPLITS[k]}: " + ", ".join(f"{n} {v:.4g}" for n, v in zip(START, values, strict=True)))

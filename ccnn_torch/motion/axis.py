@@ -4,8 +4,8 @@ The motor's torque is the gain times (command less position). With everything di
 
     inertia * q'' = clip(gain * supply * (u - q), 1 / weakness) - viscous * q' - F(q') * sign(q') - gravity(q) - cogging(q)
 
-where u is the command after delay, speed limit and offset: torques are then angles (N m per N m/rad), the inertia is in
-s^2, the viscous friction in s. With all of these 0 the position follows the command exactly: that axis is nominal where
+where u is the command after delay, speed limit and offset: torques are then angles (N m per N m/rad), the inertia is
+in s^2, the viscous friction in s. With all of these 0 the position follows the command exactly: that axis is nominal where
 nothing is known. The rule for the integration is SDIRK2 (Alexander 1977), whose two implicit stages are solved in closed
 form, dry friction included, so that an axis without mass, or one that sticks, needs no smaller steps.
 """
@@ -109,7 +109,7 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     """
     like = drive.command
     # Every entry has the same first dimension then, also where a single value stands for all.
-    shape = torch.broadcast_shapes(*(v.shape for v in parameters.values()), (1, len(like)))
+    shape = torch.Size([max([1, *(len(v) for v in parameters.values())]), len(like)])
     tensors = {n: parameters.get(n, like.new_full((1, 1), v)).expand(shape) for n, v in ABSENT.items()}
     u = drive.command
     if bool((tensors["delay"] != 0).any()):

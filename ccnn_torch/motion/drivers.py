@@ -1,5 +1,4 @@
-"""What a residual may follow that no effect describes: functions of speed, acceleration, reversal, position, torque, time
-and temperature.
+"""What a residual may follow that no effect describes: speed, acceleration, reversal, position, torque, time, temperature.
 
 Each is a group of columns that are added to the simulated position. Where one of them is part of the most probable set,
 the cause is outside the library, and its driver says where to look.
@@ -74,7 +73,7 @@ def _hats(driver: Tensor, judged: Tensor) -> Tensor:
     found = []
     for one in driver:
         grid = torch.linspace(*_ENDS, _KNOTS, dtype=one.dtype)
-        knots = torch.quantile(_few(one[judged]), grid).unique()
+        knots = torch.tensor(sorted(set(torch.quantile(_few(one[judged]), grid).tolist())), dtype=one.dtype)
         if len(knots) < 3:
             found.append(torch.zeros(_KNOTS, *one.shape, dtype=one.dtype))
             continue
@@ -113,7 +112,7 @@ def _over_time(problem: Problem) -> Tensor:
     """Piecewise linear functions of the time in each run, `n x m x b x s`."""
     data = problem.data
     share = torch.zeros_like(data.time)
-    for run in data.run.unique():
+    for run in sorted(set(data.run.tolist())):
         mine = data.run == run
         ends = data.time[mine][data.judged[mine]]
         share[mine] = ((data.time[mine] - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)).clamp(0, 1)

@@ -39,6 +39,8 @@ _NEARLY = 0.98
 # Names are added as long as they take the held-out gap to less than this share of itself; a verdict that loses one is
 # no surer than the second number.
 _NEARLY_LEAST, _DOUBTED = 1.02, 0.9
+# Marginal probability from which something is there even where no names hold, which are then no surer than that.
+_CONFIRMED = 0.5
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,9 @@ def diagnose_motion(
     none = [_none(library) for _ in verdicts]
     whole = [v.best.spec for v in verdicts]
     names = _in_order(problem, verdicts)
-    steps = [[_only(library, s, [library.names.index(m) for m in names[: k + 1]]) for s in whole] for k in range(len(names))]
+    steps = [
+        [_only(library, s, [library.names.index(m) for m in names[: k + 1]]) for s in whole] for k in range(len(names))
+    ]
     sets = [none, *steps, *singles.values()]
     residuals = held_out(problem, found.whitening, sets)
     spread = Spread(problem, seed)
@@ -133,16 +137,23 @@ def diagnose_motion(
     outside = any(v.driver is not None for v in verdicts)
     probability = math.prod(v.probability for v in verdicts)
     kept = _kept(squares[: len(steps) + 1]) if names else 0
+    unconfirmed = not kept and any(m > _CONFIRMED for v in verdicts for m in v.marginal.values())
+    if unconfirmed and names and not outside:
+        # More is seen than chance, and no set of names holds on the other runs: the one that comes nearest is named.
+        kept = 1 + min(range(len(names)), key=lambda k: float(squares[k + 1].sum()))
     if kept < len(names) and not outside:
         # A name has to take something away on runs that no fit saw.
         verdicts = [_reduced(library, found.found[i], v, names[:kept]) for i, v in enumerate(verdicts)]
         names, steps = names[:kept], steps[:kept]
         probability = math.prod(v.probability for v in verdicts)
         total = shrink_of(spread, squares[0], squares[kept], floor)
+    probability = min(probability, _CONFIRMED) if unconfirmed and names and not outside else probability
     unit = data.units[0]
     drivers = list(dict.fromkeys(v.driver for v in verdicts if v.driver))
     after = residuals[len(names)]
-    listed = _effects(problem, found, verdicts, spread, squares[0], dict(zip(singles, squares[-len(singles) :], strict=True)), floor)
+    listed = _effects(
+        problem, found, verdicts, spread, squares[0], dict(zip(singles, squares[-len(singles) :], strict=True)), floor
+    )
     at_step("next measurements")
     wanted, proposed = next_motions(found, verdicts)
     verdict: dict[str, Any] = {
@@ -224,7 +235,7 @@ def _facts(data: Stretches, i: int, nominal: Nominal, followed: Tensor, supply: 
 
 def _within_runs(data: Stretches, warm: Tensor) -> float:
     """The largest change of the temperature in one run: between runs other things change as well."""
-    own = [warm[data.run == run][data.judged[data.run == run]] for run in data.run.unique()]
+    own = [warm[data.run == run][data.judged[data.run == run]] for run in set(data.run.tolist())]
     return max(float(v.max() - v.min()) for v in own)
 
 
@@ -312,7 +323,8 @@ def _where(problem: Problem, before: Tensor, spread: Spread) -> dict[str, Any]:
     all_ = sum(samples.values()) or 1.0
     empty: dict[str, Any] = {"outputs": {}, "legs": {}, "regions": [], "covariates": {}}
     return {
-        "where": empty | {
+        "where": empty
+        | {
             "joints": shares(joints),
             "phases": {n: {"share": s, "samples": samples[n] / all_} for n, s in shares(phases).items()},
         },
@@ -365,7 +377,7 @@ def _notes(problem: Problem, nominal: Nominal, found: Search, floor: float, nois
     notes = [*data.notes, *nominal.notes]
     library = problem.library
     notes += [unseen_text(n, why) for n, why in zip(library.names, library.lacking, strict=True) if why]
-    runs = len(data.run.unique())
+    runs = len(set(data.run.tolist()))
     folds = int(folds_of(problem).max()) + 1
     if runs > 1:
         notes.append(f"held out were whole runs, {runs} of them in {folds} folds")

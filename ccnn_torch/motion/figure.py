@@ -49,7 +49,12 @@ def course_plot(results: Mapping[str, Any], arrays: Arrays) -> Plot | None:
         for b in mine:
             on = judged[b]
             t = arrays["time"][b][on]
-            named = {"command": "command", "position": "position", "before": "model as it is", "after": "with the effects"}
+            named = {
+                "command": "command",
+                "position": "position",
+                "before": "model as it is",
+                "after": "with the effects",
+            }
             named = named if labels else dict.fromkeys(named, "")
             top.plot(t, arrays["command"][i, b][on], color=FLOOR, linestyle="--", label=named["command"] or None)
             top.plot(t, arrays["position"][i, b][on], color=SERIES[2], label=named["position"] or None)
@@ -58,7 +63,14 @@ def course_plot(results: Mapping[str, Any], arrays: Arrays) -> Plot | None:
             for name, colour in _SHADED.items():
                 there = arrays["phase"][i, b][on] == PHASES.index(name)
                 low.fill_between(
-                    t, 0, 1, where=there, transform=low.get_xaxis_transform(), color=colour, alpha=0.18, linewidth=0,
+                    t,
+                    0,
+                    1,
+                    where=there,
+                    transform=low.get_xaxis_transform(),
+                    color=colour,
+                    alpha=0.18,
+                    linewidth=0,
                     label=name if labels else None,
                 )
             labels = False

@@ -94,7 +94,10 @@ def started(library: Library, spec: Spec, variant: Variant, axis: int) -> Spec:
         theta[list(variant.held)] = variant.shapes[axis]
     both = sorted([*zip(spec.members, spec.active, strict=True), (variant.effect, variant.active)])
     return Spec(
-        tuple(m for m, _ in both), theta, tuple(a for _, a in both), spec.log_prior + variant.log_prior,
+        tuple(m for m, _ in both),
+        theta,
+        tuple(a for _, a in both),
+        spec.log_prior + variant.log_prior,
         (*spec.free, *variant.free(library.held)),
     )
 
@@ -143,7 +146,7 @@ def sensitivities(
     step = torch.where(active >= 0, _STEP, 0.0).transpose(1, 2).to(theta.dtype)
     moved[:, 1:].scatter_add_(-1, index[..., None], step[..., None])
     residual = problem.residual(moved.flatten(0, 1), chosen)
-    white = problem.whitened(residual, whitening, chosen).unflatten(1, (h, m + 1))
+    white = problem.whitened(residual, whitening, chosen).reshape(n, h, m + 1, -1)
     return white[:, :, 0], (white[:, :, :1] - white[:, :, 1:]) / _STEP
 
 
@@ -176,7 +179,7 @@ def _fit_lot(
         move = move.clamp(-_FARTHEST, _FARTHEST)
         trials = torch.stack([theta.scatter_add(-1, safe, share * move).clamp(low, high) for share in _SHARES])
         left = problem.whitened(problem.residual(trials.flatten(0, 1), chosen), whitening, chosen)
-        costs = _cost(left, trials.flatten(0, 1), values).unflatten(0, (len(_SHARES), h))
+        costs = _cost(left, trials.flatten(0, 1), values).reshape(len(_SHARES), h, n)
         best, which = costs.min(0)
         better = best < cost
         taken = trials.gather(0, which[None, ..., None].expand(1, *theta.shape))[0]
@@ -188,7 +191,7 @@ def _fit_lot(
     # Here, since the whitened residual does not tell it.
     plain = problem.pooled(problem.residual(theta, chosen))
     left = (plain.square() * judged).sum((-1, -2)) / values
-    squares = residual.square().unflatten(-1, judged.shape).sum(-1)
+    squares = residual.square().reshape(n, h, *judged.shape).sum(-1)
     found = []
     for a, row in enumerate(specs):
         fits = []

@@ -22,7 +22,7 @@ _LEAST_GAP = 1e-3
 def folds_of(problem: Problem) -> Tensor:
     """Fold of each stretch: whole runs, dealt out in order; parts of the run where there is one alone."""
     run = problem.data.run
-    runs = run.unique()
+    runs = torch.tensor(sorted(set(run.tolist())))
     count = len(run)
     if len(runs) < 2:
         return torch.arange(count) * min(_FOLDS, count) // count

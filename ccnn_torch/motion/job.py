@@ -74,7 +74,9 @@ def verdict_of(config: DiagnoseConfig, tell: Callable[..., None] | None = None) 
     if config.mechanism is None:
         raise InputError("mechanism: is missing; give --mechanism servo, a machine, or path/to/file.py:NAME")
     if config.records is not None:
-        raise InputError("records and motion: a diagnosis is of poses or of a motion; give one of --records and --motion")
+        raise InputError(
+            "records and motion: a diagnosis is of poses or of a motion; give one of --records and --motion"
+        )
     files = [config.motion] if isinstance(config.motion, str) else config.motion
     logs = load_logs(files, config.columns)
     nominal = nominal_of(config.mechanism, config.mechanism_keys, logs[0].units)
@@ -105,8 +107,10 @@ def motion_arrays(found: MotionDiagnosis) -> dict[str, Any]:
 
 def _about(config: DiagnoseConfig, folder: Path, found: MotionDiagnosis) -> dict[str, Any]:
     files = [config.motion] if isinstance(config.motion, str) else list(config.motion or [])
-    noise = "The noise was given." if config.noise is not None else (
-        "The noise is what the most probable model leaves; it may hold another cause."
+    noise = (
+        "The noise was given."
+        if config.noise is not None
+        else ("The noise is what the most probable model leaves; it may hold another cause.")
     )
     return {
         "name": folder.name,

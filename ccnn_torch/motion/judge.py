@@ -1,8 +1,8 @@
 """From fitted sets to a verdict on each axis: tempered posterior, classes, and what is outside the library.
 
 Evidence counts every sample as new information about one right model. The model is never right, so that log odds are
-tempered by the stretches of the logs. Of a difference of log likelihoods, D over all stretches, those stretches that speak
-against it, d < 0, show how far chance reaches: a normal variable with the mean D and twice their sum of squares as its
+tempered by the stretches of the logs. Of a difference of log likelihoods, D over all stretches, those that speak against
+it, d < 0, show how far chance reaches: a normal variable with the mean D and twice their sum of squares as its
 variance has log odds D^2 / sum(d^2). And no stretch alone bears a verdict: odds are at most twice those without the
 stretch that speaks most for it. The smallest of the three counts.
 """
@@ -29,8 +29,8 @@ _OUTSIDE = math.log(0.001)
 _LIKE = math.log(20.0)
 # A driver is part of the cause where it takes away this share of the mean square that the best set leaves, unwhitened.
 _SHARE = 0.1
-# An effect without which the mean square grows by less than this share of the gap's only corrects the form of others;
-# or, since the nominal model has a form that is not right either, by the square of this share of what the position differs
+# An effect without which the mean square grows by less than this share of the gap's only corrects the form of others.
+# Or, since the nominal model has a form that is not right either, by the square of this share of what the position differs
 # from the command.
 _FORM, _FORM_NOMINAL = 0.01, 0.01
 # Claims are never surer.
@@ -183,7 +183,7 @@ def _outside(found: Search, axis: int, drivers: dict[str, Tensor]) -> _Wild:
             grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
             fit = fit_sets(grams, [[*starts, torch.arange(m, len(x))]], 0.0)
             mean = fit.mean[0]
-            after = (y - mean @ x).square().unflatten(-1, blocks).sum(-1)
+            after = (y - mean @ x).square().reshape(blocks).sum(-1)
             gained = 0.5 * (best.squares - after) / best.noise
             evidence = float(fit.log_evidence[0]) - best.log_evidence
             odds = _tempered(evidence, gained) + prior - (log_posterior(best) - best.log_evidence)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -119,9 +119,7 @@ class Library(NamedTuple):
             if not bool((theta[..., j] != 0).any()):
                 continue
             for a, (name, _, how) in enumerate(self.numbers[0][j].acts):
-                amount = theta[..., j] * theta.new_tensor(
-                    [axis[j].scale * axis[j].acts[a][1] for axis in self.numbers]
-                )
+                amount = theta[..., j] * theta.new_tensor([axis[j].scale * axis[j].acts[a][1] for axis in self.numbers])
                 before = found.get(name, torch.full_like(amount, ABSENT[name]))
                 found[name] = before + amount if how == "add" else before * amount.clamp(-5, 5).exp()
         for name, place in self.held.items():
@@ -161,7 +159,9 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
     variants = []
     for e in range(len(effects)):
         count = min(len(s) for s in shapes[e])
-        variants.append(tuple(_variant(e, effects[e].name, k, places[e], numbers, shapes[e], held, count) for k in range(count)))
+        variants.append(
+            tuple(_variant(e, effects[e].name, k, places[e], numbers, shapes[e], held, count) for k in range(count))
+        )
     nominal = {
         name: torch.tensor([axis.nominal.get(name, ABSENT[name]) for axis in facts], dtype=torch.float64)
         for name in ABSENT
@@ -187,7 +187,7 @@ def _variant(
     k: int,
     places: tuple[int, ...],
     numbers: list[list[Number]],
-    shapes: list[tuple[dict[str, float], ...]],
+    shapes: Sequence[Sequence[Mapping[str, float]]],
     held: dict[str, int],
     count: int,
 ) -> Variant:

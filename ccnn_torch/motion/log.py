@@ -68,9 +68,7 @@ class Log:
         return tuple(f"q{i + 1}" for i in range(self.command.shape[1]))
 
 
-def load_logs(
-    sources: Sequence[str | Path | Frame | Table], columns: Mapping[str, str] | None = None
-) -> list[Log]:
+def load_logs(sources: Sequence[str | Path | Frame | Table], columns: Mapping[str, str] | None = None) -> list[Log]:
     """Read logs; every file is a run, or several where it has a column `run[1]`.
 
     Args:

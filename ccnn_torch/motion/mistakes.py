@@ -72,7 +72,9 @@ def lag_of(log: Log, joint: int) -> float:
     step = float(np.median(np.diff(log.time)))
     c, q = command - command.mean(), position - position.mean()
     size = 1 << (2 * len(c) - 1).bit_length()
-    like = np.fft.irfft(np.fft.rfft(q, size) * np.conj(np.fft.rfft(c, size)), size)[: max(int(_LONGEST_LAG * len(c)), 1)]
+    like = np.fft.irfft(np.fft.rfft(q, size) * np.conj(np.fft.rfft(c, size)), size)[
+        : max(int(_LONGEST_LAG * len(c)), 1)
+    ]
     best = int(np.argmax(like))
     # A position that is not the command at all lags behind it by nothing.
     return best * step if like[best] > _ALIKE * np.linalg.norm(c) * np.linalg.norm(q) else 0.0

@@ -114,7 +114,8 @@ def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[d
                     "load": motion.load,
                 },
             }
-            for rival in rivals or [None]:
+            others: list[Fit | None] = [*rivals] or [None]
+            for rival in others:
                 gain = _gain(problem, whitening, i, verdict.best, rival)
                 names = [] if rival is None else _apart(library.names, verdict.best, rival)
                 entries.append((entry | {"separates": names, "gain": gain}, motion))
@@ -150,7 +151,9 @@ def _alike(library: Library, axis: int, best: Fit, rival: Fit) -> bool:
 
 
 def _apart(names: Sequence[str], best: Fit, rival: Fit) -> list[str]:
-    return [names[e] for e in (*sorted({*best.members} - {*rival.members}), *sorted({*rival.members} - {*best.members}))]
+    return [
+        names[e] for e in (*sorted({*best.members} - {*rival.members}), *sorted({*rival.members} - {*best.members}))
+    ]
 
 
 def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
@@ -164,13 +167,27 @@ def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
     nominal["gravity_sin"] = nominal.get("gravity_sin", 0.0) + motion.load
     library = _only(problem, axis, nominal)
     data = Stretches(
-        motion.time[None], row[None], row[None], torch.zeros(1, 1, s, dtype=torch.float64), judged,
-        torch.zeros(1, dtype=torch.int64), {}, torch.zeros(1, s, dtype=torch.int64), ("next",), (facts.unit,), (),
+        motion.time[None],
+        row[None],
+        row[None],
+        torch.zeros(1, 1, s, dtype=torch.float64),
+        judged,
+        torch.zeros(1, dtype=torch.int64),
+        {},
+        torch.zeros(1, s, dtype=torch.int64),
+        ("next",),
+        (facts.unit,),
+        (),
     )
     still = torch.zeros(1, s, dtype=torch.float64)
     step = float(problem.data.time.diff(dim=-1).median()) * problem.pool
     return replace(
-        problem, data=data, library=library, followed=row[None], supply=still, warm=still,
+        problem,
+        data=data,
+        library=library,
+        followed=row[None],
+        supply=still,
+        warm=still,
         pool=max(round(step / _STEP), 1),
     )
 

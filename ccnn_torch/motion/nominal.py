@@ -100,7 +100,9 @@ def nominal_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) ->
     if mechanism == "servo":
         return _servo(keys, n)
     simulator = simulator_of(mechanism, keys, units)
-    return Nominal(mechanism, ({},) * n, (None,) * n, (None,) * n, None, simulator, simulator.notes if simulator else ())
+    return Nominal(
+        mechanism, ({},) * n, (None,) * n, (None,) * n, None, simulator, simulator.notes if simulator else ()
+    )
 
 
 def _servo(keys: Mapping[str, Any], n: int) -> Nominal:
@@ -151,7 +153,9 @@ def _numbers(key: str, value: Any, n: int) -> list[float]:
         for v in values
     )
     if not fine or (key in ("gain", "supply", "length") and not all(v > 0 for v in values)):
-        what = "a number" if signed else "a number not below 0" if key not in ("gain", "supply", "length") else "above 0"
+        what = (
+            "a number" if signed else "a number not below 0" if key not in ("gain", "supply", "length") else "above 0"
+        )
         raise InputError(
             f"mechanism_keys: {key} must be {what}, or a list with one for each of the {n} joints, not {value}"
         )

@@ -153,9 +153,7 @@ def print_motion(
         )
 
 
-def _sections(
-    results: Block, about: About, figures: Mapping[str, InlineFigure], least: float = 0.0
-) -> list[Section]:
+def _sections(results: Block, about: About, figures: Mapping[str, InlineFigure], least: float = 0.0) -> list[Section]:
     planned: list[tuple[str, tuple[str, ...], tuple[Table | None, ...]]] = [
         ("How large is the gap?", ("gap",), (gap_table(results, about), order_table(results))),
         ("Which effect?", ("probabilities",), (effect_table(results, least=least), parameter_table(results))),
@@ -183,7 +181,9 @@ def _phase_table(results: Block) -> Table | None:
         share, samples = block["share"], f"{100 * block['samples']:.0f}"
         rows.append((name, *_share(share, known.get("phases", {}).get(name)), samples))
     columns = ("part", "share of the gap [%]", "95 % interval [%]", "share of the time [%]")
-    note = "Share: of the gap's mean square. Phases by the measured speed; reversal: 0.15 s around a change of direction."
+    note = (
+        "Share: of the gap's mean square. Phases by the measured speed; reversal: 0.15 s around a change of direction."
+    )
     return Table("Where is the gap?", columns, tuple(rows), note) if rows else None
 
 
@@ -194,7 +194,13 @@ def _share(share: float, interval: list[float] | None) -> tuple[str, str]:
 
 def _next_table(results: Block) -> Table | None:
     rows = tuple(
-        (str(k), e["motion"]["joint"], e["motion"]["text"], " or ".join(e["separates"]) or "–", number_text(e["gain"], 3))
+        (
+            str(k),
+            e["motion"]["joint"],
+            e["motion"]["text"],
+            " or ".join(e["separates"]) or "–",
+            number_text(e["gain"], 3),
+        )
         for k, e in enumerate(results["next_measurements"], 1)
     )
     note = (

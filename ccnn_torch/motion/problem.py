@@ -87,7 +87,8 @@ class Problem:
     def pooled(self, residual: Tensor) -> Tensor:
         """Means over `pool` samples each, `... x s` -> `... x t`."""
         m = self.pool
-        return residual[..., : residual.shape[-1] // m * m].unflatten(-1, (-1, m)).mean(-1)
+        kept = residual[..., : residual.shape[-1] // m * m]
+        return kept.reshape(*kept.shape[:-1], -1, m).mean(-1)
 
     @property
     def judged(self) -> Tensor:

@@ -140,7 +140,11 @@ class _Pool:
         for _ in range(3):
             before = self.best()
             less = [
-                [s for k in range(len(f.members)) if (s := without(self.library, f.spec, k)).members not in self.found[i]]
+                [
+                    s
+                    for k in range(len(f.members))
+                    if (s := without(self.library, f.spec, k)).members not in self.found[i]
+                ]
                 for i, f in enumerate(before)
             ]
             self.fit(less, _LONG)
@@ -163,7 +167,8 @@ class _Pool:
             self.fit(less, _SHORT)
             now = [
                 min(
-                    (self.found[i][without(self.library, s, k).members] for k in range(len(s.members))), key=lambda f: f.left
+                    (self.found[i][without(self.library, s, k).members] for k in range(len(s.members))),
+                    key=lambda f: f.left,
                 ).spec
                 if s.members
                 else s

@@ -78,7 +78,7 @@ def simulator_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) 
     if is_plugin(mechanism):
         return _own(mechanism, keys)
     if Path(mechanism).suffix.lower() in (".xml", ".mjcf") and Path(mechanism).is_file():
-        from ccnn_torch.motion.mujoco_model import mujoco_simulator, is_mjcf
+        from ccnn_torch.motion.mujoco_model import is_mjcf, mujoco_simulator
 
         if is_mjcf(Path(mechanism)):
             return mujoco_simulator(mechanism, keys, units)

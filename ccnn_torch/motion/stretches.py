@@ -7,6 +7,7 @@ its end. The folds of a cross-validation are whole runs, or stretches of a run w
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -101,12 +102,13 @@ def smooth_speed(time: NDArray[np.float64], position: NDArray[np.float64]) -> ND
     from scipy.signal import savgol_filter
 
     step = float(np.median(np.diff(time)))
-    width = min(2 * max(int(round(_WINDOW / step)), 2) + 1, (len(time) - 1) // 2 * 2 + 1)
+    width = min(2 * max(round(_WINDOW / step), 2) + 1, (len(time) - 1) // 2 * 2 + 1)
     if width < 5:
         return np.gradient(position, time, axis=0)
     # Of both, as the steps are not equal.
     slope: NDArray[np.float64] = savgol_filter(position, width, 2, deriv=1, axis=0)
-    return slope / savgol_filter(time, width, 2, deriv=1)[:, None]
+    steps: NDArray[np.float64] = savgol_filter(time, width, 2, deriv=1)
+    return np.asarray(slope / steps[:, None])
 
 
 def _uninterrupted(log: Log) -> list[NDArray[np.int64]]:
@@ -122,10 +124,10 @@ def _pieces(time: NDArray[np.float64], rows: NDArray[np.int64], whole: bool) -> 
     lead = int(np.searchsorted(time, time[0] + _LEAD))
     if whole:
         return [(rows, lead)]
-    count = max(int(round((time[-1] - time[lead]) / _JUDGED)), 1)
+    count = max(round((time[-1] - time[lead]) / _JUDGED), 1)
     begins = np.searchsorted(time, np.linspace(time[lead], time[-1], count + 1))
     found = []
-    for a, b in zip(begins[:-1], begins[1:], strict=True):
+    for a, b in pairwise(begins.tolist()):
         first = int(np.searchsorted(time, time[a] - _LEAD))
         found.append((rows[first : b + 1 if b == len(time) - 1 else b], int(a) - first))
     return found
@@ -151,11 +153,15 @@ def _padded(logs: Sequence[Log], pieces: Sequence[tuple[int, NDArray[np.int64], 
         for name, column in beside.items():
             column[k, :m], column[k, m:] = log.beside[name][rows], log.beside[name][rows[-1]]
     return Stretches(
-        *(torch.from_numpy(v) for v in (time, command, position, speed, judged)),
-        torch.tensor([number for number, _, _ in pieces]),
-        {name: torch.from_numpy(v) for name, v in beside.items()},
-        torch.from_numpy(place),
-        tuple(log.name for log in logs),
-        logs[0].units,
-        tuple(notes),
+        time=torch.from_numpy(time),
+        command=torch.from_numpy(command),
+        position=torch.from_numpy(position),
+        speed=torch.from_numpy(speed),
+        judged=torch.from_numpy(judged),
+        run=torch.tensor([number for number, _, _ in pieces]),
+        beside={name: torch.from_numpy(v) for name, v in beside.items()},
+        log=torch.from_numpy(place),
+        names=tuple(log.name for log in logs),
+        units=logs[0].units,
+        notes=tuple(notes),
     )

@@ -29,7 +29,9 @@ def moved(
 
     def rate(t: float, state: Array) -> list[float]:
         u = float(np.interp(t - delay, time, asked))
-        torque = GAIN * (u - state[0]) - viscous * state[1] - weight * np.sin(state[0]) - dry * np.tanh(state[1] / 0.002)
+        torque = (
+            GAIN * (u - state[0]) - viscous * state[1] - weight * np.sin(state[0]) - dry * np.tanh(state[1] / 0.002)
+        )
         return [float(state[1]), float(torque / INERTIA)]
 
     found = solve_ivp(rate, (time[0], time[-1]), [asked[0], 0.0], "LSODA", time, rtol=1e-6, atol=1e-8, max_step=0.01)

@@ -106,7 +106,7 @@ def test_a_mujoco_model_is_a_model(tmp_path: Path) -> None:
     model = tmp_path / "servo.xml"
     joint = f'<joint axis="0 1 0" armature="{KEYS["inertia"]}" damping="{KEYS["viscous"]}"/>'
     body = f'<body>{joint}<geom type="sphere" size="0.01" mass="1e-6"/></body>'
-    text = '<mujoco><worldbody>{}</worldbody><actuator>{}</actuator></mujoco>'
+    text = "<mujoco><worldbody>{}</worldbody><actuator>{}</actuator></mujoco>"
     model.write_text(text.format(body.replace("<joint ", '<joint name="q" '), f'<position joint="q" kp="{GAIN}"/>'))
     found = diagnose_motion(load_logs([log]), nominal_of(str(model), {}, ["rad"]), ["gravity", "delay"]).content
     assert found["verdict"]["effects"] == ["gravity"]
@@ -149,7 +149,9 @@ def test_a_file_that_cannot_be_is_refused_in_one_sentence(tmp_path: Path, cli: C
     with pytest.raises(InputError, match="inertia is given without gain"):
         nominal_of("servo", {"inertia": 2.0}, ["rad"])
     with pytest.raises(InputError, match="no effect of motion 'delai'; 'delay' is the nearest"):
-        diagnose_motion(load_logs([write_log(tmp_path / "fine.csv", (0,))]), nominal_of("servo", {}, ["rad"]), ["delai"])
+        diagnose_motion(
+            load_logs([write_log(tmp_path / "fine.csv", (0,))]), nominal_of("servo", {}, ["rad"]), ["delai"]
+        )
 
 
 def test_gaps_wrapped_counters_and_drives_that_are_off_are_left_out(tmp_path: Path) -> None:

@@ -61,10 +61,7 @@ def pendulum_xml(axis: Axis) -> str:
             else f'<joint name="far" axis="0 1 0" stiffness="{axis.spring}" '
             f'damping="{axis.extra.get("spring_damping", 0.0)}"/>'
         )
-        load = (
-            '<geom type="sphere" size="0.01" mass="0.001"/>'
-            f"<body>{second}{load}</body>"
-        )
+        load = f'<geom type="sphere" size="0.01" mass="0.001"/><body>{second}{load}</body>'
     return f"""<mujoco>
   <compiler angle="radian"/>
   <option timestep="0.0005" integrator="implicitfast" gravity="{gx} 0 {gz}"/>

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -77,7 +77,8 @@ def _changed(
     family: str, nominal: Axis, generator: np.random.Generator, most: float
 ) -> tuple[Axis, Told, Pushed | None, Callable[[Array], Array] | None, Callable[[Array, int], Array]]:
     """The real machine, what its controller is told, a torque that is applied, the supply, and the encoder's drift."""
-    real, pushes = nominal, []
+    real = nominal
+    pushes: list[Pushed] = []
     told: Told = lambda time, command: command  # noqa: E731
     voltage: Callable[[Array], Array] | None = None
     drift: Callable[[Array, int], Array] = lambda time, run: np.zeros_like(time)  # noqa: E731
@@ -117,17 +118,28 @@ def _changed(
             real = replace(real, force=generator.uniform(0.35, 0.6) * most)
         elif cause == "supply":
             low = generator.uniform(0.5, 0.75)
-            voltage = lambda time, low=low: _VOLTS * (low + (1 - low) * 0.5 * (1 + np.cos(2 * np.pi * time / 6.3)))  # noqa: E731
+            voltage = _drooping(low)
         elif cause == "cogging":
             pushes.append(_toothed(0.02 * size * kp, float(generator.integers(6, 20)), generator.uniform(0, 6.28)))
         elif cause == "rubber_stop":
             pushes.append(_rubber(2.0 * size * kp, generator.uniform(0.6, 0.8)))
         elif cause == "drifting_encoder":
-            drift = lambda time, run, size=size: 0.02 * size * sign * (1 - np.exp(-(time + 0.0) / 2.0))  # noqa: E731
+            drift = _creeping(0.02 * size * sign)
         elif cause == "dragging_brake":
             pushes.append(_brake(0.05 * size * kp, generator.uniform(2.0, 4.0), generator.uniform(5.0, 7.0)))
-    push = (lambda t, q, v: sum(p(t, q, v) for p in pushes)) if pushes else None
-    return real, told, push, voltage, drift
+    return real, told, _together(pushes) if pushes else None, voltage, drift
+
+
+def _together(pushes: Sequence[Pushed]) -> Pushed:
+    return lambda t, q, v: float(sum(p(t, q, v) for p in pushes))
+
+
+def _drooping(low: float) -> Callable[[Array], Array]:
+    return lambda time: _VOLTS * (low + (1 - low) * 0.5 * (1 + np.cos(2 * np.pi * time / 6.3)))
+
+
+def _creeping(size: float) -> Callable[[Array, int], Array]:
+    return lambda time, run: size * (1 - np.exp(-time / 2.0))
 
 
 def _torque(nominal: Axis, command: Callable[[Array], Array]) -> float:
@@ -163,34 +175,40 @@ def _slow(fastest: float) -> Told:
 
 def _sticky(torque: float, speed: float) -> Pushed:
     # Falls with the speed itself, not with its square.
-    return lambda t, q, v: -torque * np.exp(-abs(v) / speed) * np.tanh(v / 0.005)
+    return lambda t, q, v: float(-torque * np.exp(-abs(v) / speed) * np.tanh(v / 0.005))
 
 
 def _toothed(torque: float, teeth: float, phase: float) -> Pushed:
-    return lambda t, q, v: torque * np.sin(teeth * q + phase)
+    return lambda t, q, v: float(torque * np.sin(teeth * q + phase))
 
 
 def _rubber(stiffness: float, begin: float) -> Pushed:
-    return lambda t, q, v: -stiffness * max(q - begin, 0.0) ** 1.5
+    return lambda t, q, v: float(-stiffness * max(q - begin, 0.0) ** 1.5)
 
 
 def _brake(torque: float, begin: float, end: float) -> Pushed:
-    return lambda t, q, v: -torque * np.tanh(v / 0.01) if begin < t < end else 0.0
+    return lambda t, q, v: float(-torque * np.tanh(v / 0.01)) if begin < t < end else 0.0
 
 
 def _motion(kind: int, generator: np.random.Generator, most: float) -> Callable[[Array], Array]:
     """Sines, a chirp, steps with ramps, a slow triangle; all begin at rest."""
     amplitude = generator.uniform(0.6, 1.0) * most
     rate = generator.uniform(0.8, 1.25)
-    soft = lambda time: np.clip(time / 0.7, 0, 1)  # noqa: E731
+
+    def soft(time: Array) -> Array:
+        return np.clip(time / 0.7, 0, 1)
+
     if kind == 0:
         return lambda t: soft(t) * amplitude * (0.6 * np.sin(2.1 * rate * t) + 0.4 * np.sin(5.3 * rate * t))
     if kind == 1:
         return lambda t: soft(t) * 0.35 * amplitude * np.sin(2 * np.pi * (0.2 * t + 0.13 * rate * t**2))
     if kind == 2:
         levels = generator.uniform(-1, 1, 9) * amplitude
-        return lambda t: np.interp(t, np.repeat(np.arange(9.0), 2)[1:-1] + np.tile([-0.12, 0.12], 9)[1:-1],
-                                   np.repeat(np.concatenate([[0.0], levels[1:]]), 2)[:-2])
+        return lambda t: np.interp(
+            t,
+            np.repeat(np.arange(9.0), 2)[1:-1] + np.tile([-0.12, 0.12], 9)[1:-1],
+            np.repeat(np.concatenate([[0.0], levels[1:]]), 2)[:-2],
+        )
     period = 4.0 / rate
     return lambda t: amplitude * (2 / np.pi) * np.arcsin(np.sin(2 * np.pi * t / period))
 
