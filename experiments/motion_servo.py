@@ -1,7 +1,7 @@
 """Diagnose a real servo whose model is told one wrong thing at a time: a confusion matrix of real causes.
 
-The logs are of Rhoban/bam (see experiments/data/README.md): one servo with a known pendulum, four motions at three gains.
-The complete model is identified on two of the motions; the diagnosis sees the two others.
+The logs are of Rhoban/bam (see experiments/data/README.md): one servo with a known pendulum, four motions at three
+gains. The complete model is identified on two of the motions; the diagnosis sees the two others.
 
     python experiments/motion_servo.py FOLDER_OF_LOGS [GAIN …]
 """
@@ -85,9 +85,7 @@ def main() -> None:
     """Print one line for each case."""
     folder = Path(sys.argv[1])
     gains = [int(g) for g in sys.argv[2:]] or [100, 400, 800]
-    print(
-        "identified on | kp | told | named | class | driver | probability | gap before -> after on held-out motions [mrad]"
-    )
+    print("identified on | kp | told | named | class | driver | probability | gap before -> after, held out [mrad]")
     for k in range(2):
         values = identified(folder, SPLITS[k], [100, 400, 800])
         print(f"# {SPLITS[k]}: " + ", ".join(f"{n} {v:.4g}" for n, v in zip(START, values, strict=True)))

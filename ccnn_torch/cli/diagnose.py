@@ -47,8 +47,8 @@ def diagnose(
 
     The diagnosis comes first; then a network is trained on the residual of the effects, to estimate its further gain
     (seconds; --no-network omits that). The folder gets diagnosis.json, report.html and next_measurements.csv, the most
-    informative poses to measure next. With --motion it is of time series: delay, gains, friction, play, weights, limits.
-    Keys: records, motion, columns, mechanism, out, mechanism_keys, covariates, noise,
+    informative poses to measure next. With --motion it is of time series: delay, gains, friction, play,
+    weights, limits. Keys: records, motion, columns, mechanism, out, mechanism_keys, covariates, noise,
     effects, gravity, network, seed.
 
     Examples:

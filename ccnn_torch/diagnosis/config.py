@@ -44,7 +44,7 @@ class DiagnoseConfig(Section):
     )
     motion: Files | None = Field(
         default=None,
-        description="CSV of the logs of a machine in motion, each a run; the same as --motion. One of records and motion",
+        description="CSV of the logs of a machine in motion, each a run; the same as --motion; in the place of records",
     )
     columns: Columns
     mechanism: str | None = Field(default=None, description="the nominal machine; the same as --mechanism")

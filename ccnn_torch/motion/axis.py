@@ -2,12 +2,12 @@
 
 The motor's torque is the gain times (command less position). With everything divided by the nominal gain, an axis obeys
 
-    inertia * q'' = clip(gain * supply * (u - q), 1 / weakness) - viscous * q' - F(q') * sign(q') - gravity(q) - cogging(q)
+    inertia * q'' = clip(gain * supply * (u - q), 1 / weakness) - viscous * q' - F(q') * sign(q') - weight(q) - teeth(q)
 
 where u is the command after delay, speed limit and offset: torques are then angles (N m per N m/rad), the inertia is
-in s^2, the viscous friction in s. With all of these 0 the position follows the command exactly: that axis is nominal where
-nothing is known. The rule for the integration is SDIRK2 (Alexander 1977), whose two implicit stages are solved in closed
-form, dry friction included, so that an axis without mass, or one that sticks, needs no smaller steps.
+in s^2, the viscous friction in s. With all of these 0 the position follows the command exactly: that axis is nominal
+where nothing is known. The rule for the integration is SDIRK2 (Alexander 1977), whose two implicit stages are solved in
+closed form, dry friction included, so that an axis without mass, or one that sticks, needs no smaller steps.
 """
 
 from __future__ import annotations

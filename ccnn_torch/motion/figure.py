@@ -28,7 +28,7 @@ def course_plot(results: Mapping[str, Any], arrays: Arrays) -> Plot | None:
 
     Args:
         results: as in `diagnosis.json`.
-        arrays: `time` `b x s`, `command`, `position`, `before`, `after`, `phase` `n x b x s`, `judged` `b x s`, `run` `b`.
+        arrays: `time`, `judged` `b x s`, `command`, `position`, `before`, `after`, `phase` `n x b x s`, and `run` `b`.
     """
     if "before" not in arrays:
         return None
@@ -80,7 +80,7 @@ def course_plot(results: Mapping[str, Any], arrays: Arrays) -> Plot | None:
         low.legend(loc="upper right", ncols=4)
     grid[-1].set_xlabel("time [s]")
     caption = (
-        "The run with the largest gap. Measured less simulated position, held out: by a fit that saw no part of this run "
-        "(or, of a single run, not this part). Shaded: reversals (yellow) and standstill (grey)."
+        "The run with the largest gap. Measured less simulated position, held out: by a fit that saw no part of this "
+        "run (or, of a single run, not this part). Shaded: reversals (yellow) and standstill (grey)."
     )
     return Plot("course", figure, caption)

@@ -1,8 +1,8 @@
 """From fitted sets to a verdict on each axis: tempered posterior, classes, and what is outside the library.
 
 Evidence counts every sample as new information about one right model. The model is never right, so that log odds are
-tempered by the stretches of the logs. Of a difference of log likelihoods, D over all stretches, those that speak against
-it, d < 0, show how far chance reaches: a normal variable with the mean D and twice their sum of squares as its
+tempered by the stretches of the logs. Of a difference of log likelihoods, D over all stretches, those that speak
+against it, d < 0, show how far chance reaches: a normal variable with the mean D and twice their sum of squares as its
 variance has log odds D^2 / sum(d^2). And no stretch alone bears a verdict: odds are at most twice those without the
 stretch that speaks most for it. The smallest of the three counts.
 """
@@ -30,8 +30,8 @@ _LIKE = math.log(20.0)
 # A driver is part of the cause where it takes away this share of the mean square that the best set leaves, unwhitened.
 _SHARE = 0.1
 # An effect without which the mean square grows by less than this share of the gap's only corrects the form of others.
-# Or, since the nominal model has a form that is not right either, by the square of this share of what the position differs
-# from the command.
+# Or, since the nominal model has a form that is not right either, by the square of this share of what the position
+# differs from the command.
 _FORM, _FORM_NOMINAL = 0.01, 0.01
 # Claims are never surer.
 _MOST = 0.995
@@ -156,7 +156,7 @@ class _Wild(NamedTuple):
 
 
 def _outside(found: Search, axis: int, drivers: dict[str, Tensor]) -> _Wild:
-    """Drivers beside the sets that lead from none to the best one: what is outside need not leave the best set as it is."""
+    """Drivers beside the sets that lead from none to the best one: with one, the best set may be smaller."""
     problem, fits = found.problem, found.found[axis]
     best, by_members = fits[0], {f.members: f for f in fits}
     slight = _slight(found, axis, by_members[()])

@@ -152,8 +152,8 @@ def _unit(table: Table, position: str, command: str) -> str:
         units.append(si)
     if units[0] != units[1]:
         raise InputError(
-            f"{table.path}: '{command}' is in {units[1]} and '{position}' in {units[0]}; a command and the position that "
-            "follows it have one unit"
+            f"{table.path}: '{command}' is in {units[1]} and '{position}' in {units[0]}; a command and the position "
+            "that follows it have one unit"
         )
     return units[0]
 
@@ -173,8 +173,8 @@ def _log(
     if len(back):
         more = f", and {len(back) - 1} times more" if len(back) > 1 else ""
         raise InputError(
-            f"{table.path}: time does not increase at {table.name_rows([int(rows[back[0] + 1])])}{more}; sort the rows, "
-            "and write one row for each time"
+            f"{table.path}: time does not increase at {table.name_rows([int(rows[back[0] + 1])])}{more}; sort the "
+            "rows, and write one row for each time"
         )
     own = {n: v[rows] for n, v in beside.items()}
     notes: list[str] = []

@@ -1,4 +1,4 @@
-"""Mistakes in logs that no diagnosis survives: swapped joints, wrong units, a drive that was off, nothing that moves."""
+"""Mistakes in logs that no diagnosis survives: swapped joints, wrong units, a drive that was off, no motion."""
 
 from __future__ import annotations
 

@@ -45,8 +45,8 @@ def mujoco_simulator(path: str, keys: Mapping[str, Any], units: Sequence[str]) -
     position = [k for k in held if model.actuator_biasprm[k, 1] < 0 and model.actuator_gainprm[k, 0] > 0]
     if len(position) != model.nu or model.nu != len(units):
         raise InputError(
-            f"{path}: has {model.nu} actuators, {len(position)} of which hold the position of a joint, and the logs have "
-            f"{len(units)} commands; give it one <position joint=…/> for each command, in their order"
+            f"{path}: has {model.nu} actuators, {len(position)} of which hold the position of a joint, and the logs "
+            f"have {len(units)} commands; give it one <position joint=…/> for each command, in their order"
         )
     joints = [int(model.actuator_trnid[k, 0]) for k in position]
     own = ["m" if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE else "rad" for j in joints]

@@ -1,4 +1,4 @@
-"""The report of a diagnosis of motion: the same first screen, tables and figures as for poses, and the course over time."""
+"""The report of a diagnosis of motion: first screen, tables and figures as for poses, and the course over time."""
 
 from __future__ import annotations
 
@@ -204,8 +204,8 @@ def _next_table(results: Block) -> Table | None:
         for k, e in enumerate(results["next_measurements"], 1)
     )
     note = (
-        "Gain: expected log odds by which the motion tells the two apart, or where there is no rival the information on "
-        f"the numbers of the only model. The first as commands to play: {NEXT}."
+        "Gain: expected log odds by which the motion tells the two apart, or where there is no rival the information "
+        f"on the numbers of the only model. The first as commands to play: {NEXT}."
     )
     columns = ("number", "joint", "motion", "separates", "gain [nat]")
     return Table("What should be recorded next?", columns, rows, note, ("motion", "separates")) if rows else None

@@ -14,8 +14,8 @@ __all__ = ["fitted_whitening"]
 _HIGHEST = 8
 # A residual that is a constant or a ramp would give a root outside the unit circle: so much is added to the diagonal.
 _RIDGE = 1e-9
-# Poles are drawn in by this factor (bandwidth expansion of linear prediction): what a model leaves is no stationary noise,
-# and a pole at the unit circle would leave the slow half of every effect without weight.
+# Poles are drawn in by this factor (bandwidth expansion of linear prediction): what a model leaves is no stationary
+# noise, and a pole at the unit circle would leave the slow half of every effect without weight.
 _WIDER = 0.9
 
 

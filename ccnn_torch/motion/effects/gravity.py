@@ -1,7 +1,7 @@
 """Weight that the model lacks or has wrong: sag of an axis that turns against its own weight.
 
-Sine and cosine of the joint's angle, since the direction of the weight is not known; of a sliding axis a constant, which
-is an offset.
+Sine and cosine of the joint's angle, since the direction of the weight is not known; of a sliding axis a constant,
+which is an offset.
 """
 
 from __future__ import annotations

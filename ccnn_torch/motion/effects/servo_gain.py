@@ -1,6 +1,7 @@
 """Gains of the position control: the proportional one, and a damping one on the speed.
 
-Of an axis of which nothing is known the proportional gain has nothing to work against; a finite gain then shows as a lag.
+Of an axis of which nothing is known the proportional gain has nothing to work against; a finite gain then shows
+as a lag.
 """
 
 from __future__ import annotations
