@@ -1,4 +1,5 @@
-"""What a residual may follow that no effect describes: speed, acceleration, reversal, position, torque, time, warmth.
+"""What a residual may follow that no effect describes: speed, acceleration, reversal, position, torque, time and
+temperature.
 
 Each is a group of columns that are added to the simulated position. Where one of them is part of the most probable set,
 the cause is outside the library, and its driver says where to look.
