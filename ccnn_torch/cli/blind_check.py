@@ -40,9 +40,9 @@ def blind_check(
     Four more sources share no formula with the library or each other. They were written without a look at its code:
     semi_real adds a known error to measured rows of real arms (folder CCNN_MEASURED; without it the UR10 of
     experiments/data), multibody changes MuJoCo models, adversarial has noise, plans and causes that are not of the
-    textbook's form, and motion has logs of axes in motion, simulated in MuJoCo (by the author of its effects, before they
-    were tuned). For these --seed is the seed of the first case of each family, and the folder holds source.json,
-    source.csv and source.md.
+    textbook's form, and motion has logs of axes in motion, simulated in MuJoCo (by the author of its effects, but
+    before they were tuned). For these --seed is the seed of the first case of each family, and the folder holds
+    source.json, source.csv and source.md.
 
     Examples:
 

@@ -17,11 +17,11 @@ from ccnn_torch.report.json_files import load_schema
 
 Cli = Callable[..., tuple[int, str, str]]
 DATA = Path(__file__).parents[2] / "experiments" / "data"
-FEW = ["delay", "coulomb", "viscous", "offset", "backlash"]
+FEW = ["delay", "coulomb", "offset", "backlash"]
 
 
 def test_two_causes_are_named_with_their_values(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", dry=0.1, delay=0.03)
+    log = write_log(tmp_path / "log.csv", (0, 1), 4.0, dry=0.1, delay=0.03)
     found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), FEW).content
     assert sorted(found["verdict"]["effects"]) == ["coulomb", "delay"] and found["verdict"]["probability"] > 0.9
     values = {e["name"]: e["parameters"] for e in found["effects"]}
@@ -32,14 +32,14 @@ def test_two_causes_are_named_with_their_values(tmp_path: Path) -> None:
 
 
 def test_a_right_model_leaves_no_claim_and_its_error_says_where(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", (0, 1), dry=0.02 * GAIN)
+    log = write_log(tmp_path / "log.csv", (0, 1), 4.0, dry=0.02 * GAIN)
     right = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS | {"coulomb": 0.02 * GAIN}, ["rad"]), FEW)
     assert right.content["verdict"]["none"] and right.content["verdict"]["effects"] == []
 
 
 def test_what_no_motion_separates_is_a_class(tmp_path: Path) -> None:
     # Of an axis of which nothing is known, a finite gain and viscous friction are one and the same lag.
-    log = write_log(tmp_path / "log.csv", (0, 2))
+    log = write_log(tmp_path / "log.csv", (0, 2), 3.0)
     found = diagnose_motion(load_logs([log]), nominal_of("servo", {}, ["rad"]), ["servo_gain", "viscous", "inertia"])
     named = {e["name"]: e["indistinguishable_from"] for e in found.content["effects"]}
     lag = next(n for n in ("servo_gain", "viscous") if n in found.content["verdict"]["effects"])
@@ -78,7 +78,7 @@ def test_the_command_on_a_real_servo(tmp_path: Path, cli: Cli) -> None:
 
 
 def test_a_simulator_of_ones_own_is_a_model(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", (0, 1), delay=0.05)
+    log = write_log(tmp_path / "log.csv", (0, 1), 3.0, delay=0.05)
     own = tmp_path / "mine.py"
     own.write_text(
         "import numpy as np\n"
@@ -95,7 +95,7 @@ def test_a_simulator_of_ones_own_is_a_model(tmp_path: Path) -> None:
         "        return commands[1:]\n"
     )
     logs = load_logs([log])
-    found = diagnose_motion(logs, nominal_of(f"{own}:SERVO", {}, ["rad"]), ["delay", "offset", "backlash"]).content
+    found = diagnose_motion(logs, nominal_of(f"{own}:SERVO", {}, ["rad"]), ["delay", "offset"]).content
     assert found["verdict"]["effects"] == ["delay"]
     with pytest.raises(InputError, match="must return a position for each"):
         diagnose_motion(logs, nominal_of(f"{own}:BROKEN", {}, ["rad"]), ["delay"])
