@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.progress import at_step
 from ccnn_torch.diagnosis.shrink.held_out import INTERVAL
-from ccnn_torch.diagnosis.verdict.text import unseen_text, verdict_text
+from ccnn_torch.diagnosis.verdict.text import listed, unseen_text, verdict_text
 from ccnn_torch.display import number_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion.effects import Facts, MotionEffect, motion_effects
@@ -137,21 +137,24 @@ def diagnose_motion(
     outside = any(v.driver is not None for v in verdicts)
     probability = math.prod(v.probability for v in verdicts)
     kept = _kept(squares[: len(steps) + 1]) if names else 0
-    unconfirmed = not kept and any(m > _CONFIRMED for v in verdicts for m in v.marginal.values())
-    if unconfirmed and names and not outside:
-        # More is seen than chance, and no set of names holds on the other runs: the one that comes nearest is named.
+    helped = min((float(v.sum()) for v in squares[1 : len(steps) + 1]), default=math.inf) < float(squares[0].sum())
+    seen = any(m > _CONFIRMED for v in verdicts for m in v.marginal.values())
+    unconfirmed = not kept and seen and helped and not outside
+    if unconfirmed:
+        # More is seen than chance, and what it takes away elsewhere is little: the names that take most.
         kept = 1 + min(range(len(names)), key=lambda k: float(squares[k + 1].sum()))
+    dropped = [] if outside else names[kept:]
     if kept < len(names) and not outside:
         # A name has to take something away on runs that no fit saw.
         verdicts = [_reduced(library, found.found[i], v, names[:kept]) for i, v in enumerate(verdicts)]
         names, steps = names[:kept], steps[:kept]
         probability = math.prod(v.probability for v in verdicts)
         total = shrink_of(spread, squares[0], squares[kept], floor)
-    probability = min(probability, _CONFIRMED) if unconfirmed and names and not outside else probability
+    probability = min(probability, _CONFIRMED) if unconfirmed else probability
     unit = data.units[0]
     drivers = list(dict.fromkeys(v.driver for v in verdicts if v.driver))
     after = residuals[len(names)]
-    listed = _effects(
+    every = _effects(
         problem, found, verdicts, spread, squares[0], dict(zip(singles, squares[-len(singles) :], strict=True)), floor
     )
     at_step("next measurements")
@@ -185,7 +188,7 @@ def diagnose_motion(
         },
         "gap_rotation": None,
         **_where(problem, residuals[0], spread),
-        "effects": listed,
+        "effects": every,
         "in_order": [
             {"name": name, "gap_after": own[1], "shrink": own[2], "shrink_ci95": own[3]}
             for name, own in (
@@ -201,7 +204,7 @@ def diagnose_motion(
         "rows_set_aside": [],
         "why_set_aside": [],
         "cautions": [],
-        "notes": _notes(problem, nominal, found, floor_rms, noise),
+        "notes": _notes(problem, nominal, found, floor_rms, noise, dropped),
     }
     verdict["text"] = verdict_text(content)
     return MotionDiagnosis(content, problem, found, verdicts, residuals[0], after, proposed)
@@ -276,8 +279,7 @@ def _reduced(library: Library, fits: Sequence[Fit], verdict: AxisVerdict, names:
         place = [old.spec.flat.index(j) for j in spec.flat]
         best = old._replace(spec=spec, mean=old.mean[place], covariance=old.covariance[place][:, place])
     like = {m: verdict.classes[m] for m in members}
-    gone = [m for m in verdict.best.members if m not in members]
-    each = [1 - verdict.marginal.get(m, 0.0) for m in gone] + [verdict.marginal.get(m, 1.0) for m in members]
+    each = [verdict.marginal.get(m, 1.0) for m in members] or [1 - max(verdict.marginal.values(), default=0.0)]
     return AxisVerdict(best, min([verdict.probability, _DOUBTED, *each]), verdict.marginal, like, verdict.driver)
 
 
@@ -342,7 +344,7 @@ def _effects(
     floor: float,
 ) -> list[dict[str, Any]]:
     library = problem.library
-    listed = []
+    rows = []
     for name, squares in alone.items():
         e = library.names.index(name)
         own = shrink_of(spread, before, squares, floor)
@@ -352,7 +354,7 @@ def _effects(
             fit = v.best if e in v.best.members else _alone(found.found[i], e)
             if fit is not None and (e in v.best.members or not any(e in w.best.members for w in verdicts)):
                 parameters |= parameters_of(library, i, fit, e)
-        listed.append(
+        rows.append(
             {
                 "name": name,
                 "probability": 1 - math.prod(1 - v.marginal.get(e, 0.0) for v in verdicts),
@@ -365,18 +367,24 @@ def _effects(
                 "signatures": {},
             }
         )
-    return sorted(listed, key=lambda e: (-e["probability"], e["gap_after"], e["name"]))
+    return sorted(rows, key=lambda e: (-e["probability"], e["gap_after"], e["name"]))
 
 
 def _alone(fits: Sequence[Fit], effect: int) -> Fit | None:
     return next((f for f in fits if f.members == (effect,)), None)
 
 
-def _notes(problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None) -> list[str]:
+def _notes(
+    problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None, dropped: Sequence[str]
+) -> list[str]:
     data = problem.data
     notes = [*data.notes, *nominal.notes]
     library = problem.library
     notes += [unseen_text(n, why) for n, why in zip(library.names, library.lacking, strict=True) if why]
+    if dropped:
+        notes.append(
+            f"{listed(dropped)} fit these runs as well, and take nothing away on runs that were not fitted: not named"
+        )
     runs = len(set(data.run.tolist()))
     folds = int(folds_of(problem).max()) + 1
     if runs > 1:

@@ -29,6 +29,8 @@ _OUTSIDE = math.log(0.001)
 _LIKE = math.log(20.0)
 # A driver is part of the cause where it takes away this share of the mean square that the best set leaves, unwhitened.
 _SHARE = 0.1
+# And this share of that of the gap: less is the form of an effect that is named.
+_OF_GAP = 0.03
 # An effect without which the mean square grows by less than this share of the gap's only corrects the form of others.
 # Or, since the nominal model has a form that is not right either, by the square of this share of what the position
 # differs from the command.
@@ -190,7 +192,7 @@ def _outside(found: Search, axis: int, drivers: dict[str, Tensor]) -> _Wild:
             # What it takes away of the position itself, not of its whitened form.
             taken = plain - (mean[m:, None, None] * columns[axis]).sum(0)
             before2, after2 = (float(v[judged].square().mean()) for v in (plain, taken))
-            if before2 - after2 < max(_SHARE * before2, slight):
+            if before2 - after2 < max(_SHARE * before2, _OF_GAP * by_members[()].left, slight):
                 odds = min(odds, _OUTSIDE)
             if odds > top.odds:
                 top = _Wild(name, base, odds)
