@@ -76,8 +76,8 @@ def course_plot(results: Mapping[str, Any], arrays: Arrays) -> Plot | None:
             labels = False
         top.set_ylabel(f"q{i + 1} [{unit}]")
         low.set_ylabel(f"residual [{shown}]")
-        top.legend(loc="upper right", ncols=2)
-        low.legend(loc="upper right", ncols=4)
+        top.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=2)
+        low.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=4)
     grid[-1].set_xlabel("time [s]")
     caption = (
         "The run with the largest gap. Measured less simulated position, held out: by a fit that saw no part of this "
