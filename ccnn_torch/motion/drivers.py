@@ -24,6 +24,8 @@ _FADING = (0.03, 0.1, 0.3)
 _SOFT = 0.1
 # Changes of the temperature below this show nothing [K].
 _WARMER = 5.0
+# Share of the motion from which the lead of the command over the position is a torque.
+_LOADED = 1e-4
 # Quantiles between which the knots lie.
 _ENDS = (0.02, 0.98)
 
@@ -42,13 +44,16 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> dict[str, Tensor]:
     speed = _slope(moved, step)
     acceleration = _slope(speed, step)
     error = problem.followed - moved
-    size = 0.05 * (data.position.amax((-1, -2)) - data.position.amin((-1, -2)))[:, None, None, None]
+    # An axis that follows exactly has no torque, and what rounding leaves of it has the sign of the speed.
+    span = data.position.amax((-1, -2)) - data.position.amin((-1, -2))
+    loaded = error.abs().amax((-1, -2)) > _LOADED * span
+    size = 0.05 * span[:, None, None, None]
     found = {
         "speed": _hats(speed, data.judged),
         "acceleration": _hats(acceleration, data.judged),
         "reversal": _fading(speed, data.time),
         "position": _hats(moved, data.judged),
-        "torque": _hats(error, data.judged),
+        "torque": _hats(error, data.judged) * loaded[:, None, None, None],
         # What comes and goes with time, and friction that does.
         "time": torch.cat([(over := _over_time(problem)), over * _direction(speed)[:, None]], 1),
     }
