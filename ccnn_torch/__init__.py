@@ -12,6 +12,7 @@ from ccnn_torch.version import __version__
 
 if TYPE_CHECKING:
     from ccnn_torch.api import calibrate as calibrate
+    from ccnn_torch.api import diagnose_motion as diagnose_motion
     from ccnn_torch.api import identify as identify
     from ccnn_torch.api import verify as verify
     from ccnn_torch.compensation import Compensator as Compensator
@@ -29,6 +30,7 @@ _HOMES = {
     "Mechanism": "ccnn_torch.mechanisms",
     "calibrate": "ccnn_torch.api",
     "diagnose": "ccnn_torch.diagnosis",
+    "diagnose_motion": "ccnn_torch.api",
     "export_model": "ccnn_torch.compensation",
     "identify": "ccnn_torch.api",
     "joint_deviations": "ccnn_torch.pseudoerror",

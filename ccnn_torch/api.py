@@ -11,14 +11,18 @@ from ccnn_torch.calibration.config import make_config
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.config.held_out import given_records, name_given
+from ccnn_torch.config.tree import config_from_keys
+from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.identification.config import make_identify_config
 from ccnn_torch.identification.identify import Identification
 from ccnn_torch.identification.identify import identify as _identify
+from ccnn_torch.motion import MotionDiagnosis
+from ccnn_torch.motion.job import verdict_of
 from ccnn_torch.sweep.config import load_sweep
 from ccnn_torch.sweep.job import Row, run_sweep
 from ccnn_torch.verification.job import verify_model
 
-__all__ = ["calibrate", "identify", "sweep", "verify"]
+__all__ = ["calibrate", "diagnose_motion", "identify", "sweep", "verify"]
 
 
 def calibrate(**keys: Any) -> Calibration:
@@ -41,6 +45,22 @@ def calibrate(**keys: Any) -> Calibration:
     config = make_config(**{**keys, "records": name_given(given)})
     config = config.model_copy(update={"records": name_given(given)})
     return _calibrate(config, prepared=prepare(config, given))
+
+
+def diagnose_motion(**keys: Any) -> MotionDiagnosis:
+    """Diagnose logs of a machine in motion; nothing is written.
+
+    Args:
+        keys: those of `ccnn diagnose`, for example `motion=["sine.csv", "steps.csv"], mechanism="servo",
+            mechanism_keys={"gain": 0.9, "mass": 0.49, "length": 0.1}, effects=["delay", "coulomb"]`.
+
+    Returns:
+        A `MotionDiagnosis`; its `content` is that of diagnosis.json.
+
+    Raises:
+        InputError: a key, the logs or the model cannot be used; the sentence says what to change.
+    """
+    return verdict_of(config_from_keys(DiagnoseConfig, keys))
 
 
 def identify(**keys: Any) -> Identification:

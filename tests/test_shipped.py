@@ -31,9 +31,11 @@ FLOORS = [
     ["identification/problems", "identification/solvers", "identification/identifiability", "identification/__init__"],
     ["compensation"],
     ["diagnosis"],
+    ["motion"],
     ["engine", "run_folder", "report", "config", "testing"],
     ["simulation", "planning", "verification/promise", "identification"],
     ["diagnosis/config", "diagnosis/page", "diagnosis/outputs", "diagnosis/job"],
+    ["motion/figure", "motion/page", "motion/job"],
     ["calibration", "sklearn", "suite", "sweep", "comparison", "verification", "starter"],
     ["api", "cli", "__init__", "__main__"],
 ]

@@ -21,6 +21,10 @@ def diagnose(
         str | None,
         typer.Option(help="A mechanism's name, file, or path/to/file.py:Name.", autocompletion=complete_mechanism),
     ] = None,
+    motion: Annotated[
+        list[Path] | None,
+        typer.Option(help="CSV of time, commands and positions of a machine in motion; a run, may be repeated."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write diagnosis.json to.")] = None,
     noise: Annotated[
         str | None,
@@ -43,7 +47,8 @@ def diagnose(
 
     The diagnosis comes first; then a network is trained on the residual of the effects, to estimate its further gain
     (seconds; --no-network omits that). The folder gets diagnosis.json, report.html and next_measurements.csv, the most
-    informative poses to measure next. Keys: records, columns, mechanism, out, mechanism_keys, covariates, noise,
+    informative poses to measure next. With --motion it is of time series: delay, gains, friction, play,
+    weights, limits. Keys: records, motion, columns, mechanism, out, mechanism_keys, covariates, noise,
     effects, gravity, network, seed.
 
     Examples:
@@ -55,8 +60,12 @@ def diagnose(
     ccnn diagnose --records measured.csv --mechanism stewart --out runs/s --effects all,my_effect.py:Mine
 
     ccnn diagnose --records measured.csv --mechanism my_simulator.py:PRESS --out runs/press
+
+    ccnn diagnose --motion sine.csv --motion steps.csv --mechanism servo --out runs/axis
     """
     with loading():
         from ccnn_torch.diagnosis.job import run_diagnosis
+        from ccnn_torch.motion.job import run_motion
 
-    run_diagnosis(configured(overrides, records, mechanism, noise, effects, config, seed, out, network), quiet, details)
+    wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out, network, motion)
+    (run_motion if wanted.motion else run_diagnosis)(wanted, quiet, details)

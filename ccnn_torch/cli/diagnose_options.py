@@ -22,6 +22,7 @@ def configured(
     seed: int | None,
     out: Path | None = None,
     network: bool | None = None,
+    motion: list[Path] | None = None,
 ) -> DiagnoseConfig:
     """The config file, overridden by the options of the command line."""
     from ccnn_torch.config.noise import read_noise
@@ -33,6 +34,7 @@ def configured(
     names = None if effects is None else [e.strip() for e in effects.split(",") if e.strip()]
     given = {
         "records": None if records is None else listed_files(str(records), Path()),
+        "motion": [str(log) for log in motion] if motion else None,
         "mechanism": mechanism,
         "effects": names,
         "seed": seed,

@@ -42,10 +42,17 @@ class DiagnoseConfig(Section):
         default=None,
         description="CSV (or .xlsx) of the records, or a list of such files; the same as --records",
     )
+    motion: Files | None = Field(
+        default=None,
+        description="CSV of the logs of a machine in motion, each a run; the same as --motion; in the place of records",
+    )
     columns: Columns
     mechanism: str | None = Field(default=None, description="the nominal machine; the same as --mechanism")
     out: str | None = Field(default=None, description="folder to write; the same as --out")
-    mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    mechanism_keys: dict[str, Any] = Field(
+        default={},
+        description="keys of the mechanism's constructor; of a servo its gain, inertia, mass, length, viscous, …",
+    )
     covariates: Names | None = Field(
         default=None,
         description="covariate columns by name or pattern; null = time, temperature, load_*, direction*, …",

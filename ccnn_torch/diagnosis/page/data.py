@@ -120,6 +120,8 @@ def about_of(labels: Mapping[str, Any]) -> About:
 def gaps_of(results: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
     """The gaps that are there, by what they are of; a machine without a position has its rotation under `gap`."""
     blocks = [block for block in (results["gap"], results.get("gap_rotation")) if block]
+    if results.get("motion"):
+        return [("joint position", block) for block in blocks]
     return [("rotation" if block["unit"] == "rad" else "position", block) for block in blocks]
 
 

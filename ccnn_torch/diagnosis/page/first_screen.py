@@ -97,8 +97,11 @@ def _removed(results: Block) -> str:
     verdict, gap, far = results["verdict"], results["gap"], results.get("by_block")
     if not verdict["effects"] or verdict["effects"] == [OUTLIER] or gap["before"] is None or gap["after"] is None:
         return ""
-    text = f"{size_text(gap['before'], gap)} → {size_text(gap['after'], gap)} on rows at random"
-    if far is not None:
+    rows = "runs not used for fitting" if results.get("motion") else "rows at random"
+    text = f"{size_text(gap['before'], gap)} → {size_text(gap['after'], gap)} on {rows}"
+    if results.get("motion"):
+        pass
+    elif far is not None:
         before, after = (size_text(far[key], far) for key in ("before", "after"))
         text += f", {before} → {after} where nothing was measured (by block)"
     else:
@@ -120,7 +123,9 @@ def _measure(results: Block, about: About) -> str:
         aim = f"to tell {listed(rivals, 'from')} apart" if rivals else "to sharpen the numbers"
         aim = f"to see whether {rivals[0]} acts" if len(rivals) == 1 else aim
         path = f"{about.folder}/{NEXT}" if about.folder else NEXT
-        said.append(f"{len(wanted)} poses {aim}: {path}.")
+        motion = wanted[0].get("motion")
+        what = f"{len(wanted)} poses" if motion is None else f"{motion['joint']}: {motion['text']},"
+        said.append(f"{what} {aim}: {path}.")
     missing = results.get("missing_covariates")
     if missing:
         each = [f"{columns_text(entry['columns'])} (would show {listed(list(entry['effects']))})" for entry in missing]

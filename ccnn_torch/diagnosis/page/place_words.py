@@ -18,6 +18,8 @@ Block = Mapping[str, Any]
 
 # Joints that are named, and the share from which.
 _MOST_JOINTS, _JOINT = 3, 0.1
+# Share of the gap from which a phase of a motion is named.
+_PHASE = 0.2
 # Times the share of the rows from which a region holds more of the gap than others.
 _MORE = 1.5
 # Of the distances of all regions from the base: a region among the nearest or farthest third is called so, where the
@@ -44,6 +46,8 @@ def where_words(results: Block, about: About) -> list[str]:
     if len(joints) > 1 and most:
         shares = listed([f"{places([_joint(name)])} {100 * share:.0f} %" for name, share in most])
         said.append(f"{shares} of the gap")
+    if phase := _phase(results["where"].get("phases", {})):
+        said.append(phase)
     if region := _region(results["where"]["regions"]):
         said.append(region)
     if regime := _regime(results, about):
@@ -53,6 +57,18 @@ def where_words(results: Block, about: About) -> list[str]:
 
 def _joint(name: str) -> str:
     return f"joint {name.removeprefix('joint ').removeprefix('q')}"
+
+
+def _phase(phases: Mapping[str, Any]) -> str:
+    """The phase of a motion that holds most of the gap for its time; empty where none stands out."""
+    there = {n: p for n, p in phases.items() if p["share"] >= _PHASE and p["samples"] > 0}
+    if not there:
+        return ""
+    name = max(there, key=lambda n: there[n]["share"] / there[n]["samples"])
+    share, part = there[name]["share"], there[name]["samples"]
+    words = {"standstill": "at standstill", "reversal": "around reversals", "fast": "in fast motion"}
+    text = f"{100 * share:.0f} % of it {words.get(name, 'in slow motion')} ({100 * part:.0f} % of the time)"
+    return text if share > _MORE * part else "spread over all phases of the motion"
 
 
 def _region(regions: list[Block]) -> str:

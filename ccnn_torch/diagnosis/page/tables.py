@@ -68,6 +68,8 @@ def gap_table(results: Block, about: About) -> Table:
         "effects of the verdict in the model; above the noise: share of the mean square that a better model could "
         "remove."
     )
+    if results.get("motion"):
+        note = note.replace("rows not used", "runs not used").replace("pose;", "position;")
     return Table("How large is the gap?", columns, tuple(rows), f"{note} {about.noise}".rstrip())
 
 

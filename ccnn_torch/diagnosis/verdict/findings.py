@@ -26,6 +26,8 @@ _LEAST_SHARE = 0.1
 # Angles at which the largest value of a sum of harmonics is sought.
 _ANGLES = 720
 _A_TURN = " times a turn"
+# Speeds below this [m/s or rad/s] are drifts, told by the hour.
+_DRIFT = 1e-3
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 
@@ -96,7 +98,7 @@ def size_words(value: float, unit: str, digits: int = 3) -> str:
         return f"{number_text(100 * value, digits)} %"
     if unit == "s" and abs(value) >= 120:
         return f"{number_text(value / 60, digits)} min"
-    if unit in ("m/s", "rad/s"):
+    if unit in ("m/s", "rad/s") and abs(value) < _DRIFT:
         scale, shown = display_unit(unit[:-2], 3600 * value)
         return f"{number_text(3600 * value / scale, digits)} {shown}/h"
     if unit == "s" and abs(value) < 1:

@@ -41,7 +41,17 @@ SURE = 0.95
 
 # Up to so many effects without support are named one by one.
 _FEW_TRIED = 3
-_DRIVERS = {"workspace": "the position in the workspace", "temperature": "the temperature", "time": "the time"}
+_DRIVERS = {
+    "workspace": "the position in the workspace",
+    "temperature": "the temperature",
+    "time": "the time",
+    # Of a machine in motion.
+    "speed": "the speed",
+    "acceleration": "the acceleration",
+    "reversal": "the reversals of the motion",
+    "position": "the position of the joint",
+    "torque": "the torque of the motor",
+}
 
 
 def effect_words(name: str) -> str:

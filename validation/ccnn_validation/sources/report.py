@@ -21,6 +21,7 @@ _KEYS = ("count", "of", "share", "low", "high")
 _NOTES = {
     "semi_real": "A known error is added to measured rows of real arms; right: the verdict gains its name alone.",
     "multibody": "Machines are simulated in MuJoCo; a cause is a change of its model.",
+    "motion": "Axes in motion, simulated in MuJoCo; a cause changes its model or what its controller is told.",
     "adversarial": "Noise, designs and causes that are not of the textbook's form.",
 }
 _KINDS = ("none", "single", "pair", "several", "outside", "data")

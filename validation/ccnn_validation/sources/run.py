@@ -20,6 +20,7 @@ from ccnn_torch.engine import Job, run_jobs
 from ccnn_torch.errors import CcnnError, InputError, MethodFailedError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.motion import diagnose_motion, load_logs, nominal_of
 from ccnn_torch.records import load_records, write_table
 from ccnn_torch.report.json_files import read_json, write_json
 from ccnn_torch.report.screen import note, say_place, stdout
@@ -34,7 +35,7 @@ __all__ = ["SOURCES", "diagnosed", "run_source", "source_of"]
 
 _Task = tuple[str, str, int, Path]
 """Source, family, seed, and the file of its answer."""
-SOURCES = ("semi_real", "multibody", "adversarial")
+SOURCES = ("semi_real", "multibody", "adversarial", "motion")
 
 
 def source_of(name: str) -> Source:
@@ -131,6 +132,8 @@ def diagnosed(case: SourceCase, columns: Mapping[str, NDArray[Any]]) -> dict[str
     with TemporaryDirectory() as folder:
         path = Path(folder) / "records.csv"
         write_table(path, dict(columns))
+        if "command1[rad]" in columns:
+            return _in_motion(case, path)
         try:
             mechanism = _mechanism(case, Path(folder))
             records = load_records(path, mechanism, learns=False)
@@ -143,6 +146,19 @@ def diagnosed(case: SourceCase, columns: Mapping[str, NDArray[Any]]) -> dict[str
         except CcnnError as problem:
             return {"failed": str(problem)}
     return {**found.to_json(), "true_shrink": _shrink(case, found)}
+
+
+def _in_motion(case: SourceCase, path: Path) -> dict[str, Any]:
+    """The answer to the log of a motion."""
+    mechanism = case.mechanism
+    if "\n" in mechanism:
+        mechanism = str(path.parent / f"machine-{zlib.crc32(case.mechanism.encode()):08x}.xml")
+        write_whole(Path(mechanism), case.mechanism)
+    try:
+        logs = load_logs([path])
+        return {**diagnose_motion(logs, nominal_of(mechanism, case.mechanism_keys or {}, logs[0].units)).to_json()}
+    except CcnnError as problem:
+        return {"failed": str(problem)}
 
 
 def _mechanism(case: SourceCase, folder: Path) -> Mechanism:

@@ -1,0 +1,8 @@
+"""Diagnosis of a machine in motion, from logs of time, commands and positions."""
+
+from ccnn_torch.motion.engine import MotionDiagnosis as MotionDiagnosis
+from ccnn_torch.motion.engine import diagnose_motion as diagnose_motion
+from ccnn_torch.motion.log import Log as Log
+from ccnn_torch.motion.log import load_logs as load_logs
+from ccnn_torch.motion.nominal import Nominal as Nominal
+from ccnn_torch.motion.nominal import nominal_of as nominal_of

@@ -1,0 +1,127 @@
+"""What a residual may follow that no effect describes: speed, acceleration, reversal, position, torque, time and
+temperature.
+
+Each is a group of columns that are added to the simulated position. Where one of them is part of the most probable set,
+the cause is outside the library, and its driver says where to look.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.motion.fit import Spec
+from ccnn_torch.motion.problem import Problem
+
+__all__ = ["DRIVERS", "driver_columns"]
+
+DRIVERS = ("speed", "acceleration", "reversal", "position", "torque", "time", "temperature")
+# Knots of a piecewise linear function of a driver, and of one of the time.
+_KNOTS, _TIMES = 7, 5
+# Time constants of what fades after a reversal [s].
+_FADING = (0.03, 0.1, 0.3)
+# Share of the mean speed at which a direction is settled.
+_SOFT = 0.1
+# Changes of the temperature below this show nothing [K].
+_WARMER = 5.0
+# Share of the motion from which the lead of the command over the position is a torque.
+_LOADED = 1e-4
+# Quantiles between which the knots lie.
+_ENDS = (0.02, 0.98)
+
+
+def driver_columns(problem: Problem, specs: list[Spec]) -> dict[str, Tensor]:
+    """Columns of each driver in plausible sizes [rad or m], `n x m x b x s`; drivers that do not vary are left out.
+
+    Args:
+        problem: the data.
+        specs: of each axis the set whose motion tells speed, acceleration and torque.
+    """
+    data = problem.data
+    theta = torch.stack([spec.theta for spec in specs])[None]
+    moved = problem.positions(theta)[0]
+    step = data.time.diff(dim=-1).clamp_min(1e-9)
+    speed = _slope(moved, step)
+    acceleration = _slope(speed, step)
+    error = problem.followed - moved
+    # An axis that follows exactly has no torque, and what rounding leaves of it has the sign of the speed.
+    span = data.position.amax((-1, -2)) - data.position.amin((-1, -2))
+    loaded = error.abs().amax((-1, -2)) > _LOADED * span
+    size = 0.05 * span[:, None, None, None]
+    found = {
+        "speed": _hats(speed, data.judged),
+        "acceleration": _hats(acceleration, data.judged),
+        "reversal": _fading(speed, data.time),
+        "position": _hats(moved, data.judged),
+        "torque": _hats(error, data.judged) * loaded[:, None, None, None],
+        # What comes and goes with time, and friction that does.
+        "time": torch.cat([(over := _over_time(problem)), over * _direction(speed)[:, None]], 1),
+    }
+    if float(problem.warm.abs().max()) >= _WARMER:
+        warm = (problem.warm / problem.warm.abs().max()).expand(len(moved), -1, -1)
+        found["temperature"] = torch.stack([warm, warm * torch.sign(speed)], 1)
+    return {name: size * columns for name, columns in found.items() if name in DRIVERS}
+
+
+def _direction(speed: Tensor) -> Tensor:
+    """The sign of the speed, soft near standstill."""
+    size = speed.abs().mean((-1, -2), keepdim=True)
+    return torch.tanh(speed / (_SOFT * size).clamp_min(1e-12))
+
+
+def _slope(values: Tensor, step: Tensor) -> Tensor:
+    slope = values.diff(dim=-1) / step
+    return torch.cat([slope[..., :1], slope], -1)
+
+
+def _hats(driver: Tensor, judged: Tensor) -> Tensor:
+    """Piecewise linear functions with their knots at quantiles, `n x m x b x s`."""
+    found = []
+    for one in driver:
+        grid = torch.linspace(*_ENDS, _KNOTS, dtype=one.dtype)
+        knots = torch.tensor(sorted(set(torch.quantile(_few(one[judged]), grid).tolist())), dtype=one.dtype)
+        if len(knots) < 3:
+            found.append(torch.zeros(_KNOTS, *one.shape, dtype=one.dtype))
+            continue
+        place = (torch.searchsorted(knots, one.contiguous()) - 1).clamp(0, len(knots) - 2)
+        share = ((one - knots[place]) / (knots[place + 1] - knots[place])).clamp(0, 1)
+        hats = torch.zeros(_KNOTS, *one.shape, dtype=one.dtype)
+        hats.scatter_(0, place[None], (1 - share)[None])
+        hats.scatter_(0, place[None] + 1, share[None])
+        found.append(hats)
+    return torch.stack(found)
+
+
+def _few(values: Tensor) -> Tensor:
+    """Enough of many values for quantiles."""
+    return values[:: max(len(values) // 10_000, 1)]
+
+
+def _fading(speed: Tensor, time: Tensor) -> Tensor:
+    """What jumps with the sign of the speed at a reversal and fades, `n x m x b x s`."""
+    sign = torch.sign(speed)
+    turned = torch.zeros_like(sign)
+    turned[..., 1:] = 0.5 * (sign[..., 1:] - sign[..., :-1])
+    columns = [torch.zeros_like(sign) for _ in _FADING]
+    step = time.diff(dim=-1)
+    for column, constant in zip(columns, _FADING, strict=True):
+        now = torch.zeros_like(sign[..., 0])
+        for k in range(sign.shape[-1]):
+            now = now + turned[..., k]
+            column[..., k] = now
+            if k < sign.shape[-1] - 1:
+                now = now * torch.exp(-step[:, k] / constant)
+    return torch.stack(columns, 1)
+
+
+def _over_time(problem: Problem) -> Tensor:
+    """Piecewise linear functions of the time in each run, `n x m x b x s`."""
+    data = problem.data
+    share = torch.zeros_like(data.time)
+    for run in sorted(set(data.run.tolist())):
+        mine = data.run == run
+        ends = data.time[mine][data.judged[mine]]
+        share[mine] = ((data.time[mine] - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)).clamp(0, 1)
+    knots = torch.linspace(0, 1, _TIMES, dtype=share.dtype)
+    hats = (1 - (share[None] - knots[:, None, None]).abs() * (_TIMES - 1)).clamp_min(0)
+    return hats.expand(len(problem.followed), -1, -1, -1)

@@ -1,0 +1,33 @@
+"""A mass at the end of the axis' lever that the model lacks or has wrong: weight and inertia in one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ccnn_torch.motion.effects.protocol import Facts, Number, add
+
+__all__ = ["PAYLOAD", "STANDARD_GRAVITY"]
+
+STANDARD_GRAVITY = 9.80665
+"""m/s^2."""
+
+
+class _Payload:
+    name = "payload"
+
+    def missing(self, axis: Facts) -> str:
+        if axis.unit != "rad":
+            return "a turning joint"
+        return "" if axis.length and axis.gain else "the axis' gain and the lever of its load (keys gain and length)"
+
+    def numbers(self, axis: Facts) -> tuple[Number, ...]:
+        lever, gain = axis.length or 1.0, axis.gain or 1.0
+        acts = (add("gravity_sin", STANDARD_GRAVITY * lever / gain), add("inertia", lever**2 / gain))
+        # A mass whose weight differs the command and the position by a tenth of a radian.
+        return (Number("mass", "kg", 0.1 * gain / (STANDARD_GRAVITY * lever), acts),)
+
+    def shapes(self, axis: Facts) -> tuple[Mapping[str, float], ...]:
+        return ({},)
+
+
+PAYLOAD = _Payload()

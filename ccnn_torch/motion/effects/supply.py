@@ -1,0 +1,34 @@
+"""Supply voltage: the motor's strength and its limit go with it, damping and friction do not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ccnn_torch.motion.effects.protocol import Facts, Number, add, scaled
+
+__all__ = ["SUPPLY"]
+
+# A smaller change of the recorded voltage shows nothing.
+_LEAST = 0.03
+
+
+class _Supply:
+    name = "supply"
+
+    def missing(self, axis: Facts) -> str:
+        if axis.nominal.get("weakness", 0.0) and axis.driven:
+            return ""
+        if axis.supply < _LEAST:
+            return f"a column supply[V] that changes by {100 * _LEAST:.0f} %, or a model with the motor's limit"
+        return ""
+
+    def numbers(self, axis: Facts) -> tuple[Number, ...]:
+        if axis.supply >= _LEAST:
+            return (Number("share of its change", "1", 1.0, (add("supply"),), 0.5),)
+        return (Number("log voltage", "1", 0.3, (scaled("gain"), scaled("weakness", -1.0)), 0.0),)
+
+    def shapes(self, axis: Facts) -> tuple[Mapping[str, float], ...]:
+        return ({},) if axis.supply >= _LEAST else ({"log voltage": 0.3}, {"log voltage": -0.3})
+
+
+SUPPLY = _Supply()

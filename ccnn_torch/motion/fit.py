@@ -1,0 +1,236 @@
+"""Fits of many sets of effects side by side: Gauss-Newton steps, then the evidence of the model linearised there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.motion.library import Library, Variant
+from ccnn_torch.motion.problem import Problem, Whitening
+
+__all__ = ["Fit", "Spec", "evidence_of", "fit_many", "sensitivities", "started"]
+
+# Of a difference quotient, in plausible sizes.
+_STEP = 1e-3
+# Standard deviation of the numbers in plausible sizes while they are fitted; the evidence has scales of its own.
+_WIDE = 10.0
+_STEPS = 6
+# Shares of a Gauss-Newton step that are tried, and what a step is damped by.
+_SHARES = (1.0, 0.25)
+_DAMPING, _LESS, _MORE = 1e-3, 0.2, 10.0
+# Plausible sizes that a number moves at most in a step.
+_FARTHEST = 5.0
+# Simulated values that are held in memory at a time.
+_VALUES = 3e7
+# Half deviance for each value that a step must gain for another one to be made.
+_GAINED = 1e-4
+
+
+class Spec(NamedTuple):
+    """A set of effects of one axis, and where its fit begins.
+
+    Attributes:
+        members: effects, ascending.
+        theta: all numbers, `k`; those of other effects 0.
+        active: places that are fitted, effect by effect.
+        log_prior: of the variants.
+        free: places of shapes that are refined beside them; what they cost is in the variants' prior.
+    """
+
+    members: tuple[int, ...]
+    theta: Tensor
+    active: tuple[tuple[int, ...], ...]
+    log_prior: float
+    free: tuple[int, ...] = ()
+
+    @property
+    def moved(self) -> tuple[int, ...]:
+        return (*self.flat, *self.free)
+
+    @property
+    def flat(self) -> tuple[int, ...]:
+        return tuple(j for group in self.active for j in group)
+
+
+class Fit(NamedTuple):
+    """A fitted set of one axis.
+
+    Attributes:
+        spec: the set, with `theta` where the fit ended.
+        log_evidence: of the linearised model.
+        noise: variance of the whitened residual.
+        mean, covariance: of the active numbers in plausible sizes, `m`, `m x m`.
+        squares: of the whitened residual by stretch, `b`.
+        rss: their sum.
+        effective: number of coefficients that the data determine.
+        left: mean square of the residual itself [rad^2 or m^2].
+    """
+
+    spec: Spec
+    log_evidence: float
+    noise: float
+    mean: Tensor
+    covariance: Tensor
+    squares: Tensor
+    rss: float
+    effective: float
+    left: float
+
+    @property
+    def members(self) -> tuple[int, ...]:
+        return self.spec.members
+
+
+def started(library: Library, spec: Spec, variant: Variant, axis: int) -> Spec:
+    """The set with one effect more, which begins as its variant says."""
+    theta = spec.theta.clone()
+    theta[list(variant.active)] = variant.values[axis]
+    if variant.held:
+        theta[list(variant.held)] = variant.shapes[axis]
+    both = sorted([*zip(spec.members, spec.active, strict=True), (variant.effect, variant.active)])
+    return Spec(
+        tuple(m for m, _ in both),
+        theta,
+        tuple(a for _, a in both),
+        spec.log_prior + variant.log_prior,
+        (*spec.free, *variant.free(library.held)),
+    )
+
+
+def fit_many(
+    problem: Problem,
+    whitening: Whitening,
+    specs: Sequence[Sequence[Spec]],
+    steps: int = _STEPS,
+    chosen: Tensor | None = None,
+) -> list[list[Fit]]:
+    """Fit sets side by side.
+
+    Args:
+        problem: what is fitted.
+        whitening: of the residual of each axis.
+        specs: for each of `h` sets, one a joint, `n`.
+        steps: Gauss-Newton steps.
+        chosen: stretches that count; all when None.
+    """
+    wide = max((len(s.moved) for row in specs for s in row), default=0)
+    judged = problem.data.judged if chosen is None else problem.data.judged[chosen]
+    per = problem.followed.shape[0] * judged.numel() * (wide + 2)
+    lot = max(int(_VALUES / per), 1)
+    found: list[list[Fit]] = []
+    for k in range(0, len(specs), lot):
+        found += _fit_lot(problem, whitening, specs[k : k + lot], steps, chosen)
+    return found
+
+
+def sensitivities(
+    problem: Problem, whitening: Whitening, theta: Tensor, active: Tensor, chosen: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Whitened residuals and what the active numbers change in the positions.
+
+    Args:
+        theta: `h x n x k`.
+        active: places, `h x n x m`, -1 = none.
+
+    Returns:
+        `n x h x v` and `n x h x m x v`, `v` values.
+    """
+    h, n, m = active.shape
+    moved = theta[:, None].expand(h, m + 1, n, -1).clone()
+    index = active.clamp_min(0).transpose(1, 2)
+    step = torch.where(active >= 0, _STEP, 0.0).transpose(1, 2).to(theta.dtype)
+    moved[:, 1:].scatter_add_(-1, index[..., None], step[..., None])
+    residual = problem.residual(moved.flatten(0, 1), chosen)
+    white = problem.whitened(residual, whitening, chosen).reshape(n, h, m + 1, -1)
+    return white[:, :, 0], (white[:, :, :1] - white[:, :, 1:]) / _STEP
+
+
+def _fit_lot(
+    problem: Problem, whitening: Whitening, specs: Sequence[Sequence[Spec]], steps: int, chosen: Tensor | None
+) -> list[list[Fit]]:
+    h, n = len(specs), len(specs[0])
+    theta = torch.stack([torch.stack([s.theta for s in row]) for row in specs])
+    wide = max(len(s.moved) for row in specs for s in row)
+    active = torch.full((h, n, wide), -1)
+    for a, row in enumerate(specs):
+        for b, spec in enumerate(row):
+            active[a, b, : len(spec.moved)] = torch.tensor(spec.moved, dtype=torch.int64)
+    safe, real = active.clamp_min(0), (active >= 0).to(theta.dtype)
+    low, high = problem.library.bounds
+    damping = torch.full((h, n), _DAMPING, dtype=theta.dtype)
+    residual, columns = sensitivities(problem, whitening, theta, active, chosen)
+    judged = problem.judged if chosen is None else problem.judged[chosen]
+    values = float(judged.sum())
+    for _ in range(steps if wide else 0):
+        cost = _cost(residual, theta, values)
+        noise = residual.square().sum(-1).mT / values
+        gram = (columns @ columns.mT).transpose(0, 1) / noise[..., None, None].clamp_min(1e-300)
+        push = (columns @ residual[..., None])[..., 0].transpose(0, 1) / noise[..., None].clamp_min(1e-300)
+        own = theta.gather(-1, safe) * real
+        push = push - own / _WIDE**2
+        diagonal = gram.diagonal(dim1=-2, dim2=-1)
+        inner = gram + torch.diag_embed(damping[..., None] * diagonal + 1 / _WIDE**2 + (1 - real))
+        move = torch.linalg.solve(inner, push[..., None])[..., 0] * real
+        move = move.clamp(-_FARTHEST, _FARTHEST)
+        trials = torch.stack([theta.scatter_add(-1, safe, share * move).clamp(low, high) for share in _SHARES])
+        left = problem.whitened(problem.residual(trials.flatten(0, 1), chosen), whitening, chosen)
+        costs = _cost(left, trials.flatten(0, 1), values).reshape(len(_SHARES), h, n)
+        best, which = costs.min(0)
+        better = best < cost
+        taken = trials.gather(0, which[None, ..., None].expand(1, *theta.shape))[0]
+        theta = torch.where(better[..., None], taken, theta)
+        damping = torch.where(better & (which == 0), damping * _LESS, damping * _MORE).clamp(1e-8, 1e8)
+        residual, columns = sensitivities(problem, whitening, theta, active, chosen)
+        if bool(((cost - best) < _GAINED * values).all()):
+            break
+    # Here, since the whitened residual does not tell it.
+    plain = problem.pooled(problem.residual(theta, chosen))
+    left = (plain.square() * judged).sum((-1, -2)) / values
+    squares = residual.square().reshape(n, h, *judged.shape).sum(-1)
+    found = []
+    for a, row in enumerate(specs):
+        fits = []
+        for b, spec in enumerate(row):
+            mine = spec._replace(theta=theta[a, b])
+            x = columns[b, a, : len(spec.flat)]
+            fits.append(evidence_of(mine, residual[b, a], x, squares[b, a], values, float(left[a, b])))
+        found.append(fits)
+    return found
+
+
+def evidence_of(
+    spec: Spec, residual: Tensor, columns: Tensor, squares: Tensor, values: float, left: float = 0.0
+) -> Fit:
+    """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`, the rest as of `Fit`."""
+    own = spec.theta[list(spec.flat)]
+    y = residual + own @ columns
+    grams = grams_of(columns.mT[:, None, :], y[:, None])._replace(values=values)
+    groups, begin = [], 0
+    for group in spec.active:
+        groups.append(torch.arange(begin, begin + len(group)))
+        begin += len(group)
+    fit = fit_sets(grams, [groups], 0.0)
+    m = len(own)
+    evidence = float(fit.log_evidence[0])
+    return Fit(
+        spec,
+        evidence if math.isfinite(evidence) else -math.inf,
+        float(fit.noise[0]),
+        fit.mean[0, :m],
+        fit.covariance[0, :m, :m],
+        squares,
+        float(residual.square().sum()),
+        float(fit.effective[0]),
+        left,
+    )
+
+
+def _cost(residual: Tensor, theta: Tensor, values: float) -> Tensor:
+    """Half the deviance, `h x n`; residual `n x h x v`, theta `h x n x k`."""
+    rss = residual.square().sum(-1).mT
+    return 0.5 * values * torch.log(rss.clamp_min(1e-300)) + 0.5 * theta.square().sum(-1) / _WIDE**2

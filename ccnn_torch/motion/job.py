@@ -1,0 +1,122 @@
+"""`ccnn diagnose --motion`: from a config to a verdict and its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ccnn_torch.diagnosis.config import DiagnoseConfig
+from ccnn_torch.diagnosis.page.compensate import typed_path
+from ccnn_torch.diagnosis.page.data import NEXT, RESULT, about_of, load_labels
+from ccnn_torch.diagnosis.progress import watched
+from ccnn_torch.display import short_path
+from ccnn_torch.errors import InputError
+from ccnn_torch.files.write import sweep
+from ccnn_torch.motion.engine import MotionDiagnosis, diagnose_motion
+from ccnn_torch.motion.log import load_logs
+from ccnn_torch.motion.nominal import nominal_of
+from ccnn_torch.motion.page import print_motion, write_motion_report, write_next_motion
+from ccnn_torch.motion.phases import phases_of
+from ccnn_torch.report.json_files import plain, write_json
+from ccnn_torch.report.screen import say_place, stdout, step_bar
+from ccnn_torch.report.table import print_text
+from ccnn_torch.run_folder.interrupt import if_stopped
+from ccnn_torch.run_folder.lock import locked
+
+__all__ = ["run_motion", "verdict_of"]
+
+_STEPS = {
+    "reading the records": 1.0,
+    "searching the effects": 20.0,
+    "judging on held-out rows": 4.0,
+    "next measurements": 1.0,
+}
+
+
+def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = False) -> Path:
+    """Diagnose logs of a motion, and write the folder of the config; the verdict is kept before the report is drawn.
+
+    Args:
+        config: with `motion`, `mechanism` and `out`.
+        quiet: no verdict, no table, no progress.
+        details: show all tables.
+
+    Raises:
+        InputError: something is missing or wrong in the files or keys, or the folder cannot be written.
+    """
+    if config.out is None:
+        raise InputError("name the folder to write with --out DIR")
+    stopped = if_stopped("interrupted before there was a verdict; nothing was written")
+    with stopped, step_bar(_STEPS, quiet) as tell:
+        found = verdict_of(config, tell)
+    folder, results = Path(config.out), dict(plain(found.to_json()))
+    with locked(folder):
+        sweep(folder)
+        write_json(folder / RESULT, results)
+        kept = f"interrupted after the verdict, which is kept in {folder / RESULT}; the rest is not complete"
+        with if_stopped(kept):
+            if not quiet:
+                print_text(results["verdict"]["text"], stdout, "bold")
+            write_next_motion(folder / NEXT, list(found.proposed), results["next_measurements"], results["gap"]["unit"])
+            labels = {"about": _about(config, folder, found)}
+            write_motion_report(folder, results, motion_arrays(found), labels)
+            if not quiet:
+                print_motion(results, stdout, about_of(load_labels(folder)), verdict=False, details=details)
+                say_place(f"Written: {folder / RESULT} and report.html beside it")
+    return folder
+
+
+def verdict_of(config: DiagnoseConfig, tell: Callable[..., None] | None = None) -> MotionDiagnosis:
+    """Diagnose what a config names; nothing is written."""
+    if not config.motion:
+        raise InputError("motion: is missing; give --motion LOG.csv")
+    if config.mechanism is None:
+        raise InputError("mechanism: is missing; give --mechanism servo, a machine, or path/to/file.py:NAME")
+    if config.records is not None:
+        raise InputError(
+            "records and motion: a diagnosis is of poses or of a motion; give one of --records and --motion"
+        )
+    files = [config.motion] if isinstance(config.motion, str) else config.motion
+    logs = load_logs(files, config.columns)
+    nominal = nominal_of(config.mechanism, config.mechanism_keys, logs[0].units)
+    noise = config.noise
+    if isinstance(noise, dict):
+        raise InputError("noise: of a motion must be one standard deviation of the position, such as 1e-3 or 0.1mrad")
+    from ccnn_torch.config.sizes import size
+
+    deviation = None if noise is None else size(noise, None, "noise")
+    with watched(tell or (lambda step, share: None)):
+        return diagnose_motion(logs, nominal, config.effects, deviation, config.seed)
+
+
+def motion_arrays(found: MotionDiagnosis) -> dict[str, Any]:
+    """What the figures draw, by name; see `course_plot`."""
+    data = found.problem.data
+    return {
+        "time": data.time,
+        "command": data.command,
+        "position": data.position,
+        "before": found.before,
+        "after": found.after,
+        "phase": phases_of(data).double(),
+        "judged": data.judged.double(),
+        "run": data.run.double(),
+    }
+
+
+def _about(config: DiagnoseConfig, folder: Path, found: MotionDiagnosis) -> dict[str, Any]:
+    files = [config.motion] if isinstance(config.motion, str) else list(config.motion or [])
+    noise = (
+        "The noise was given."
+        if config.noise is not None
+        else ("The noise is what the most probable model leaves; it may hold another cause.")
+    )
+    return {
+        "name": folder.name,
+        "mechanism": short_path(str(config.mechanism)),
+        "records": ", ".join(short_path(str(file)) for file in files),
+        "noise": noise,
+        "folder": typed_path(str(folder)),
+        "units": {f"q{i + 1}": unit for i, unit in enumerate(found.problem.data.units)},
+    }

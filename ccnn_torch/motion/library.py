@@ -1,0 +1,213 @@
+"""The effects that are tried, as one vector of numbers, and what any such vector makes of every axis."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.motion.axis import ABSENT
+from ccnn_torch.motion.effects import Facts, MotionEffect, Number
+
+__all__ = ["Library", "Variant", "library_of"]
+
+# What may not be below 0, and what not above.
+_POSITIVE = (
+    *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "delay", "play"),
+    *("flexibility", "gain"),
+)
+_MOST = {"load_friction": 0.9}
+# Plausible sizes: no number is larger.
+_WIDEST = 1e3
+# Log odds against what is seen less often than the rest, and can take the form of nearly anything.
+_RARER = {"stribeck": math.log(0.1), "cogging": math.log(0.1)}
+# Shapes that a fit refines from where they begin.
+_REFINED = ("cogging_order", "stribeck_speed")
+
+
+class Variant(NamedTuple):
+    """One way to begin a fit of an effect.
+
+    Attributes:
+        effect: its number in the library.
+        active: the numbers that a fit moves, places in the vector.
+        values: where they begin, in plausible sizes, `n x len(active)`.
+        held: places in the vector of shapes that are held at a value.
+        shapes: those values, `n x len(held)`.
+        log_prior: log of the share of the effect's prior that it has.
+    """
+
+    effect: int
+    active: tuple[int, ...]
+    values: Tensor
+    held: tuple[int, ...]
+    shapes: Tensor
+    log_prior: float
+
+    def free(self, held: dict[str, int]) -> tuple[int, ...]:
+        """Places of the shapes that a fit refines."""
+        return tuple(place for name, place in held.items() if name in _REFINED and place in self.held)
+
+
+class Library(NamedTuple):
+    """Effects of `n` axes whose numbers, in plausible sizes, stand in vectors of `k`.
+
+    Attributes:
+        effects: what is tried.
+        facts: of each axis.
+        numbers: of each axis, those of every effect one after the other; shapes that are held have none.
+        owner: effect of each number, `k`; -1 for a shape.
+        places: places of each effect's numbers.
+        variants: of each effect.
+        held: place of every shape by the axis' parameter.
+        nominal: parameters of the axes, `n` each.
+        lacking: of each effect what every axis lacks to show it; "" where one axis can.
+        there: whether an axis can show an effect, `n x effects`.
+    """
+
+    effects: tuple[MotionEffect, ...]
+    facts: tuple[Facts, ...]
+    numbers: tuple[tuple[Number, ...], ...]
+    owner: tuple[int, ...]
+    places: tuple[tuple[int, ...], ...]
+    variants: tuple[tuple[Variant, ...], ...]
+    held: dict[str, int]
+    nominal: dict[str, Tensor]
+    lacking: tuple[str, ...]
+    there: Tensor
+
+    @property
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Least and largest value of every number, `n x k` each: what is not negative in nature stays so."""
+        low = torch.full((len(self.facts), self.size), -_WIDEST, dtype=torch.float64)
+        high = -low
+        for i, axis in enumerate(self.numbers):
+            for j, number in enumerate(axis):
+                for name, factor, how in number.acts:
+                    if how == "add" and name in _POSITIVE:
+                        nominal = self.facts[i].nominal.get(name, ABSENT[name])
+                        low[i, j] = max(float(low[i, j]), -nominal / (factor * number.scale))
+                        high[i, j] = min(float(high[i, j]), (_MOST.get(name, math.inf) - nominal) / number.scale)
+        # 0 stands for a shape that is not used.
+        low[:, list(self.held.values())] = 0.0
+        return low, high
+
+    @property
+    def size(self) -> int:
+        """`k`."""
+        return len(self.owner)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(effect.name for effect in self.effects)
+
+    def parameters(self, theta: Tensor) -> dict[str, Tensor]:
+        """Parameters of the axes.
+
+        Args:
+            theta: numbers in plausible sizes, `... x n x k`.
+
+        Returns:
+            Of every parameter that is not absent everywhere, `... x n`.
+        """
+        found = {name: value.expand(theta.shape[:-1]).clone() for name, value in self.nominal.items()}
+        for j in range(len(self.numbers[0])):
+            if not bool((theta[..., j] != 0).any()):
+                continue
+            for a, (name, _, how) in enumerate(self.numbers[0][j].acts):
+                amount = theta[..., j] * theta.new_tensor([axis[j].scale * axis[j].acts[a][1] for axis in self.numbers])
+                before = found.get(name, torch.full_like(amount, ABSENT[name]))
+                found[name] = before + amount if how == "add" else before * amount.clamp(-5, 5).exp()
+        for name, place in self.held.items():
+            value = theta[..., place]
+            if bool((value != 0).any()):
+                found[name] = torch.where(value != 0, value, found.get(name, torch.full_like(value, ABSENT[name])))
+        for name in _POSITIVE:
+            if name in found:
+                found[name] = found[name].clamp(0, _MOST.get(name, math.inf))
+        return found
+
+
+def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Library:
+    """The library for some axes."""
+    lacking = [[effect.missing(axis) for axis in facts] for effect in effects]
+    there = torch.tensor([[not lacking[e][i] for e in range(len(effects))] for i in range(len(facts))])
+    numbers: list[list[Number]] = [[] for _ in facts]
+    owner: list[int] = []
+    places: list[tuple[int, ...]] = []
+    for e, effect in enumerate(effects):
+        own = [effect.numbers(axis) for axis in facts]
+        # An axis that is driven otherwise than the first one has other numbers of the same length, or the first one's.
+        own = [o if len(o) == len(own[0]) else own[0] for o in own]
+        begin = len(owner)
+        for i, those in enumerate(own):
+            numbers[i] += those
+        owner += [e] * len(own[0])
+        places.append(tuple(range(begin, len(owner))))
+    shapes = [[effect.shapes(axis) for axis in facts] for effect in effects]
+    held: dict[str, int] = {}
+    for e in range(len(effects)):
+        own_names = {numbers[0][j].name for j in places[e]}
+        for name in itertools.chain.from_iterable(one.keys() for one in shapes[e][0]):
+            if name not in own_names and name not in held:
+                held[name] = len(owner)
+                owner.append(-1)
+    variants = []
+    for e in range(len(effects)):
+        count = min(len(s) for s in shapes[e])
+        variants.append(
+            tuple(_variant(e, effects[e].name, k, places[e], numbers, shapes[e], held, count) for k in range(count))
+        )
+    nominal = {
+        name: torch.tensor([axis.nominal.get(name, ABSENT[name]) for axis in facts], dtype=torch.float64)
+        for name in ABSENT
+        if any(axis.nominal.get(name, ABSENT[name]) != ABSENT[name] for axis in facts)
+    }
+    return Library(
+        tuple(effects),
+        tuple(facts),
+        tuple(map(tuple, numbers)),
+        tuple(owner),
+        tuple(places),
+        tuple(variants),
+        held,
+        nominal,
+        tuple("" if not all(why) else why[0] for why in lacking),
+        there,
+    )
+
+
+def _variant(
+    effect: int,
+    name: str,
+    k: int,
+    places: tuple[int, ...],
+    numbers: list[list[Number]],
+    shapes: Sequence[Sequence[Mapping[str, float]]],
+    held: dict[str, int],
+    count: int,
+) -> Variant:
+    first = shapes[0][k]
+    names = [numbers[0][j].name for j in places]
+    values = [
+        [
+            shapes[i][k][numbers[i][j].name] / numbers[i][j].scale
+            if numbers[i][j].name in shapes[i][k]
+            else numbers[i][j].start
+            for j in places
+        ]
+        for i in range(len(numbers))
+    ]
+    own = [name for name in first if name not in names]
+    return Variant(
+        effect,
+        places,
+        torch.tensor(values, dtype=torch.float64),
+        tuple(held[name] for name in own),
+        torch.tensor([[s[k][name] for name in own] for s in shapes], dtype=torch.float64),
+        -math.log(count) + _RARER.get(name, 0.0),
+    )

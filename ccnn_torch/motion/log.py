@@ -1,0 +1,244 @@
+"""Logs of a machine in motion: time, commands and positions of each joint, and what was recorded beside them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccnn_torch.display import count_text
+from ccnn_torch.errors import InputError
+from ccnn_torch.motion.mistakes import refuse_mistakes
+from ccnn_torch.records.read_table import Frame, read_frame, read_table
+from ccnn_torch.records.table import Table
+from ccnn_torch.units import si_unit_of
+
+__all__ = ["Log", "load_logs"]
+
+Array = NDArray[np.float64]
+_RUN, _POSITION = "run", re.compile(r"q(\d+)")
+_COMMAND = re.compile(r"command(\d+)")
+_SHARED = {"supply": "V", "temperature": "K", "torque_on": "1"}
+_EACH = {"speed": None, "torque": "N*m", "current": "A", "pwm": "1"}
+# Steps longer than this many usual ones are gaps; longer than so many, late samples that the simulation can bridge.
+_GAP, _LATE = 6.0, 1.6
+# A position that jumps by a whole turn, to this share, was wrapped by its counter.
+_TURN, _TURN_SLACK = 2 * np.pi, 0.1
+# A jump of the position this many times the largest usual step is no motion.
+_JUMP, _USUAL = 12.0, 0.995
+# Samples with no output of the drive at all from which it is taken to be off, and the error that it then must have, as
+# a share of the motion.
+_OFF, _OFF_ERROR = 20, 0.1
+
+
+@dataclass(frozen=True)
+class Log:
+    """One run: `s` samples of `n` joints.
+
+    Attributes:
+        name: file, and the run in it.
+        time: `s` [s], increasing.
+        command, position: `s x n` [rad or m].
+        units: `rad` or `m` of each joint.
+        beside: columns that were recorded beside them, in SI, by name: `supply`, `temperature`, `speed1`, `pwm1`, …
+        on: whether the drive was on and the sample is usable, `s`.
+        cut: whether something is missing before the sample, so that it begins anew, `s`.
+        lines: line of each sample in the file, `s`.
+        notes: what was recognised and left out, one sentence each without a full stop.
+    """
+
+    name: str
+    time: Array
+    command: Array
+    position: Array
+    units: tuple[str, ...]
+    beside: Mapping[str, Array]
+    on: NDArray[np.bool_]
+    cut: NDArray[np.bool_]
+    lines: NDArray[np.int64]
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """`q1`, `q2`, …"""
+        return tuple(f"q{i + 1}" for i in range(self.command.shape[1]))
+
+
+def load_logs(sources: Sequence[str | Path | Frame | Table], columns: Mapping[str, str] | None = None) -> list[Log]:
+    """Read logs; every file is a run, or several where it has a column `run[1]`.
+
+    Args:
+        sources: CSV files (or .xlsx, or data frames) with `time[s]`, `command1[rad]…`, `q1[rad]…` and optional columns.
+        columns: other headers -> ours, as for `read_table`.
+
+    Raises:
+        InputError: a column is missing or in a wrong unit, time does not increase, commands and positions do not fit
+            each other, the drive was off throughout, or nothing moves.
+    """
+    if not sources:
+        raise InputError("motion: name at least one log with --motion LOG.csv")
+    logs = [log for source in sources for log in _of_table(_table(source, columns))]
+    first = logs[0]
+    for log in logs[1:]:
+        if log.units != first.units:
+            raise InputError(
+                f"{log.name}: has joints in {', '.join(log.units)}, and {first.name} in {', '.join(first.units)}; "
+                "diagnose logs of one machine together"
+            )
+    refuse_mistakes(logs)
+    return logs
+
+
+def _table(source: str | Path | Frame | Table, columns: Mapping[str, str] | None) -> Table:
+    if isinstance(source, Table):
+        return source
+    return read_table(source, columns) if isinstance(source, str | Path) else read_frame(source, columns)
+
+
+def _of_table(table: Table) -> list[Log]:
+    count = _joints(table)
+    units = tuple(_unit(table, f"q{i}", f"command{i}") for i in range(1, count + 1))
+    stacked = [
+        np.stack([table.column(f"{kind}{i + 1}", units[i]) for i in range(count)], -1) for kind in ("command", "q")
+    ]
+    time = table.column("time", "s")
+    beside = {n: table.column(n, unit) for n, unit in _SHARED.items() if n in table}
+    for kind, unit in _EACH.items():
+        for i in range(1, count + 1):
+            if (name := f"{kind}{i}") in table:
+                beside[name] = table.column(name, unit if kind != "speed" else f"{units[i - 1]}/s")
+    if _RUN not in table:
+        parts = [(str(table.path), np.arange(len(table)))]
+    else:
+        number = table.column(_RUN, "1")
+        begins = np.flatnonzero(np.diff(number, prepend=number[:1] - 1))
+        parts = [
+            (f"{table.path} run {number[rows[0]]:g}", rows) for rows in np.split(np.arange(len(number)), begins[1:])
+        ]
+    return [
+        _log(table, name, rows, time[rows], stacked[0][rows], stacked[1][rows], units, beside) for name, rows in parts
+    ]
+
+
+def _joints(table: Table) -> int:
+    """How many joints there are; every one has a command and a position."""
+    found = {
+        kind: {int(m[1]) for n in table.names if (m := pattern.fullmatch(n))}
+        for kind, pattern in (("command", _COMMAND), ("q", _POSITION))
+    }
+    count = max(*found["command"], *found["q"], 1) if found["command"] | found["q"] else 1
+    for kind, there in found.items():
+        for i in range(1, count + 1):
+            if i not in there:
+                table.column(f"{kind}{i}")
+    return count
+
+
+def _unit(table: Table, position: str, command: str) -> str:
+    units = []
+    for name in (position, command):
+        table.column(name)
+        unit = table.units[name]
+        si = si_unit_of(unit, f"{table.path}: column '{name}'") if unit else ""
+        if si not in ("rad", "m"):
+            raise InputError(
+                f"{table.path}: column '{name}' must be an angle or a length; write '{name}[rad]', '{name}[deg]' or "
+                f"'{name}[mm]'"
+            )
+        units.append(si)
+    if units[0] != units[1]:
+        raise InputError(
+            f"{table.path}: '{command}' is in {units[1]} and '{position}' in {units[0]}; a command and the position "
+            "that follows it have one unit"
+        )
+    return units[0]
+
+
+def _log(
+    table: Table,
+    name: str,
+    rows: NDArray[np.int64],
+    time: Array,
+    command: Array,
+    position: Array,
+    units: tuple[str, ...],
+    beside: Mapping[str, Array],
+) -> Log:
+    steps = np.diff(time)
+    back = np.flatnonzero(steps <= 0)
+    if len(back):
+        more = f", and {len(back) - 1} times more" if len(back) > 1 else ""
+        raise InputError(
+            f"{table.path}: time does not increase at {table.name_rows([int(rows[back[0] + 1])])}{more}; sort the "
+            "rows, and write one row for each time"
+        )
+    own = {n: v[rows] for n, v in beside.items()}
+    notes: list[str] = []
+    cut = np.zeros(len(time), dtype=np.bool_)
+    usual = float(np.median(steps)) if len(steps) else 1.0
+    gaps, late = steps > _GAP * usual, (steps > _LATE * usual) & (steps <= _GAP * usual)
+    cut[1:] |= gaps
+    if gaps.any():
+        notes.append(f"{name}: {count_text(int(gaps.sum()), 'gap')} of {steps[gaps].sum():.3g} s in all, left out")
+    if late.any():
+        notes.append(f"{name}: {count_text(int(late.sum()), 'sample')} came late; the simulation uses their own times")
+    position = position.copy()
+    for i, unit in enumerate(units):
+        moved = np.diff(position[:, i])
+        # Beside what the command moves, which across a gap may be much.
+        beyond = moved - np.diff(command[:, i])
+        turns = np.round(beyond / _TURN)
+        wrapped = (unit == "rad") & (turns != 0) & (np.abs(beyond - turns * _TURN) < _TURN_SLACK * _TURN)
+        wrapped &= np.abs(moved) > _TURN / 2
+        if wrapped.any():
+            position[1:, i] -= _TURN * np.cumsum(np.where(wrapped, turns, 0.0))
+            notes.append(f"{name}: the counter of q{i + 1} wrapped {count_text(int(wrapped.sum()), 'time')}, unwrapped")
+            moved = np.diff(position[:, i])
+        size = np.abs(moved)
+        span = float(np.ptp(position[:, i]))
+        jump = size > max(_JUMP * float(np.quantile(size, _USUAL)), 0.1 * span) if len(size) > 10 else size < 0
+        if jump.any():
+            cut[1:] |= jump
+            notes.append(f"{name}: q{i + 1} jumps {count_text(int(jump.sum()), 'time')}; the log is cut there")
+    on = _drive_on(name, time, command, position, own, notes)
+    cut[1:] |= on[1:] & ~on[:-1]
+    return Log(name, time, command, position, units, own, on, cut, table.lines[rows], tuple(notes))
+
+
+def _drive_on(
+    name: str, time: Array, command: Array, position: Array, beside: Mapping[str, Array], notes: list[str]
+) -> NDArray[np.bool_]:
+    """Where the drive was on: as recorded; else where it gives no output at all although the position is off."""
+    on = np.ones(len(time), dtype=np.bool_)
+    if "torque_on" in beside:
+        on = beside["torque_on"] > 0.5
+        source = "torque_on"
+    else:
+        source = ""
+        for i in range(command.shape[1]):
+            for kind in ("pwm", "current", "torque"):
+                output = beside.get(f"{kind}{i + 1}")
+                error = np.abs(command[:, i] - position[:, i])
+                if output is None or not np.any(output):
+                    continue
+                off = _runs_of((output == 0) & (error > _OFF_ERROR * np.ptp(command[:, i])), _OFF)
+                if off.any():
+                    on &= ~off
+                    source = f"{kind}{i + 1}, which is 0 although the position is off"
+    if not on.all() and on.any():
+        lost = float(np.diff(time, append=time[-1])[~on].sum())
+        notes.append(f"{name}: the drive was off for {lost:.3g} s ({source}), left out")
+    return on
+
+
+def _runs_of(flags: NDArray[np.bool_], least: int) -> NDArray[np.bool_]:
+    """The flags without runs of fewer than `least`."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    kept = np.zeros_like(flags)
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        kept[a:b] = b - a >= least
+    return kept

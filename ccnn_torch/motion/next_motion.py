@@ -1,0 +1,221 @@
+"""The next motion to record: the one on which the most probable models differ most, or that sharpens the only one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.motion.fit import Fit, sensitivities
+from ccnn_torch.motion.judge import AxisVerdict
+from ccnn_torch.motion.library import Library
+from ccnn_torch.motion.problem import Problem, Whitening
+from ccnn_torch.motion.search import Search
+from ccnn_torch.motion.stretches import Stretches
+
+__all__ = ["Motion", "motions", "next_motions"]
+
+# Seconds of a proposed motion, its sampling, and the lead that is not judged.
+_SECONDS, _STEP, _LEAD = 8.0, 0.01, 0.3
+# So many are proposed.
+_PROPOSED = 4
+# Rivals of a verdict that are told apart.
+_RIVALS = 3
+# Directions of a model's numbers with less than this share of the largest one are rounding.
+_DIGITS = 1e-9
+
+
+class Motion(NamedTuple):
+    """A motion of one joint about a middle.
+
+    Attributes:
+        kind: its name.
+        text: how to make it, without a full stop.
+        time, command: `s` [s], `s` [rad or m].
+        gain: factor on the proportional gain while it is recorded.
+        load: torque of a load that is added, per gain [rad or m].
+    """
+
+    kind: str
+    text: str
+    time: Tensor
+    command: Tensor
+    gain: float = 1.0
+    load: float = 0.0
+
+
+def motions(middle: float, amplitude: float, speed: float, unit: str) -> list[Motion]:
+    """Motions that are within what was recorded: amplitude [rad or m], speed [per s]."""
+    t = torch.arange(0, _SECONDS, _STEP, dtype=torch.float64)
+
+    def triangle(rate: float) -> Tensor:
+        period = 4 * amplitude / rate
+        return amplitude * (2 / math.pi) * torch.asin(torch.sin(2 * math.pi * t / period))
+
+    slow = triangle(max(0.08 * speed, 6 * amplitude / _SECONDS * 0.5))
+    high = min(max(speed / (2 * math.pi * 0.25 * amplitude), 0.5), 5.0)
+    chirp = 0.25 * amplitude * torch.sin(2 * math.pi * (0.2 * t + 0.5 * (high - 0.2) * t.square() / _SECONDS))
+    steps = amplitude * torch.sign(torch.sin(2 * math.pi * t / 4))
+    wave = amplitude * torch.sin(2 * math.pi * t / _SECONDS)
+    mixed = 0.6 * amplitude * torch.sin(2 * math.pi * 0.3 * t) + 0.25 * amplitude * torch.sin(2 * math.pi * 1.3 * t)
+    far, fast = f"{amplitude:.3g} {unit}", f"{high:.2g} Hz"
+    plain = [
+        Motion("slow reversals", f"a triangle of ±{far}, slow", t, middle + slow),
+        Motion("chirp", f"a sine of ±{0.25 * amplitude:.3g} {unit}, from 0.2 to {fast}", t, middle + chirp),
+        Motion("steps", f"steps between ±{far}, 2 s each", t, middle + steps),
+        Motion("slow wave", f"one sine of ±{far} in {_SECONDS:.0f} s", t, middle + wave),
+        Motion("two sines", f"sines of 0.3 and 1.3 Hz within ±{far}", t, middle + mixed),
+    ]
+    other = [
+        m._replace(kind=f"{m.kind}, half the gain", text=f"{m.text}, with half the proportional gain", gain=0.5)
+        for m in plain[:2]
+    ]
+    loaded = [
+        m._replace(kind=f"{m.kind}, loaded", text=f"{m.text}, with a load at the end of the axis", load=0.1)
+        for m in plain[:2]
+        if unit == "rad"
+    ]
+    return [*plain, *other, *loaded]
+
+
+def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[dict[str, Any]], list[Motion]]:
+    """`next_measurements` of diagnosis.json, and the motions themselves; empty where the cause is outside the library.
+
+    `gain` is the expected log odds by which the motion tells the two models apart, the numbers of the other refitted;
+    where there is no rival, the information on the numbers of the only model; both in nats.
+    """
+    entries: list[tuple[dict[str, Any], Motion]] = []
+    data, library = found.problem.data, found.problem.library
+    for i, verdict in enumerate(verdicts):
+        if verdict.driver is not None:
+            continue
+        position = data.position[i][data.judged]
+        middle, amplitude = float(position.mean()), 0.5 * float(position.max() - position.min())
+        if not amplitude:
+            continue
+        # Two effects that do the same to this model are told apart by no motion.
+        rivals = [f for f in _rivals(found.found[i], verdict) if not _alike(library, i, verdict.best, f)]
+        for motion in motions(middle, amplitude, library.facts[i].speed, library.facts[i].unit):
+            problem = _problem_of(found.problem, i, motion)
+            whitening = Whitening(found.whitening.coefficients[i : i + 1])
+            entry = {
+                "joints": {f"q{i + 1}": amplitude},
+                "covariates": {},
+                "motion": {
+                    "joint": f"q{i + 1}",
+                    "kind": motion.kind,
+                    "text": motion.text,
+                    "seconds": _SECONDS,
+                    "gain": motion.gain,
+                    "load": motion.load,
+                },
+            }
+            others: list[Fit | None] = [*rivals] or [None]
+            for rival in others:
+                gain = _gain(problem, whitening, i, verdict.best, rival)
+                names = [] if rival is None else _apart(library.names, verdict.best, rival)
+                entries.append((entry | {"separates": names, "gain": gain}, motion))
+    entries = [e for e in entries if math.isfinite(e[0]["gain"])]
+    entries.sort(key=lambda e: -e[0]["gain"])
+    chosen: list[tuple[dict[str, Any], Motion]] = []
+    # The best for each pair first, then what is left.
+    for fresh in (True, False):
+        for e in entries:
+            seen = [c[0]["separates"] for c in chosen]
+            if len(chosen) < _PROPOSED and e not in chosen and (e[0]["separates"] not in seen) == fresh:
+                chosen.append(e)
+    return [c[0] for c in chosen], [c[1] for c in chosen]
+
+
+def _rivals(fits: Sequence[Fit], verdict: AxisVerdict) -> list[Fit]:
+    """The most probable sets in which a member of the verdict is replaced by one of its class."""
+    found = []
+    for member, like in verdict.classes.items():
+        for other in like:
+            wanted = tuple(sorted({*verdict.best.members} - {member} | {other}))
+            found += [f for f in fits if f.members == wanted]
+    return found[:_RIVALS]
+
+
+def _alike(library: Library, axis: int, best: Fit, rival: Fit) -> bool:
+    """Whether two sets act on the same parameters of the axis."""
+    acts = [
+        sorted(act for member in f.members for j in library.places[member] for act in library.numbers[axis][j].acts)
+        for f in (best, rival)
+    ]
+    return acts[0] == acts[1]
+
+
+def _apart(names: Sequence[str], best: Fit, rival: Fit) -> list[str]:
+    return [
+        names[e] for e in (*sorted({*best.members} - {*rival.members}), *sorted({*rival.members} - {*best.members}))
+    ]
+
+
+def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
+    """One axis that is commanded by a motion."""
+    s = len(motion.time)
+    row = motion.command[None]
+    judged = (motion.time > _LEAD)[None]
+    facts = problem.library.facts[axis]
+    nominal = dict(facts.nominal)
+    nominal["gain"] = nominal.get("gain", 1.0) * motion.gain
+    nominal["gravity_sin"] = nominal.get("gravity_sin", 0.0) + motion.load
+    library = _only(problem, axis, nominal)
+    data = Stretches(
+        motion.time[None],
+        row[None],
+        row[None],
+        torch.zeros(1, 1, s, dtype=torch.float64),
+        judged,
+        torch.zeros(1, dtype=torch.int64),
+        {},
+        torch.zeros(1, s, dtype=torch.int64),
+        ("next",),
+        (facts.unit,),
+        (),
+    )
+    still = torch.zeros(1, s, dtype=torch.float64)
+    step = float(problem.data.time.diff(dim=-1).median()) * problem.pool
+    return replace(
+        problem,
+        data=data,
+        library=library,
+        followed=row[None],
+        supply=still,
+        warm=still,
+        pool=max(round(step / _STEP), 1),
+    )
+
+
+def _only(problem: Problem, axis: int, nominal: Mapping[str, float]) -> Any:
+    """The library of one axis."""
+    library = problem.library
+    return library._replace(
+        facts=(replace(library.facts[axis], nominal=nominal),),
+        numbers=(library.numbers[axis],),
+        nominal={n: torch.tensor([v], dtype=torch.float64) for n, v in nominal.items()},
+    )
+
+
+def _gain(problem: Problem, whitening: Whitening, axis: int, best: Fit, rival: Fit | None) -> float:
+    """In nats."""
+    other = best if rival is None else rival
+    active = torch.tensor([[list(other.spec.flat)]], dtype=torch.int64).reshape(1, 1, -1)
+    mine = problem.positions(torch.stack([best.spec.theta])[None])[0]
+    there = replace(problem, data=problem.data._replace(position=mine))
+    difference, columns = sensitivities(there, whitening, other.spec.theta[None, None], active)
+    x = columns[0, 0].mT / math.sqrt(best.noise)
+    if rival is None:
+        inner = torch.eye(x.shape[1], dtype=x.dtype) + x.mT @ x @ best.covariance
+        return 0.5 * float(torch.linalg.slogdet(inner).logabsdet) if x.shape[1] else 0.0
+    y = difference[0, 0] / math.sqrt(best.noise)
+    if x.shape[1]:
+        u, values, _ = torch.linalg.svd(x, full_matrices=False)
+        u = u[:, values > _DIGITS * values[0]]
+        y = y - u @ (u.mT @ y)
+    return 0.5 * float(y.square().sum())

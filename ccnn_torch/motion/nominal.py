@@ -1,0 +1,162 @@
+"""The nominal model of a motion: what is known of every axis, and what positions it makes of the commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
+from ccnn_torch.motion.log import Log
+from ccnn_torch.motion.simulators import Simulator, simulator_of
+from ccnn_torch.motion.stretches import Stretches
+from ccnn_torch.spelling import nearest
+
+__all__ = ["KEYS", "Nominal", "nominal_of"]
+
+KEYS: dict[str, str] = {
+    "gain": "proportional gain [N*m/rad]; without it torques are told as angles",
+    "inertia": "of the axis without its load [kg*m^2]",
+    "mass": "of the load at the end of its lever [kg]",
+    "length": "lever of the load [m]",
+    "viscous": "viscous friction, the motor's damping included [N*m*s/rad]",
+    "coulomb": "dry friction [N*m]",
+    "load_friction": "dry friction as a share of the motor's torque [1]",
+    "stribeck": "dry friction at rest beyond that in motion [N*m]",
+    "stribeck_speed": "speed at which that has fallen to 1/e [rad/s]",
+    "gravity_sin": "torque of the weight at 90 degrees beyond that of the load [N*m]",
+    "gravity_cos": "torque of the weight at 0 [N*m]",
+    "delay": "from command to motor [s]",
+    "offset": "of the position from the command [rad]",
+    "backlash": "whole width of the play [rad]",
+    "speed_limit": "[rad/s]",
+    "torque_limit": "of the motor at the nominal supply [N*m]",
+    "supply": "nominal supply voltage, at which gain and torque_limit hold [V]",
+}
+"""Keys of the built-in servo; a number for all axes, or a list with one for each."""
+
+# Torques, which are divided by the gain.
+_TORQUES = ("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity_cos")
+_SAME = {"delay": "delay", "offset": "offset", "backlash": "play", "load_friction": "load_friction"}
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """A nominal model.
+
+    Attributes:
+        name: as given.
+        axes: parameters of each axis, as in `ABSENT`.
+        gains: N m/rad of each axis, None where it is not known.
+        lengths: lever of each axis' load [m].
+        supply: nominal supply voltage; None where the motor's strength is not known to follow it.
+        simulator: makes the positions that the axes follow; None where they follow the commands.
+        notes: sentences without a full stop.
+    """
+
+    name: str
+    axes: tuple[Mapping[str, float], ...]
+    gains: tuple[float | None, ...]
+    lengths: tuple[float | None, ...]
+    supply: float | None = None
+    simulator: Simulator | None = None
+    notes: tuple[str, ...] = field(default=())
+
+    def followed(self, logs: Sequence[Log], data: Stretches) -> Tensor:
+        """What the axes follow, `n x b x s`: the commands, or what a simulator makes of them from each log's start on.
+
+        Raises:
+            InputError: the simulator fails.
+        """
+        if self.simulator is None:
+            return data.command
+        made = [self.simulator.positions(log.time, log.command) for log in logs]
+        found = data.command.clone()
+        for k, number in enumerate(data.run.tolist()):
+            rows = data.log[k]
+            here = torch.from_numpy(made[number])[rows.clamp_min(0)].mT
+            last = int((rows >= 0).sum()) - 1
+            found[:, k] = torch.where(rows >= 0, here, here[:, last : last + 1])
+        return found
+
+
+def nominal_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) -> Nominal:
+    """The nominal model by its name.
+
+    Args:
+        mechanism: `servo`, a simulator `file.py:NAME`, an MJCF with position actuators, or a mechanism.
+        keys: of the built-in servo (`KEYS`), or of the mechanism.
+        units: of the joints in the logs.
+
+    Raises:
+        InputError: a name or a key is not known, or the model has another number of joints than the logs.
+    """
+    n = len(units)
+    if mechanism == "servo":
+        return _servo(keys, n)
+    simulator = simulator_of(mechanism, keys, units)
+    return Nominal(
+        mechanism, ({},) * n, (None,) * n, (None,) * n, None, simulator, simulator.notes if simulator else ()
+    )
+
+
+def _servo(keys: Mapping[str, Any], n: int) -> Nominal:
+    for key in keys:
+        if key not in KEYS:
+            near = nearest(key, list(KEYS))
+            raise InputError(
+                f"mechanism_keys: the servo has no key '{key}'"
+                f"{f'; {near!r} is the nearest' if near else ''}; it has {', '.join(KEYS)}"
+            )
+    each = {key: _numbers(key, value, n) for key, value in keys.items()}
+    axes, gains, lengths = [], [], []
+    for i in range(n):
+        own = {key: values[i] for key, values in each.items()}
+        gain = own.get("gain")
+        needs = [k for k in (*_TORQUES, "mass", "torque_limit") if own.get(k)]
+        if gain is None and needs:
+            raise InputError(f"mechanism_keys: {needs[0]} is given without gain; give gain [N*m/rad] as well")
+        if own.get("mass") and not own.get("length"):
+            raise InputError("mechanism_keys: mass is given without length; give the lever of the load [m] as well")
+        unit = gain or 1.0
+        axis = {name: own[name] / unit for name in _TORQUES if name in own}
+        load, lever = own.get("mass", 0.0), own.get("length", 0.0)
+        axis["inertia"] = axis.get("inertia", 0.0) + load * lever**2 / unit
+        axis["load"] = load * lever**2 / unit
+        axis["gravity_sin"] = axis.get("gravity_sin", 0.0) + load * STANDARD_GRAVITY * lever / unit
+        axis |= {name: own[key] for key, name in _SAME.items() if key in own}
+        if own.get("stribeck_speed"):
+            axis["stribeck_speed"] = own["stribeck_speed"]
+        if own.get("torque_limit"):
+            axis["weakness"] = unit / own["torque_limit"]
+        if own.get("speed_limit"):
+            axis["slowness"] = 1 / own["speed_limit"]
+        if own.get("supply"):
+            axis["supply"] = 1.0
+        axes.append({name: value for name, value in axis.items() if value})
+        gains.append(gain)
+        lengths.append(own.get("length"))
+    supply = each["supply"][0] if each.get("supply") else None
+    return Nominal("servo", tuple(axes), tuple(gains), tuple(lengths), supply)
+
+
+def _numbers(key: str, value: Any, n: int) -> list[float]:
+    values = value if isinstance(value, list | tuple) else [value] * n
+    signed = key in ("offset", "gravity_sin", "gravity_cos")
+    fine = len(values) == n and all(
+        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and (signed or v >= 0)
+        for v in values
+    )
+    if not fine or (key in ("gain", "supply", "length") and not all(v > 0 for v in values)):
+        what = (
+            "a number" if signed else "a number not below 0" if key not in ("gain", "supply", "length") else "above 0"
+        )
+        raise InputError(
+            f"mechanism_keys: {key} must be {what}, or a list with one for each of the {n} joints, not {value}"
+        )
+    return [float(v) for v in values]

@@ -1,0 +1,101 @@
+"""The residual of many models at once: measured less simulated positions, whitened."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.motion.axis import Drive, simulate_axes
+from ccnn_torch.motion.library import Library
+from ccnn_torch.motion.stretches import Stretches
+
+__all__ = ["Problem", "Whitening", "white_noise"]
+
+# Of an axis that ran away: no residual is larger, in units of the motion.
+_FARTHEST = 10.0
+
+
+class Whitening(NamedTuple):
+    """An autoregressive model of each axis' residual: e_t = r_t - sum_k a_k r_(t-k), `n x order`."""
+
+    coefficients: Tensor
+
+    def __call__(self, residual: Tensor) -> Tensor:
+        """`n x ... x s`, of the same shape; the first samples, which lack some before them, are as they are."""
+        white = residual.clone()
+        shape = [-1] + [1] * (residual.dim() - 1)
+        for k in range(1, self.coefficients.shape[1] + 1):
+            white[..., k:] -= self.coefficients[:, k - 1].reshape(shape) * residual[..., :-k]
+        return white
+
+
+def white_noise(axes: int) -> Whitening:
+    """No correlation."""
+    return Whitening(torch.zeros(axes, 0, dtype=torch.float64))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Stretches of logs, the library for their axes, and the nominal positions that the axes are commanded by.
+
+    Attributes:
+        data: `n` joints, `b` stretches, `s` samples.
+        library: effects.
+        followed: what the axes follow, `n x b x s`: the commands, or what a simulator makes of them.
+        supply, warm: as of `Drive`, `b x s`.
+        pool: so many samples are averaged before they are judged: what is faster than the motion is noise.
+    """
+
+    data: Stretches
+    library: Library
+    followed: Tensor
+    supply: Tensor
+    warm: Tensor
+    pool: int = 1
+
+    def positions(self, theta: Tensor, chosen: Tensor | None = None) -> Tensor:
+        """Simulated positions, `p x n x b x s`; theta: `p x n x k`; chosen: stretches, all when None."""
+        data = self.data
+        rows = torch.arange(len(data.time)) if chosen is None else chosen
+        n, b = len(self.followed), len(rows)
+        time = data.time[rows].expand(n, -1, -1).reshape(n * b, -1)
+        start = torch.stack([data.position[:, rows, 0], data.speed[:, rows, 0]], -1).reshape(n * b, 2)
+        drive = Drive(
+            time,
+            self.followed[:, rows].reshape(n * b, -1),
+            start,
+            self.supply[rows].expand(n, -1, -1).reshape(n * b, -1),
+            self.warm[rows].expand(n, -1, -1).reshape(n * b, -1),
+        )
+        values = {
+            name: value[..., None].expand(*value.shape, b).reshape(len(theta), n * b)
+            for name, value in self.library.parameters(theta).items()
+        }
+        moved = simulate_axes(drive, values).reshape(-1, n, b, time.shape[-1])
+        return moved.expand(len(theta), -1, -1, -1)
+
+    def residual(self, theta: Tensor, chosen: Tensor | None = None) -> Tensor:
+        """Measured less simulated, `p x n x b x s` [rad or m]; finite."""
+        measured = self.data.position if chosen is None else self.data.position[:, chosen]
+        far = _FARTHEST * (measured.amax((-1, -2)) - measured.amin((-1, -2)))[:, None, None] + 1e-12
+        left = measured - self.positions(theta, chosen)
+        return torch.maximum(torch.minimum(torch.nan_to_num(left, nan=torch.inf), far), -far)
+
+    def pooled(self, residual: Tensor) -> Tensor:
+        """Means over `pool` samples each, `... x s` -> `... x t`."""
+        m = self.pool
+        kept = residual[..., : residual.shape[-1] // m * m]
+        return kept.reshape(*kept.shape[:-1], -1, m).mean(-1)
+
+    @property
+    def judged(self) -> Tensor:
+        """Which of the means count, `b x t`."""
+        return self.pooled(self.data.judged.double()) == 1
+
+    def whitened(self, residual: Tensor, whitening: Whitening, chosen: Tensor | None = None) -> Tensor:
+        """Whitened means of the residuals, `n x p x (b t)`; 0 where they do not count."""
+        judged = self.judged if chosen is None else self.judged[chosen]
+        return (whitening(self.pooled(residual).transpose(0, 1)) * judged).flatten(2)

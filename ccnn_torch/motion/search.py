@@ -1,0 +1,268 @@
+"""The search over sets of effects: forward with a screen of every effect, then replacements and removals.
+
+All axes go side by side, each with its own sets: they share the simulated time steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.motion.fit import Fit, Spec, fit_many, sensitivities, started
+from ccnn_torch.motion.library import Library, Variant
+from ccnn_torch.motion.problem import Problem, Whitening, white_noise
+from ccnn_torch.motion.whiten import fitted_whitening
+
+__all__ = ["Search", "log_posterior", "search"]
+
+# Log prior odds of an effect, and what a third and every further one at once costs beside it, as for effects of a pose.
+LOG_ODDS, CROWD = math.log(0.1), math.log(0.1)
+# Sets that are extended, effects that are fitted for each of them after the screen, and members at most.
+_BEAM, _FITTED, _MOST = 2, 4, 9
+# Log posterior that a level must bring.
+_GAINED = 1.0
+# Sets that are fitted anew under another noise.
+_KEPT = 6
+# Difference quotients of the screen, for numbers that begin at 0 [plausible sizes].
+_STEP = 0.1
+_LONG, _SHORT, _FEW = 8, 5, 3
+
+
+class Search(NamedTuple):
+    """What was fitted.
+
+    Attributes:
+        problem: the data.
+        whitening: of the residual of each axis.
+        found: of each axis the fits of all sets, most probable first.
+        rich: residual of each axis under the white fit with the most effects, `n x b x s` [rad or m].
+    """
+
+    problem: Problem
+    whitening: Whitening
+    found: tuple[tuple[Fit, ...], ...]
+    rich: Tensor
+
+
+def log_posterior(fit: Fit) -> float:
+    """Log evidence with the prior of the set, not normalised."""
+    count = len(fit.members)
+    return fit.log_evidence + fit.spec.log_prior + LOG_ODDS * count + CROWD * max(count - 2, 0)
+
+
+def search(problem: Problem) -> Search:
+    """Find the probable sets of every axis."""
+    n = len(problem.followed)
+    plain = _Pool(problem, white_noise(n))
+    plain.forward()
+    best = plain.best()
+    theta = torch.stack([f.spec.theta for f in best])[None]
+    rich = problem.residual(theta)[0]
+    pool = _Pool(problem, fitted_whitening(problem.pooled(rich), problem.judged))
+    pool.again(plain)
+    pool.forward()
+    # The noise of what is left by what is most probable now.
+    theta = torch.stack([f.spec.theta for f in pool.best()])[None]
+    left = problem.residual(theta)[0]
+    final = _Pool(problem, fitted_whitening(problem.pooled(left), problem.judged))
+    final.again(pool)
+    final.neighbours()
+    final.reduced()
+    return Search(problem, final.whitening, tuple(tuple(p) for p in final.ranked()), rich)
+
+
+class _Pool:
+    """Fits of each axis by their members, under one noise."""
+
+    def __init__(self, problem: Problem, whitening: Whitening) -> None:
+        self.problem, self.whitening = problem, whitening
+        self.library: Library = problem.library
+        self.axes = len(problem.followed)
+        zero = torch.zeros(self.library.size, dtype=torch.float64)
+        self.found: list[dict[tuple[int, ...], Fit]] = [{} for _ in range(self.axes)]
+        self.fit([[Spec((), zero, (), 0.0)] for _ in range(self.axes)], 0)
+
+    def best(self) -> list[Fit]:
+        return [self.ranked()[i][0] for i in range(self.axes)]
+
+    def ranked(self) -> list[list[Fit]]:
+        return [sorted(found.values(), key=lambda f: -log_posterior(f)) for found in self.found]
+
+    def fit(self, wanted: Sequence[Sequence[Spec]], steps: int) -> None:
+        """Fit sets of each axis; one that was fitted before stays if it was better."""
+        wide = max((len(w) for w in wanted), default=0)
+        if not wide:
+            return
+        # An axis with fewer sets repeats one.
+        spare = [w[0] if w else next(iter(self.found[i].values())).spec for i, w in enumerate(wanted)]
+        rows = [[w[k] if k < len(w) else spare[i] for i, w in enumerate(wanted)] for k in range(wide)]
+        # Sets of one size together, since the others are padded to it.
+        for row in fit_many(self.problem, self.whitening, rows, steps):
+            for i, fit in enumerate(row):
+                old = self.found[i].get(fit.members)
+                if old is None or log_posterior(fit) > log_posterior(old):
+                    self.found[i][fit.members] = fit
+
+    def again(self, other: _Pool) -> None:
+        """Fit the most probable sets of another pool under this noise, and every effect alone."""
+        ranked = other.ranked()
+        self.fit([[f.spec for f in fits[:_KEPT] if len(f.members) > 1] for fits in ranked], _LONG)
+        self.fit([[f.spec for f in fits if len(f.members) == 1] for fits in ranked], _FEW)
+
+    def forward(self) -> None:
+        """Add effects one after the other, as long as that brings evidence."""
+        done: list[set[tuple[int, ...]]] = [set() for _ in range(self.axes)]
+        for _ in range(_MOST):
+            before = [log_posterior(f) for f in self.best()]
+            bases = [
+                [f for f in ranked[:_BEAM] if f.members not in d and len(f.members) < _MOST]
+                for ranked, d in zip(self.ranked(), done, strict=True)
+            ]
+            if not any(bases):
+                return
+            for d, own in zip(done, bases, strict=True):
+                d |= {f.members for f in own}
+            # Alone every effect is fitted: its own share of the gap is told.
+            alone = all(not f.members for own in bases for f in own)
+            self.fit(self.screened(bases, len(self.library.effects) if alone else _FITTED), _SHORT)
+            self.fit([[f.spec for f in ranked[:_BEAM] if f.members] for ranked in self.ranked()], _SHORT)
+            after = [log_posterior(f) for f in self.best()]
+            if all(a < b + _GAINED for a, b in zip(after, before, strict=True)):
+                return
+
+    def neighbours(self) -> None:
+        """The most probable set without each of its members, and with another effect in the place of each."""
+        for _ in range(3):
+            before = self.best()
+            less = [
+                [
+                    s
+                    for k in range(len(f.members))
+                    if (s := without(self.library, f.spec, k)).members not in self.found[i]
+                ]
+                for i, f in enumerate(before)
+            ]
+            self.fit(less, _LONG)
+            bases = [
+                [self.found[i][without(self.library, f.spec, k).members] for k in range(len(f.members))]
+                for i, f in enumerate(before)
+            ]
+            self.fit(self.screened(bases, 2), _LONG)
+            if all(a.members == b.members for a, b in zip(before, self.best(), strict=True)):
+                return
+
+    def reduced(self) -> None:
+        """The most probable set of each axis without its least members, one after the other, down to none."""
+        now = [f.spec for f in self.best()]
+        while any(s.members for s in now):
+            less = [
+                [o for k in range(len(s.members)) if (o := without(self.library, s, k)).members not in self.found[i]]
+                for i, s in enumerate(now)
+            ]
+            self.fit(less, _SHORT)
+            now = [
+                min(
+                    (self.found[i][without(self.library, s, k).members] for k in range(len(s.members))),
+                    key=lambda f: f.left,
+                ).spec
+                if s.members
+                else s
+                for i, s in enumerate(now)
+            ]
+
+    def screened(self, bases: Sequence[Sequence[Fit]], most: int = _FITTED) -> list[list[Spec]]:
+        """For each base the effects that promise most, by what a difference quotient of each explains."""
+        library, wide = self.library, max(map(len, bases))
+        spare = [b[0] if b else next(iter(self.found[i].values())) for i, b in enumerate(bases)]
+        wanted: list[dict[tuple[int, ...], Spec]] = [{} for _ in bases]
+        for k in range(wide):
+            row = [b[k] if k < len(b) else spare[i] for i, b in enumerate(bases)]
+            promise = self.promise(row)
+            for i, fit in enumerate(row):
+                if k >= len(bases[i]):
+                    continue
+                scores: dict[int, tuple[float, Variant]] = {}
+                for score, variant in promise[i]:
+                    if variant.effect not in scores or score > scores[variant.effect][0]:
+                        scores[variant.effect] = (score, variant)
+                for _, variant in sorted(scores.values(), key=lambda item: -item[0])[:most]:
+                    spec = started(library, fit.spec, variant, i)
+                    if spec.members not in self.found[i]:
+                        wanted[i].setdefault(spec.members, spec)
+        return [list(w.values()) for w in wanted]
+
+    def promise(self, bases: Sequence[Fit]) -> list[list[tuple[float, Variant]]]:
+        """Of each axis, for every variant of an effect that is not in its base, the evidence of both together."""
+        problem, library = self.problem, self.library
+        theta = torch.stack([f.spec.theta for f in bases])
+        variants = [v for own in library.variants for v in own]
+        moved, steps = [], []
+        for v in variants:
+            for a, j in enumerate(v.active):
+                changed = theta.clone()
+                value = v.values[:, a]
+                step = torch.where(value.abs() > 1e-6, value, torch.full_like(value, _STEP))
+                changed[:, j] += step
+                for b, place in enumerate(v.held):
+                    changed[:, place] = v.shapes[:, b]
+                moved.append(changed)
+                steps.append(step)
+        wide = max(len(f.spec.flat) for f in bases)
+        active = torch.full((1, len(bases), wide), -1)
+        for i, f in enumerate(bases):
+            active[0, i, : len(f.spec.flat)] = torch.tensor(f.spec.flat, dtype=torch.int64)
+        residual, own = sensitivities(problem, self.whitening, theta[None], active)
+        columns = []
+        for k in range(0, len(moved), 16):
+            part = torch.stack(moved[k : k + 16])
+            left = problem.whitened(problem.residual(part), self.whitening)
+            columns.append((residual - left) / torch.stack(steps[k : k + 16]).mT[..., None])
+        new = torch.cat(columns, 1)
+        values = float(problem.judged.sum())
+        found = []
+        for i, f in enumerate(bases):
+            m = len(f.spec.flat)
+            y = residual[i, 0] + f.spec.theta[list(f.spec.flat)] @ own[i, 0, :m]
+            x = torch.cat([own[i, 0, :m], new[i]])
+            grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
+            base_groups = _groups(f.spec.active)
+            sets, kept, place = [], [], m
+            for v in variants:
+                width = len(v.active)
+                if v.effect not in f.members and bool(library.there[i, v.effect]):
+                    sets.append([*base_groups, torch.arange(place, place + width)])
+                    kept.append(v)
+                place += width
+            scores = fit_sets(grams, sets, 0.0).log_evidence.tolist() if sets else []
+            found.append(
+                [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, kept, strict=True)]
+            )
+        return found
+
+
+def without(library: Library, spec: Spec, place: int) -> Spec:
+    """The set without one of its members."""
+    theta, effect = spec.theta.clone(), spec.members[place]
+    rest = [k for k in range(len(spec.members)) if k != place]
+    held = {p for v in library.variants[effect] for p in v.held}
+    theta[[*spec.active[place], *held]] = 0.0
+    return Spec(
+        tuple(spec.members[k] for k in rest),
+        theta,
+        tuple(spec.active[k] for k in rest),
+        spec.log_prior,
+        tuple(p for p in spec.free if p not in held),
+    )
+
+
+def _groups(active: Iterable[tuple[int, ...]]) -> list[Tensor]:
+    groups, begin = [], 0
+    for group in active:
+        groups.append(torch.arange(begin, begin + len(group)))
+        begin += len(group)
+    return groups

@@ -1,0 +1,167 @@
+"""Logs cut into stretches of a second or two, which are simulated side by side.
+
+A stretch begins with a lead that is simulated and not judged: what is not known of the state at its start has faded by
+its end. The folds of a cross-validation are whole runs, or stretches of a run where there is only one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ccnn_torch.display import count_text
+from ccnn_torch.errors import InputError
+from ccnn_torch.motion.log import Log
+
+__all__ = ["Stretches", "cut_stretches", "smooth_speed"]
+
+# Seconds of the part that is judged, and of the lead.
+_JUDGED, _LEAD = 1.2, 0.3
+# A stretch is judged over at least so long.
+_SHORTEST = 0.4
+# Samples are thinned to this spacing [s]: nothing that is looked for is faster.
+_STEP = 0.008
+# At most so many stretches are evaluated, spread evenly over the logs.
+_MOST = 48
+# Half the width of the window in which the speed is the slope of a parabola [s].
+_WINDOW = 0.03
+
+
+class Stretches(NamedTuple):
+    """`n` joints, `b` stretches, `s` samples, padded.
+
+    Attributes:
+        time: `b x s` [s], increasing also in the padding.
+        command, position: `n x b x s` [rad or m].
+        speed: smoothed, `n x b x s`.
+        judged: whether a sample counts, `b x s`.
+        run: the number of the log of each, `b`.
+        beside: recorded columns by name, `b x s`.
+        log: every sample's place in its log, `b x s`, int64.
+        names: of the runs.
+        units: of the joints.
+        notes: what was left out, one sentence each without a full stop.
+    """
+
+    time: Tensor
+    command: Tensor
+    position: Tensor
+    speed: Tensor
+    judged: Tensor
+    run: Tensor
+    beside: dict[str, Tensor]
+    log: Tensor
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def cut_stretches(logs: Sequence[Log], whole: bool = False, most: int = _MOST) -> Stretches:
+    """Cut logs into stretches.
+
+    Args:
+        logs: runs of one machine.
+        whole: each uninterrupted part of a log in one piece, for simulators that start where the log does.
+        most: so many stretches at most.
+
+    Raises:
+        InputError: no part with the drive on is long enough.
+    """
+    pieces: list[tuple[int, NDArray[np.int64], int]] = []
+    notes = [note for log in logs for note in log.notes]
+    strides = []
+    for number, log in enumerate(logs):
+        step = float(np.median(np.diff(log.time)))
+        # Half a step more, so that 3.9 ms are not thinned to 7.8.
+        stride = max(int((_STEP + 0.5 * step) / step), 1)
+        strides.append(stride)
+        for part in _uninterrupted(log):
+            rows = part[::stride]
+            pieces += [(number, *piece) for piece in _pieces(log.time[rows], rows, whole)]
+    if not pieces:
+        raise InputError(
+            f"{', '.join(log.name for log in logs)}: no part with the drive on and without gaps lasts "
+            f"{_LEAD + _SHORTEST:g} s"
+        )
+    if max(strides) > 1:
+        notes.append(f"of the samples every {max(strides)}. was evaluated, one in {_STEP * 1e3:.0f} ms or so")
+    if len(pieces) > most:
+        notes.append(f"{most} of {count_text(len(pieces), 'stretch')}, spread evenly over the logs, were evaluated")
+        pieces = [pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, most).round().astype(int))]
+    return _padded(logs, pieces, notes)
+
+
+def smooth_speed(time: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Slope of a parabola through the neighbours of each sample, `s x n` [rad/s]."""
+    from scipy.signal import savgol_filter
+
+    step = float(np.median(np.diff(time)))
+    width = min(2 * max(round(_WINDOW / step), 2) + 1, (len(time) - 1) // 2 * 2 + 1)
+    if width < 5:
+        return np.gradient(position, time, axis=0)
+    # Of both, as the steps are not equal.
+    slope: NDArray[np.float64] = savgol_filter(position, width, 2, deriv=1, axis=0)
+    steps: NDArray[np.float64] = savgol_filter(time, width, 2, deriv=1)
+    return np.asarray(slope / steps[:, None])
+
+
+def _uninterrupted(log: Log) -> list[NDArray[np.int64]]:
+    rows = np.arange(len(log.time))
+    ends = np.flatnonzero(log.cut | (np.diff(log.on, prepend=log.on[:1])))
+    return [part for part in np.split(rows, ends) if len(part) and log.on[part].all()]
+
+
+def _pieces(time: NDArray[np.float64], rows: NDArray[np.int64], whole: bool) -> list[tuple[NDArray[np.int64], int]]:
+    """Rows of each stretch with its lead, and the number of samples of the lead."""
+    if len(time) < 8 or time[-1] - time[0] < _LEAD + _SHORTEST:
+        return []
+    lead = int(np.searchsorted(time, time[0] + _LEAD))
+    if whole:
+        return [(rows, lead)]
+    count = max(round((time[-1] - time[lead]) / _JUDGED), 1)
+    begins = np.searchsorted(time, np.linspace(time[lead], time[-1], count + 1))
+    found = []
+    for a, b in pairwise(begins.tolist()):
+        first = int(np.searchsorted(time, time[a] - _LEAD))
+        found.append((rows[first : b + 1 if b == len(time) - 1 else b], int(a) - first))
+    return found
+
+
+def _padded(logs: Sequence[Log], pieces: Sequence[tuple[int, NDArray[np.int64], int]], notes: list[str]) -> Stretches:
+    length, n = max(len(rows) for _, rows, _ in pieces), len(logs[0].units)
+    names = set.intersection(*(set(log.beside) for log in logs))
+    time = np.zeros((len(pieces), length))
+    command, position, speed = (np.zeros((n, len(pieces), length)) for _ in range(3))
+    judged = np.zeros((len(pieces), length), dtype=np.bool_)
+    place = np.full((len(pieces), length), -1, dtype=np.int64)
+    beside = {name: np.zeros((len(pieces), length)) for name in sorted(names)}
+    for k, (number, rows, lead) in enumerate(pieces):
+        log, m = logs[number], len(rows)
+        step = float(np.median(np.diff(log.time[rows])))
+        time[k, :m], place[k, :m] = log.time[rows], rows
+        time[k, m:] = log.time[rows[-1]] + step * np.arange(1, length - m + 1)
+        judged[k, lead:m] = True
+        slope = smooth_speed(log.time[rows], log.position[rows])
+        for table, values in ((command, log.command[rows]), (position, log.position[rows]), (speed, slope)):
+            table[:, k, :m], table[:, k, m:] = values.T, values[-1][:, None]
+        for name, column in beside.items():
+            column[k, :m], column[k, m:] = log.beside[name][rows], log.beside[name][rows[-1]]
+    return Stretches(
+        time=torch.from_numpy(time),
+        command=torch.from_numpy(command),
+        position=torch.from_numpy(position),
+        speed=torch.from_numpy(speed),
+        judged=torch.from_numpy(judged),
+        run=torch.tensor([number for number, _, _ in pieces]),
+        beside={name: torch.from_numpy(v) for name, v in beside.items()},
+        log=torch.from_numpy(place),
+        names=tuple(log.name for log in logs),
+        units=logs[0].units,
+        notes=tuple(notes),
+    )

@@ -1,0 +1,52 @@
+"""The autoregressive model of a residual: its order is the one with the most evidence."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.motion.problem import Whitening
+
+__all__ = ["fitted_whitening"]
+
+_HIGHEST = 8
+# A residual that is a constant or a ramp would give a root outside the unit circle: so much is added to the diagonal.
+_RIDGE = 1e-9
+# Poles are drawn in by this factor (bandwidth expansion of linear prediction): what a model leaves is no stationary
+# noise, and a pole at the unit circle would leave the slow half of every effect without weight.
+_WIDER = 0.9
+
+
+def fitted_whitening(residual: Tensor, judged: Tensor) -> Whitening:
+    """Fit orders 0 to 8 and take, for each axis, the one with the most evidence (Schwarz 1978).
+
+    Args:
+        residual: `n x b x s`.
+        judged: samples that count, `b x s`; those before them may be looked back at.
+    """
+    n, high = len(residual), _HIGHEST
+    now = judged.clone()
+    now[:, :high] = False
+    # Every stretch's lead is longer than the highest order, so that hardly a judged sample is lost.
+    past = torch.stack([torch.roll(residual, k, -1)[:, now] for k in range(1, high + 1)], -1)
+    target = residual[:, now]
+    found = torch.zeros(n, high, dtype=residual.dtype)
+    count = target.shape[1]
+    for i in range(n):
+        best = math.inf
+        gram, along = past[i].mT @ past[i], past[i].mT @ target[i]
+        for order in range(high + 1):
+            a = torch.zeros(high, dtype=residual.dtype)
+            if order:
+                inner = gram[:order, :order]
+                inner = inner + _RIDGE * inner.diagonal().mean() * torch.eye(order, dtype=inner.dtype)
+                a[:order] = torch.linalg.solve(inner, along[:order])
+            left = float((target[i] - past[i] @ a).square().mean())
+            cost = count * math.log(max(left, 1e-300)) + order * math.log(max(count, 2))
+            if cost < best:
+                best, found[i] = cost, a
+    found = found * _WIDER ** torch.arange(1, high + 1, dtype=found.dtype)
+    used = int((found != 0).any(0).sum())
+    return Whitening(found[:, :used])

@@ -1,0 +1,55 @@
+"""A servo that is integrated by scipy from its equation of motion, for tests: no formula of `ccnn_torch.motion`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+Array = NDArray[np.float64]
+GAIN, INERTIA, VISCOUS = 2.0, 0.004, 0.09
+
+
+def command(kind: int, time: Array) -> Array:
+    """Two sines, a triangle, or a chirp."""
+    soft = np.clip(time / 0.5, 0, 1)
+    if kind == 0:
+        return soft * (0.6 * np.sin(2.2 * time) + 0.3 * np.sin(7.0 * time))
+    if kind == 1:
+        return 0.8 * np.arcsin(np.sin(2 * time)) * 2 / np.pi
+    return soft * 0.4 * np.sin(2 * np.pi * (0.2 * time + 0.2 * time**2))
+
+
+def moved(
+    time: Array, asked: Array, dry: float = 0.0, delay: float = 0.0, weight: float = 0.0, viscous: float = VISCOUS
+) -> Array:
+    """Position of `INERTIA q'' = GAIN (u - q) - viscous q' - weight sin q - dry tanh(q' / 0.002)`."""
+
+    def rate(t: float, state: Array) -> list[float]:
+        u = float(np.interp(t - delay, time, asked))
+        torque = (
+            GAIN * (u - state[0]) - viscous * state[1] - weight * np.sin(state[0]) - dry * np.tanh(state[1] / 0.002)
+        )
+        return [float(state[1]), float(torque / INERTIA)]
+
+    found = solve_ivp(rate, (time[0], time[-1]), [asked[0], 0.0], "LSODA", time, rtol=1e-6, atol=1e-8, max_step=0.01)
+    return np.asarray(found.y[0])
+
+
+def write_log(path: Path, kinds: tuple[int, ...] = (0, 1, 2), seconds: float = 5.0, **real: float) -> Path:
+    """A log of several runs with an encoder of 16384 steps."""
+    generator = np.random.default_rng(3)
+    lines = ["time[s],run[1],command1[rad],q1[rad]"]
+    for run, kind in enumerate(kinds):
+        time = np.arange(0, seconds, 0.01) + generator.uniform(0, 1e-4, round(seconds / 0.01))
+        asked = command(kind, time)
+        step = 2 * np.pi / 16384
+        q = np.round(moved(time, asked, **real) / step + 0.3 * generator.standard_normal(len(time))) * step
+        lines += [f"{t:.17g},{run},{u:.17g},{x:.17g}" for t, u, x in zip(time, asked, q, strict=True)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+KEYS = {"gain": GAIN, "inertia": INERTIA, "viscous": VISCOUS}

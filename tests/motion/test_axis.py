@@ -1,0 +1,89 @@
+"""The simulated axis against scipy and against what each law means."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from motion.servo import GAIN, INERTIA, VISCOUS, command, moved
+
+from ccnn_torch.motion.axis import ABSENT, Drive, simulate_axes
+from ccnn_torch.motion.effects import EFFECTS, Facts, motion_effects
+from ccnn_torch.motion.library import library_of
+
+
+def axis(time: np.ndarray, asked: np.ndarray, **parameters: float) -> np.ndarray:
+    t, u = torch.from_numpy(time)[None], torch.from_numpy(asked)[None]
+    start = torch.tensor([[asked[0], 0.0]], dtype=torch.float64)
+    drive = Drive(t, u, start, torch.zeros_like(t), torch.zeros_like(t))
+    given = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in parameters.items()}
+    return simulate_axes(drive, given)[0, 0].numpy()
+
+
+TIME = np.sort(np.arange(0, 4, 0.01) + np.random.default_rng(0).uniform(0, 0.003, 400))
+OWN = {"inertia": INERTIA / GAIN, "viscous": VISCOUS / GAIN}
+
+
+@pytest.mark.parametrize("real", [{}, {"weight": 0.3}, {"delay": 0.03}, {"dry": 0.1}])
+def test_it_moves_as_its_equation_says(real: dict[str, float]) -> None:
+    asked = command(0, TIME)
+    torques = {"weight": "gravity_sin", "dry": "coulomb"}
+    mine = {torques.get(n, n): v / (GAIN if n in torques else 1) for n, v in real.items()}
+    error = axis(TIME, asked, **OWN, **mine) - moved(TIME, asked, **real)
+    assert np.abs(error).max() < 2e-3 * np.ptp(asked)
+
+
+def test_without_parameters_the_position_is_the_command() -> None:
+    asked = command(2, TIME)
+    assert np.abs(axis(TIME, asked) - asked).max() < 1e-7
+
+
+def test_each_law_does_what_its_name_says() -> None:
+    ramp = np.maximum(TIME - 0.5, 0)
+    # Dry friction keeps it until the command leads by so much, then the command leads by just that.
+    stuck = axis(TIME, ramp, coulomb=0.1)
+    assert np.abs(stuck - np.maximum(ramp - 0.1, 0)).max() < 1e-7
+    # A share of the load is friction too: it holds a weight at rest, and more lead is needed.
+    assert axis(TIME, ramp, coulomb=0.1, load_friction=0.5)[-1] < stuck[-1] - 0.09
+    # The driven side of a play comes half of it late, on either way.
+    wave = np.sin(2 * TIME)
+    late = wave - axis(TIME, wave, play=0.1)
+    assert late.max() == pytest.approx(0.05) and late.min() == pytest.approx(-0.05)
+    slow = axis(TIME, 3 * np.minimum(TIME, 1), slowness=1 / 1.5)
+    assert slow[-1] == pytest.approx(3) and np.diff(slow).max() < 1.5 * 1.0001 * np.diff(TIME).max()
+    # No torque beyond the limit: the acceleration is limit over inertia.
+    step = np.where(TIME < 1, 0.0, 1.0)
+    speed = np.gradient(axis(TIME, step, inertia=0.05, viscous=0.1, weakness=1 / 0.2), TIME)
+    begin = int(np.searchsorted(TIME, 1.1))
+    assert speed[begin] == pytest.approx((0.2 / 0.1) * (1 - np.exp(-2 * (TIME[begin] - 1))), rel=0.1)
+    # Two teeth of a period of pi: the sag is the torque.
+    teeth = axis(TIME, np.full(400, 0.3), cogging_sin=0.02, cogging_order=2.0, viscous=0.05)
+    assert teeth[-1] == pytest.approx(0.3 - 0.02 * np.sin(2 * teeth[-1]), abs=1e-6)
+    # Behind a spring of 5 Hz a step rings at 5 Hz.
+    rings = axis(TIME, step, flexibility=1 / (10 * np.pi) ** 2, flexible_damping=0.02)[TIME > 1.02] - 1
+    assert np.sum(np.diff(np.sign(rings)) != 0) in range(26, 32)
+
+
+def test_parameters_are_batched_and_never_run_away() -> None:
+    asked = torch.from_numpy(command(0, TIME))[None]
+    time = torch.from_numpy(TIME)[None]
+    start = torch.zeros(1, 2, dtype=torch.float64)
+    drive = Drive(time, asked, start, torch.zeros_like(time), torch.zeros_like(time))
+    inertia = torch.tensor([[1e-3], [5e-3], [2e-2]], dtype=torch.float64)
+    together = simulate_axes(drive, {"inertia": inertia})
+    for k in range(3):
+        assert torch.equal(together[k], simulate_axes(drive, {"inertia": inertia[k : k + 1]})[0])
+    library = library_of(motion_effects(), [Facts("rad", {}, gain=2.0, length=0.1)])
+    for j in range(len(library.numbers[0])):
+        theta = torch.zeros(2, 1, library.size, dtype=torch.float64)
+        theta[0, 0, j], theta[1, 0, j] = 200.0, -200.0
+        assert torch.isfinite(simulate_axes(drive, library.parameters(theta))).all()
+
+
+def test_every_effect_acts_on_parameters_that_the_axis_has() -> None:
+    facts = Facts("rad", {"inertia": 0.01, "weakness": 1.0}, gain=2.0, length=0.1, supply=0.2, temperature=10)
+    for name, effect in EFFECTS.items():
+        assert effect.name == name and not effect.missing(facts)
+        for number in effect.numbers(facts):
+            assert number.scale > 0 and all(act[0] in ABSENT for act in number.acts)
+        assert len(effect.shapes(facts)) >= 1
