@@ -35,8 +35,8 @@ _OF_GAP = 0.03
 # Or, since the nominal model has a form that is not right either, by the square of this share of what the position
 # differs from the command.
 _FORM, _FORM_NOMINAL = 0.01, 0.01
-# Claims are never surer.
-_MOST = 0.995
+# Claims are never surer: of those of 0.95 and more on simulated motions, before this limit, 19 of 28 were right.
+_MOST = 0.9
 
 
 class AxisVerdict(NamedTuple):
