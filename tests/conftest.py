@@ -5,7 +5,6 @@ One thread: the tensors are small, and threads of two processes would wait for e
 
 from __future__ import annotations
 
-import functools
 import gc
 import os
 import sys
@@ -17,9 +16,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
-from torch._export import utils as export_utils
-from torch.export import exported_program
-from torch.onnx._internal.exporter import _registration as onnx_registration
 
 from ccnn_torch.cli import main
 
@@ -32,14 +28,6 @@ def pytest_collection_finish() -> None:
     gc.freeze()
     # And rarely at what is new: 700 new objects, Python's own threshold, are made by one operation on tensors.
     gc.set_threshold(50_000, 10, 10)
-
-
-# Tables of operators, which torch makes anew for each export and which stay the same: a third of an export's time.
-onnx_registration.ONNXRegistry.from_torchlib = staticmethod(  # type: ignore[method-assign, assignment]
-    functools.cache(onnx_registration.ONNXRegistry.from_torchlib)
-)
-for module in (export_utils, exported_program):
-    module._collect_all_valid_cia_ops = functools.cache(export_utils._collect_all_valid_cia_ops)  # type: ignore[attr-defined]
 
 
 @pytest.fixture
