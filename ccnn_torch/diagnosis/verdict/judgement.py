@@ -80,7 +80,14 @@ def judge(analysis: Analysis) -> Judgement:
     found = max([*_refitted(analysis, [chosen]), *same], key=lambda f: f.log_posterior)
     outside = driver is not None
     if not outside and is_unexplained(analysis, found):
-        outside, driver = True, _driver_of_remainder(analysis, leading, usual)
+        outside = True
+        # A set with a discrepancy term that does explain the rows goes before one that does not.
+        fits = ((one, _refitted(analysis, [one[3]])[0]) for one in leading if one[1] is not None)
+        other = next(((one, fit) for one, fit in fits if not is_unexplained(analysis, fit)), None)
+        if other is None:
+            driver = _driver_of_remainder(analysis, leading, usual)
+        else:
+            (names, driver, _, _), found = other
     if outside and _little(analysis):
         names, found = frozenset(), _empty(analysis)
     classes = {} if outside else _classes(analysis, likeliest, chosen, names)
