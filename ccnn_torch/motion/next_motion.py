@@ -23,7 +23,7 @@ __all__ = ["Motion", "motions", "next_motions"]
 _SECONDS, _STEP, _LEAD = 8.0, 0.01, 0.3
 # So many are proposed.
 _PROPOSED = 4
-# Rivals of a verdict that are told apart.
+# Alternatives to a verdict that a motion has to distinguish.
 _RIVALS = 3
 # Directions of a model's numbers with less than this share of the largest one are rounding.
 _DIGITS = 1e-9
@@ -97,7 +97,7 @@ def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[d
         middle, amplitude = float(position.mean()), 0.5 * float(position.max() - position.min())
         if not amplitude:
             continue
-        # Two effects that do the same to this model are told apart by no motion.
+        # Two effects that do the same to this model are distinguished by no motion.
         rivals = [f for f in _rivals(found.found[i], verdict) if not _alike(library, i, verdict.best, f)]
         for motion in motions(middle, amplitude, library.facts[i].speed, library.facts[i].unit):
             problem = _problem_of(found.problem, i, motion)
