@@ -134,10 +134,11 @@ def diagnose_rows(
     gap, gap_rotation, listed = blocks(made)
     nothing = not judgement.names and not judgement.outside
     outlier = nothing and bool(rows.astray.any() or gross_outliers(analysis).any())
-    missing = missing_covariates(analysis, every, lacking, judgement.driver, seed)
+    missing = missing_covariates(analysis, every, lacking, judgement.drivers, seed)
     doubts = cautions(analysis, judgement, rows, missing, together)
     texts = [caution.text for caution in doubts]
-    drivers = [d for d in (judgement.driver or "").split(CROSS) if d and not d.startswith(SPEED)]
+    every_driver = dict.fromkeys(d for one in judgement.drivers for d in one.split(CROSS))
+    drivers = [d for d in every_driver if not d.startswith(SPEED)]
     # A condition says more than the joint that it acts beside.
     drivers.sort(key=lambda d: d.startswith("joint"))
     verdict = {

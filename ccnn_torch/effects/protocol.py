@@ -30,8 +30,6 @@ class Coefficient:
             simulation leaves it 0 unless given.
         borrowed: whether alone it is what another effect does (a constant part): it is no evidence for this
             one.
-        doubtful: whether something else may do the same over time (a mount that follows the temperature, which
-            rises from morning to noon): it speaks for this effect where the gap follows what the effect needs.
         mends: whether it is but a correction of the form of the others, and cannot be many times as large as they are.
         positive: whether physics allows it no negative value (backlash, compliance); for drawing it in a simulation.
     """
@@ -43,7 +41,6 @@ class Coefficient:
     leg: int | None = None
     secondary: bool = False
     borrowed: bool = False
-    doubtful: bool = False
     mends: bool = False
     positive: bool = False
 

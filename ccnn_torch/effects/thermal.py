@@ -67,7 +67,7 @@ class Thermal:
             if j.unit == "m"
         ]
         found += [
-            Coefficient(f"{j.name} mount", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True, doubtful=True)
+            Coefficient(f"{j.name} mount", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
             for j in mechanism.joints
         ]
         found.append(Coefficient("reference", "1", _STEEL * _REFERENCE_OFF, secondary=True))
@@ -76,14 +76,12 @@ class Thermal:
             found.append(Coefficient("at once", "1/K", uneven, secondary=True))
             found.append(Coefficient("late", "1/K", uneven, secondary=True))
             found += [
-                Coefficient(
-                    f"{j.name} bend", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True, doubtful=True
-                )
+                Coefficient(f"{j.name} bend", f"{j.unit}/K", _MOUNT[j.unit], joint=j.name, secondary=True)
                 for j in mechanism.joints
             ]
-            found.append(Coefficient("warm-up", "1", own * _TAKEN_ON, secondary=True, doubtful=True))
+            found.append(Coefficient("warm-up", "1", own * _TAKEN_ON, secondary=True))
             found += [
-                Coefficient(f"{j.name} warm-up", "1", own, joint=j.name, secondary=True, doubtful=True)
+                Coefficient(f"{j.name} warm-up", "1", own, joint=j.name, secondary=True)
                 for j in mechanism.joints
                 if j.unit == "m"
             ]

@@ -1,11 +1,16 @@
 """Jumps, products of two drivers, and the noise that records show without a model."""
 
+import math
+
 import pytest
 import torch
-from _machines import NOISE, acting, reached_with, rows_of
+from diagnosis._machines import NOISE, acting, reached_with, rows_of
+from diagnosis.test_convergence import columns, looked_at
 from torch import Tensor
 
 from ccnn_torch.diagnosis import diagnose_rows
+from ccnn_torch.diagnosis.evidence.beside import gain_beside
+from ccnn_torch.diagnosis.evidence.single_groups import NO_COLUMNS, fit_single_groups, own_products
 from ccnn_torch.diagnosis.residual.noise_evidence import noise_of_repeats
 from ccnn_torch.effects import Situation
 
@@ -66,3 +71,30 @@ def test_repeats_show_the_noise_and_what_is_none() -> None:
     whole = 1 - (found.gap["after"] / found.gap["before"]) ** 2
     low, high = found.verdict["shrink_ci95"]
     assert low <= whole + 1e-9 and high >= found.verdict["shrink"]
+
+
+def test_two_causes_outside_the_library_are_told_by_both_drivers() -> None:
+    situation = rows_of("five_bar", 300, 35)
+    change = torch.zeros_like(situation.joints)
+    off = situation.joints[:, 0] - situation.joints[:, 0].median()
+    change[:, 0] = 2 * torch.exp(-((off / (0.15 * off.std())) ** 2))
+    change[180:, 1] = 1
+    found = diagnose_rows(situation, measured(situation, change, 6, 5))
+    assert found.verdict["outside_library"] and found.verdict["drivers"] == ["time", "joint q1"]
+    assert "follows the time and joint q1" in found.verdict["text"]
+
+
+def test_what_columns_add_to_a_set_is_their_evidence_under_what_the_set_leaves_open() -> None:
+    dictionary, y, found = looked_at()
+    groups = [columns(7, 2), 0.3 * y[..., None] + columns(8, 1), columns(9, 3)]
+    kernel = torch.eye(y.numel(), dtype=y.dtype)
+    for i, scale in zip(found[0].members, found[0].log_scale, strict=True):
+        own = dictionary.columns[..., dictionary.groups[i]].flatten(0, 1)
+        kernel += math.exp(scale) / found[0].noise * own @ own.mT
+    factor = torch.linalg.cholesky(kernel)
+    white = [torch.linalg.solve_triangular(factor, g.flatten(0, 1), upper=False) for g in (y[..., None], *groups)]
+    products = [own_products(g[:, None], white[0]) for g in white[1:]]
+    fits = fit_single_groups([NO_COLUMNS, *products], white[0].square().sum(), float(y.numel()), 0.0)
+    wanted = (fits.log_evidence[1:] - fits.log_evidence[0]).tolist()
+    assert gain_beside(dictionary, found[0], groups, y) == pytest.approx(wanted, rel=1e-6)
+    assert wanted[1] > 5 > max(wanted[0], wanted[2])

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ccnn_validation.ablation import ablate, scaled
 from ccnn_validation.sources.case import SourceCase, Truth
 from ccnn_validation.sources.judge import judged
 from ccnn_validation.sources.report import figures
 from ccnn_validation.sources.run import diagnosed, source_of
 
+from ccnn_torch.diagnosis.search import form_error
 from ccnn_torch.errors import InputError
 
 Cli = Callable[..., tuple[int, str, str]]
@@ -75,3 +77,13 @@ def test_the_command(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) 
     assert code == 2 and "known: blind, semi_real, multibody, adversarial" in errors
     with pytest.raises(InputError, match="is not there"):
         source_of("nowhere")
+
+
+def test_a_constant_halved_and_doubled_is_set_back(tmp_path: Path) -> None:
+    assert scaled((0.9, 4, 0.2), 2.0) == (pytest.approx(0.95), 8, 0.4) and scaled(1, 0.5) == 1
+    before = form_error._FORM
+    table = ablate(["adversarial"], 1, tmp_path, 3, "a factor of 4", "local")
+    assert [row[0] for row in table.rows] == ["search/form_error _EXACT, _FORM, _SMOOTH"]
+    assert before == form_error._FORM and len(list(tmp_path.glob("*.json"))) == 3
+    with pytest.raises(InputError, match="no constant"):
+        ablate(["adversarial"], 1, tmp_path, 3, "nobody", "local")

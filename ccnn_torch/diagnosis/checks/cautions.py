@@ -80,7 +80,7 @@ def _of_place(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     """Rows set aside that lie together: bad ones lie anywhere."""
     aside = (analysis.whitening.weight <= 0) & ~analysis.near_singular
     count = int(aside.sum())
-    if count < _SEVERAL or judgement.driver is not None:
+    if count < _SEVERAL or judgement.drivers:
         return []
     place = analysis.situation.pose
     place = (place - place.mean(0)) / place.std(0).clamp_min(1e-300)

@@ -27,7 +27,7 @@ _ROWS = 60
 
 
 def missing_covariates(
-    analysis: Analysis, effects: Sequence[Effect], lacking: Mapping[str, str], driver: str | None, seed: int
+    analysis: Analysis, effects: Sequence[Effect], lacking: Mapping[str, str], drivers: Sequence[str], seed: int
 ) -> list[dict[str, Any]]:
     """The block `missing_covariates` of diagnosis.json: what to record beside the pose, most promising first.
 
@@ -40,7 +40,7 @@ def missing_covariates(
         analysis: of the rows.
         effects: all candidates.
         lacking: what is missing for those of them that the rows cannot show, by name.
-        driver: of what no effect describes.
+        drivers: of what no effect describes.
         seed: of the conditions drawn.
     """
     rows = torch.unique(torch.linspace(0, len(analysis.situation.joints) - 1, _ROWS).round().long())
@@ -71,7 +71,7 @@ def missing_covariates(
         {"columns": [f"{n}[{units[n]}]" for n in added], "effects": sizes, "unit": "m" if position else "rad"}
         for added, sizes in found.items()
     ]
-    first = "temperature" if driver == "time" else ""
+    first = "temperature" if "time" in drivers else ""
     return sorted(
         entries, key=lambda e: (not first or not e["columns"][0].startswith(first), -max(e["effects"].values()))
     )

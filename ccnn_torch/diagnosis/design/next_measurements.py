@@ -79,8 +79,8 @@ def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Fitte
     atoms, own = analysis.dictionary.atoms, judgement.found
     plain = [
         (probability, one)
-        for _, driver, probability, one in judgement.leading
-        if driver is None and not any(atoms[i].is_discrepancy for i in one.members)
+        for _, drivers, probability, one in judgement.leading
+        if not drivers and not any(atoms[i].is_discrepancy for i in one.members)
     ]
     if not plain:
         return []

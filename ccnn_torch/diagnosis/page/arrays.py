@@ -64,7 +64,7 @@ def picture_arrays(diagnosis: Diagnosis, seed: int = 0) -> tuple[dict[str, Tenso
     labels: dict[str, Any] = {}
     parts = [analysis.dictionary.atoms[i].columns @ mean for i, mean in zip(found.members, found.mean, strict=True)]
     columns = _drivers(analysis, place)
-    shown = set(diagnosis.verdict["effects"]) | {diagnosis.judgement.driver}
+    shown = set(diagnosis.verdict["effects"]) | set(diagnosis.judgement.drivers)
     # What the whole set leaves, discrepancy term and all: the signature of one cause is drawn with all others taken
     # off.
     left = _remainder(analysis, residual, found.members, seed, with_discrepancies=True)

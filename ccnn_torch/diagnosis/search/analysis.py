@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -79,6 +79,7 @@ class Analysis:
         idle: effects that change no pose in these rows, and were no candidates.
         correlation: of the noise between the rows that count.
         shared: columns of all atoms and `y` before what rows share was taken out of them; None where that is nothing.
+        outside: whitened columns of every discrepancy term, by its number, in the dictionary or not, `s x c x m` each.
     """
 
     situation: Situation
@@ -94,6 +95,7 @@ class Analysis:
     idle: tuple[str, ...] = ()
     correlation: Correlation = INDEPENDENT
     shared: tuple[Tensor, Tensor] | None = None
+    outside: Mapping[int, Tensor] = field(default_factory=dict)
     instrument: Tensor | None = None
 
     @property
@@ -362,6 +364,7 @@ def _searched(
         rows.fitted,
         correlation=correlation,
         shared=shared,
+        outside={i: c for i, (a, c) in enumerate(zip(atoms, columns, strict=True)) if a.is_discrepancy},
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 
-from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.evidence.dictionary import FittedSet
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.search.form_error import Posterior
@@ -12,8 +11,8 @@ from ccnn_torch.diagnosis.verdict.plausible import implausible_size
 
 __all__ = ["borrowed_names"]
 
-# Share of an effect's own squares that must not be borrowed from what other effects do, and of what may be doubtful.
-_OWN, _DOUBTED = 0.1, 0.5
+# Share of an effect's own squares that must not be borrowed from what other effects do.
+_OWN = 0.1
 # Or that must come from other coefficients than those that mend its form, where these are so many times as large, in
 # plausible sizes.
 _MAIN, _MENDED = 0.5, 15.0
@@ -32,35 +31,16 @@ def borrowed_names(analysis: Analysis, posterior: Posterior, found: FittedSet) -
         if len(found.members) > 1 and max(main_sizes, default=0.0) > most:
             names.add(atom.name)
             continue
-        if not any(c.borrowed or c.doubtful or c.mends for c in coefficients):
+        if not any(c.borrowed or c.mends for c in coefficients):
             continue
-        borrowed, doubtful, corrections = (
+        borrowed, corrections = (
             torch.tensor(flags, dtype=torch.bool)
-            for flags in zip(*((c.borrowed, c.doubtful, c.mends) for c in coefficients), strict=True)
+            for flags in zip(*((c.borrowed, c.mends) for c in coefficients), strict=True)
         )
         gram = dictionary.grams.xx[group][:, group]
-        parts = (mean * ~borrowed, mean * doubtful, mean * ~corrections, mean)
-        alone, unsure, main, whole = (float(m @ gram @ m) for m in parts)
+        parts = (mean * ~borrowed, mean * ~corrections, mean)
+        alone, main, whole = (float(m @ gram @ m) for m in parts)
         largest, mended = (float((mean * kind).abs().max()) for kind in (~corrections, corrections))
-        if (
-            alone < _OWN * whole
-            or (main < _MAIN * whole and mended > _MENDED * largest)
-            or (unsure > _DOUBTED * whole and not _follows_need(analysis, posterior, atom))
-        ):
+        if alone < _OWN * whole or (main < _MAIN * whole and mended > _MENDED * largest):
             names.add(atom.name)
     return frozenset(names)
-
-
-def _follows_need(analysis: Analysis, posterior: Posterior, atom: Atom) -> bool:
-    """Whether, without an effect, something outside the library seems to follow a covariate that the effect needs."""
-    atoms = posterior.dictionary.atoms
-    named = ([atoms[i] for i in found.members] for found in posterior.found)
-    drivers = (
-        next((a.name for a in members if a.is_discrepancy), None)
-        for members in named
-        if all(a.name != atom.name for a in members)
-    )
-    driver = next((d for d in drivers if d is not None), None)
-    others = [c for c in analysis.situation.covariates if c != driver]
-    assert atom.effect is not None
-    return bool(atom.effect.missing(analysis.situation.mechanism, others))

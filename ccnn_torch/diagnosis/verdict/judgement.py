@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ccnn_torch.diagnosis.discrepancy.smooth import ANY
+from ccnn_torch.diagnosis.evidence.beside import gain_beside
 from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.search.form_error import Posterior, is_unexplained, with_form_error
@@ -28,7 +29,7 @@ _NAMED = 0.9
 _BESIDE_UNKNOWN = 0.6
 
 
-_Leading = list[tuple[frozenset[str], str | None, float, FittedSet]]
+_Leading = list[tuple[frozenset[str], tuple[str, ...], float, FittedSet]]
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,10 @@ class Judgement:
         names: library effects, the favourite of each class.
         classes: for each of them the names that cannot be distinguished from it.
         probability: that the verdict, classes taken as one, is right.
-        outside: whether something is there that no library effect describes; `driver` says what it follows.
-        driver: of the discrepancy term, or None.
+        outside: whether something is there that no library effect describes; `drivers` says what it follows.
+        drivers: of the discrepancy terms, the one that does most first.
         marginal: probability of each candidate's name.
-        leading: name sets by probability, most probable first (library names, driver or None, probability, set).
+        leading: name sets by probability, most probable first (library names, drivers, probability, set).
     """
 
     found: FittedSet
@@ -54,7 +55,7 @@ class Judgement:
     classes: dict[str, tuple[str, ...]]
     probability: float
     outside: bool
-    driver: str | None
+    drivers: tuple[str, ...]
     marginal: dict[str, float]
     leading: _Leading
 
@@ -64,37 +65,39 @@ def judge(analysis: Analysis) -> Judgement:
     levels = with_form_error(analysis)
     usual, likeliest = levels[0], max(levels, key=lambda level: level.weight)
     leading = _leading(analysis, levels, frozenset())
-    names, driver, _, chosen = leading[0]
+    names, drivers, _, chosen = leading[0]
     # Names that rest on what makes other effects what they are are no candidates.
     without: frozenset[str] = frozenset()
     while borrowed := borrowed_names(analysis, usual, chosen):
         without |= borrowed
         leading = _leading(analysis, levels, without)
-        names, driver, _, chosen = leading[0]
+        names, drivers, _, chosen = leading[0]
     sure = frozenset(n for n in names if _marginal(leading, n) >= _NAMED)
-    names, driver, chosen = next(
-        ((n, d, f) for n, d, _, f in leading if n == sure and (d is None) == (driver is None)), (names, driver, chosen)
+    names, drivers, chosen = next(
+        ((n, d, f) for n, d, _, f in leading if n == sure and bool(d) == bool(drivers)), (names, drivers, chosen)
     )
     # Of the shapes that form errors do not tell apart those that fit best.
-    same = (f for f in analysis.found if _named(analysis, f) == (names, driver))
+    same = (f for f in analysis.found if _named(analysis, f) == (names, drivers))
     found = max([*_refitted(analysis, [chosen]), *same], key=lambda f: f.log_posterior)
-    outside = driver is not None
+    outside = bool(drivers)
     if not outside and is_unexplained(analysis, found):
         outside = True
         # A set with a discrepancy term that does explain the rows goes before one that does not.
-        fits = ((one, _refitted(analysis, [one[3]])[0]) for one in leading if one[1] is not None)
+        fits = ((one, _refitted(analysis, [one[3]])[0]) for one in leading if one[1])
         other = next(((one, fit) for one, fit in fits if not is_unexplained(analysis, fit)), None)
         if other is None:
-            driver = _driver_of_remainder(analysis, leading, usual)
+            drivers = _drivers_of_remainder(analysis, leading, usual)
         else:
-            (names, driver, _, _), found = other
+            (names, drivers, _, _), found = other
+    if drivers:
+        drivers += _second_driver(analysis, usual, found)
     if outside and _little(analysis):
         names, found = frozenset(), _empty(analysis)
     classes = {} if outside else _classes(analysis, likeliest, chosen, names)
     if outside:
-        told = [p for _, drive, p, _ in leading if drive is not None] if leading[0][1] else []
+        told = [p for _, some, p, _ in leading if some] if leading[0][1] else []
     else:
-        told = [p for members, drive, p, _ in leading if drive is None and _equals(members, names, classes)]
+        told = [p for members, some, p, _ in leading if not some and _equals(members, names, classes)]
     more = (f for f in analysis.found if found.members and set(found.members) <= set(f.members))
     return Judgement(
         found=found,
@@ -103,7 +106,7 @@ def judge(analysis: Analysis) -> Judgement:
         classes=classes,
         probability=_BESIDE_UNKNOWN if outside and (names or not told) else min(sum(told), 1.0),
         outside=outside,
-        driver=driver,
+        drivers=drivers,
         marginal={a.name: _marginal(leading, a.name) for a in analysis.dictionary.atoms if not a.is_discrepancy},
         leading=[
             (*one[:3], fit) for one, fit in zip(leading, _refitted(analysis, [one[3] for one in leading]), strict=True)
@@ -118,13 +121,13 @@ def without_names(analysis: Analysis, judgement: Judgement) -> Judgement:
 
 
 def _leading(analysis: Analysis, levels: Sequence[Posterior], without: frozenset[str]) -> _Leading:
-    """Names and driver of the sets by probability, the mean over the levels of the form error, each with its most
+    """Names and drivers of the sets by probability, the mean over the levels of the form error, each with its most
     probable set; without: names of none of them."""
-    shares: dict[tuple[frozenset[str], str | None], list[tuple[float, FittedSet]]] = {}
+    shares: dict[tuple[frozenset[str], tuple[str, ...]], list[tuple[float, FittedSet]]] = {}
     for posterior in levels:
         allowed = [f for f in posterior.found if not without & _named(analysis, f)[0]]
         top = allowed[0].log_posterior
-        first: dict[tuple[frozenset[str], str | None], FittedSet] = {}
+        first: dict[tuple[frozenset[str], tuple[str, ...]], FittedSet] = {}
         for found in allowed:
             if found.log_posterior > top - _FAR:
                 first.setdefault(_named(analysis, found), found)
@@ -166,13 +169,14 @@ def _little(analysis: Analysis) -> bool:
     return left > (1 - _LEAST_EXPLAINED) * max(float(analysis.dictionary.grams.yy) / count - analysis.floor, 0.0)
 
 
-def _named(analysis: Analysis, found: FittedSet) -> tuple[frozenset[str], str | None]:
+def _named(analysis: Analysis, found: FittedSet) -> tuple[frozenset[str], tuple[str, ...]]:
     atoms = analysis.dictionary.atoms
     names = frozenset(atoms[i].name for i in found.members if not atoms[i].is_discrepancy)
-    driver = next((atoms[i].name for i in found.members if atoms[i].is_discrepancy), None)
-    if driver is not None and driver.endswith(ANY):
-        driver = _leader(analysis, driver.removesuffix(ANY))
-    return names, driver
+    return names, tuple(_driver(analysis, atoms[i].name) for i in found.members if atoms[i].is_discrepancy)
+
+
+def _driver(analysis: Analysis, name: str) -> str:
+    return _leader(analysis, name.removesuffix(ANY)) if name.endswith(ANY) else name
 
 
 def _leader(analysis: Analysis, kind: str) -> str:
@@ -187,16 +191,24 @@ def _energy(analysis: Analysis, found: FittedSet, name: str) -> float:
     return sum(e for i, e in zip(found.members, found.energy, strict=True) if analysis.dictionary.atoms[i].name == name)
 
 
-def _driver_of_remainder(analysis: Analysis, leading: _Leading, posterior: Posterior) -> str | None:
-    """The most probable driver; where no probable set has one, that of the most probable set with one."""
-    share: dict[str, float] = {}
-    for _, driver, p, _ in leading:
-        if driver is not None:
-            share[driver] = share.get(driver, 0.0) + p
-    if share:
-        return max(share, key=lambda driver: share[driver])
-    drivers = (_named(analysis, found)[1] for found in posterior.found)
-    return next((driver for driver in drivers if driver is not None), None)
+def _second_driver(analysis: Analysis, posterior: Posterior, found: FittedSet) -> tuple[str, ...]:
+    """What a part of the remainder follows beside the set, where that is more probable than not."""
+    dictionary, atoms, size = posterior.dictionary, analysis.dictionary.atoms, math.sqrt(posterior.variance)
+    there = {atoms[i].name for i in found.members if atoms[i].is_discrepancy}
+    more = [i for i in analysis.outside if atoms[i].name not in there and not atoms[i].name.endswith(ANY)]
+    if not there or not more:
+        return ()
+    known = _fits(dictionary, [found.members], {f.members: f for f in posterior.found})[0]
+    gains = gain_beside(dictionary, known, [analysis.outside[i] / size for i in more], analysis.y / size)
+    odds, best = max((gain + atoms[i].log_prior, i) for gain, i in zip(gains, more, strict=True))
+    return (atoms[best].name,) if odds > 0 else ()
+
+
+def _drivers_of_remainder(analysis: Analysis, leading: _Leading, posterior: Posterior) -> tuple[str, ...]:
+    """The most probable drivers; where no probable set has any, those of the most probable set with some."""
+    likely = next((drivers for _, drivers, _, _ in leading if drivers), None)
+    every = (_named(analysis, found)[1] for found in posterior.found)
+    return likely or next((drivers for drivers in every if drivers), ())
 
 
 def _classes(
