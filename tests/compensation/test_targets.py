@@ -144,6 +144,7 @@ def test_structured_text_is_parsed_and_gives_the_numbers(
         # As in a large model, whose parser would take minutes.
         monkeypatch.setattr(from_graph, "_ELEMENTS", 2)
         monkeypatch.setattr(from_graph, "_PRODUCTS", 4)
+    compensator.secant = dtype == "float64"
     form, golden = made(compensator, dtype, sd=dtype == "float32")
     files = print_structured_text(form, golden)
     assert (" DO" in files["compensator.st"].partition("CCNN_Compensate")[0]) == arrays

@@ -28,9 +28,9 @@ class SerialGeometry(nn.Module):
     f is the identified forward kinematics, g the nominal inverse kinematics: here two damped Gauss-Newton steps from q
     that share the Jacobian at q, which the deviation (milliradians) changes by thousandths. Near a singularity the
     damping bounds δ. Only sums, products, quotients, sines and cosines: no solver is called and no arc function, so
-    that the graph runs in ONNX Runtime in double. A command evaluates this half a dozen times, hence the few operations:
-    each link is `cos q C + sin q S + D` with constant matrices, base and tool folded in, and a joint moves what is
-    behind it about a screw that is constant in its own link.
+    that the graph runs in ONNX Runtime in double. A command evaluates this half a dozen times, hence the few
+    operations: each link is `cos q C + sin q S + D` with constant matrices, base and tool folded in, and a joint moves
+    what is behind it about a screw that is constant in its own link.
 
     Attributes:
         nominal, identified: all parameters of the arm, frames included, `... x k` [SI].
