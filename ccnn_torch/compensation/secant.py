@@ -49,7 +49,8 @@ def next_correction(
     whole = (deviation - correction) / unit
     if steps:
         for before, after in pairwise(steps):
-            whole = whole + after.whole * ((before.dual * whole) @ ones)
+            # Steps shrink, so that the share is below 1 but for rounding, which must not grow.
+            whole = whole + after.whole * torch.clamp((before.dual * whole) @ ones, -1.0, 1.0)
         whole = whole / torch.clamp_min(1 - (steps[-1].dual * whole) @ ones, _LEAST)
     # A sum as a product: engines with a narrow operator list have no other reduction.
     dual = whole / ((whole * whole) @ ones + _ROUNDING**2)
