@@ -1,4 +1,4 @@
-"""All ways to run a model against PyTorch over 100,000 vectors, for every kind of model: `python benchmarks/equality.py`.
+"""All ways to run a model against PyTorch over 100,000 vectors, for every kind: `python benchmarks/equality.py`.
 
 Arguments: number of vectors (100000), then further model.safetensors. Prints for each kind of model the largest
 difference of the deviation as a share of the limit, and how often the status is another one: C and ONNX Runtime in
