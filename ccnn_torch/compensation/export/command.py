@@ -130,7 +130,7 @@ def command_graph(
     whole = graph.solid(ideal)
     for name, sign, by in (("command", "Sub", correction), ("ideal", "Add", first[0])):
         found[name] = graph.node(sign, [whole.name, graph.solid(by).name], whole.shape, whole.shape)
-    if "deviation_sd" in outputs:
+    if "inside_domain" in outputs:
         (found["inside_domain"],) = Traced(inside, blank)(graph, last[1])
         (found["ideal_inside_domain"],) = Traced(inside, blank)(graph, first[1])
         features = compensator.scaling.features(points)
