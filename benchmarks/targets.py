@@ -251,7 +251,8 @@ def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> None
             run = session(folder / file)
             parts = [run.run(["deviation"], {"joints": part})[0] for part in np.array_split(given, 100)]
             off = np.abs((np.concatenate(parts) - wanted) / limit).max()
-            call = bound(run, given[:1]) if file == "controller.onnx" else lambda q, run=run: run.run(None, {"joints": q})
+            plain = file == "model.onnx"
+            call = (lambda q, run=run: run.run(None, {"joints": q})) if plain else bound(run, given[:1])
             rows[f"onnxruntime, {file}"] = [*streamed(compensator, call, calls // 100), "", len(content), off]
         for dtype in ("float64", "float32"):
             try:
@@ -273,9 +274,7 @@ def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> None
                 *figures, found = timed(folder, compensator, calls, "gcc", given)
                 rows["written by hand, float64, gcc"] = [*figures, float((np.abs(found - wanted) / limit).max())]
     for way, (p50, p99, most, allocations, size, share) in rows.items():
-        print(
-            f"  {way:30}{p50:9.2f}{p99:9.2f}{most:9.0f}{allocations!s:>8}{size!s:>10}{share:11.1e}")
-        )
+        print(f"  {way:30}{p50:9.2f}{p99:9.2f}{most:9.0f}{allocations!s:>8}{size!s:>10}{share:11.1e}")
 
 
 def main(calls: int, models: list[str]) -> None:
