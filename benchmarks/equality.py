@@ -139,7 +139,7 @@ def compare(name: str, compensator: Compensator, rows: int) -> None:
         # A joint that never deviates has no limit.
         share = (np.abs(deviation - wanted) / np.where(limit > 0, limit, 1)).max()
         others = 0 if status is None else int(((status == 0) != inside).sum())
-        cells.append(f"{share:.0e}" + (f" ({others})" if others else ""))
+        cells.append(f"{share:.1e}" + (f" ({others})" if others else ""))
         print(f"    {name}, {way.__name__}, {dtype}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
     print(f"| {name} | {compensator.iterations} | " + " | ".join(cells) + " |", flush=True)
 

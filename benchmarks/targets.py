@@ -252,7 +252,7 @@ def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> None
             parts = [run.run(["deviation"], {"joints": part})[0] for part in np.array_split(given, 100)]
             off = np.abs((np.concatenate(parts) - wanted) / limit).max()
             plain = file == "model.onnx"
-            call = (lambda q, run=run: run.run(None, {"joints": q})) if plain else bound(run, given[:1])
+            call = (lambda q, run=run: run.run(None, {"joints": q})) if plain else bound(run, given[:1].copy())
             rows[f"onnxruntime, {file}"] = [*streamed(compensator, call, calls // 100), "", len(content), off]
         for dtype in ("float64", "float32"):
             try:
