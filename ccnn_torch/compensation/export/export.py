@@ -83,7 +83,8 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
         what = "links of the arm" if compensator.effects is None else "physical effects"
         raise MethodFailedError(f"the {what} need double precision; use the float64 file")
     twin = copy.copy(compensator)
-    twin.iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), _TOLERANCE_FLOAT32 / 10)
+    if not twin.secant:
+        twin.iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), _TOLERANCE_FLOAT32 / 10)
     joints, covariates = probe_points(compensator)
     given = [v.float() for v in (joints, covariates) if v is not None]
     model = command_graph(twin, _OPSET_FLOAT32, metadata, _OUTPUTS_FLOAT32, "float32")
