@@ -32,7 +32,9 @@ from kinds import masked  # noqa: E402
 
 from ccnn_torch.compensation import Compensator, load_model  # noqa: E402
 from ccnn_torch.compensation.export.export import export_onnx  # noqa: E402
+from ccnn_torch.compensation.model_files.onnx_session import OUTPUTS  # noqa: E402
 from ccnn_torch.compensation.targets.c99 import print_c99  # noqa: E402
+from ccnn_torch.compensation.targets.export import COMMAND  # noqa: E402
 from ccnn_torch.compensation.targets.from_model import form_of  # noqa: E402
 from ccnn_torch.compensation.targets.golden import golden_vectors, require_equal  # noqa: E402
 from ccnn_torch.errors import MethodFailedError  # noqa: E402
@@ -92,39 +94,36 @@ int main(void)
 }
 """
 
+_LAYER = """
+    double a@NEXT@[@OUT@];
+    for (int i = 0; i < @OUT@; i++) {
+        double s = b@K@[i];
+        for (int j = 0; j < @IN@; j++) s += w@K@[i][j] * a@K@[j];
+        a@NEXT@[i] = @VALUE@;
+    }"""
+
 # What a programmer would write: loops over the network's matrices, the guard, and the fixed point around them.
 _BY_HAND = """
 #include "compensator.h"
 #include <math.h>
 @TABLES@
-static double delta(const double q[3], double d[3])
+static double delta(const double q[@N@], double d[@N@])
 {
-    double x[3], f[3], a[6], b[6], u = 0.0;
-    for (int j = 0; j < 3; j++) {
+    double x[@N@], a0[@N@], u = 0.0;
+    for (int j = 0; j < @N@; j++) {
         x[j] = fmin(fmax(q[j], cage_low[j]), cage_high[j]);
-        f[j] = (x[j] - centre[j]) / half[j];
+        a0[j] = (x[j] - centre[j]) / half[j];
     }
-    for (int i = 0; i < 6; i++) {
-        double s = b0[i];
-        for (int j = 0; j < 3; j++) s += w0[i][j] * f[j];
-        a[i] = 1.0 / (1.0 + exp(-s));
-    }
-    for (int i = 0; i < 6; i++) {
-        double s = b1[i];
-        for (int j = 0; j < 6; j++) s += w1[i][j] * a[j];
-        b[i] = 1.0 / (1.0 + exp(-s));
-    }
-    for (int i = 0; i < 6; i++) {
+@LAYERS@
+    for (int i = 0; i < 2 * @N@; i++) {
         double y = 0.0;
-        for (int j = 0; j < 3; j++) y += axes[j][i] * (x[j] - middle_of[j]);
+        for (int j = 0; j < @N@; j++) y += axes[j][i] * (x[j] - middle_of[j]);
         const double e = fmax(fabs(y - middle[i]) - radius[i], 0.0) / width[i];
         u += e * e;
     }
     const double fade = fmax(1.0 - u, 0.0), weight = fade * fade;
-    for (int i = 0; i < 3; i++) {
-        double s = b2[i];
-        for (int j = 0; j < 6; j++) s += w2[i][j] * b[j];
-        s = fmin(fmax(s * scale[i] + mean[i], -limit[i]), limit[i]);
+    for (int i = 0; i < @N@; i++) {
+        const double s = fmin(fmax(@LAST@[i] * scale[i] + mean[i], -limit[i]), limit[i]);
         d[i] = fmin(fmax(weight * s + (1.0 - weight) * safe[i], -limit[i]), limit[i]);
     }
     return u;
@@ -132,12 +131,12 @@ static double delta(const double q[3], double d[3])
 int ccnn_compensate(const double joints[], const double covariates[], double command[], double deviation[])
 {
     (void)covariates;
-    for (int j = 0; j < 3; j++) {
+    for (int j = 0; j < @N@; j++) {
         if (!(fabs(joints[j]) < 1e300)) return 2;
     }
     double u = delta(joints, deviation);
     for (int k = 0; k < @STEPS@; k++) {
-        for (int j = 0; j < 3; j++) command[j] = joints[j] - deviation[j];
+        for (int j = 0; j < @N@; j++) command[j] = joints[j] - deviation[j];
         u = delta(command, deviation);
     }
     return u > 0.0;
@@ -158,7 +157,19 @@ def by_hand(compensator: Compensator) -> str:
     for name, values in tables.items():
         numbers = repr(values.tolist()).replace("[", "{").replace("]", "}")
         lines.append(f"static const double {name}{''.join(f'[{n}]' for n in values.shape)} = {numbers};")
-    return _BY_HAND.replace("@TABLES@", "\n".join(lines)).replace("@STEPS@", str(compensator.iterations))
+    parts = []
+    for k, layer in enumerate(layers):
+        value = "s" if k == len(layers) - 1 else "1.0 / (1.0 + exp(-s))"
+        names = {"OUT": layer.out_features, "IN": layer.in_features, "NEXT": k + 1, "K": k, "VALUE": value}
+        parts.append(_filled(_LAYER, names))
+    names = {"TABLES": "\n".join(lines), "LAYERS": "".join(parts), "LAST": f"a{len(layers)}"}
+    return _filled(_BY_HAND, names | {"STEPS": compensator.iterations, "N": len(compensator.joints)})
+
+
+def _filled(text: str, names: dict[str, object]) -> str:
+    for key, value in names.items():
+        text = text.replace(f"@{key}@", str(value))
+    return text
 
 
 def timed(folder: Path, compensator: Compensator, calls: int, compiler: str, given: np.ndarray) -> list[object]:
@@ -207,6 +218,20 @@ def streamed(compensator: Compensator, call: Callable[[np.ndarray], object], cyc
     return [float(v) / 1e3 for v in (*np.percentile(times, (50, 99)), times.max())]
 
 
+def bound(run: onnxruntime.InferenceSession, row: np.ndarray) -> Callable[[np.ndarray], object]:
+    """Inputs and outputs stay where they are from call to call."""
+    binding, value = run.io_binding(), onnxruntime.OrtValue.ortvalue_from_numpy(row)
+    binding.bind_ortvalue_input("joints", value)
+    for output in run.get_outputs():
+        binding.bind_output(output.name)
+
+    def call(q: np.ndarray) -> None:
+        value.update_inplace(q)
+        run.run_with_iobinding(binding)
+
+    return call
+
+
 def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> None:
     """Measure one model and print its rows."""
     n, domain, limit = len(compensator.joints), compensator.domain, compensator.limit.numpy()
@@ -220,13 +245,15 @@ def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> None
         }
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        content = export_onnx(compensator, "{}")
-        (folder / "m.onnx").write_bytes(content)
-        run = session(folder / "m.onnx")
-        parts = [run.run(["deviation"], {"joints": part})[0] for part in np.array_split(given, 100)]
-        off = np.abs((np.concatenate(parts) - wanted) / limit).max()
-        way = streamed(compensator, lambda q: run.run(None, {"joints": q}), calls // 100)
-        rows["onnxruntime, float64"] = [*way, "", len(content), off]
+        for file, outputs in (("model.onnx", OUTPUTS), ("controller.onnx", COMMAND)):
+            content = export_onnx(compensator, "{}", outputs)
+            (folder / file).write_bytes(content)
+            run = session(folder / file)
+            parts = [run.run(["deviation"], {"joints": part})[0] for part in np.array_split(given, 100)]
+            off = np.abs((np.concatenate(parts) - wanted) / limit).max()
+            plain = file == "model.onnx"
+            call = (lambda q, run=run: run.run(None, {"joints": q})) if plain else bound(run, given[:1].copy())
+            rows[f"onnxruntime, {file}"] = [*streamed(compensator, call, calls // 100), "", len(content), off]
         for dtype in ("float64", "float32"):
             try:
                 form = form_of(compensator, dtype)
@@ -261,7 +288,7 @@ def main(calls: int, models: list[str]) -> None:
     for path in [str(ROOT / "checkpoints" / "tripod" / "model.safetensors"), *models]:
         compensator = load_model(path).compensator
         assert compensator is not None and not compensator.covariates
-        measure(path, compensator, calls, False)
+        measure(path, compensator, calls, compensator.geometry is None and compensator.effects is None)
 
 
 if __name__ == "__main__":

@@ -32,9 +32,10 @@ def export(
     compares more than a thousand golden vectors. The code has no heap, no recursion and no global state, and does
     the same operations in each call. st writes compensator.st, selftest.st and a README.md for TwinCAT and CODESYS.
     linuxcnc writes ccnnkins.comp, the machine's kinematics with the compensation around them, for halcompile; of an
-    identified.yaml the kinematics with the identified parameters. onnx writes model.onnx with master and card. urdf
-    writes an arm with its identified links as URDF, MuJoCo model and DH table. table writes the deviation over a grid,
-    tables of single axes and a mesh where they suffice, and how far off each of them is.
+    identified.yaml the kinematics with the identified parameters. onnx writes model.onnx with master and card, and
+    controller.onnx with the command alone. urdf writes an arm with its identified links as URDF, MuJoCo model and DH
+    table. table writes the deviation over a grid, tables of single axes and a mesh where they suffice, and how far off
+    each of them is. Of an identified.yaml the others make a closed form of the correction, and say what it leaves.
 
     Source code returns the same codes: 0 inside the domain; 1 outside, or where the model broke its limit; 2 where an
     input is not finite, and then command = joints. Before a file is written its operations are compared with the

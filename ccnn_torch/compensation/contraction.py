@@ -13,8 +13,8 @@ from ccnn_torch.compensation.domain import Domain
 
 __all__ = ["GENTLE", "STEEPEST_DEVIATION", "TOLERANCE", "Steepness", "iterations_needed", "spread_points", "steepest"]
 
-# A unique command exists below a slope of 1. At this one the fixed point takes 40 steps, which a model file unrolls,
-# and a slope that sampling missed still has room.
+# A unique command exists below a slope of 1. At this one the fixed point takes 40 steps, and
+# a slope that sampling missed still has room.
 STEEPEST_DEVIATION = 0.5
 # What is left to geometry and known effects of such slopes: the fixed point then takes 17 steps.
 GENTLE = 0.2

@@ -30,6 +30,9 @@ _PRECISION_RANGE = (1e-8, 1e12)
 _LEAST_FREEDOM = 0.1
 # Directions of the amplitudes' covariance that a model keeps of each joint, the widest ones.
 _DIRECTIONS = 32
+# A harmonic that the evidence switched off keeps some 1e-6 of the deviations' scale; below this it is none, and costs a
+# command nothing.
+_SWITCHED_OFF = 1e-4
 
 
 @dataclass(frozen=True)
@@ -137,7 +140,8 @@ def _fit(
     # Sine and cosine of one harmonic of one joint share a precision.
     harmonic = torch.arange(joints * count, device=rows.device).reshape(joints, count).repeat(1, 2).flatten()
     amplitude, covariance = _evidence(gram, moment, energy, rows.sum(), harmonic, outputs)
-    own = amplitude.reshape(joints, 2 * count)
+    waves = amplitude.reshape(joints, 2, count)
+    own = torch.where(waves.norm(dim=1, keepdim=True) < _SWITCHED_OFF, 0.0, waves).flatten(1)
     blocks = covariance.reshape(joints, 2 * count, joints, 2 * count)
     blocks = torch.stack([blocks[joint, :, joint] for joint in range(joints)])
     values, vectors = torch.linalg.eigh(blocks)

@@ -154,6 +154,7 @@ KINDS: dict[str, Callable[[], Compensator]] = {
     "tripod": tripod_compensator,
     "covariates": arm_compensator,
     "masked": masked,
+    "steep": lambda: tripod_compensator(gain=2.0, size=2e-2),
     "sliding arm": lambda: geometry_of_an_arm()[0],
     "six joints": six_joints,
     "expanded geometry": expanded,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import numpy as np
@@ -179,11 +180,16 @@ def test_iterations_count_the_largest_deviation() -> None:
     assert iterations_needed(Steepness(0.01, 0.0)) == 1
 
 
-def test_a_steep_deviation_is_solved_for_in_more_steps() -> None:
+def test_a_steep_deviation_is_solved_for_in_few_steps() -> None:
+    """By Broyden's method, where the fixed point takes 40; both come to the same."""
     steep = tripod_compensator(gain=2.0, size=2e-2)
-    assert steep.share == 1 and 0.2 < steep.lipschitz <= 0.5 and steep.iterations > 17
+    assert steep.share == 1 and 0.2 < steep.lipschitz <= 0.5 and steep.secant and steep.iterations < 12
     joints = tripod_joints()
     command, deviation, _ = steep(joints)
+    slow = copy.copy(steep)
+    slow.secant, slow.iterations = False, iterations_needed(Steepness(steep.lipschitz, 1.0))
+    assert slow.iterations > 30
+    torch.testing.assert_close(command, slow(joints)[0], rtol=0, atol=1e-12 * float(steep.limit.min()))
     torch.testing.assert_close(command + steep.deviation(command), joints, rtol=0, atol=1e-12)
     assert float(deviation.abs().max()) > 1e-3
 

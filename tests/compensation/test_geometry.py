@@ -23,7 +23,7 @@ from ccnn_torch.compensation import (
 from ccnn_torch.compensation.export.to_onnx import to_onnx
 from ccnn_torch.compensation.geometry import identified as _geometry
 from ccnn_torch.compensation.geometry.expanded import ExpandedGeometry, expand_geometry
-from ccnn_torch.compensation.geometry.serial import SerialGeometry
+from ccnn_torch.compensation.geometry.serial import SerialGeometry, _chain, _placed
 from ccnn_torch.compensation.model_files.onnx_session import check_graph, open_onnx
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
@@ -222,7 +222,8 @@ def test_slopes_of_an_arm_are_those_of_its_own_jacobian() -> None:
     for arm, identified, joints in (six_joint_arm(), three_joint_arm()):
         module = SerialGeometry(arm, arm.nominal, identified, 0.3, 0.01)
         weight = torch.tensor([1.0] * 3 + [0.3] * 3, dtype=torch.float64)[: len(arm.pose), None]
-        torch.testing.assert_close(module._slope(joints), arm.jacobian(joints) * weight, rtol=0, atol=1e-13)
+        slope = module._slope(_chain(_placed(module._moved(joints), module._nominal_links)))
+        torch.testing.assert_close(slope.mT, arm.jacobian(joints) * weight, rtol=0, atol=1e-13)
 
 
 def test_without_geometry_the_form_of_the_file_is_that_of_before(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from torch import Tensor
 from ccnn_torch import export_model
 from ccnn_torch.compensation import Compensator, fit_compensator, load_model, save_model
 from ccnn_torch.compensation.geometry.serial import SerialGeometry
+from ccnn_torch.compensation.model_files.onnx_session import open_onnx
 from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
@@ -137,17 +138,20 @@ def test_identified_links_go_back_into_a_simulator(tmp_path: Path, cli: Cli) -> 
     assert (tmp_path / "second" / "robot.xml").read_text() == (tmp_path / "robot" / "robot.xml").read_text()
     files = export_model(tmp_path / "identified.yaml", "linuxcnc", tmp_path / "kins")
     assert "double ccnn_nominal" not in files["ccnnkins.comp"].read_text().replace("static void", "")
-    with pytest.raises(ModelFileError, match="export it as linuxcnc or urdf"):
-        export_model(tmp_path / "identified.yaml", "table", tmp_path / "none")
+    assert "table.csv" in export_model(tmp_path / "identified.yaml", "table", tmp_path / "table")
 
 
 def test_onnx_as_a_target(tmp_path: Path) -> None:
     compensator = masked(0.5)
     path = save_model(tmp_path, compensator, fields(), forms=("safetensors",))["safetensors"]
     files = export_model(path, "onnx", tmp_path / "out")
-    assert {*files} == {"model.safetensors", "model.onnx", "model.float32.onnx", "card.json"}
+    assert {*files} == {"model.safetensors", "model.onnx", "model.float32.onnx", "card.json", "controller.onnx"}
     point = compensator.domain.centre[None].numpy()
-    assert np.abs(load_model(files["model.onnx"])(point)["command"] - load_model(path)(point)["command"]).max() < 1e-15
+    wanted = load_model(path)(point)
+    assert np.abs(load_model(files["model.onnx"])(point)["command"] - wanted["command"]).max() < 1e-15
+    session = open_onnx(files["controller.onnx"].read_bytes())
+    assert [o.name for o in session.get_outputs()] == ["command", "deviation", "inside_domain"]
+    assert np.abs(session.run(["command"], {"joints": point})[0] - wanted["command"]).max() < 1e-15
 
 
 def test_what_cannot_be_exported_says_so(tmp_path: Path, cli: Cli) -> None:

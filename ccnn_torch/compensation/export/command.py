@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import onnx
 import torch
@@ -12,6 +13,7 @@ from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.export.graph import Graph, Value
 from ccnn_torch.compensation.export.to_onnx import Traced, rows_apart_from
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
+from ccnn_torch.compensation.secant import Step
 
 __all__ = ["command_graph"]
 
@@ -51,6 +53,18 @@ class _Step:
             moved = own.geometry(caged[..., :n] + value)
             value = own._limited(value + (moved if own.geometry.extrapolates else weight * moved))
         return value, excess, weight, features
+
+
+def _advanced(compensator: Compensator, joints: Tensor, kept: int) -> Traced:
+    """(δ, correction, numbers kept of the steps before) -> the next correction, and these with the new ones."""
+
+    def function(found: Tensor, correction: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
+        steps = [Step(*pair) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
+        correction, steps = compensator.next_correction(found, correction, steps)
+        return correction, *(number for step in steps for number in step)
+
+    # Each of its own: what is traced is told apart by its tensor.
+    return Traced(function, *(joints.clone() for _ in range(2 + kept)))
 
 
 def command_graph(
@@ -97,9 +111,15 @@ def command_graph(
         low, high = domain._cage_low - room, domain._cage_high + room
         (start,) = Traced(lambda v: torch.minimum(torch.maximum(v, low), high), points)(graph, inputs)
     at, more = Traced(parts, points)(graph, start)
-    first = last = one(graph, at, more, strange, torch.zeros_like(joints))
+    correction: Any = torch.zeros_like(joints)
+    first = last = one(graph, at, more, strange, correction)
+    kept: list[Value] = []
     for _ in range(compensator.iterations):
-        last = one(graph, at, more, strange, last[0])
+        if compensator.secant:
+            correction, *kept = _advanced(compensator, joints, len(kept))(graph, last[0], correction, *kept)
+        else:
+            correction = last[0]
+        last = one(graph, at, more, strange, correction)
 
     def inside(excess: Tensor) -> Tensor:
         return (excess <= 0).squeeze(-1)
@@ -107,10 +127,10 @@ def command_graph(
     found: Mapping[str, Value] = {}
     found = {"deviation": graph.solid(last[0]), "back_deviation": graph.solid(first[0])}
     found |= {"guard": last[2], "back_guard": first[2]}
-    for name, sign, of in (("command", "Sub", "deviation"), ("ideal", "Add", "back_deviation")):
-        whole = graph.solid(ideal)
-        found[name] = graph.node(sign, [whole.name, found[of].name], whole.shape, whole.shape)
-    if "deviation_sd" in outputs:
+    whole = graph.solid(ideal)
+    for name, sign, by in (("command", "Sub", correction), ("ideal", "Add", first[0])):
+        found[name] = graph.node(sign, [whole.name, graph.solid(by).name], whole.shape, whole.shape)
+    if "inside_domain" in outputs:
         (found["inside_domain"],) = Traced(inside, blank)(graph, last[1])
         (found["ideal_inside_domain"],) = Traced(inside, blank)(graph, first[1])
         features = compensator.scaling.features(points)

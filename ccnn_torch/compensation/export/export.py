@@ -7,6 +7,7 @@ and none for Tan, Asin, Acos, Atan, Softplus, Elu, Gelu and Erf: a network made 
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ _TOLERANCE_FLOAT32 = 1e-5
 _OUTPUTS_FLOAT32 = ("deviation", "guard", "back_deviation", "back_guard")
 
 
-def export_onnx(compensator: Compensator, metadata: str) -> bytes:
+def export_onnx(compensator: Compensator, metadata: str, outputs: Sequence[str] = OUTPUTS) -> bytes:
     """The compensator in float64 as a verified ONNX file without external data, for any number of rows.
 
     Inputs `joints` (`s x n`, ideal, SI) and, where there are any, `covariates` (`s x m`, SI). Outputs `command`,
@@ -46,11 +47,12 @@ def export_onnx(compensator: Compensator, metadata: str) -> bytes:
     Args:
         compensator: fitted.
         metadata: JSON to carry in the file.
+        outputs: those that are wanted; each costs its own operations in every call.
 
     Raises:
         MethodFailedError: the file does not give the eager model's numbers, see `verify`, or cannot be run.
     """
-    model = command_graph(compensator, _OPSET, metadata, OUTPUTS)
+    model = command_graph(compensator, _OPSET, metadata, outputs)
     # What is read back must not be refused.
     check_graph(model)
     content: bytes = model.SerializeToString(deterministic=True)
@@ -61,7 +63,7 @@ def export_onnx(compensator: Compensator, metadata: str) -> bytes:
             f"an operator of this model has no kernel in ONNX Runtime in double ({str(reason).rpartition(' : ')[2]}); "
             "leave out the learner or the effect (instrument on a machine that turns) that brings it"
         ) from None
-    verify(compensator, lambda joints, covariates: run_onnx(session, joints, covariates), "ONNX")
+    verify(compensator, lambda joints, covariates: run_onnx(session, joints, covariates), "ONNX", outputs)
     return content
 
 
@@ -81,7 +83,8 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
         what = "links of the arm" if compensator.effects is None else "physical effects"
         raise MethodFailedError(f"the {what} need double precision; use the float64 file")
     twin = copy.copy(compensator)
-    twin.iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), _TOLERANCE_FLOAT32 / 10)
+    if not twin.secant:
+        twin.iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), _TOLERANCE_FLOAT32 / 10)
     joints, covariates = probe_points(compensator)
     given = [v.float() for v in (joints, covariates) if v is not None]
     model = command_graph(twin, _OPSET_FLOAT32, metadata, _OUTPUTS_FLOAT32, "float32")
@@ -103,12 +106,13 @@ def export_float32(compensator: Compensator, metadata: str) -> bytes:
     return content
 
 
-def verify(compensator: Compensator, run: Any, form: str) -> None:
+def verify(compensator: Compensator, run: Any, form: str, outputs: Sequence[str] = OUTPUTS) -> None:
     """Compare an exported form with the eager model, at random and at extreme points, one by one and in a batch.
 
     Args:
         run: (joints `s x n`, covariates `s x m` or None) -> outputs by name.
         form: what the file is called in the error.
+        outputs: that there are.
 
     Raises:
         MethodFailedError: it differs by more than 1e-12 of the limit (commands: and the rounding of a joint; standard
@@ -124,7 +128,7 @@ def verify(compensator: Compensator, run: Any, form: str) -> None:
     share = min(max(TOLERANCE, *(getattr(part, "export_tolerance", TOLERANCE) for part in parts)), _LOOSEST)
     tolerance = share * compensator.limit.numpy()
     for found, wanted in ((run(*given), expected), (run(*single), {k: v[:1] for k, v in expected.items()})):
-        for name in OUTPUTS:
+        for name in outputs:
             if found[name].dtype == bool:
                 good = bool((found[name] == wanted[name]).all())
             else:

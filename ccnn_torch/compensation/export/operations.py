@@ -222,6 +222,18 @@ def _flipped(graph: Graph, value: Value, dims: Sequence[int]) -> Value:
     return value
 
 
+def _cross(graph: Graph, a: Any, b: Any, dim: int = -1) -> Value:
+    def turned(value: Any, places: list[int]) -> Any:
+        axis, order = dim % len(value.shape), torch.tensor(places)
+        if isinstance(value, Value):
+            return _picked(graph, value, axis, order)
+        return value.index_select(axis, order)
+
+    after, before = [1, 2, 0], [2, 0, 1]
+    left = _binary(graph, "mul", turned(a, after), turned(b, before))
+    return _binary(graph, "sub", left, _binary(graph, "mul", turned(a, before), turned(b, after)))
+
+
 def _joined(graph: Graph, parts: Sequence[Any], dim: int = 0) -> Value:
     rank = len(_shape(parts[0]))
     dim %= rank
@@ -343,6 +355,6 @@ _OTHERS: dict[str, Callable[..., Any]] = {
     "t": _transposed, "select": _selected, "slice": _sliced, "index": _indexed, "index_select": _picked,
     "flip": _flipped, "cat": _joined, "stack": _stacked, "expand": _expanded,
     "expand_as": lambda g, a, b: _expanded(g, a, _shape(b)),
-    "broadcast_tensors": _broadcast, "split": _split, "split_with_sizes": _split,
+    "linalg_cross": _cross, "broadcast_tensors": _broadcast, "split": _split, "split_with_sizes": _split,
     "unbind": lambda g, v, dim=0: [_selected(g, v, dim, k) for k in range(v.shape[dim])],
 }  # fmt: skip

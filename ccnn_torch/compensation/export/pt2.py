@@ -13,10 +13,12 @@ import torch
 from torch import Tensor, nn
 from torch.fx import Graph, Node
 from torch.fx import config as fx_config
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.export.export import verify
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY, OUTPUTS, Array
+from ccnn_torch.compensation.secant import Step, next_correction
 
 __all__ = ["export_pt2"]
 
@@ -56,7 +58,7 @@ def export_pt2(compensator: Compensator, metadata: str) -> bytes:
         # Where in the source a step came from: paths of the machine that wrote the file.
         for key in ("stack_trace", "source_fn_stack", "nn_module_stack", "from_node", "torch_fn"):
             node.meta.pop(key, None)
-    _unroll(program, compensator.iterations)
+    _unroll(program, compensator)
     module = program.module()
 
     def run(joints: Array, covariates: Array | None) -> dict[str, Array]:
@@ -72,7 +74,7 @@ def export_pt2(compensator: Compensator, metadata: str) -> bytes:
     return stream.getvalue()
 
 
-def _unroll(program: torch.export.ExportedProgram, times: int) -> None:
+def _unroll(program: torch.export.ExportedProgram, compensator: Compensator) -> None:
     """Put further steps after the one that was traced, in place; the way back stays with the first."""
     graph = program.graph
     output = graph.output_node()
@@ -81,10 +83,17 @@ def _unroll(program: torch.export.ExportedProgram, times: int) -> None:
     way_back = outputs[3:5]
     step = _between(graph, start, [node for node in outputs if node not in way_back])
     known: dict[Node, Node] = {start: start}
-    value = outputs[1]
+    value, correction, kept = outputs[1], start, list[Node]()
+    buffers = program.graph_signature.inputs_to_buffers
+    limit = next(node for node in graph.nodes if buffers.get(node.name) == "compensator.limit")
     with graph.inserting_before(output):
-        for _ in range(times):
-            known = {start: known.get(value, value)}
+        for _ in range(compensator.iterations):
+            found = known.get(value, value)
+            if compensator.secant:
+                correction, *kept = _advanced(graph, limit, found, correction, *kept)
+            else:
+                correction = found
+            known = {start: correction}
             for node in step:
                 known[node] = graph.node_copy(node, lambda n, known=known: known.get(n, n))
     output.args = (tuple(known.get(n, n) if n not in way_back else n for n in outputs),)
@@ -92,6 +101,23 @@ def _unroll(program: torch.export.ExportedProgram, times: int) -> None:
         spec.arg.name = node.name
     graph.lint()
     program.graph_module.recompile()
+
+
+def _advanced(graph: Graph, limit: Node, *given: Node) -> Sequence[Node]:
+    """(δ, correction, numbers kept of the steps before) -> the next correction, and these with the new ones."""
+
+    def function(limit: Tensor, found: Tensor, correction: Tensor, *numbers: Tensor) -> list[Tensor]:
+        steps = [Step(*pair) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
+        correction, steps = next_correction(found, correction, steps, limit)
+        return [correction, *(number for step in steps for number in step)]
+
+    traced = make_fx(function)(*(node.meta["val"] for node in (limit, *given))).graph
+    known = dict(zip(traced.find_nodes(op="placeholder"), (limit, *given), strict=True))
+    for node in traced.nodes:
+        if node.op == "call_function":
+            known[node] = graph.node_copy(node, lambda n: known[n])
+    outputs: Any = traced.output_node().args[0]
+    return [known[node] for node in outputs]
 
 
 def _between(graph: Graph, start: Node, ends: Sequence[Node]) -> list[Node]:

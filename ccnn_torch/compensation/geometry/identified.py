@@ -102,6 +102,7 @@ def settled_damping(
     limit: Tensor,
     rotation_weight: float,
     margin: float,
+    slope: float = _SHARE * GENTLE,
 ) -> float:
     """The least damping of a serial arm's γ with which it is nowhere so steep that no command could be solved for.
 
@@ -113,6 +114,7 @@ def settled_damping(
         joints: commanded joints of all rows, `s x n` [SI]; held-out ones may be among them.
         limit: of the correction that the compensator will have, about, `n` [SI].
         rotation_weight, margin: as in `fit_geometry_module`.
+        slope: the steepest that γ may be, in units of the limits [1].
 
     Returns:
         [m per joint unit], one for all repeats; 0 for what is no serial arm.
@@ -123,8 +125,7 @@ def settled_damping(
     for pair in zip(nominal[:, 0], identified[:, 0], strict=True):
 
         def gentle(step: int, pair: tuple[Tensor, Tensor] = pair) -> bool:
-            slope = _steepness(mechanism, pair, joints, limit, rotation_weight, margin, _DAMPINGS[step])
-            return slope <= _SHARE * GENTLE
+            return _steepness(mechanism, pair, joints, limit, rotation_weight, margin, _DAMPINGS[step]) <= slope
 
         # A repeat that needs no more damping than those before costs one look.
         if gentle(low):

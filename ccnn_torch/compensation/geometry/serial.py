@@ -28,8 +28,9 @@ class SerialGeometry(nn.Module):
     f is the identified forward kinematics, g the nominal inverse kinematics: here two damped Gauss-Newton steps from q
     that share the Jacobian at q, which the deviation (milliradians) changes by thousandths. Near a singularity the
     damping bounds δ. Only sums, products, quotients, sines and cosines: no solver is called and no arc function, so
-    that the graph runs in ONNX Runtime in double. A model file unrolls this a dozen times, hence the few operations:
-    each link is `cos q C + sin q S + D` with constant matrices, base and tool folded in.
+    that the graph runs in ONNX Runtime in double. A command evaluates this half a dozen times, hence the few
+    operations: each link is `cos q C + sin q S + D` with constant matrices, base and tool folded in, and a joint moves
+    what is behind it about a screw that is constant in its own link.
 
     Attributes:
         nominal, identified: all parameters of the arm, frames included, `... x k` [SI].
@@ -45,6 +46,8 @@ class SerialGeometry(nn.Module):
     _identified_links: Tensor
     _slides: Tensor
     _turns: Tensor
+    _spins: Tensor
+    _shifts: Tensor
     _weight: Tensor
     _damped: Tensor
     _unit: Tensor
@@ -72,10 +75,14 @@ class SerialGeometry(nn.Module):
         weight = torch.ones(6 if self._turned else 3, dtype=torch.float64)
         weight[3:] = rotation_weight
         unit = torch.eye(len(arm.joints), dtype=torch.float64)
+        links = _links(arm, nominal.detach())
+        spins, shifts = _screws(links)
         for name, value in {
             "nominal": nominal.detach().clone(),
             "identified": identified.detach().clone(),
-            "_nominal_links": _links(arm, nominal.detach()),
+            "_nominal_links": links,
+            "_spins": spins,
+            "_shifts": shifts,
             "_identified_links": _links(arm, identified.detach()),
             "_slides": (~arm.revolute).to(torch.float64),
             "_turns": arm.revolute.to(torch.float64),
@@ -87,17 +94,21 @@ class SerialGeometry(nn.Module):
 
     def forward(self, joints: Tensor) -> Tensor:
         """joints: commanded, `... x n` [SI]; returns δ, `... x n` [SI]."""
-        wanted = _chain(self._moved(joints, self._identified_links))[-1]
-        slope = self._slope(joints)
-        normal = slope.mT @ slope + self._damped
-        back = _inverse(normal, self._unit) @ slope.mT
-        deviation = torch.zeros_like(joints)
-        for _ in range(_STEPS):
-            here = _chain(self._moved(joints + deviation, self._nominal_links))[-1]
+        moved = self._moved(joints)
+        wanted = _chain(_placed(moved, self._identified_links))[-1]
+        placed = _chain(_placed(moved, self._nominal_links))
+        slope = self._slope(placed)
+        inverse = _inverse(slope @ slope.mT + self._damped, self._unit)
+
+        def step(here: Tensor) -> Tensor:
             gap = wanted[..., :3, 3] - here[..., :3, 3]
             if self._turned:
                 gap = torch.cat([gap, _axis(wanted[..., :3, :3] @ here[..., :3, :3].mT)], dim=-1)
-            deviation = deviation + (back @ (self._weight * gap)[..., None])[..., 0]
+            return (inverse @ (slope @ (self._weight * gap)[..., None]))[..., 0]
+
+        deviation = step(placed[-1])
+        for _ in range(_STEPS - 1):
+            deviation = deviation + step(_chain(_placed(self._moved(joints + deviation), self._nominal_links))[-1])
         return deviation
 
     def repeat(self, index: int) -> SerialGeometry:
@@ -130,37 +141,24 @@ class SerialGeometry(nn.Module):
         arm = SerialArm(**description["arm"])
         return cls(arm, nominal, identified, description["rotation_weight"], description["damping"])
 
-    def _moved(self, joints: Tensor, links: Tensor) -> Tensor:
-        """Transforms of the links, `... x n x 4 x 4`; links `3 x ... x n x 4 x 4`."""
-        turned = torch.cos(joints) * self._turns
-        # A prismatic joint enters linearly, a revolute one by its sine.
-        other = torch.sin(joints) * self._turns + joints * self._slides
-        return turned[..., None, None] * links[0] + other[..., None, None] * links[1] + links[2]
+    def _moved(self, joints: Tensor) -> tuple[Tensor, Tensor]:
+        """Cosines, and sines of revolute joints and prismatic joints themselves, `... x n`."""
+        return torch.cos(joints) * self._turns, torch.sin(joints) * self._turns + joints * self._slides
 
-    def _slope(self, joints: Tensor) -> Tensor:
-        """Jacobian of the nominal arm with its rows weighted, `... x c x n`: every link's derivative between the links
-        before and behind it, for every convention."""
-        links = self._nominal_links
-        moved = self._moved(joints, links)
-        before = _chain(moved)
-        behind = _chain(moved.flip(-3).mT)
-        n = joints.shape[-1]
-        turning = torch.cos(joints) * self._turns + self._slides
-        rates = turning[..., None, None] * links[1] - (torch.sin(joints) * self._turns)[..., None, None] * links[0]
-        parts = []
-        for i in range(n):
-            rate = rates[..., i, :, :]
-            if i > 0:
-                rate = before[i - 1] @ rate
-            if i < n - 1:
-                rate = rate @ behind[n - 2 - i].mT
-            parts.append(rate)
-        moving = torch.stack(parts, dim=-3)
-        columns = moving[..., :3, 3]
+    def _slope(self, placed: list[Tensor]) -> Tensor:
+        """Jacobian of the nominal arm with its columns weighted, transposed, `... x n x c`.
+
+        Args:
+            placed: transforms of the links' ends, as `_chain` gives them.
+        """
+        links = torch.stack(placed, dim=-3)
+        rotations, lever = links[..., :3, :3], placed[-1][..., None, :3, 3] - links[..., :3, 3]
+        spins = (rotations @ self._spins)[..., 0]
+        shifts = (rotations @ self._shifts)[..., 0]
+        columns = shifts + _cross(spins, lever)
         if self._turned:
-            spin = moving[..., :3, :3] @ before[-1][..., None, :3, :3].mT
-            columns = torch.cat([columns, _axis(spin)], dim=-1)
-        return columns.mT * self._weight[:, None]
+            columns = torch.cat([columns, spins], dim=-1)
+        return columns * self._weight
 
 
 def _links(arm: SerialArm, values: Tensor) -> Tensor:
@@ -186,11 +184,28 @@ def _links(arm: SerialArm, values: Tensor) -> Tensor:
     return torch.where(links.abs() < _NOTHING, 0.0, links)
 
 
+def _screws(links: Tensor) -> tuple[Tensor, Tensor]:
+    """What each joint does to what is behind it, in the frame of its own link's end: rotation and velocity of the
+    frame's origin per joint unit, `... x n x 3 x 1` each, from links `3 x ... x n x 4 x 4`.
+
+    A link is `K Rot(q) L` or `K Shift(q) L` with constant K and L, so that its derivative is the link times a constant.
+    """
+    rate = torch.linalg.solve(links[0] + links[2], links[1])
+    rate = torch.where(rate.abs() < _NOTHING, 0.0, rate)
+    return _axis(rate[..., :3, :3])[..., None], rate[..., :3, 3:]
+
+
 def _homogeneous(rotation: Tensor, translation: Tensor) -> Tensor:
     """`... x 4 x 4` of a rotation `... x 3 x 3` and a translation `... x 3`."""
     whole = rotation.new_zeros(*rotation.shape[:-2], 4, 4)
     whole[..., :3, :3], whole[..., :3, 3], whole[..., 3, 3] = rotation, translation, 1.0
     return whole
+
+
+def _placed(moved: tuple[Tensor, Tensor], links: Tensor) -> Tensor:
+    """Transforms of the links, `... x n x 4 x 4`; links `3 x ... x n x 4 x 4`."""
+    turned, other = moved
+    return turned[..., None, None] * links[0] + other[..., None, None] * links[1] + links[2]
 
 
 def _chain(moved: Tensor) -> list[Tensor]:
@@ -207,6 +222,12 @@ def _axis(turn: Tensor) -> Tensor:
     angle; of a rate of rotation the rate."""
     half = (turn - turn.mT) / 2
     return torch.stack([half[..., 2, 1], half[..., 0, 2], half[..., 1, 0]], dim=-1)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross product of `... x 3`, without an operation that a file lacks."""
+    next_, last = [1, 2, 0], [2, 0, 1]
+    return a[..., next_] * b[..., last] - a[..., last] * b[..., next_]
 
 
 def _inverse(matrix: Tensor, unit: Tensor) -> Tensor:

@@ -134,6 +134,7 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
         tensors["safe_sd"],
         cast(Geometry | None, geometry),
         cast(PhysicalEffects | None, effects),
+        facts.get("secant", False),
     )
 
 

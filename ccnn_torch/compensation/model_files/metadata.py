@@ -23,6 +23,7 @@ __all__ = [
     "FORMAT",
     "FORMAT_EFFECTS",
     "FORMAT_GEOMETRY",
+    "FORMAT_SECANT",
     "check_keys",
     "check_tensors",
     "coordinates",
@@ -36,7 +37,9 @@ FORMAT = "ccnn_torch compensator 2"
 FORMAT_GEOMETRY = "ccnn_torch compensator 3"
 # The same of effects.
 FORMAT_EFFECTS = "ccnn_torch compensator 4"
-_KNOWN = (FORMAT, FORMAT_GEOMETRY, FORMAT_EFFECTS)
+# The same of steps that are not those of the fixed point.
+FORMAT_SECANT = "ccnn_torch compensator 5"
+_KNOWN = (FORMAT, FORMAT_GEOMETRY, FORMAT_EFFECTS, FORMAT_SECANT)
 _FORMATS = "ccnn_torch compensator "
 
 _REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
@@ -75,6 +78,8 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
         "versions": {"python": platform.python_version(), "ccnn_torch": __version__}
         | {name: version(name) for name in _PACKAGES},
     }
+    if compensator.secant:
+        facts["secant"] = True
     if compensator.geometry is not None:
         facts["geometry"] = compensator.geometry.describe()
     if compensator.effects is not None:
@@ -148,6 +153,8 @@ def from_json(text: str | bytes) -> Any:
 
 def _format(compensator: Compensator) -> str:
     """The shortest form without loss."""
+    if compensator.secant:
+        return FORMAT_SECANT
     if compensator.effects is not None:
         return FORMAT_EFFECTS
     return FORMAT if compensator.geometry is None else FORMAT_GEOMETRY

@@ -74,6 +74,7 @@ class _Facts(_Form):
     limits: dict[str, _Limit]
     lipschitz: _Size
     iterations: Annotated[int, Field(ge=0, le=_MOST_ITERATIONS)]
+    secant: bool = False
 
 
 def check_form(facts: Mapping[str, Any]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Sequence
+from functools import reduce
 
 import numpy as np
 import torch
@@ -53,6 +54,9 @@ class Builder:
         # Of what is multiplied the factors that a sine or cosine was taken of, without multiples of others.
         self._angles: dict[int, list[float]] = {}
         self._tables: dict[int, Array] = {}
+        # Numbers that may be none: (whether there is one, the number). Some targets have no constant that is no number.
+        self._maybe: dict[int, tuple[int, int]] = {}
+        self._truths: dict[int, frozenset[int]] = {}
         self._next = 0
 
     def constant(self, value: float) -> int:
@@ -99,6 +103,10 @@ class Builder:
 
     def apply(self, op: str, *args: int) -> int:
         """The node of an operation, simplified."""
+        if op == "select" and self._is_none(args[2]) and args[1] not in self._maybe:
+            return self._perhaps(args[0], args[1])
+        if any(i in self._maybe for i in args):
+            return self._of_maybe(op, args)
         found = self._simplified(op, args)
         if found is not None:
             return found
@@ -121,7 +129,7 @@ class Builder:
             op: operation, or "" for the one operand itself.
             operands: nodes.
         """
-        leaves = [self._leaf(ids, shape) for ids in operands]
+        leaves = [self._leaf(self._certain(ids), shape) for ids in operands]
         expression: Expression = (op, *leaves) if op else leaves[0]
         key = (expression, tuple(shape), reduce)
         outer = list(shape[:-1] if reduce else shape)
@@ -133,7 +141,7 @@ class Builder:
 
     def program(self, name: str, inputs: dict[str, int], outputs: dict[str, Tensor]) -> Program:
         """What was built, without what the outputs do not need."""
-        wanted = {key: [int(i) for i in ids.flatten()] for key, ids in outputs.items()}
+        wanted = {key: [int(i) for i in self._certain(ids).flatten()] for key, ids in outputs.items()}
         every = {i for ids in wanted.values() for i in ids}
         for i in every:
             self._load(i)
@@ -148,6 +156,72 @@ class Builder:
             self._finite.add(self._next)
         self._next += 1
         return self._next - 1
+
+    def _is_none(self, i: int) -> bool:
+        value = self._value(i)
+        return value is not None and math.isnan(value)
+
+    def _perhaps(self, there: int, value: int) -> int:
+        """A number where there is one."""
+        if self._value(there) == 1.0:
+            return value
+        key = ("maybe", there, value)
+        if key not in self._known:
+            self._known[key] = self._next
+            self._maybe[self._next] = (there, value)
+            self._next += 1
+        return self._known[key]
+
+    def _of_maybe(self, op: str, args: tuple[int, ...]) -> int:
+        """What is made of numbers that may be none is none where one is; comparisons with it are false."""
+        parts = [self._maybe.get(i, (self.constant(1.0), i)) for i in args]
+        value = self.apply(op, *(v for _, v in parts))
+        if op == "select":
+            (_, which), (first, _), (second, _) = parts
+            if self._is_none(args[2]):
+                return self._perhaps(self.apply("and", which, first), parts[1][1])
+            return self._perhaps(self._chosen(which, first, second), value)
+        there = reduce(lambda a, b: self.apply("and", a, b), (t for t, _ in parts))
+        if op in BOOLEAN:
+            # The same number twice: whether there is one.
+            return self.apply("and", there, value)
+        return self._perhaps(there, value)
+
+    def _chosen(self, which: int, first: int, second: int) -> int:
+        """One of two truth values."""
+        if first == second:
+            return first
+        other = self.apply("not", which)
+        for one, two, here in ((first, second, which), (second, first, other)):
+            if self._value(two) == 1.0 and self._parts(one) <= self._parts(here):
+                return two
+        left, right = self.apply("and", which, first), self.apply("and", other, second)
+        return self.apply("or", left, right)
+
+    def _parts(self, i: int) -> frozenset[int]:
+        """What must all be true for a truth value to be."""
+        if i not in self._truths:
+            node = self._nodes[i]
+            own = frozenset([i] if self._value(i) != 1.0 else [])
+            self._truths[i] = frozenset().union(*map(self._parts, node.args)) if node.op == "and" else own
+        return self._truths[i]
+
+    def _certain(self, ids: Tensor) -> Tensor:
+        """With numbers that may be none as such."""
+        if not self._maybe:
+            return ids
+        flat = [self._solid(i) for i in ids.flatten().tolist()]
+        return torch.tensor(flat, dtype=torch.int64).reshape(ids.shape)
+
+    def _solid(self, i: int) -> int:
+        if i not in self._maybe:
+            return i
+        there, value = self._maybe[i]
+        key = ("select", (there, value, self.constant(math.nan)))
+        if key not in self._known:
+            self._known[key] = node = self._add(Node(*key), False)
+            self._steps.append(Let(node))
+        return self._known[key]
 
     def _owner(self, i: int) -> int | None:
         """The buffer of an element; None for another node."""
@@ -197,6 +271,8 @@ class Builder:
             return self.apply("neg", second)
         if op == "sub" and self._nodes[second].op == "neg":
             return self.apply("add", first, self._nodes[second].args[0])
+        if op == "not" and self._nodes[first].op == "not":
+            return self._nodes[first].args[0]
         if op == "neg" and self._nodes[first].op == "neg":
             return self._nodes[first].args[0]
         if op == "mul":
@@ -204,6 +280,10 @@ class Builder:
         if op in ("and", "or") and (a is not None or b is not None):
             value, other = (a, second) if a is not None else (b, first)
             return other if bool(value) == (op == "and") else self.constant(float(op == "or"))
+        if op == "and":
+            for x, y in ((first, second), (second, first)):
+                if self._parts(y) <= self._parts(x):
+                    return x
         if op == "div" and a == 0.0 and self._is_finite(second):
             return first
         if op == "div" and b is not None and b != 0.0 and 1e-300 < abs(1 / b) < 1e300:

@@ -8,11 +8,13 @@ from ccnn_torch.compensation.targets.c99_text import (
     COVARIATES,
     DECLARATIONS,
     DRIVER,
+    FIXED_POINT,
     GIVEN,
     MAKEFILE,
     SD_DECLARATION,
     SD_DRIVER,
     SD_TEST,
+    SECANT,
     SELFTEST,
     SMALLER,
 )
@@ -150,6 +152,9 @@ def _source(form: Form, texts: list[Text], dialect: Dialect) -> str:
             parts += [SMALLER.format(name=name, sign=sign)]
     m = len(form.covariates)
     driver = DRIVER + (SD_DRIVER if form.spread is not None else "")
+    for key, text in (FIXED_POINT if form.secant is None else SECANT).items():
+        driver = driver.replace(key, text)
+    driver = driver.replace("@SIZE@", str(form.kept))
     driver = driver.replace("@EPS@", dialect.literal(8 * float(np.finfo(form.dtype).eps))).replace("fabs(", f"fabs{s}(")
     driver = driver.replace("@STEPS@", str(form.iterations)).replace("@ZERO@", dialect.literal(0.0))
     for key, with_covariates in COVARIATES.items():

@@ -6,11 +6,13 @@ __all__ = [
     "COVARIATES",
     "DECLARATIONS",
     "DRIVER",
+    "FIXED_POINT",
     "GIVEN",
     "MAKEFILE",
     "SD_DECLARATION",
     "SD_DRIVER",
     "SD_TEST",
+    "SECANT",
     "SELFTEST",
     "SMALLER",
 ]
@@ -50,13 +52,13 @@ DRIVER = """int ccnn_compensate(const ccnn_real joints[], const ccnn_real covari
                     ccnn_real deviation[])
 {
     ccnn_real q[CCNN_JOINTS], at[CCNN_JOINTS], found[CCNN_JOINTS], strange[1], excess[1];
-@XDECLARE@@GIVEN@    ccnn_clean(joints@XSET@, q@X@, strange);
+@KEPT@@XDECLARE@@GIVEN@    ccnn_clean(joints@XSET@, q@X@, strange);
     int good = !(strange[0] > @ZERO@);
     if (good) {
         ccnn_deviation(q@X@, found, excess);
         for (int k = 0; k < @STEPS@; k++) {
-            for (int j = 0; j < CCNN_JOINTS; j++) {
-                at[j] = q[j] - found[j];
+@NEXT@            for (int j = 0; j < CCNN_JOINTS; j++) {
+                at[j] = q[j] - @CORRECTION@[j];
             }
             ccnn_deviation(at@X@, found, excess);
         }
@@ -88,6 +90,22 @@ int ccnn_ideal(const ccnn_real command[], const ccnn_real covariates[], ccnn_rea
     return strange[0] > @ZERO@ ? 2 : (good && excess[0] <= @ZERO@ ? 0 : 1);
 }
 """
+
+# What changes where steps are those of Broyden's method: the printed function returns what it took, one step on.
+SECANT = {
+    "@KEPT@": "    ccnn_real correction[CCNN_JOINTS] = {@ZERO@}, steps[@SIZE@] = {@ZERO@};\n"
+    "    ccnn_real next[CCNN_JOINTS], done[@SIZE@];\n",
+    "@NEXT@": """            ccnn_secant(found, correction, steps, next, done);
+            for (int j = 0; j < CCNN_JOINTS; j++) {
+                correction[j] = next[j];
+            }
+            for (int j = 0; j < @SIZE@; j++) {
+                steps[j] = done[j];
+            }
+""",
+    "@CORRECTION@": "correction",
+}
+FIXED_POINT = {"@KEPT@": "", "@NEXT@": "", "@CORRECTION@": "found"}
 
 SD_DRIVER = """
 int ccnn_deviation_sd(const ccnn_real command[], const ccnn_real covariates[], ccnn_real sd[])

@@ -6,14 +6,17 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 
 from ccnn_torch.compensation.compensator import Compensator
+from ccnn_torch.compensation.export.export import export_onnx
 from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry, load_compensation
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.model_files.save import save_model
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
+from ccnn_torch.compensation.targets.from_geometry import compensator_of_geometry
 from ccnn_torch.compensation.targets.from_model import form_of
 from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal
 from ccnn_torch.compensation.targets.linuxcnc import print_linuxcnc
@@ -26,12 +29,14 @@ from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 from ccnn_torch.spelling import nearest
 from ccnn_torch.version import __version__
 
-__all__ = ["DTYPES", "TARGETS", "export_model"]
+__all__ = ["COMMAND", "DTYPES", "TARGETS", "export_model"]
 
 DTYPES = ("float64", "float32")
+# What a controller needs: without the way back and the standard deviation a graph takes three quarters of the time.
+COMMAND = ("command", "deviation", "inside_domain")
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Order:
     """What is to be exported, and how; the parts that targets need are made when they ask."""
 
@@ -40,14 +45,12 @@ class _Order:
     dtype: str
     sd: bool
     allow_code: bool
+    told: str = ""
 
     def compensator(self) -> Compensator:
-        if not isinstance(self.model, LoadedModel):
-            raise ModelFileError(
-                f"{self.path}: identified geometry alone is solved by iteration until it converges, which this target "
-                "cannot; export it as linuxcnc or urdf, or train with it (ccnn run … geometry=identify) and export "
-                "that model.safetensors"
-            )
+        if isinstance(self.model, IdentifiedGeometry):
+            made, self.told = compensator_of_geometry(self.model)
+            return made
         if self.model.compensator is None:
             raise ModelFileError(f"{self.path}: an export is made of the master; give the .safetensors beside it")
         return self.model.compensator
@@ -55,7 +58,7 @@ class _Order:
     def proven(self) -> tuple[Form, Golden]:
         compensator = self.compensator()
         form = form_of(compensator, self.dtype, self.sd)
-        form.facts = [f"Compensation of the joints of {self.source()}."]
+        form.facts = [f"Compensation of the joints of {self.source()}.", *([self.told] if self.told else [])]
         golden = golden_vectors(compensator, form)
         require_equal(form, golden)
         return form, golden
@@ -82,18 +85,23 @@ def _linuxcnc(order: _Order) -> dict[str, str]:
 
 
 def _onnx(order: _Order) -> dict[str, bytes]:
-    compensator = order.compensator()
-    assert isinstance(order.model, LoadedModel)
-    fields = {key: order.model.facts[key] for key in ("mechanism", "metrics", "data_sha256", "seed")}
+    compensator, facts = order.compensator(), order.model.facts
+    if isinstance(order.model, IdentifiedGeometry):
+        # Nothing was measured for this file but what identified the machine.
+        facts = facts | {"metrics": {}, "data_sha256": sha256(order.path.read_bytes()).hexdigest(), "seed": 0}
+    fields = {key: facts[key] for key in ("mechanism", "metrics", "data_sha256", "seed")}
     made = Path(tempfile.mkdtemp())
     try:
         paths = save_model(made, compensator, fields, forms=("onnx", "float32.onnx"))
-        return {path.name: path.read_bytes() for path in paths.values()}
+        files = {path.name: path.read_bytes() for path in paths.values()}
     finally:
         shutil.rmtree(made)
+    return files | {"controller.onnx": export_onnx(compensator, "{}", COMMAND)}
 
 
 def _table(order: _Order) -> dict[str, str]:
+    if isinstance(order.model, IdentifiedGeometry):
+        return print_tables(order.compensator(), order.model.nominal)
     known = "spec" in order.model.facts["mechanism"]
     return print_tables(order.compensator(), order.mechanism() if known else None)
 
@@ -120,7 +128,7 @@ def export_model(
     """Write a model as source code, table or file of a controller or simulator.
 
     Args:
-        path: a .safetensors file; for `linuxcnc` and `urdf` an identified.yaml, too.
+        path: a .safetensors file, or an identified.yaml.
         to: `c99`, `st` (IEC 61131-3 Structured Text), `linuxcnc` (kinematics component), `onnx`, `urdf` (with MuJoCo
             model and DH table), or `table` (error tables).
         out: folder; made where it is not there.

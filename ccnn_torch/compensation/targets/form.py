@@ -147,13 +147,15 @@ class Form:
 
     Attributes:
         joints, covariates: headers `name[unit]` in order.
-        iterations: steps of the fixed point.
+        iterations: steps from the joints to their command.
         limit: of |deviation|, `n` [SI].
         slack: how far command + deviation may be from the joints before the model is not trusted, `n` [SI].
         fallback_sd: standard deviation where the deviation is taken as 0, `n` [SI].
         dtype: `float64` or `float32`.
         clean: (given joints and covariates) -> finite `joints`, `covariates`, and how many were not, `strange`.
         deviation: (commanded joints, covariates) -> `deviation`, and `excess`: above 0 outside the domain.
+        secant: (`found` deviation, `correction`, `steps` before) -> the next `correction` and `steps`; None where that
+            correction is the deviation that was found.
         spread: (commanded joints, covariates) -> `sd`; None where it was not asked for.
         facts: lines about the model for a reader: where it came from.
     """
@@ -167,19 +169,26 @@ class Form:
     dtype: str
     clean: Program
     deviation: Program
+    secant: Program | None
     spread: Program | None
     facts: list[str] = field(default_factory=list)
 
     @property
     def programs(self) -> list[Program]:
         """Those that there are."""
-        return [self.clean, self.deviation] + ([self.spread] if self.spread else [])
+        return [p for p in (self.clean, self.deviation, self.secant, self.spread) if p is not None]
+
+    @property
+    def kept(self) -> int:
+        """How many numbers `secant` takes with it from step to step."""
+        return len(self.secant.outputs["steps"]) if self.secant else 0
 
     def operations(self) -> Counter[str]:
         """Of one command."""
         count = self.clean.operations()
-        for op, times in self.deviation.operations().items():
-            count[op] += times * (self.iterations + 1)
+        for program, calls in ((self.deviation, self.iterations + 1), (self.secant, self.iterations)):
+            for op, times in (program.operations() if program else {}).items():
+                count[op] += times * calls
         return count
 
 

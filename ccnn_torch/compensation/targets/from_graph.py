@@ -275,6 +275,17 @@ class _Lowering:
         dims = [*range(value.ids.dim())] if dims is None else [dims] if isinstance(dims, int) else [*dims]
         return self.each("sqrt", self.reduced("add", self._square(value), dims, keep))
 
+    def _linalg_cross(self, a: Any, b: Any, dim: int = -1) -> Any:
+        turned = [[self._turned(v, k, dim) for k in (1, 2)] for v in (a, b)]
+        (next_a, last_a), (next_b, last_b) = turned
+        return self.each("sub", self.each("mul", next_a, last_b), self.each("mul", last_a, next_b))
+
+    def _turned(self, value: Any, places: int, dim: int) -> Any:
+        """The coordinates of vectors, so many places on."""
+        if isinstance(value, Value):
+            return Value(torch.roll(value.ids, -places, dim))
+        return torch.roll(value, -places, dim)
+
     def _gt(self, a: Any, b: Any) -> Any:
         return self.each("lt", b, a)
 

@@ -12,6 +12,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.contraction import Steepness, iterations_needed
+from ccnn_torch.compensation.secant import Step
 from ccnn_torch.compensation.targets.form import Form, Program
 from ccnn_torch.compensation.targets.from_graph import program_of
 
@@ -47,6 +48,19 @@ class _Step(nn.Module):
         return found.value, found.excess, self.compensator._sd(found)
 
 
+class _Next(nn.Module):
+    def __init__(self, compensator: Compensator) -> None:
+        super().__init__()
+        self.compensator = compensator
+
+    def forward(self, found: Tensor, correction: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
+        """The next correction, and all steps before but the oldest with this one: so many numbers as before."""
+        pairs = steps.reshape(*found.shape[:-1], -1, 2, found.shape[-1]).unbind(-3)
+        before = [Step(*pair.unbind(-2)) for pair in pairs]
+        correction, after = self.compensator.next_correction(found, correction, before)
+        return correction, torch.cat([number for step in after[1:] for number in step], -1)
+
+
 def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) -> Form:
     """The form of a fitted compensator.
 
@@ -62,13 +76,20 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     iterations = compensator.iterations
     if dtype == "float32":
         compensator.domain.huge.fill_(_HUGE_SINGLE)
-        iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), SINGLE_TOLERANCE / 10)
+        if not compensator.secant:
+            iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), SINGLE_TOLERANCE / 10)
     n = len(compensator.joints)
     point = compensator.domain.centre.unsqueeze(0)
     example = (point[:, :n].clone(), point[:, n:].clone())[: 2 if compensator.covariates else 1]
     names = ("joints", "covariates")[: len(example)]
 
     kept: list[list[str | None]] = [["deviation", "excess", None], *([[None, None, "sd"]] if sd else [])]
+    secant = None
+    if compensator.secant:
+        # Each of its own: what is traced is told apart by its tensor.
+        blank = [torch.zeros(1, k * n, dtype=torch.float64) for k in (1, 1, 2 * max(1, iterations - 1))]
+        given = ("found", "correction", "steps")
+        secant = traced_program(_Next(compensator), (*blank,), "secant", given, [*given[1:]])
     (clean,) = _programs(_Clean(compensator), example, "clean", names, [["joints", "covariates", "strange"]])
     deviation, *spread = _programs(_Step(compensator), example, "deviation", names, kept)
     for one in spread:
@@ -84,6 +105,7 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
         dtype,
         clean,
         deviation,
+        secant,
         spread[0] if spread else None,
     )
 

@@ -197,9 +197,10 @@ def costs(form: Form) -> list[str]:
     tables = {values.tobytes(): len(values) for program in form.programs for values in program.tables.values()}
     arrays = max(sum(program.sizes[b] for b in program.buffers) for program in form.programs)
     parts = {what: sum(count[op] for op in ops) for what, ops in _COUNTED.items()}
+    method = "Broyden's method" if form.secant else "the fixed point"
     return [
         f"Tables: {width * sum(tables.values())} bytes. Arrays at work: {width * arrays} bytes at most.",
-        f"Operations of one command ({form.iterations} steps of the fixed point), always the same: "
+        f"Operations of one command ({form.iterations} steps of {method}), always the same: "
         + ", ".join(f"{times} {what}" for what, times in parts.items() if times)
         + ".",
     ]

@@ -89,9 +89,14 @@ def run_form(form: Form, joints: Array, covariates: Array | None) -> dict[str, A
         return found["deviation"], found["excess"][:, 0]
 
     first, first_excess = last, excess = deviation(q)
-    command = q
+    command, correction, steps = q, np.zeros_like(q), np.zeros((len(q), form.kept), form.dtype)
     for _ in range(form.iterations):
-        command = q - last
+        if form.secant is None:
+            correction = last
+        else:
+            before = {"found": last, "correction": correction, "steps": steps}
+            correction, steps = run_program(form.secant, before, form.dtype).values()
+        command = q - correction
         last, excess = deviation(command)
     eps = np.finfo(form.dtype).eps
     trusted = np.abs(command + last - q) <= form.slack + 8 * eps * (np.abs(q) + np.abs(last))

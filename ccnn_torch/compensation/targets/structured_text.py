@@ -11,9 +11,11 @@ from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
 from ccnn_torch.compensation.targets.structured_text_blocks import (
     COMPENSATE,
+    FIXED_POINT,
     IDEAL,
     README,
     SD,
+    SECANT,
     SELFTEST,
 )
 from ccnn_torch.errors import MethodFailedError
@@ -156,6 +158,9 @@ def _block(program: Program, text: Text, form: Form) -> str:
 def _filled(template: str, form: Form, constants: dict[str, Array]) -> str:
     """A block around the programs, with its names, sizes and numbers."""
     real, m = _real(form), len(form.covariates)
+    for key, text in (FIXED_POINT if form.secant is None else SECANT).items():
+        template = template.replace(key, text)
+    template = template.replace("@LAST@", str(form.kept - 1))
     found = (
         template.replace("@N@", str(len(form.joints) - 1)).replace("@M@", str(max(m, 1) - 1)).replace("@REAL@", real)
     )

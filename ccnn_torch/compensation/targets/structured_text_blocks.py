@@ -4,9 +4,11 @@ from __future__ import annotations
 
 __all__ = [
     "COMPENSATE",
+    "FIXED_POINT",
     "IDEAL",
     "README",
     "SD",
+    "SECANT",
     "SELFTEST",
 ]
 
@@ -27,16 +29,16 @@ END_VAR
 VAR
     clean : CCNN_Clean_;
     delta : CCNN_Deviation_;
-    here : ARRAY[0..@N@] OF @REAL@;
+@KEPT@    here : ARRAY[0..@N@] OF @REAL@;
     rounding : @REAL@;
     good : BOOL;
     j, k : DINT;
 END_VAR
 clean(joints := joints@GIVEN@);
 delta(joints := clean.joints_out@X@);
-FOR k := 1 TO @STEPS@ DO
-    FOR j := 0 TO @N@ DO
-        here[j] := clean.joints_out[j] - delta.deviation_out[j];
+@BLANK@FOR k := 1 TO @STEPS@ DO
+@NEXT@    FOR j := 0 TO @N@ DO
+        here[j] := clean.joints_out[j] - @CORRECTION@[j];
     END_FOR
     delta(joints := here@X@);
 END_FOR
@@ -58,6 +60,31 @@ ELSE
     status := 1;
 END_IF
 END_FUNCTION_BLOCK"""
+
+# What changes where steps are those of Broyden's method.
+SECANT = {
+    "@KEPT@": """    secant : CCNN_Secant_;
+    correction : ARRAY[0..@N@] OF @REAL@;
+    steps : ARRAY[0..@LAST@] OF @REAL@;
+""",
+    "@BLANK@": """FOR j := 0 TO @N@ DO
+    correction[j] := @ZERO@;
+END_FOR
+FOR j := 0 TO @LAST@ DO
+    steps[j] := @ZERO@;
+END_FOR
+""",
+    "@NEXT@": """    secant(found := delta.deviation_out, correction := correction, steps := steps);
+    FOR j := 0 TO @N@ DO
+        correction[j] := secant.correction_out[j];
+    END_FOR
+    FOR j := 0 TO @LAST@ DO
+        steps[j] := secant.steps_out[j];
+    END_FOR
+""",
+    "@CORRECTION@": "correction",
+}
+FIXED_POINT = {"@KEPT@": "", "@BLANK@": "", "@NEXT@": "", "@CORRECTION@": "delta.deviation_out"}
 
 IDEAL = """(* The way back: ideal joints of a command, or of joints fed back. *)
 FUNCTION_BLOCK CCNN_Ideal
