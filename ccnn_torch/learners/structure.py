@@ -25,6 +25,8 @@ _PASSES = 2
 # Log evidence per measured value by which a member may fall short of the best and still be averaged. That is a lot: a
 # descent that failed. Evidence is too rough a guide to leave out more; averages did better than the best member.
 _SHORT = 0.5
+# Iterations of the refit, in units of those of any other descent: it ends where its evidence does.
+_LAST = 3
 
 
 class MemberRows(NamedTuple):
@@ -79,7 +81,9 @@ class Structure:
         channels = outputs if rows.metric is None else rows.metric.shape[-2]
         zeros = partial(torch.zeros, dtype=self.evidence.dtype, device=self.evidence.device)
         self.precisions = Precisions(
-            zeros(len(self.evidence), int(groups.max()) + 1), zeros(len(self.evidence), channels), zeros(len(self.evidence))
+            zeros(len(self.evidence), int(groups.max()) + 1),
+            zeros(len(self.evidence), channels),
+            zeros(len(self.evidence)),
         )
         # Whether a search found nothing in what these networks leave: the next one would not either.
         self._searched = False
@@ -225,9 +229,7 @@ class Structure:
         plain = Bundle(masks, weights, no_waves(tuple(masks[0].shape[:1]), 0, weights[0]))
         return resized(plain, self.slots)
 
-    def _descend(
-        self, model: Bundle, index: Tensor, known: Precisions | None
-    ) -> tuple[Bundle, Tensor, Precisions]:
+    def _descend(self, model: Bundle, index: Tensor, known: Precisions | None) -> tuple[Bundle, Tensor, Precisions]:
         """The refined networks, their log evidence and precisions. index: which of the `b` networks the model has."""
         rows = self.rows.of(index)
         outputs = rows.targets.shape[-1]
@@ -240,7 +242,7 @@ class Structure:
             rows.inputs,
             rows.targets,
             rows.weights,
-            RefinementSettings(iterations=self.settings.refinement_iterations),
+            RefinementSettings(iterations=self.settings.refinement_iterations * (1 if known is None else _LAST)),
             rows.metric,
             small.waves,
             known and known._replace(prior=resized_prior(known.prior, outputs, self.slots, used)),
