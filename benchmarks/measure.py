@@ -22,6 +22,8 @@ Call = Callable[[], Any]
 
 # A round of a short task repeats it until it has taken so long [s]; the clock's own steps are far below.
 _ROUND = 0.03
+# A task so long is not run once more than its rounds say [s].
+_LONG = 2.0
 # Size of the product that the machine's limit is measured with: 100 ms at 20 GFLOP/s would disturb the rounds.
 _GEMM = 512
 
@@ -90,9 +92,13 @@ def compare(
     if flops:
         square = torch.ones(_GEMM, _GEMM, dtype=torch.float64)
         calls["gemm"] = (lambda: square @ square, 1.0)
-    # The first call of each is not measured: it fills caches, and says how often to repeat.
-    often = {name: max(1, int(_ROUND / max(seconds_of(call), 1e-6))) for name, (call, _) in calls.items()}
+    # The first call of each fills caches and says how often to repeat; of a long task it is a round.
+    first = {name: seconds_of(call) for name, (call, _) in calls.items()}
+    often = {name: max(1, int(_ROUND / max(taken, 1e-6))) for name, taken in first.items()}
     times: dict[str, list[float]] = {name: [] for name in calls}
+    if first[""] > _LONG:
+        times = {name: [taken / calls[name][1]] for name, taken in first.items()}
+        rounds -= 1
     for _ in range(rounds):
         for name, (call, share) in calls.items():
             times[name].append(seconds_of(lambda c=call, n=often[name]: [c() for _ in range(n)]) / often[name] / share)

@@ -4,9 +4,9 @@ For a tripod with a CCNN 3-6-6-3 (all connections, then 40 % of them) and the mo
 our C in double and single precision, and for the dense tripod C written by hand with the same network, guard and fixed
 point. Every way follows one trajectory, as a controller of 1 kHz would send it: a million commands (a hundredth with
 `--quick`, and again in Python) along sines in the domain, one after the other, each between two readings of the clock:
-p50, with p99 and largest in the note. The C program counts calls of malloc, calloc and realloc in its loop. Then 100,000
-vectors, in and out of the domain, by all ways: largest difference of the deviation from the eager model's, as a share
-of the limit.
+p50, with p99 and largest in the note. The C program counts calls of malloc, calloc and realloc in its loop. Then
+100,000 vectors, in and out of the domain, by all ways: largest difference of the deviation from the eager model's, as a
+share of the limit.
 """
 
 from __future__ import annotations

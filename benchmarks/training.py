@@ -25,7 +25,7 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
 
         def perceptrons(x: object = x, y: object = y) -> list[MLPRegressor]:
             keys = {"activation": "logistic", "solver": "lbfgs", "max_iter": 2000}
-            return [MLPRegressor((24,), random_state=k, **keys).fit(x, y) for k in range(MEMBERS)]
+            return [MLPRegressor(hidden_layer_sizes=(24,), random_state=k, **keys).fit(x, y) for k in range(MEMBERS)]
 
         yield from compare(
             "train the default network, 3 outputs",

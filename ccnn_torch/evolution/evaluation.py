@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.genome import Genome
+from ccnn_torch.numerics.blocks import block_size
 
 __all__ = ["Task", "fitness", "joined_errors", "make_task", "network_errors"]
 
@@ -91,7 +92,7 @@ def joined_errors(
     sets = representatives[0].mask.shape[1]
     widest = max(genome.mask.shape[-2] for genome in representatives)
     each = max(1, sets * widest * task.inputs.shape[-1])
-    block = block or _BLOCK.get(population.weight.device.type, _BLOCK_ELSEWHERE)
+    block = block or _block(population.weight.device)
     columns = min(individuals, max(1, block // each))
     rows = max(1, block // (each * columns))
     if rows >= repeats and columns >= individuals:
@@ -126,7 +127,7 @@ def network_errors(networks: Sequence[Genome], task: Task, block: int | None = N
     """
     repeats, count = networks[0].mask.shape[:2]
     each = max(genome.mask.shape[-2] for genome in networks) * task.inputs.shape[-1]
-    block = block or _BLOCK.get(task.inputs.device.type, _BLOCK_ELSEWHERE)
+    block = block or _block(task.inputs.device)
     columns = min(count, max(1, block // each))
     rows = max(1, block // (each * columns))
     parts = []
@@ -144,6 +145,11 @@ def network_errors(networks: Sequence[Genome], task: Task, block: int | None = N
         ]
         parts.append(torch.cat(pieces, dim=-1))
     return torch.cat(parts)[:, 0]
+
+
+def _block(device: torch.device) -> int:
+    """Activations at a time: what suits the device, and the budget of memory holds (in, out, and the masks')."""
+    return min(_BLOCK.get(device.type, _BLOCK_ELSEWHERE), block_size(3 * 8))
 
 
 def _errors(layer: int | None, population: Genome | None, representatives: Sequence[Genome], task: Task) -> Tensor:

@@ -45,6 +45,6 @@ def _wave_layer(last: int) -> int:
 def resized_prior(prior: Tensor, outputs: int, before: int, after: int) -> Tensor:
     """Prior precisions `... x g` for another number of slots; those of new ones are 0 (not known)."""
     plain, waves, last = torch.split(prior, [prior.shape[-1] - outputs * before - 1, outputs * before, 1], -1)
-    waves = waves.unflatten(-1, (outputs, before))
+    waves = waves.reshape(*waves.shape[:-1], outputs, before)
     kept = waves[..., : min(before, after)]
     return torch.cat([plain, nn.functional.pad(kept, (0, after - kept.shape[-1])).flatten(-2), last], -1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from operator import itemgetter
 from typing import NamedTuple
 
 import torch
@@ -17,6 +17,7 @@ from ccnn_torch.evolution.priors import prior_groups, resized_prior
 from ccnn_torch.evolution.refinement import Precisions, RefinementSettings, refine
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves
+from ccnn_torch.numerics.blocks import blocks
 
 __all__ = ["MemberRows", "Structure"]
 
@@ -27,6 +28,8 @@ _PASSES = 2
 _SHORT = 0.5
 # Iterations of the refit, in units of those of any other descent: it ends where its evidence does.
 _LAST = 3
+# Matrices of weights by weights that a descent holds at a time.
+_MATRICES = 6
 
 
 class MemberRows(NamedTuple):
@@ -79,12 +82,8 @@ class Structure:
             [mask.shape[-2:] for mask in self.refined.masks], settings.bias, RefinementSettings().groups, self.slots
         )
         channels = outputs if rows.metric is None else rows.metric.shape[-2]
-        zeros = partial(torch.zeros, dtype=self.evidence.dtype, device=self.evidence.device)
-        self.precisions = Precisions(
-            zeros(len(self.evidence), int(groups.max()) + 1),
-            zeros(len(self.evidence), channels),
-            zeros(len(self.evidence)),
-        )
+        batch, zeros = len(self.evidence), self.evidence.new_zeros
+        self.precisions = Precisions(zeros(batch, int(groups.max()) + 1), zeros(batch, channels), zeros(batch))
         # Whether a search found nothing in what these networks leave: the next one would not either.
         self._searched = False
         self._first: dict[str, Tensor] | None = None
@@ -231,6 +230,26 @@ class Structure:
 
     def _descend(self, model: Bundle, index: Tensor, known: Precisions | None) -> tuple[Bundle, Tensor, Precisions]:
         """The refined networks, their log evidence and precisions. index: which of the `b` networks the model has."""
+        # Matrices of a network, at their largest: the normal matrix, its factors, its inverse.
+        weights = sum(int(mask.flatten(1).sum(1).max()) + mask.shape[-2] for mask in model.masks)
+        parts = []
+        for few in blocks(len(index), _MATRICES * 8 * weights**2):
+            here = None if known is None else Precisions(*(part[few] for part in known))
+            parts.append(self._descend_together(mapped(model, itemgetter(few)), index[few], here))
+        if len(parts) == 1:
+            return parts[0]
+        bundles, evidence, precisions = zip(*parts, strict=True)
+        names = bundles[0].tensors
+        return (
+            Bundle.from_tensors({name: torch.cat([one.tensors[name] for one in bundles]) for name in names}),
+            torch.cat(evidence),
+            Precisions(*(torch.cat(part) for part in zip(*precisions, strict=True))),
+        )
+
+    def _descend_together(
+        self, model: Bundle, index: Tensor, known: Precisions | None
+    ) -> tuple[Bundle, Tensor, Precisions]:
+        """The same of as many networks as the budget of memory holds."""
         rows = self.rows.of(index)
         outputs = rows.targets.shape[-1]
         # Slots are filled from the first on: those that are free in every network need not be carried along.
