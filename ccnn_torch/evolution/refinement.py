@@ -29,6 +29,7 @@ from ccnn_torch.evolution.refinement_state import (
     RefinementSettings,
     RefinementState,
     SecondOrder,
+    chosen_state,
     part_of_problem,
     part_of_state,
     put_part,
@@ -108,7 +109,7 @@ def refine(
         if problem.settings.bayesian and int(state.iteration) > problem.settings.warm_up:
             evidence = log_evidence(part, now, local)
             risen = evidence > highest[going]
-            best = put_part(best, going[risen], part_of_state(now, torch.nonzero(risen).flatten()))
+            best = put_part(best, going, chosen_state(risen, now, part_of_state(best, going)))
             much = evidence > highest[going] + _NATS
             stale = stale.index_copy(0, going, torch.where(much, 0, stale[going] + 1))
             highest = highest.index_copy(0, going, torch.where(risen, evidence, highest[going]))
@@ -193,7 +194,8 @@ def start_refinement(
         noise=noise,
         effective=effective,
         calm=torch.zeros(batch, dtype=torch.int64, device=flat.device),
-        iteration=torch.zeros((), dtype=torch.int64, device=flat.device),
+        # Counted by the host, which need not wait to read it.
+        iteration=torch.zeros((), dtype=torch.int64, device="cpu"),
     )
     if not settings.bayesian:
         return state
@@ -231,10 +233,10 @@ def step_refinement(
         candidate = state.weights[todo].scatter_add(1, kept[todo], -step)
         after = _objective(part_of_problem(problem, todo), part_of_state(state, todo), candidate)
         good = (failed == 0) & (after < before[todo])
-        taken = todo[good]
-        weights = weights.index_copy(0, taken, candidate[good])
-        reached = reached.index_copy(0, taken, after[good])
+        weights = weights.index_copy(0, todo, torch.where(good.unsqueeze(-1), candidate, weights[todo]))
+        reached = reached.index_copy(0, todo, torch.where(good, after, reached[todo]))
         damping = damping.index_copy(0, todo, torch.where(good, damping[todo] / 10, damping[todo] * 10))
+        # The host waits for the device here, once a trial: most iterations need one, and none takes up the others.
         todo = todo[~good]
         if len(todo) == 0:
             break

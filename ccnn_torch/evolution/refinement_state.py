@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Literal, NamedTuple
 
+import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.gauss_newton import Network
@@ -17,6 +18,7 @@ __all__ = [
     "RefinementSettings",
     "RefinementState",
     "SecondOrder",
+    "chosen_state",
     "part_of_problem",
     "part_of_state",
     "put_part",
@@ -214,6 +216,17 @@ def part_of_state(state: RefinementState, index: Tensor) -> RefinementState:
     """The state of some of the networks."""
     tensors = state.state_dict()
     return RefinementState(**{name: value[index] if value.dim() else value for name, value in tensors.items()})
+
+
+def chosen_state(first: Tensor, one: RefinementState, other: RefinementState) -> RefinementState:
+    """Network by network, `one` where `first` (`b` bool) is set; the iteration is that of `one`."""
+    ours, theirs = one.state_dict(), other.state_dict()
+    return RefinementState(
+        **{
+            name: torch.where(first.view(-1, *([1] * (value.dim() - 1))), value, theirs[name]) if value.dim() else value
+            for name, value in ours.items()
+        }
+    )
 
 
 def put_part(state: RefinementState, index: Tensor, part: RefinementState) -> RefinementState:
