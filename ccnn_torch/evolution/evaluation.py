@@ -25,6 +25,8 @@ _FORCED_OFF = -1e4
 # cache (measured: flat from 2^18 to 2^20, a third slower at 2^22); an accelerator wants to be filled.
 _BLOCK = {"cpu": 1 << 19}
 _BLOCK_ELSEWHERE = 1 << 26
+# Copies of a block that are held at a time.
+_COPIES = 3
 
 
 class Task(NamedTuple):
@@ -149,7 +151,7 @@ def network_errors(networks: Sequence[Genome], task: Task, block: int | None = N
 
 def _block(device: torch.device) -> int:
     """Activations at a time: what suits the device, and the budget of memory holds (in, out, and the masks')."""
-    return min(_BLOCK.get(device.type, _BLOCK_ELSEWHERE), block_size(3 * 8))
+    return block_size(_COPIES * 8, _COPIES * 8 * _BLOCK.get(device.type, _BLOCK_ELSEWHERE))
 
 
 def _errors(layer: int | None, population: Genome | None, representatives: Sequence[Genome], task: Task) -> Tensor:
