@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -21,6 +22,9 @@ from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.structure import MemberRows, Structure
 
 __all__ = ["CCNN", "CCNNSettings"]
+
+# A training with rows held out chooses the number of steps, and a longer one on all rows goes on from its networks.
+_CHOOSING = 3
 
 
 class CCNN:
@@ -76,7 +80,10 @@ class CCNN:
         )
         self._data, self._phase = data, 0
         self._layers = settings.structures(targets.shape[-1])
-        self._structures = [Structure(hidden, settings, rows) for hidden in self._layers]
+        iterations = settings.refinement_iterations
+        if data.validation is not None:
+            iterations = math.ceil(iterations / _CHOOSING)
+        self._structures = [Structure(hidden, settings, rows, iterations) for hidden in self._layers]
 
     def step(self) -> dict[str, Tensor]:
         """One generation, or one refinement or search after the last of them."""

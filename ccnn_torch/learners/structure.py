@@ -26,8 +26,6 @@ _PASSES = 2
 # Log evidence per measured value by which a member may fall short of the best and still be averaged. That is a lot: a
 # descent that failed. Evidence is too rough a guide to leave out more; averages did better than the best member.
 _SHORT = 0.5
-# Iterations of the refit, in units of those of any other descent: it ends where its evidence does.
-_LAST = 3
 # Matrices of weights by weights that a descent holds at a time.
 _MATRICES = 6
 
@@ -69,8 +67,8 @@ class Structure:
     get periodic nodes, in several searches, and are refined again after each. The model is the mean of these members.
     """
 
-    def __init__(self, hidden: tuple[int, ...], settings: CCNNSettings, rows: MemberRows) -> None:
-        self.settings, self.rows = settings, rows
+    def __init__(self, hidden: tuple[int, ...], settings: CCNNSettings, rows: MemberRows, iterations: int) -> None:
+        self.settings, self.rows, self.iterations = settings, rows, iterations
         self.slots = settings.waves if settings.refinement_iterations else 0
         self.kept = min(settings.kept, settings.members) if settings.refinement_iterations else settings.members
         inputs, outputs = rows.task.inputs.shape[1], rows.targets.shape[-1]
@@ -261,7 +259,7 @@ class Structure:
             rows.inputs,
             rows.targets,
             rows.weights,
-            RefinementSettings(iterations=self.settings.refinement_iterations * (1 if known is None else _LAST)),
+            RefinementSettings(iterations=self.iterations),
             rows.metric,
             small.waves,
             known and known._replace(prior=resized_prior(known.prior, outputs, self.slots, used)),
