@@ -106,7 +106,7 @@ def _time(seconds: float) -> str:
 def draw(rows: list[Row], curves: list[dict[str, object]]) -> Figure:
     """Seconds over size, one panel for what is counted; dashed where the last two sizes are drawn on."""
     kinds = sorted({str(c["of"]) for c in curves}) or ["rows"]
-    figure = Figure(figsize=(5.0 * len(kinds), 4.2), layout="constrained")
+    figure = Figure(figsize=(5.0 * len(kinds), 6.0), layout="constrained")
     points = _by_task(rows)
     for axes, kind in zip(np.atleast_1d(figure.subplots(1, len(kinds))), kinds, strict=True):
         for c in (c for c in curves if c["of"] == kind):
@@ -117,5 +117,5 @@ def draw(rows: list[Row], curves: list[dict[str, object]]) -> Figure:
         axes.set(xscale="log", yscale="log", xlabel=kind, ylabel="processor time [s]")
         axes.grid(alpha=0.3)
         if axes.lines:
-            axes.legend(fontsize=7)
+            axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15))
     return figure
