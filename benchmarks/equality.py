@@ -1,4 +1,4 @@
-"""All ways to run a model against PyTorch over 100,000 vectors, for every kind: `python benchmarks/equality.py`.
+"""All ways to run a model against PyTorch over 100,000 vectors, for every kind: `python -m benchmarks.equality`.
 
 Arguments: number of vectors (100000), then further model.safetensors. Prints for each kind of model the largest
 difference of the deviation as a share of the limit, and how often the status is another one: C and ONNX Runtime in
@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 import torch
-from command import session
+
+from benchmarks.command import session
 
 ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "compensation")]

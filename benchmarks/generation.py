@@ -1,24 +1,19 @@
-"""Generations and joined networks a second, beside a plain numpy loop over individuals, measured in the same run.
+"""One generation of the coevolution beside a numpy loop over individuals that does what the batched code does.
 
-    python benchmarks/generation.py
-    python benchmarks/generation.py --populations 80 800 --hidden 12 12 --rows 125 --threads 1
-
-The peer evaluates what the batched code does (every individual joined with the best and three random representatives,
-eq. 11), one joined network after another, its operators one individual at a time. Times are the least of several, in
-process time on one thread and wall time on more, so that a busy machine disturbs little.
+The loop joins every individual with the best and three random representatives (eq. 11), one network after another.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from benchmarks.measure import Row, compare
 from ccnn_torch.evolution import CCNNSettings
 from ccnn_torch.evolution.coevolution import advance, start
 from ccnn_torch.evolution.evaluation import make_task
@@ -27,39 +22,22 @@ Array = NDArray[np.float64]
 Individual = tuple[NDArray[np.bool_], Array]
 
 
-def main() -> None:
-    """Print one table row a population."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--populations", type=int, nargs="+", default=[80, 800])
-    parser.add_argument("--hidden", type=int, nargs="+", default=[12, 12])
-    parser.add_argument("--inputs", type=int, default=3)
-    parser.add_argument("--outputs", type=int, default=3)
-    parser.add_argument("--rows", type=int, default=125)
-    parser.add_argument("--repeats", type=int, default=1, help="runs side by side in the batched code")
-    parser.add_argument("--threads", type=int, default=1)
-    given = parser.parse_args()
-    torch.set_num_threads(given.threads)
-    sizes = [given.inputs, *given.hidden, given.outputs]
-    clock = time.process_time if given.threads == 1 else time.perf_counter
-    print(f"{'-'.join(map(str, sizes))}, {given.rows} rows, {given.repeats} repeats, {given.threads} threads")
-    print(f"{'population':>10} {'generations/s':>14} {'networks/s':>11} {'numpy loop: generations/s':>26} {'ratio':>6}")
-    for population in given.populations:
-        settings = CCNNSettings(hidden=tuple(given.hidden), population=population, generations=120)
-        joined = len(sizes[1:]) * population * (settings.representatives + 1)
-        rate = given.repeats / least_time(batched(sizes, given.rows, given.repeats, settings), clock)
-        peer = 1 / least_time(NumpyLoop(sizes, given.rows, settings).generation, clock)
-        print(f"{population:>10} {rate:>14.1f} {rate * joined:>11.0f} {peer:>26.2f} {rate / peer:>6.1f}")
+SIZES, ROWS = [3, 12, 12, 3], 125
 
 
-def least_time(step: Callable[[], None], clock: Callable[[], float], seconds: float = 3.0) -> float:
-    """Least time of one call over about so many seconds, three calls at least."""
-    step()
-    times: list[float] = []
-    while len(times) < 3 or sum(times) < seconds:
-        began = clock()
-        step()
-        times.append(clock() - began)
-    return min(times)
+def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
+    """The paper's population, and larger ones."""
+    for population in (80,) if quick else (80, 800, 8000):
+        settings = CCNNSettings(hidden=tuple(SIZES[1:-1]), population=population, generations=120)
+        loop = NumpyLoop(SIZES, ROWS, settings).generation if population <= 800 else None
+        yield from compare(
+            f"one generation, 3-12-12-3, {ROWS} rows",
+            3 * population,
+            "individuals",
+            batched(SIZES, ROWS, 1, settings),
+            {"numpy loop": loop} if loop else None,
+            rounds=3,
+        )
 
 
 def toy_rows(sizes: list[int], rows: int) -> tuple[Array, Array]:
@@ -172,7 +150,3 @@ class NumpyLoop:
                 signal = fed / (1 + np.exp(-signal))
         error = np.sqrt(((signal - self.targets) ** 2).sum(1)).mean()
         return 1 / (float(error) + self.settings.epsilon)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,27 +1,17 @@
-"""Time of an identification, beside SciPy's least squares on the same residual, measured in the same run.
+"""Identification of simulated machines beside SciPy's least squares on the same residual.
 
-    python benchmarks/identification.py
-    python benchmarks/identification.py --mechanisms five_bar stewart --machines 1000 --poses 36
-
-Inverse calibration of simulated machines with all parameters free, decorrelated by the pose noise. `solve_lm` works on
-one machine, and on all at once. SciPy's `least_squares` works on one machine after another (a sample of them, for the
-time of all), with its default tolerances and
+All parameters are free, decorrelated by the pose noise. SciPy's `least_squares` has its default tolerances and
 
 * `trf, jacobian_of`: its default method, the Jacobian of the residual by this package's `jacobian_of`;
 * `trf, quick`: the same method, the Jacobian by the routine that `solve_lm` itself uses;
 * `lm, quick`: MINPACK's Levenberg-Marquardt with that Jacobian;
 * `trf, 2-point`: the default method with its own finite differences, as it does without being told.
-
-In each the residual is the same torch function, without gradient. Times are the least of several, in process time on
-one thread, so that a busy machine disturbs little. `off` is the largest difference from SciPy's minimum (at tolerances
-of 1e-15) in standard errors.
 """
 
 from __future__ import annotations
 
-import argparse
-import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,58 +19,44 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from benchmarks.measure import Row, compare
 from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.identification import Problem, inverse_problem, solve_lm, what_is_known
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.numerics.least_squares import jacobian_of
 
 Array = NDArray[np.float64]
-NOISE = 1e-4
+NOISE, POSES = 1e-4, 36
 KINDS: dict[str, dict[str, str]] = {
-    "trf, jacobian_of": {"method": "trf", "jacobian": "plain"},
-    "trf, quick": {"method": "trf", "jacobian": "quick"},
-    "lm, quick": {"method": "lm", "jacobian": "quick"},
-    "trf, 2-point": {"method": "trf", "jacobian": "2-point"},
+    "SciPy trf, jacobian_of": {"method": "trf", "jacobian": "plain"},
+    "SciPy trf, quick": {"method": "trf", "jacobian": "quick"},
+    "SciPy lm, quick": {"method": "lm", "jacobian": "quick"},
+    "SciPy trf, 2-point": {"method": "trf", "jacobian": "2-point"},
 }
 
 
-def main() -> None:
-    """Print one table a mechanism."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mechanisms", nargs="+", default=["five_bar", "stewart"])
-    parser.add_argument("--machines", type=int, default=1000)
-    parser.add_argument("--poses", type=int, default=36)
-    parser.add_argument("--sample", type=int, default=10, help="machines that SciPy works on")
-    given = parser.parse_args()
-    torch.set_num_threads(1)
-    for name in given.mechanisms:
-        compare(name, given.machines, given.poses, given.sample)
-
-
-def compare(name: str, machines: int, poses: int, sample: int) -> None:
-    """One table."""
-    everyone, alone = problems(name, machines, poses, sample)
-    n, k = len(everyone.channels), len(everyone.parameters)
-    print(f"{name}: {poses} poses, {n} joints, {k} parameters; {sample} machines one by one, {machines} at once")
-    together, all_ms = least_time(lambda: solve_lm(everyone), 3)
-    assert bool(together.converged.all()), together.message
-    one = [least_time(lambda p=p: solve_lm(p), 30) for p in alone]
-    ours = float(np.mean([ms for _, ms in one]))
-    exact = [SciPy(p).solve("trf", "quick", xtol=1e-15, ftol=1e-15, gtol=1e-15) for p in alone]
-    sd = [what_is_known(p, torch.from_numpy(x)[None]).sd[0].numpy() for p, x in zip(alone, exact, strict=True)]
-
-    def off(values: list[Array]) -> float:
-        return max(float(np.abs((v - x) / s).max()) for v, x, s in zip(values, exact, sd, strict=True))
-
-    print(f"{'':>18} {'ms a machine':>13} {'off':>8} {'solve_lm alone':>15} {'solve_lm at once':>17}")
-    print(f"{'solve_lm, alone':>18} {ours:>13.2f} {off([fit.values[0].numpy() for fit, _ in one]):>8.0e}")
-    each = all_ms / machines
-    print(f"{'solve_lm, at once':>18} {each:>13.3f} {off([v.numpy() for v in together.values[:sample]]):>8.0e}")
-    for label, keys in KINDS.items():
-        solvers = [SciPy(p) for p in alone]
-        runs = [least_time(lambda s=s, q=keys: s.solve(**q), 10) for s in solvers]
-        ms = float(np.mean([t for _, t in runs]))
-        print(f"{label:>18} {ms:>13.2f} {off([x for x, _ in runs]):>8.0e} {ms / ours:>14.1f}x {ms / each:>16.1f}x")
+def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
+    """One machine, and 10 to 1,000 at once; SciPy works on one after the other, a sample of them."""
+    for name in ("five_bar",) if quick else ("five_bar", "stewart"):
+        for machines in (1, 30, 1000):
+            sample = 1 if machines == 1 else 3
+            everyone, alone = problems(name, machines, POSES, sample)
+            solvers = [SciPy(p) for p in alone]
+            found, exact = solve_lm(everyone), [s.solve("trf", "quick", xtol=1e-15, ftol=1e-15) for s in solvers]
+            sd = [what_is_known(p, torch.from_numpy(x)[None]).sd[0].numpy() for p, x in zip(alone, exact, strict=True)]
+            off = max(np.abs((v.numpy() - x) / d).max() for v, x, d in zip(found.values, exact, sd, strict=False))
+            yield from compare(
+                f"identify a {name}, {POSES} poses",
+                machines,
+                "machines",
+                lambda p=everyone: solve_lm(p),
+                {
+                    label: (lambda s=solvers, q=keys: [one.solve(**q) for one in s], sample / machines)
+                    for label, keys in KINDS.items()
+                },
+                rounds=3,
+                note=f"off SciPy's minimum by {off:.0e} standard errors",
+            )
 
 
 def problems(name: str, machines: int, poses: int, sample: int) -> tuple[Problem, list[Problem]]:
@@ -128,17 +104,3 @@ class SciPy:
         slope = self.problem.residual.jacobian(self.point(x), self.problem.data)[1]  # type: ignore[attr-defined]
         values: Array = slope.reshape(-1, len(x)).numpy()
         return values
-
-
-def least_time(call: Callable[[], Any], times: int) -> tuple[Any, float]:
-    """What it returns, and its least process time [ms]."""
-    answer, least = call(), float("inf")
-    for _ in range(times):
-        began = time.process_time()
-        answer = call()
-        least = min(least, time.process_time() - began)
-    return answer, 1000 * least
-
-
-if __name__ == "__main__":
-    main()

@@ -1,19 +1,17 @@
-"""Seconds of a diagnosis of motion for logs of 1e4 and 1e6 samples, and of SciPy on the numbers that it names.
-
-python benchmarks/motion.py
-"""
+"""Diagnosis of motion from logs, and SciPy on the numbers that it names."""
 
 from __future__ import annotations
 
-import sys
-import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.optimize import least_squares
 
+from benchmarks.measure import Row, compare
 from ccnn_torch.motion import diagnose_motion, load_logs, nominal_of
 from ccnn_torch.motion.axis import Drive, simulate_axes
 from ccnn_torch.motion.effects import motion_effects
@@ -39,21 +37,27 @@ def write_log(path: Path, samples: int) -> None:
     np.savetxt(path, table, delimiter=",", header="time[s],run[1],command1[rad],q1[rad]", comments="")
 
 
-def main() -> None:
-    """Print one line for each size, and one for SciPy."""
-    torch.set_num_threads(1)
+def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
+    """Logs read and diagnosed; SciPy fits the three numbers of the two true effects, and nothing else."""
     nominal = nominal_of("servo", KEYS, ["rad"])
     with TemporaryDirectory() as folder:
-        for samples in [int(float(s)) for s in sys.argv[1:]] or [10_000, 1_000_000]:
-            path = Path(folder) / "log.csv"
+        for samples in (2000,) if quick else (10_000, 100_000, 1_000_000):
+            path = Path(folder) / f"{samples}.csv"
             write_log(path, samples)
-            began = time.process_time()
-            logs = load_logs([path])
-            read = time.process_time() - began
-            found = diagnose_motion(logs, nominal).content
-            took = time.process_time() - began
-            print(f"{samples} samples: {took:.1f} s of CPU, {read:.1f} of them reading; {found['verdict']['effects']}")
-        logs = load_logs([path]) if samples <= 20_000 else logs[:5]
+            found = diagnose_motion(load_logs([path]), nominal).content
+            yield from compare(
+                "diagnose a servo in motion",
+                samples,
+                "samples",
+                lambda p=path: diagnose_motion(load_logs([p]), nominal),
+                {"SciPy, the true effects alone": scipy_fit(load_logs([path]), nominal)} if samples <= 10_000 else None,
+                rounds=1,
+                note=f"named: {', '.join(found['verdict']['effects']) or 'none'}",
+            )
+
+
+def scipy_fit(logs: Any, nominal: Any) -> Callable[[], object]:
+    """`least_squares` on the same residual."""
     problem = problem_of(logs, nominal, motion_effects(["delay", "coulomb"]))
     zero = torch.zeros(1, 1, problem.library.size, dtype=torch.float64)
 
@@ -62,14 +66,5 @@ def main() -> None:
         theta[0, 0, :3] = torch.from_numpy(values)
         return problem.pooled(problem.residual(theta))[0, 0][problem.judged].numpy()
 
-    began = time.process_time()
     bounds = ([0.0, 0.0, 0.0], [10.0, 10.0, 4.0])
-    fit = least_squares(residual, np.full(3, 0.3), bounds=bounds, diff_step=1e-4)
-    names = [n.name for n in problem.library.numbers[0]]
-    sizes = [n.scale for n in problem.library.numbers[0]]
-    values = ", ".join(f"{n} {v * s:.4g}" for n, v, s in zip(names, fit.x, sizes, strict=True))
-    print(f"SciPy, these three numbers alone: {time.process_time() - began:.1f} s, {fit.nfev} steps; {values}")
-
-
-if __name__ == "__main__":
-    main()
+    return lambda: least_squares(residual, np.full(3, 0.3), bounds=bounds, diff_step=1e-4)

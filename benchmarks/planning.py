@@ -1,29 +1,30 @@
-"""Candidates per second in pose planning: `python benchmarks/planning.py [CANDIDATES] [POSES]`.
+"""Gain of every candidate pose in one exchange of a plan, beside a loop over determinants.
 
 A step of active calibration asks of every candidate what the determinant of the information would become if it took a
 chosen pose's place. Ours updates determinant and inverse; the plain loop builds the information with each candidate and
 takes its determinant anew, one candidate after the other in numpy, as textbook code does. Both get the same rows and
-one thread, and both must name the same best candidate. The rows are those of a five-bar: one leg (6 parameters, 1
+one thread; both must name the same best candidate. The rows are those of a five-bar: one leg (6 parameters, 1
 equation a pose) and both legs (12 parameters, 2 equations).
 """
 
 from __future__ import annotations
 
-import sys
-import time
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks.measure import Row, compare
 from ccnn_torch.identification import inverse_problem, split_by_leg
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.planning import draw_candidates
 from ccnn_torch.planning.candidates import common_coordinates, identification_rows
-from ccnn_torch.planning.design import Design, _exchange_gain, add_best, exchange, make_design
+from ccnn_torch.planning.design import Design, _exchange_gain, add_best, make_design
 from ccnn_torch.planning.small_matrices import log_determinant, small_cholesky
 
 # Candidates that the plain loop is timed on; all 100,000 would take it half a minute a step.
-_PLAIN = 5000
+PLAIN = 2000
 
 
 def all_gains(design: Design, old: int) -> torch.Tensor:
@@ -41,54 +42,33 @@ def plain_gains(rows: np.ndarray, chosen: list[int], old: int) -> np.ndarray:
     return np.array([np.linalg.slogdet(left + row.T @ row)[1] - base for row in rows])
 
 
-def measure(name: str, rows: torch.Tensor, poses: int) -> None:
-    """Time one step of each kind, and a whole plan."""
-    count = len(rows)
-    held = torch.zeros(rows.shape[-1], dtype=torch.float64)
-    even = rows @ common_coordinates(rows, held, [])
-    start = time.perf_counter()
-    design = make_design(even)
-    for _ in range(poses):
-        add_best(design)
-    design.prior = torch.zeros_like(design.prior)
-    design.refresh()
-    added = time.perf_counter() - start
-    old = design.chosen[0]
-    all_gains(design, old)
-    start = time.perf_counter()
-    for _ in range(5):
-        gains = all_gains(design, old)
-    step = (time.perf_counter() - start) / 5
-    part = even[:_PLAIN].numpy()
-    shifted = np.concatenate([part, even[design.chosen].numpy()])
-    chosen = list(range(len(part), len(shifted)))
-    start = time.perf_counter()
-    plain = plain_gains(shifted, chosen, chosen[0])[: len(part)]
-    loop = (time.perf_counter() - start) / len(shifted)
-    assert int(plain.argmax()) == int(gains[: len(part)].argmax())
-    assert np.allclose(plain, gains[: len(part)].numpy(), atol=1e-7)
-    start = time.perf_counter()
-    settled = exchange(design)
-    exchanged = time.perf_counter() - start
-    print(f"{name}: {count} candidates, {poses} poses, {rows.shape[1]} x {rows.shape[2]} rows")
-    print(f"  updates      {count / step:12.3g} candidates a second")
-    print(f"  plain loop   {1 / loop:12.3g} candidates a second; ratio {count / step * loop:.0f}")
-    print(f"  whole plan   {added:.2f} s adding, {exchanged:.2f} s exchanging{'' if settled else ' (not settled)'}")
-
-
-def main(count: int, poses: int) -> None:
-    """Measure and print."""
-    torch.set_num_threads(1)
+def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
+    """A step of the exchange over many candidates, for one leg and for both."""
     mechanism = load_mechanism("five_bar")
-    start = time.perf_counter()
+    count, poses = (20_000, 18) if quick else (100_000, 18)
     found = draw_candidates(mechanism, count)
     problem = inverse_problem(mechanism, found.joints, found.pose, pose_noise=1e-4, per_leg=True)
     leg = identification_rows(split_by_leg(problem)[0])
-    common = identification_rows(inverse_problem(mechanism, found.joints, found.pose, pose_noise=1e-4))
-    print(f"{count} candidates drawn, their rows differentiated: {time.perf_counter() - start:.1f} s")
-    measure("one leg", leg, poses)
-    measure("both legs", common, 2 * poses)
-
-
-if __name__ == "__main__":
-    main(*(int(word) for word in (sys.argv[1:] + ["100000", "18"][len(sys.argv) - 1 :])))
+    both = identification_rows(inverse_problem(mechanism, found.joints, found.pose, pose_noise=1e-4))
+    for name, rows, many in (("one leg", leg, poses), ("both legs", both, 2 * poses)):
+        held = torch.zeros(rows.shape[-1], dtype=torch.float64)
+        even = rows @ common_coordinates(rows, held)
+        design = make_design(even)
+        for _ in range(many):
+            add_best(design)
+        design.prior = torch.zeros_like(design.prior)
+        design.refresh()
+        old = design.chosen[0]
+        shifted = np.concatenate([even[:PLAIN].numpy(), even[design.chosen].numpy()])
+        chosen = list(range(PLAIN, len(shifted)))
+        gains, plain = all_gains(design, old)[:PLAIN].numpy(), plain_gains(shifted, chosen, chosen[0])[:PLAIN]
+        assert gains.argmax() == plain.argmax()
+        np.testing.assert_allclose(plain, gains, atol=1e-7)
+        yield from compare(
+            f"gain of every candidate pose, {name} of a five-bar",
+            count,
+            "candidates",
+            lambda design=design, old=old: all_gains(design, old),
+            {"numpy loop": (lambda r=shifted, c=chosen: plain_gains(r, c, c[0]), len(shifted) / count)},
+            rounds=3,
+        )

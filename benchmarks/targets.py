@@ -1,12 +1,12 @@
-"""A command as it runs on a controller: `python benchmarks/targets.py [CYCLES] [MODEL.safetensors …]`; needs gcc.
+"""A command as it runs on a controller, by gcc and clang where they are, and by hand.
 
-For a tripod with a CCNN 3-6-6-3 (all connections, then 40 % of them), the shipped tripod, and the models named: eager,
-ONNX Runtime, our C in double and single precision by gcc and clang, and for the dense tripod C written by hand with
-the same network, guard and fixed point. Every way follows one trajectory, as a controller of 1 kHz would send it:
-CYCLES commands (a million; in Python a hundredth) along sines in the domain, one after the other, each between two
-readings of the clock: p50, p99 and largest [µs]. The C program counts calls of malloc, calloc and realloc in its loop.
-Then 100,000 vectors, in and out of the domain, by all ways: largest difference of the deviation from the eager model's,
-as a share of the limit.
+For a tripod with a CCNN 3-6-6-3 (all connections, then 40 % of them) and the model of a folder: eager, ONNX Runtime,
+our C in double and single precision, and for the dense tripod C written by hand with the same network, guard and fixed
+point. Every way follows one trajectory, as a controller of 1 kHz would send it: a million commands (a hundredth with
+`--quick`, and again in Python) along sines in the domain, one after the other, each between two readings of the clock:
+p50, with p99 and largest in the note. The C program counts calls of malloc, calloc and realloc in its loop. Then
+100,000 vectors, in and out of the domain, by all ways: largest difference of the deviation from the eager model's, as a
+share of the limit.
 """
 
 from __future__ import annotations
@@ -17,19 +17,20 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
 import torch
-from command import session
 
 ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "compensation")]
 
 from kinds import masked  # noqa: E402
 
+from benchmarks.command import session  # noqa: E402
+from benchmarks.measure import Row  # noqa: E402
 from ccnn_torch.compensation import Compensator, load_model  # noqa: E402
 from ccnn_torch.compensation.export.export import export_onnx  # noqa: E402
 from ccnn_torch.compensation.model_files.onnx_session import OUTPUTS  # noqa: E402
@@ -232,16 +233,15 @@ def bound(run: onnxruntime.InferenceSession, row: np.ndarray) -> Callable[[np.nd
     return call
 
 
-def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> None:
-    """Measure one model and print its rows."""
+def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> Iterator[Row]:
+    """Measure one model."""
     n, domain, limit = len(compensator.joints), compensator.domain, compensator.limit.numpy()
     draw = torch.rand(100_000, n, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     given = (domain.centre + domain.half_range * (4 * draw - 2)).numpy()
     with torch.inference_mode():
         wanted = compensator(torch.from_numpy(given))[1].numpy()
-        print(f"\n{name}: {compensator.iterations} steps of the fixed point")
         rows = {
-            "eager": [*streamed(compensator, lambda q: compensator(torch.from_numpy(q)), calls // 500), "", "", 0.0]
+            "eager": [*streamed(compensator, lambda q: compensator(torch.from_numpy(q)), calls // 100), "", "", 0.0]
         }
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
@@ -273,23 +273,27 @@ def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> None
                 (folder / "compensator.c").write_text(by_hand(compensator))
                 *figures, found = timed(folder, compensator, calls, "gcc", given)
                 rows["written by hand, float64, gcc"] = [*figures, float((np.abs(found - wanted) / limit).max())]
+    base = rows.get("ccnn export, float64, gcc", rows["eager"])[0]
     for way, (p50, p99, most, allocations, size, share) in rows.items():
-        print(f"  {way:30}{p50:9.2f}{p99:9.2f}{most:9.0f}{allocations!s:>8}{size!s:>10}{share:11.1e}")
+        counted = f", {allocations} allocations, {size} bytes" if allocations != "" else ""
+        note = f"p99 {p99:.2f} µs, largest {most:.0f} µs{counted}, off by {share:.0e} of the limit"
+        yield Row(f"one command of {name}", 1, "command", base * 1e-6, way, p50 / base, None, note)
 
 
-def main(calls: int, models: list[str]) -> None:
-    """Measure all and print."""
-    torch.set_num_threads(1)
+def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
+    """Dense, masked, and the model of the folder that is named."""
     # It tells of nodes that it does not fold.
     onnxruntime.set_default_logger_severity(3)
-    print(f"{'':32}{'p50 µs':>9}{'p99 µs':>9}{'max µs':>9}{'malloc':>8}{'bytes':>10}{'off/limit':>11}")
-    measure("tripod, CCNN 3-6-6-3, all connections", masked(1.0), calls, True)
-    measure("tripod, CCNN 3-6-6-3, masked", masked(0.4), calls, False)
-    for path in [str(ROOT / "checkpoints" / "tripod" / "model.safetensors"), *models]:
-        compensator = load_model(path).compensator
+    calls = 10_000 if quick else 1_000_000
+    yield from measure("a dense tripod, CCNN 3-6-6-3", masked(1.0), calls, True)
+    if not quick:
+        yield from measure("a masked tripod, CCNN 3-6-6-3", masked(0.4), calls, False)
+    if model is not None:
+        compensator = load_model(model / "model.safetensors").compensator
         assert compensator is not None and not compensator.covariates
-        measure(path, compensator, calls, compensator.geometry is None and compensator.effects is None)
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000, sys.argv[2:])
+        yield from measure(
+            f"the model in {model.name}",
+            compensator,
+            calls,
+            compensator.geometry is None and compensator.effects is None,
+        )

@@ -86,6 +86,31 @@ def test_folds_side_by_side_are_those_run_one_by_one() -> None:
     assert torch.equal(fitted.training.best_step, best) and torch.equal(fitted.score, choice.best_validation)
 
 
+def test_a_refit_goes_on_from_the_networks_of_the_first_training_on_all_rows() -> None:
+    dataset = linear_dataset(repeats=2, train=40, held=11, test=20)
+    settings = CCNNSettings(
+        hidden=(3,), rival_hidden=(), population=8, generations=2, members=2, refinement_iterations=4, waves=2
+    )
+    fitted = fit_method("ccnn", lambda: CCNN(settings), dataset, Plan(True, None, 20), None, lambda *_: [])
+    choice = fitted.choice
+    assert choice is not None and choice.state is not None and choice.scaling is not None
+    assert fitted.data.inputs.shape[1] == 51 and bool((choice.best_step > 2).all())
+    torch.testing.assert_close(fitted.scaling.centre, choice.scaling.centre)
+    found = fitted.learner.state_dict()
+    for layer in range(2):
+        name = f"structure_0_refined_mask_{layer}"
+        assert torch.equal(found[name], choice.state[name])
+    first = CCNN(settings)
+    first.start(fitted.data)
+    first.load_state_dict(choice.state)
+    before, after = (
+        weighted_mse(learner.predict(fitted.data.inputs), fitted.data.targets, fitted.data.weights)
+        for learner in (first, fitted.learner)
+    )
+    assert float(after.mean()) < float(before.mean())
+    assert not torch.equal(found["structure_0_evidence"], choice.state["structure_0_evidence"])
+
+
 def test_without_early_stopping_folds_judge_the_learners_end() -> None:
     dataset = linear_dataset(repeats=2)
     choice = choose("toy", Descent, dataset, Plan(False, None, 20, folds=3), None, lambda *_: [])

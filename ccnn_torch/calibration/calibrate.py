@@ -21,6 +21,7 @@ from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, defaul
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import LEARNERS, Learner, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError
+from ccnn_torch.numerics.blocks import memory_budget
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Callback, Scaling
 from ccnn_torch.verification.promise import configurations, promise_block
@@ -171,7 +172,11 @@ def calibrate(
         InputError: the config or its data cannot be used.
         MethodFailedError: no method could be trained.
     """
-    prepared = prepared or prepare(config)
+    with memory_budget(config.max_bytes):
+        return _calibrate(config, folder, watch, prepared or prepare(config))
+
+
+def _calibrate(config: RunConfig, folder: RunFolder | None, watch: Watch, prepared: Prepared) -> Calibration:
     # Looked at before anything is computed, though it is used last.
     _limit(config, len(prepared.mechanism.joints))
     plan, dataset = plan_of(config), prepared.dataset

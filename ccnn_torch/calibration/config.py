@@ -180,8 +180,8 @@ class RunConfig(_Part):
     max_bytes: int | None = Field(
         default=None,
         ge=1,
-        description="memory in bytes that a run may take; more repeats than it holds run in blocks, one by one; "
-        "null = a quarter of what is free",
+        description="memory in bytes that a run may take; more repeats than it holds run in blocks, one by one, and "
+        "no step of a training takes more; null = a quarter of what is free, and 128 MiB for a step",
     )
     device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:\d+)?|mps)$", description="cpu, cuda, cuda:N or mps")
     covariates: Names | None = Field(

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.genome import Genome
+from ccnn_torch.numerics.blocks import block_size
 
 __all__ = ["Task", "fitness", "joined_errors", "make_task", "network_errors"]
 
@@ -24,6 +25,8 @@ _FORCED_OFF = -1e4
 # cache (measured: flat from 2^18 to 2^20, a third slower at 2^22); an accelerator wants to be filled.
 _BLOCK = {"cpu": 1 << 19}
 _BLOCK_ELSEWHERE = 1 << 26
+# Copies of a block that are held at a time.
+_COPIES = 3
 
 
 class Task(NamedTuple):
@@ -91,7 +94,7 @@ def joined_errors(
     sets = representatives[0].mask.shape[1]
     widest = max(genome.mask.shape[-2] for genome in representatives)
     each = max(1, sets * widest * task.inputs.shape[-1])
-    block = block or _BLOCK.get(population.weight.device.type, _BLOCK_ELSEWHERE)
+    block = block or _block(population.weight.device)
     columns = min(individuals, max(1, block // each))
     rows = max(1, block // (each * columns))
     if rows >= repeats and columns >= individuals:
@@ -126,7 +129,7 @@ def network_errors(networks: Sequence[Genome], task: Task, block: int | None = N
     """
     repeats, count = networks[0].mask.shape[:2]
     each = max(genome.mask.shape[-2] for genome in networks) * task.inputs.shape[-1]
-    block = block or _BLOCK.get(task.inputs.device.type, _BLOCK_ELSEWHERE)
+    block = block or _block(task.inputs.device)
     columns = min(count, max(1, block // each))
     rows = max(1, block // (each * columns))
     parts = []
@@ -144,6 +147,11 @@ def network_errors(networks: Sequence[Genome], task: Task, block: int | None = N
         ]
         parts.append(torch.cat(pieces, dim=-1))
     return torch.cat(parts)[:, 0]
+
+
+def _block(device: torch.device) -> int:
+    """Activations at a time: what suits the device, and the budget of memory holds (in, out, and the masks')."""
+    return block_size(_COPIES * 8, _COPIES * 8 * _BLOCK.get(device.type, _BLOCK_ELSEWHERE))
 
 
 def _errors(layer: int | None, population: Genome | None, representatives: Sequence[Genome], task: Task) -> Tensor:

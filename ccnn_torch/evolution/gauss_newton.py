@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.waves import Waves, wave_inputs
+from ccnn_torch.numerics.blocks import blocks
 
 __all__ = ["Linearised", "Network", "dense_jacobian", "linearise", "network_of", "residual"]
 
@@ -154,8 +155,12 @@ def residual(network: Network, flat: Tensor, inputs: Tensor, targets: Tensor, fa
     Returns:
         `b x s x c`.
     """
-    error = _activations(network, flat, inputs)[-1] - targets
-    return error if factor is None else (factor @ error.unsqueeze(-1)).squeeze(-1)
+    nodes = sum(sum(mask.shape[-2:]) for mask in network.masks)
+    parts = []
+    for rows in blocks(inputs.shape[-2], 8 * len(inputs) * nodes):
+        error = _activations(network, flat, inputs[:, rows])[-1] - targets[:, rows]
+        parts.append(error if factor is None else (factor[:, rows] @ error.unsqueeze(-1)).squeeze(-1))
+    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
 def _backward(
@@ -205,6 +210,27 @@ def linearise(
         network, flat, inputs, targets, factor: as in `residual`.
         precision: weight of every squared residual, `b x s x c`; 0 leaves it out.
     """
+    channels = precision.shape[-1]
+    found: Linearised | None = None
+    for rows in blocks(inputs.shape[-2], 8 * len(inputs) * _numbers_a_row(network, channels)):
+        part = None if factor is None else factor[:, rows]
+        more = _linearise(network, flat, inputs[:, rows], targets[:, rows], part, precision[:, rows])
+        found = more if found is None else Linearised(found.gradient + more.gradient, found.matrix.add_(more.matrix))
+    assert found is not None
+    return found
+
+
+def _numbers_a_row(network: Network, channels: int) -> int:
+    """About how many numbers `_linearise` holds for a row of one network: flows, derivatives, the largest products."""
+    layers = [(mask.shape[-2], mask.shape[-1] + 1) for mask in network.masks]
+    flowing = sum(out * (channels + 1) + into for out, into in layers)
+    pairs = max(a * b for _, a in layers for _, b in layers) + max(a * b for a, _ in layers for b, _ in layers)
+    return flowing + 2 * pairs
+
+
+def _linearise(
+    network: Network, flat: Tensor, inputs: Tensor, targets: Tensor, factor: Tensor | None, precision: Tensor
+) -> Linearised:
     flows = _activations(network, flat, inputs)
     error = flows[-1] - targets
     if factor is not None:

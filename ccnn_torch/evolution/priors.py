@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-__all__ = ["prior_groups", "wave_groups"]
+__all__ = ["prior_groups", "resized_prior", "wave_groups"]
 
 
 def prior_groups(shapes: list[torch.Size], bias: bool, kind: str, slots: int = 0) -> Tensor:
@@ -40,3 +40,11 @@ def wave_groups(last_group: int, outputs: int, slots: int) -> Tensor:
 def _wave_layer(last: int) -> int:
     """Label of the waves' groups, behind those of all layers."""
     return 2 * last + 2
+
+
+def resized_prior(prior: Tensor, outputs: int, before: int, after: int) -> Tensor:
+    """Prior precisions `... x g` for another number of slots; those of new ones are 0 (not known)."""
+    plain, waves, last = torch.split(prior, [prior.shape[-1] - outputs * before - 1, outputs * before, 1], -1)
+    waves = waves.reshape(*waves.shape[:-1], outputs, before)
+    kept = waves[..., : min(before, after)]
+    return torch.cat([plain, nn.functional.pad(kept, (0, after - kept.shape[-1])).flatten(-2), last], -1)

@@ -23,11 +23,13 @@ from torch import Tensor
 from ccnn_torch.evolution.gauss_newton import linearise, network_of, residual
 from ccnn_torch.evolution.priors import prior_groups, wave_groups
 from ccnn_torch.evolution.refinement_state import (
+    Precisions,
     Refined,
     RefinementProblem,
     RefinementSettings,
     RefinementState,
     SecondOrder,
+    chosen_state,
     part_of_problem,
     part_of_state,
     put_part,
@@ -35,6 +37,7 @@ from ccnn_torch.evolution.refinement_state import (
 from ccnn_torch.evolution.waves import Waves
 
 __all__ = [
+    "Precisions",
     "Refined",
     "RefinementProblem",
     "RefinementSettings",
@@ -67,6 +70,7 @@ def refine(
     settings: RefinementSettings | None = None,
     row_metric: Tensor | None = None,
     waves: Waves | None = None,
+    known: Precisions | None = None,
 ) -> Refined:
     """Refine the weights of masked sigmoid networks with linear output; masks stay as they are.
 
@@ -84,11 +88,15 @@ def refine(
             are judged in other channels than the outputs' own, as the pose error that joint deviations cause.
         waves: periodic nodes `... x k`, whose columns are last in the output's mask and weights; their frequencies
             are refined as well.
+        known: precisions of an earlier refinement to go on from; without them these networks begin anew.
 
     Leading dimensions of all arguments broadcast against each other.
     """
+    settings = settings or RefinementSettings()
+    if known is not None:
+        settings = replace(settings, warm_up=0)
     problem = pose_refinement(masks, weights, inputs, targets, row_weights, settings, row_metric, waves)
-    state = best = start = start_refinement(problem, weights, waves)
+    state = best = start = start_refinement(problem, weights, waves, known)
     highest = torch.full_like(state.damping, -torch.inf)
     stale = torch.zeros_like(state.calm)
     for _ in range(problem.settings.iterations):
@@ -97,15 +105,15 @@ def refine(
             break
         # Networks do not know of each other, so that those which are done need not be worked on for the others' sake.
         part, now = part_of_problem(problem, going), part_of_state(state, going)
-        known = second_order(part, now)
+        local = second_order(part, now)
         if problem.settings.bayesian and int(state.iteration) > problem.settings.warm_up:
-            evidence = log_evidence(part, now, known)
+            evidence = log_evidence(part, now, local)
             risen = evidence > highest[going]
-            best = put_part(best, going[risen], part_of_state(now, torch.nonzero(risen).flatten()))
+            best = put_part(best, going, chosen_state(risen, now, part_of_state(best, going)))
             much = evidence > highest[going] + _NATS
             stale = stale.index_copy(0, going, torch.where(much, 0, stale[going] + 1))
             highest = highest.index_copy(0, going, torch.where(risen, evidence, highest[going]))
-        state = put_part(state, going, step_refinement(part, now, known))
+        state = put_part(state, going, step_refinement(part, now, local))
     if problem.settings.bayesian and bool((highest > -torch.inf).any()):
         # The last one has not been judged; re-estimated precisions may have taken it downhill.
         last = log_evidence(problem, state)
@@ -163,8 +171,10 @@ def pose_refinement(
     )
 
 
-def start_refinement(problem: RefinementProblem, weights: list[Tensor], waves: Waves | None = None) -> RefinementState:
-    """State before the first iteration. weights: per layer `... x out x in (+ 1)`; waves as in `refine`."""
+def start_refinement(
+    problem: RefinementProblem, weights: list[Tensor], waves: Waves | None = None, known: Precisions | None = None
+) -> RefinementState:
+    """State before the first iteration. weights: per layer `... x out x in (+ 1)`; waves and known as in `refine`."""
     settings = problem.settings
     parts = [_flatten(w, problem.leading, 2).flatten(1) for w in weights]
     if waves is not None:
@@ -184,9 +194,21 @@ def start_refinement(problem: RefinementProblem, weights: list[Tensor], waves: W
         noise=noise,
         effective=effective,
         calm=torch.zeros(batch, dtype=torch.int64, device=flat.device),
-        iteration=torch.zeros((), dtype=torch.int64, device=flat.device),
+        # Counted by the host, which need not wait to read it.
+        iteration=torch.zeros((), dtype=torch.int64, device="cpu"),
     )
-    return replace(state, noise=_noise(problem, state)) if settings.bayesian else state
+    if not settings.bayesian:
+        return state
+    state = replace(state, noise=_noise(problem, state))
+    if known is None:
+        return state
+    prior, noise, damping = known
+    return replace(
+        state,
+        prior=torch.where(prior > 0, prior, state.prior),
+        noise=torch.where(noise > 0, noise, state.noise),
+        damping=torch.where(damping > 0, damping, state.damping),
+    )
 
 
 def step_refinement(
@@ -197,7 +219,8 @@ def step_refinement(
     Args:
         known: `second_order` of this state, where the caller has it already.
     """
-    gradient, matrix = known or second_order(problem, state)
+    known = known or second_order(problem, state)
+    gradient, matrix = known.gradient, known.matrix
     before = _objective(problem, state, state.weights)
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     weights, damping, kept = state.weights, state.damping, problem.network.kept_flat
@@ -210,10 +233,10 @@ def step_refinement(
         candidate = state.weights[todo].scatter_add(1, kept[todo], -step)
         after = _objective(part_of_problem(problem, todo), part_of_state(state, todo), candidate)
         good = (failed == 0) & (after < before[todo])
-        taken = todo[good]
-        weights = weights.index_copy(0, taken, candidate[good])
-        reached = reached.index_copy(0, taken, after[good])
+        weights = weights.index_copy(0, todo, torch.where(good.unsqueeze(-1), candidate, weights[todo]))
+        reached = reached.index_copy(0, todo, torch.where(good, after, reached[todo]))
         damping = damping.index_copy(0, todo, torch.where(good, damping[todo] / 10, damping[todo] * 10))
+        # The host waits for the device here, once a trial: most iterations need one, and none takes up the others.
         todo = todo[~good]
         if len(todo) == 0:
             break
@@ -226,7 +249,7 @@ def step_refinement(
     )
     if not problem.settings.bayesian or int(moved.iteration) <= problem.settings.warm_up:
         return moved
-    return _estimate_precisions(problem, moved, matrix)
+    return _estimate_precisions(problem, moved, known)
 
 
 def finish_refinement(problem: RefinementProblem, state: RefinementState, known: SecondOrder | None = None) -> Refined:
@@ -246,14 +269,16 @@ def finish_refinement(problem: RefinementProblem, state: RefinementState, known:
         effective_parameters=state.effective.sum(-1).reshape(leading),
         noise=state.noise.reshape(*leading, -1),
         log_evidence=evidence.reshape(leading),
+        precisions=Precisions(
+            state.prior.reshape(*leading, -1), state.noise.reshape(*leading, -1), state.damping.reshape(leading)
+        ),
         iterations=int(state.iteration),
     )
 
 
 def log_evidence(problem: RefinementProblem, state: RefinementState, known: SecondOrder | None = None) -> Tensor:
     """Log evidence of the weights' prior and the noise (Laplace's approximation), but for a constant: `b` [nat]."""
-    _, matrix = known or second_order(problem, state)
-    root, _ = torch.linalg.cholesky_ex(matrix)
+    root = (known or second_order(problem, state)).root
     log_determinant = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     counted = problem.network.active & (problem.groups != state.prior.shape[-1] - 1)
     log_prior = (state.prior.log()[:, problem.groups] * counted).sum(-1)
@@ -270,7 +295,8 @@ def second_order(problem: RefinementProblem, state: RefinementState) -> SecondOr
     active = problem.network.active.gather(1, kept)
     prior = state.prior[:, problem.groups].gather(1, kept)
     gradient = local.gradient + torch.where(active, prior * state.weights.gather(1, kept), 0)
-    return SecondOrder(gradient, local.matrix + torch.diag_embed(torch.where(active, prior, 1)))
+    matrix = local.matrix + torch.diag_embed(torch.where(active, prior, 1))
+    return SecondOrder(gradient, matrix, *torch.linalg.cholesky_ex(matrix))
 
 
 def _squares(problem: RefinementProblem, weights: Tensor) -> Tensor:
@@ -307,8 +333,8 @@ def _noise(problem: RefinementProblem, state: RefinementState) -> Tensor:
     return (free / squares.clamp_min(1e-300)).clamp(*_PRECISION_RANGE)
 
 
-def _estimate_precisions(problem: RefinementProblem, state: RefinementState, matrix: Tensor) -> RefinementState:
-    root, failed = torch.linalg.cholesky_ex(matrix)
+def _estimate_precisions(problem: RefinementProblem, state: RefinementState, known: SecondOrder) -> RefinementState:
+    root, failed = known.root, known.failed
     identity = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device)
     inverse_root = torch.linalg.solve_triangular(root, identity.expand_as(root), upper=False)
     kept = problem.network.kept_flat
@@ -318,9 +344,9 @@ def _estimate_precisions(problem: RefinementProblem, state: RefinementState, mat
     effective = _group_sums(problem, determined, group_count).clamp_min(0)
     squares = _group_sums(problem, state.weights.square(), group_count)
     # A periodic node is there or it is not: nothing is known of its amplitude, and the data alone may switch it off.
-    known = torch.ones(group_count, dtype=squares.dtype, device=squares.device)
-    known[problem.wave_groups] = _VAGUE
-    shape, rate = problem.settings.prior_shape * known, problem.settings.prior_rate * known
+    share = torch.ones(group_count, dtype=squares.dtype, device=squares.device)
+    share[problem.wave_groups] = _VAGUE
+    shape, rate = problem.settings.prior_shape * share, problem.settings.prior_rate * share
     prior = ((effective + 2 * shape) / (squares + 2 * rate)).clamp(*_PRECISION_RANGE)
     prior[:, -1] = _PRECISION_RANGE[0]
     usable = ((failed == 0) & effective.isfinite().all(-1)).unsqueeze(-1)

@@ -5,17 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Literal, NamedTuple
 
+import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.gauss_newton import Network
 from ccnn_torch.evolution.waves import Waves
 
 __all__ = [
+    "Precisions",
     "Refined",
     "RefinementProblem",
     "RefinementSettings",
     "RefinementState",
     "SecondOrder",
+    "chosen_state",
     "part_of_problem",
     "part_of_state",
     "put_part",
@@ -134,11 +137,28 @@ class RefinementState:
 class SecondOrder(NamedTuple):
     """Gradient `b x m` and Gauss-Newton matrix `b x m x m` of the objective in the network's kept weights.
 
-    Inactive ones among them have the gradient 0 and 1 on the diagonal.
+    Inactive ones among them have the gradient 0 and 1 on the diagonal. `root` is the matrix's Cholesky factor, and
+    `failed` (`b`) not 0 where it has none.
     """
 
     gradient: Tensor
     matrix: Tensor
+    root: Tensor
+    failed: Tensor
+
+
+class Precisions(NamedTuple):
+    """What a refinement has estimated beside the weights; 0 = not known.
+
+    Attributes:
+        prior: precision of each prior group, `... x g`.
+        noise: precision of each channel's noise, `... x c`.
+        damping: `...`.
+    """
+
+    prior: Tensor
+    noise: Tensor
+    damping: Tensor
 
 
 @dataclass(frozen=True)
@@ -154,6 +174,7 @@ class Refined:
         noise: precision of each channel's noise, `... x c`.
         log_evidence: logarithm of the probability of the targets given the masks and precisions, up to a constant of
             the data (MacKay 1992, eq. 2.23); compares networks refined on the same rows. `...`.
+        precisions: with which it ended.
         iterations: iterations done.
     """
 
@@ -164,6 +185,7 @@ class Refined:
     effective_parameters: Tensor
     noise: Tensor
     log_evidence: Tensor
+    precisions: Precisions
     iterations: int
 
 
@@ -194,6 +216,17 @@ def part_of_state(state: RefinementState, index: Tensor) -> RefinementState:
     """The state of some of the networks."""
     tensors = state.state_dict()
     return RefinementState(**{name: value[index] if value.dim() else value for name, value in tensors.items()})
+
+
+def chosen_state(first: Tensor, one: RefinementState, other: RefinementState) -> RefinementState:
+    """Network by network, `one` where `first` (`b` bool) is set; the iteration is that of `one`."""
+    ours, theirs = one.state_dict(), other.state_dict()
+    return RefinementState(
+        **{
+            name: torch.where(first.view(-1, *([1] * (value.dim() - 1))), value, theirs[name]) if value.dim() else value
+            for name, value in ours.items()
+        }
+    )
 
 
 def put_part(state: RefinementState, index: Tensor, part: RefinementState) -> RefinementState:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -21,6 +22,9 @@ from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.structure import MemberRows, Structure
 
 __all__ = ["CCNN", "CCNNSettings"]
+
+# A training with rows held out chooses the number of steps, and a longer one on all rows goes on from its networks.
+_CHOOSING = 3
 
 
 class CCNN:
@@ -76,7 +80,10 @@ class CCNN:
         )
         self._data, self._phase = data, 0
         self._layers = settings.structures(targets.shape[-1])
-        self._structures = [Structure(hidden, settings, rows) for hidden in self._layers]
+        iterations = settings.refinement_iterations
+        if data.validation is not None:
+            iterations = math.ceil(iterations / _CHOOSING)
+        self._structures = [Structure(hidden, settings, rows, iterations) for hidden in self._layers]
 
     def step(self) -> dict[str, Tensor]:
         """One generation, or one refinement or search after the last of them."""
@@ -172,10 +179,18 @@ class CCNN:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take back a state; call `start` with the same data first."""
         for number, structure in enumerate(self._structures):
-            prefix = f"structure_{number}_"
-            own = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-            structure.load(own, int(state["generation"]))
+            structure.load(_of_structure(state, number), int(state["generation"]))
         self._phase = int(state["phase"])
+
+    @property
+    def refits(self) -> bool:
+        """Whether `begin_from` shortens a training: not without refinement."""
+        return self.settings.refinement_iterations > 0
+
+    def begin_from(self, state: dict[str, Tensor]) -> None:
+        """Refine the networks of this state, found on fewer of the same rows in the same scaling; after `start`."""
+        for number, structure in enumerate(self._structures):
+            structure.begin_from(_of_structure(state, number))
 
     @property
     def _evolved(self) -> bool:
@@ -239,6 +254,11 @@ class CCNN:
         error = self._remainder(data.inputs.masked_fill(~there, 0)) - data.targets
         squares = error.masked_fill(~there, 0).square().mean(-1)
         return (squares * data.weights).sum(-1) / data.weights.sum(-1)
+
+
+def _of_structure(state: dict[str, Tensor], number: int) -> dict[str, Tensor]:
+    prefix = f"structure_{number}_"
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
 def _gears(data: TrainingData, settings: CCNNSettings) -> Harmonics | None:

@@ -19,6 +19,7 @@ from ccnn_torch.evolution.random import uniform
 from ccnn_torch.learners.gp_posterior import GPNetwork, covariance, spread_factor
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import usable_rows
+from ccnn_torch.numerics.blocks import block_size
 
 if TYPE_CHECKING:
     from ccnn_torch.learners.gp_evidence import GPPrior
@@ -28,6 +29,8 @@ __all__ = ["GPSettings", "GaussianProcess"]
 # Numbers in one matrix worked on at a time: what fits into the processor's cache is several times faster than one
 # batch of everything.
 _CHUNK = 1 << 18
+# Matrices of one size that a marginal likelihood and its slope hold at a time.
+_COPIES = 12
 # Steps between two checks of whether the likelihood still rises.
 _LOOK = 10
 # Rprop's step sizes never leave these bounds [nats of a hyperparameter's logarithm].
@@ -267,7 +270,7 @@ class GaussianProcess:
 
     def _chunks(self, going: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Indices of repeats and outputs whose search has not ended, a few at a time."""
-        size = max(1, _CHUNK // self._few**2)
+        size = max(1, min(_CHUNK, block_size(_COPIES * 8)) // self._few**2)
         for part in torch.split(torch.nonzero(going), size):
             yield part[:, 0], part[:, 1]
 
@@ -292,7 +295,7 @@ class GaussianProcess:
         self, inputs: Tensor, dual: Tensor, spread: Tensor, ask: Callable[[GPNetwork, Tensor], Tensor]
     ) -> Tensor:
         """Ask the network of every repeat; one at a time and in pieces, since they share no matrix."""
-        size = max(1, 4 * _CHUNK // (self._shape[1] * dual.shape[-1]))
+        size = max(1, min(4 * _CHUNK, block_size(_COPIES * 8)) // (self._shape[1] * dual.shape[-1]))
         found = []
         for repeat, points in enumerate(inputs):
             network = self._network(repeat, dual, spread)

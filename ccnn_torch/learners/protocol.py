@@ -54,6 +54,8 @@ class Learner(Protocol):
         variance(inputs: Tensor) -> Tensor: predictive variance of a *newly measured* standardised output, that of the
             model and of the noise together, above 0 and finite for every finite input. inputs: `r x s x i` [1]; returns
             `r x s x o` [1]. Its networks then have a method `variance` that gives the same numbers.
+        refits, begin_from(state): whether, and how, it goes on from the state of an earlier training on fewer of the
+            same rows in the same scaling; called after `start`, in place of beginning anew.
         converged -> Tensor: property, `r`, bool: False where the learner's own criterion was not met when its steps
             ended, or where the data let it do no more than the constant.
 

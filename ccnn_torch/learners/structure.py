@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import itemgetter
 from typing import NamedTuple
 
 import torch
@@ -12,9 +13,11 @@ from ccnn_torch.evolution.coevolution import Coevolution, advance, keep_refined,
 from ccnn_torch.evolution.evaluation import Task, fitness, joined_errors
 from ccnn_torch.evolution.genome import Genome
 from ccnn_torch.evolution.network import forward
-from ccnn_torch.evolution.refinement import RefinementSettings, refine
+from ccnn_torch.evolution.priors import prior_groups, resized_prior
+from ccnn_torch.evolution.refinement import Precisions, RefinementSettings, refine
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves
+from ccnn_torch.numerics.blocks import blocks
 
 __all__ = ["MemberRows", "Structure"]
 
@@ -23,6 +26,8 @@ _PASSES = 2
 # Log evidence per measured value by which a member may fall short of the best and still be averaged. That is a lot: a
 # descent that failed. Evidence is too rough a guide to leave out more; averages did better than the best member.
 _SHORT = 0.5
+# Matrices of weights by weights that a descent holds at a time.
+_MATRICES = 6
 
 
 class MemberRows(NamedTuple):
@@ -62,8 +67,8 @@ class Structure:
     get periodic nodes, in several searches, and are refined again after each. The model is the mean of these members.
     """
 
-    def __init__(self, hidden: tuple[int, ...], settings: CCNNSettings, rows: MemberRows) -> None:
-        self.settings, self.rows = settings, rows
+    def __init__(self, hidden: tuple[int, ...], settings: CCNNSettings, rows: MemberRows, iterations: int) -> None:
+        self.settings, self.rows, self.iterations = settings, rows, iterations
         self.slots = settings.waves if settings.refinement_iterations else 0
         self.kept = min(settings.kept, settings.members) if settings.refinement_iterations else settings.members
         inputs, outputs = rows.task.inputs.shape[1], rows.targets.shape[-1]
@@ -71,8 +76,19 @@ class Structure:
         self.evidence = torch.full_like(self.state.best_fitness, -torch.inf)
         self.passes = torch.zeros_like(self.evidence)
         self.refined = self._evolved()
+        groups = prior_groups(
+            [mask.shape[-2:] for mask in self.refined.masks], settings.bias, RefinementSettings().groups, self.slots
+        )
+        channels = outputs if rows.metric is None else rows.metric.shape[-2]
+        batch, zeros = len(self.evidence), self.evidence.new_zeros
+        self.precisions = Precisions(zeros(batch, int(groups.max()) + 1), zeros(batch, channels), zeros(batch))
         # Whether a search found nothing in what these networks leave: the next one would not either.
         self._searched = False
+        self._first: dict[str, Tensor] | None = None
+
+    def begin_from(self, tensors: dict[str, Tensor]) -> None:
+        """Refine the networks of an earlier training on fewer rows instead of those evolved; nothing more is sought."""
+        self._first = tensors
 
     def evolve(self) -> None:
         """One generation, and a refinement that is written back into the elite where one is due."""
@@ -85,9 +101,15 @@ class Structure:
     def refine(self) -> None:
         """Refine the best joined network of every member, keep it by evidence, and write it back where it is fitter."""
         everyone = torch.arange(len(self.passes), device=self.passes.device)
-        self._searched = False
-        candidate, evidence = self._descend(self._evolved(), everyone)
-        self.refined = choose(evidence > self.evidence, candidate, self.refined)
+        self._searched = self._first is not None
+        model, known = self._evolved(), None
+        if self._first is not None:
+            earlier, known, evidence = _refined(self._first)
+            model = choose(evidence > -torch.inf, earlier, model)
+        candidate, evidence, precisions = self._descend(model, everyone, known)
+        better = evidence > self.evidence
+        self.refined = choose(better, candidate, self.refined)
+        self.precisions = _put(self.precisions, torch.nonzero(better).flatten(), precisions, better)
         self.evidence = torch.maximum(self.evidence, evidence)
         plain = without_waves(candidate)
         genomes = tuple(
@@ -124,7 +146,8 @@ class Structure:
             model.weights,
             Waves(torch.where(fresh, source, model.waves.source), torch.where(fresh, frequency, model.waves.frequency)),
         )
-        candidate, evidence = self._descend(mapped(wider, lambda value: value[going]), index[going])
+        # With all precisions anew: those of the last descent hold the network where it is.
+        candidate, evidence, precisions = self._descend(mapped(wider, lambda value: value[going]), index[going], None)
         # Taken by all members of a repeat or by none, so that they go on sharing their slots.
         gain = (evidence - self.evidence[index[going]]).reshape(-1, each).sum(1).repeat_interleave(each)
         taken = gain > 0
@@ -133,6 +156,7 @@ class Structure:
         old, new = self.refined.tensors, chosen.tensors
         self.refined = Bundle.from_tensors({name: old[name].index_copy(0, target, new[name]) for name in old})
         self.evidence = self.evidence.index_copy(0, target, evidence[taken])
+        self.precisions = _put(self.precisions, target, precisions, taken)
 
     def members(self) -> Bundle:
         """The kept members of each repeat, refined where they are: `r x kept x ...`."""
@@ -167,6 +191,7 @@ class Structure:
                 named[f"{name}_mask_{layer}"], named[f"{name}_weight_{layer}"] = part.mask, part.weight
         named |= {f"fitness_{layer}": scores for layer, scores in enumerate(state.fitness)}
         named |= {f"refined_{name}": tensor for name, tensor in self.refined.tensors.items()}
+        named |= {f"precision_{name}": tensor for name, tensor in self.precisions._asdict().items()}
         return {name: self.by_repeat(tensor) for name, tensor in named.items()}
 
     def load(self, tensors: dict[str, Tensor], generation: int) -> None:
@@ -184,11 +209,8 @@ class Structure:
             best_fitness=flat["best_fitness"],
             generation=generation,
         )
-        prefix = "refined_"
-        self.refined = Bundle.from_tensors(
-            {name.removeprefix(prefix): tensor for name, tensor in flat.items() if name.startswith(prefix)}
-        )
-        self.evidence, self.passes = flat["evidence"], flat["passes"]
+        self.refined, self.precisions, self.evidence = _refined(tensors)
+        self.passes = flat["passes"]
 
     def _best(self) -> Tensor:
         """Numbers of the kept members, those of highest evidence, `r x kept` in `b`."""
@@ -204,8 +226,28 @@ class Structure:
         plain = Bundle(masks, weights, no_waves(tuple(masks[0].shape[:1]), 0, weights[0]))
         return resized(plain, self.slots)
 
-    def _descend(self, model: Bundle, index: Tensor) -> tuple[Bundle, Tensor]:
-        """The refined networks and their log evidence. index: which of the `b` networks the model has."""
+    def _descend(self, model: Bundle, index: Tensor, known: Precisions | None) -> tuple[Bundle, Tensor, Precisions]:
+        """The refined networks, their log evidence and precisions. index: which of the `b` networks the model has."""
+        # Matrices of a network, at their largest: the normal matrix, its factors, its inverse.
+        weights = sum(int(mask.flatten(1).sum(1).max()) + mask.shape[-2] for mask in model.masks)
+        parts = []
+        for few in blocks(len(index), _MATRICES * 8 * weights**2):
+            here = None if known is None else Precisions(*(part[few] for part in known))
+            parts.append(self._descend_together(mapped(model, itemgetter(few)), index[few], here))
+        if len(parts) == 1:
+            return parts[0]
+        bundles, evidence, precisions = zip(*parts, strict=True)
+        names = bundles[0].tensors
+        return (
+            Bundle.from_tensors({name: torch.cat([one.tensors[name] for one in bundles]) for name in names}),
+            torch.cat(evidence),
+            Precisions(*(torch.cat(part) for part in zip(*precisions, strict=True))),
+        )
+
+    def _descend_together(
+        self, model: Bundle, index: Tensor, known: Precisions | None
+    ) -> tuple[Bundle, Tensor, Precisions]:
+        """The same of as many networks as the budget of memory holds."""
         rows = self.rows.of(index)
         outputs = rows.targets.shape[-1]
         # Slots are filled from the first on: those that are free in every network need not be carried along.
@@ -217,12 +259,30 @@ class Structure:
             rows.inputs,
             rows.targets,
             rows.weights,
-            RefinementSettings(iterations=self.settings.refinement_iterations),
+            RefinementSettings(iterations=self.iterations),
             rows.metric,
             small.waves,
+            known and known._replace(prior=resized_prior(known.prior, outputs, self.slots, used)),
         )
         # Networks that were done earlier made fewer iterations; this counts those of the last one.
         self.passes = self.passes.index_add(
             0, index, torch.full_like(refined.error, refined.iterations * (outputs + 1))
         )
-        return resized(Bundle(small.masks, refined.weights, refined.waves), self.slots), refined.log_evidence
+        found = refined.precisions
+        found = found._replace(prior=resized_prior(found.prior, outputs, used, self.slots))
+        return resized(Bundle(small.masks, refined.weights, refined.waves), self.slots), refined.log_evidence, found
+
+
+def _refined(tensors: dict[str, Tensor]) -> tuple[Bundle, Precisions, Tensor]:
+    """Refined networks, their precisions and evidence from `Structure.tensors`, the repeats and members in one."""
+    flat = {name: tensor.flatten(0, 1) for name, tensor in tensors.items()}
+    prefix = "refined_"
+    bundle = Bundle.from_tensors(
+        {name.removeprefix(prefix): tensor for name, tensor in flat.items() if name.startswith(prefix)}
+    )
+    return bundle, Precisions(*(flat[f"precision_{name}"] for name in Precisions._fields)), flat["evidence"]
+
+
+def _put(precisions: Precisions, index: Tensor, new: Precisions, chosen: Tensor) -> Precisions:
+    """Those of some networks (`index`) renewed by the chosen ones of `new`."""
+    return Precisions(*(old.index_copy(0, index, part[chosen]) for old, part in zip(precisions, new, strict=True)))

@@ -65,6 +65,7 @@ def train(
     stop_at: Tensor | None = None,
     folds: int = 1,
     budget: float | None = None,
+    begin_from: dict[str, Tensor] | None = None,
 ) -> Training:
     """Drive a learner to its end and leave it in the chosen state of every repeat.
 
@@ -83,6 +84,7 @@ def train(
         folds: so many neighbouring repeats are the folds of one: they share the step of their lowest mean validation
             error.
         budget: seconds inside the learner after which no further step begins.
+        begin_from: state of an earlier training to go on from, for a learner with the verb of this name.
 
     Raises:
         InputError: the checkpoint is damaged or belongs to other data.
@@ -91,6 +93,8 @@ def train(
     began = time.perf_counter()
     with _told(learner, "at the start"):
         learner.start(data)
+        if begin_from is not None:
+            learner.begin_from(begin_from)  # type: ignore[attr-defined]
     repeats = data.inputs.shape[0]
     run = _Run(learner, data, repeats, patience, stop_at, folds, time.perf_counter() - began)
     if checkpoint is not None and checkpoint.exists():

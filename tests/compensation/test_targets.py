@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -56,10 +57,16 @@ def compiled(form: Form, golden: Golden, folder: Path) -> str:
     return subprocess.run([str(folder / "selftest")], capture_output=True, text=True).stdout
 
 
+@cache
+def made_kind(kind: str, dtype: str = "float64", sd: bool = True) -> tuple[Compensator, Form, Golden]:
+    """A stand-in, its form and vectors, traced once for all tests."""
+    compensator = KINDS[kind]()
+    return compensator, *made(compensator, dtype, sd)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_model_gives_its_numbers_in_c(kind: str, tmp_path: Path) -> None:
-    compensator = KINDS[kind]()
-    form, golden = made(compensator)
+    _, form, golden = made_kind(kind)
     worst = require_equal(form, golden)
     assert {*worst} == {"command", "deviation", "ideal", "status", "ideal_status", "sd"}
     assert len(golden.joints) > 1100 and {*golden.outputs["status"].tolist()} == {0, 1, 2}
@@ -70,7 +77,7 @@ def test_every_kind_of_model_gives_its_numbers_in_c(kind: str, tmp_path: Path) -
 
 @pytest.mark.parametrize("kind", ["covariates", "masked", "steep", "gp"])
 def test_single_precision_is_right_to_its_share_of_the_limit(kind: str, tmp_path: Path) -> None:
-    form, golden = made(KINDS[kind](), "float32")
+    _, form, golden = made_kind(kind, "float32")
     require_equal(form, golden)
     assert f"0 of {len(golden.joints)} vectors failed" in compiled(form, golden, tmp_path)
     source = (tmp_path / "compensator.c").read_text()
@@ -85,7 +92,7 @@ def test_single_precision_does_not_hold_the_links_of_an_arm() -> None:
 
 
 def test_the_code_has_no_heap_no_recursion_and_no_state(tmp_path: Path) -> None:
-    for name, content in print_c99(*made(KINDS["grnn"]())).items():
+    for name, content in print_c99(*made_kind("grnn")[1:]).items():
         (tmp_path / name).write_text(content)
     source = (tmp_path / "compensator.c").read_text()
     assert not re.search(r"\b(malloc|calloc|free|goto|while|printf)\b", source)
@@ -116,8 +123,7 @@ def test_harmonics_cost_one_sine_and_cosine_a_joint() -> None:
 
 
 def test_missing_covariates_and_numbers_that_are_none(tmp_path: Path) -> None:
-    compensator = KINDS["covariates"]()
-    form, golden = made(compensator)
+    compensator, form, golden = made_kind("covariates")
     point = compensator.domain.centre.numpy()[None]
     found = run_form(form, point[:, :2], None)
     assert found["status"] == 2 and found["ideal_status"] == 2

@@ -72,6 +72,7 @@ class Choice:
         evaluations: of all folds together, `r`; None = the learner does not count.
         step, seconds: steps done, and time spent inside the learner.
         ended: false where the budget ended it.
+        state, scaling: of the learner in its chosen state, where every repeat held out one set of rows.
     """
 
     best_step: Tensor
@@ -82,6 +83,8 @@ class Choice:
     step: int
     seconds: float
     ended: bool = True
+    state: dict[str, Tensor] | None = None
+    scaling: Scaling | None = None
 
     @property
     def best_validation(self) -> Tensor:
@@ -157,6 +160,8 @@ def choose(
         step=training.step,
         seconds=training.seconds,
         ended=training.ended,
+        state=learner.state_dict() if plan.folds == 1 else None,
+        scaling=scaling if plan.folds == 1 else None,
     )
 
 

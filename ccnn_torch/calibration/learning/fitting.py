@@ -116,13 +116,18 @@ def refit(
     folder: RunFolder | None,
     watch: WatchPhase,
 ) -> Fitted:
-    """The second phase of `fit_method`: train on all training rows, for as many steps as were chosen."""
+    """The second phase of `fit_method`: train on all training rows, for as many steps as were chosen.
+
+    A learner that can go on from the model of the first phase does, in that phase's scaling.
+    """
     learner = make()
-    data, scaling = dataset.scaled("fit", False, learner)
+    goes_on = choice is not None and choice.state is not None and getattr(learner, "refits", False)
+    data, scaling = dataset.scaled("fit", False, learner, choice.scaling if choice is not None and goes_on else None)
     data = moved(data, plan.device)
     training = train(
         learner,
         data,
+        begin_from=choice.state if choice is not None and goes_on else None,
         callbacks=watch("fit", scaling),
         checkpoint=folder.checkpoint(name, "fit") if folder else None,
         facts=folder.facts if folder else None,

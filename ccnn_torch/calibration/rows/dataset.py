@@ -90,8 +90,10 @@ class Dataset:
         rows: Tensor = getattr(split, part)
         return rows.sort().values
 
-    def scaled(self, part: str, validate: bool, learner: Learner) -> tuple[TrainingData, Scaling]:
-        """What a learner takes, scaled by its own training rows.
+    def scaled(
+        self, part: str, validate: bool, learner: Learner, scaling: Scaling | None = None
+    ) -> tuple[TrainingData, Scaling]:
+        """What a learner takes, scaled by its own training rows, or as given.
 
         Args:
             part: `train` (validation rows held out) or `fit` (both).
@@ -106,7 +108,9 @@ class Dataset:
                 "measure more, or lower split.test and split.validation"
             )
         inputs, targets = rows.take(self.inputs), rows.take(self.deviation)
-        scaling = Scaling.fit(inputs, targets, rows.weights, self.periodic, getattr(learner, "reads_angles", False))
+        if scaling is None:
+            angles = getattr(learner, "reads_angles", False)
+            scaling = Scaling.fit(inputs, targets, rows.weights, self.periodic, angles)
         held = None
         if validate:
             others = self.usable_rows("validation")

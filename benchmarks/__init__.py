@@ -1,0 +1,1 @@
+"""Measured times of this package beside named peers: `python -m benchmarks`."""

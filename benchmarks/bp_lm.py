@@ -1,0 +1,48 @@
+"""Levenberg-Marquardt on sigmoid networks 3-20-3, six starts at once, beside SciPy's on one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from scipy.optimize import least_squares
+
+from benchmarks.measure import Row, compare
+from benchmarks.training import training_rows
+from ccnn_torch.evolution.gauss_newton import dense_jacobian, network_of, residual
+from ccnn_torch.evolution.refinement import RefinementSettings, refine
+
+STARTS, HIDDEN, ITERATIONS = 6, 20, 20
+
+
+def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
+    """The same number of iterations on the same rows and starts, without the estimate of precisions."""
+    draw = torch.Generator().manual_seed(1)
+    shapes = [(HIDDEN, 3), (3, HIDDEN)]
+    masks = [torch.ones(STARTS, *shape, dtype=torch.bool) for shape in shapes]
+    weights = [torch.randn(STARTS, out, into + 1, generator=draw, dtype=torch.float64) for out, into in shapes]
+    settings = RefinementSettings(iterations=ITERATIONS, bayesian=False, tolerance=0.0)
+    network = network_of([mask[:1] for mask in masks], True)
+    first = torch.cat([w[0].flatten() for w in weights]).numpy()
+    for rows in (60, 120, 240) if quick else (100, 1000, 10_000):
+        data = training_rows(rows)
+        x, y = data.inputs, data.targets
+
+        def scipy_fit(x: torch.Tensor = x, y: torch.Tensor = y) -> object:
+            return least_squares(
+                lambda w: residual(network, torch.from_numpy(w)[None], x, y, None).flatten().numpy(),
+                first,
+                lambda w: dense_jacobian(network, torch.from_numpy(w)[None], x, y).flatten(0, 2).numpy(),
+                method="lm",
+                max_nfev=ITERATIONS,
+            )
+
+        yield from compare(
+            f"{ITERATIONS} iterations of Levenberg-Marquardt, {STARTS} networks 3-{HIDDEN}-3",
+            rows,
+            "rows",
+            lambda x=x, y=y, data=data: refine(masks, weights, x, y, data.weights, settings),
+            {"SciPy least_squares (MINPACK)": (scipy_fit, 1 / STARTS), "pyrenn": None},
+            rounds=1 if quick else 3,
+        )

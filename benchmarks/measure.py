@@ -1,0 +1,119 @@
+"""Rows of the benchmarks' table: a task beside named peers and this machine's matrix product, in alternating rounds.
+
+Times are of the processor, this process and its children, so that a busy machine disturbs little. A ratio is the median
+over the rounds of peer / ours, both measured in the same round.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+__all__ = ["Row", "compare", "installed", "seconds_of"]
+
+Call = Callable[[], Any]
+
+# A round of a short task repeats it until it has taken so long [s]; the clock's own steps are far below.
+_ROUND = 0.03
+# A task so long is not run once more than its rounds say [s].
+_LONG = 2.0
+# Size of the product that the machine's limit is measured with: 100 ms at 20 GFLOP/s would disturb the rounds.
+_GEMM = 512
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        task: what was done, by this package and by the peer.
+        size, of: how much of what, such as 1000 "rows".
+        seconds: of this package, the median.
+        peer: the other's name; "" where there is none.
+        ratio: peer's seconds / ours; None where there is no peer, or it is not installed.
+        limit: share of the operations that a float64 matrix product of this machine makes in the same time; None where
+            they are not counted.
+        note: what else there is to know.
+    """
+
+    task: str
+    size: int
+    of: str
+    seconds: float
+    peer: str = ""
+    ratio: float | None = None
+    limit: float | None = None
+    note: str = ""
+
+
+def installed(module: str) -> bool:
+    """Whether a peer can be imported."""
+    return importlib.util.find_spec(module) is not None
+
+
+def seconds_of(call: Call) -> float:
+    """Processor seconds of one call, those of processes that it waited for included."""
+    before, children = time.process_time(), os.times()
+    call()
+    after = os.times()
+    own = time.process_time() - before
+    return own + after.children_user - children.children_user + after.children_system - children.children_system
+
+
+def compare(
+    task: str,
+    size: int,
+    of: str,
+    ours: Call,
+    peers: Mapping[str, Call | tuple[Call, float] | None] | None = None,
+    *,
+    rounds: int = 5,
+    flops: float = 0.0,
+    note: str = "",
+) -> list[Row]:
+    """Measure one task: one row for each peer, or one.
+
+    Args:
+        peers: by name what they do; (call, share) where they do a share of the task only; None = not installed.
+        rounds: in each, ours and every peer are measured once, one after the other.
+        flops: floating point operations of the task in matrix products; 0 = not counted.
+    """
+    calls: dict[str, tuple[Call, float]] = {"": (ours, 1.0)}
+    for name, peer in (peers or {}).items():
+        if peer is not None:
+            calls[name] = peer if isinstance(peer, tuple) else (peer, 1.0)
+    if flops:
+        square = torch.ones(_GEMM, _GEMM, dtype=torch.float64)
+        calls["gemm"] = (lambda: square @ square, 1.0)
+    # The first call of each fills caches and says how often to repeat; of a long task it is a round.
+    first = {name: seconds_of(call) for name, (call, _) in calls.items()}
+    often = {name: max(1, int(_ROUND / max(taken, 1e-6))) for name, taken in first.items()}
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    if first[""] > _LONG:
+        times = {name: [taken / calls[name][1]] for name, taken in first.items()}
+        rounds -= 1
+    for _ in range(rounds):
+        for name, (call, share) in calls.items():
+            times[name].append(seconds_of(lambda c=call, n=often[name]: [c() for _ in range(n)]) / often[name] / share)
+    limit = None
+    if flops:
+        limit = statistics.median(
+            flops / own / (2 * _GEMM**3 / gemm) for own, gemm in zip(times[""], times["gemm"], strict=True)
+        )
+    own = statistics.median(times[""])
+    rows = []
+    for name in peers or {"": None}:
+        ratio, said = None, note
+        if name in times and name:
+            ratio = statistics.median(t / o for t, o in zip(times[name], times[""], strict=True))
+        elif name:
+            said = "not installed"
+        rows.append(Row(task, size, of, own, name, ratio, limit, said))
+    return rows
