@@ -78,7 +78,7 @@ def problem_of(
         InputError: the logs cannot show any of the effects, or cannot be used.
     """
     data = cut_stretches(logs) if most is None else cut_stretches(logs, most=most)
-    followed = nominal.followed(logs, data)
+    driven = nominal.driven(logs, data)
     supply = torch.zeros_like(data.time)
     if "supply" in data.beside:
         usual = nominal.supply or float(data.beside["supply"][data.judged].median())
@@ -86,13 +86,14 @@ def problem_of(
     warm = torch.zeros_like(data.time)
     if "temperature" in data.beside:
         warm = data.beside["temperature"] - data.beside["temperature"][data.judged].min()
-    facts = [_facts(data, i, nominal, followed, supply, warm) for i in range(len(data.units))]
+    facts = [_facts(data, i, nominal, driven.followed, supply, warm) for i in range(len(data.units))]
     library = library_of(effects, facts)
     if all(library.lacking):
         need = "; ".join(f"{name} needs {why}" for name, why in zip(library.names, library.lacking, strict=True))
         raise InputError(f"effects: these logs can show none of the candidates: {need}")
     step = float(data.time.diff(dim=-1).median())
-    return Problem(data, library, followed, supply, warm, max(round(_POOLED / step), 1))
+    pool = max(round(_POOLED / step), 1)
+    return Problem(data, library, driven.followed, supply, warm, pool, driven.torque, driven.simulated)
 
 
 @torch.no_grad()

@@ -188,6 +188,8 @@ def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
         followed=row[None],
         supply=still,
         warm=still,
+        torque=None,
+        simulated=None,
         pool=max(round(step / _STEP), 1),
     )
 

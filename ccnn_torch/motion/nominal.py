@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
@@ -17,7 +19,7 @@ from ccnn_torch.motion.simulators import Simulator, simulator_of
 from ccnn_torch.motion.stretches import Stretches
 from ccnn_torch.spelling import nearest
 
-__all__ = ["KEYS", "Nominal", "nominal_of"]
+__all__ = ["KEYS", "Driven", "Nominal", "nominal_of"]
 
 KEYS: dict[str, str] = {
     "gain": "proportional gain [N*m/rad]; without it torques are told as angles",
@@ -45,6 +47,20 @@ _TORQUES = ("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity
 _SAME = {"delay": "delay", "offset": "offset", "backlash": "play", "load_friction": "load_friction"}
 
 
+class Driven(NamedTuple):
+    """What drives the axes, `n x b x s` each.
+
+    Attributes:
+        followed: positions that they follow [rad or m].
+        torque: what resists their motors, over the gain [rad or m]; None = nothing.
+        simulated: positions of the nominal model; None where the nominal axes tell them.
+    """
+
+    followed: Tensor
+    torque: Tensor | None = None
+    simulated: Tensor | None = None
+
+
 @dataclass(frozen=True)
 class Nominal:
     """A nominal model.
@@ -67,22 +83,30 @@ class Nominal:
     simulator: Simulator | None = None
     notes: tuple[str, ...] = field(default=())
 
-    def followed(self, logs: Sequence[Log], data: Stretches) -> Tensor:
-        """What the axes follow, `n x b x s`: the commands, or what a simulator makes of them from each log's start on.
+    def driven(self, logs: Sequence[Log], data: Stretches) -> Driven:
+        """What drives the axes: the commands, or where a simulator tells no more than positions these.
 
         Raises:
             InputError: the simulator fails.
         """
         if self.simulator is None:
-            return data.command
-        made = [self.simulator.positions(log.time, log.command) for log in logs]
-        found = data.command.clone()
-        for k, number in enumerate(data.run.tolist()):
-            rows = data.log[k]
-            here = torch.from_numpy(made[number])[rows.clamp_min(0)].mT
-            last = int((rows >= 0).sum()) - 1
-            found[:, k] = torch.where(rows >= 0, here, here[:, last : last + 1])
-        return found
+            return Driven(data.command)
+        if self.simulator.loaded is None:
+            return Driven(_along([self.simulator.positions(log.time, log.command) for log in logs], data))
+        made = [self.simulator.loaded(log.time, log.command) for log in logs]
+        simulated, torque = (_along([m[k] for m in made], data) for k in range(2))
+        return Driven(data.command, torque, simulated)
+
+
+def _along(made: Sequence[NDArray[np.float64]], data: Stretches) -> Tensor:
+    """What was made for each log, at the samples of the stretches, `n x b x s`."""
+    found = data.command.clone()
+    for k, number in enumerate(data.run.tolist()):
+        rows = data.log[k]
+        here = torch.from_numpy(made[number])[rows.clamp_min(0)].mT
+        last = int((rows >= 0).sum()) - 1
+        found[:, k] = torch.where(rows >= 0, here, here[:, last : last + 1])
+    return found
 
 
 def nominal_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) -> Nominal:
@@ -100,9 +124,10 @@ def nominal_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) ->
     if mechanism == "servo":
         return _servo(keys, n)
     simulator = simulator_of(mechanism, keys, units)
-    return Nominal(
-        mechanism, ({},) * n, (None,) * n, (None,) * n, None, simulator, simulator.notes if simulator else ()
-    )
+    if simulator is None:
+        return Nominal(mechanism, ({},) * n, (None,) * n, (None,) * n)
+    axes, gains = simulator.axes or ({},) * n, simulator.gains or (None,) * n
+    return Nominal(mechanism, axes, gains, (None,) * n, None, simulator, simulator.notes)
 
 
 def _servo(keys: Mapping[str, Any], n: int) -> Nominal:

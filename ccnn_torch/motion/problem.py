@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -45,6 +46,7 @@ class Problem:
         data: `n` joints, `b` stretches, `s` samples.
         library: effects.
         followed: what the axes follow, `n x b x s`: the commands, or what a simulator makes of them.
+        torque, simulated: as of `Driven`.
         supply, warm: as of `Drive`, `b x s`.
         pool: so many samples are averaged before they are judged: what is faster than the motion is noise.
     """
@@ -55,20 +57,36 @@ class Problem:
     supply: Tensor
     warm: Tensor
     pool: int = 1
+    torque: Tensor | None = None
+    simulated: Tensor | None = None
 
     def positions(self, theta: Tensor, chosen: Tensor | None = None) -> Tensor:
         """Simulated positions, `p x n x b x s`; theta: `p x n x k`; chosen: stretches, all when None."""
         data = self.data
         rows = torch.arange(len(data.time)) if chosen is None else chosen
-        n, b = len(self.followed), len(rows)
+        start = torch.stack([data.position[:, :, 0], data.speed[:, :, 0]], -1)
+        moved = self._moved(theta, rows, start)
+        return moved if self.simulated is None else moved + self._beyond[:, rows]
+
+    @cached_property
+    def _beyond(self) -> Tensor:
+        """What a simulator makes of the commands less what its axes make of them, `n x b x s`."""
+        assert self.simulated is not None
+        begin, rows = self.simulated[..., :2], torch.arange(len(self.data.time))
+        speed = begin.diff(dim=-1) / self.data.time[:, :2].diff(dim=-1)
+        theta = torch.zeros(1, len(begin), self.library.size, dtype=torch.float64)
+        return self.simulated - self._moved(theta, rows, torch.cat([begin[..., :1], speed], -1))[0]
+
+    def _moved(self, theta: Tensor, rows: Tensor, start: Tensor) -> Tensor:
+        data, n, b = self.data, len(self.followed), len(rows)
         time = data.time[rows].expand(n, -1, -1).reshape(n * b, -1)
-        start = torch.stack([data.position[:, rows, 0], data.speed[:, rows, 0]], -1).reshape(n * b, 2)
         drive = Drive(
             time,
             self.followed[:, rows].reshape(n * b, -1),
-            start,
+            start[:, rows].reshape(n * b, 2),
             self.supply[rows].expand(n, -1, -1).reshape(n * b, -1),
             self.warm[rows].expand(n, -1, -1).reshape(n * b, -1),
+            None if self.torque is None else self.torque[:, rows].reshape(n * b, -1),
         )
         values = {
             name: value[..., None].expand(*value.shape, b).reshape(len(theta), n * b)

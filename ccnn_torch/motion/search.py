@@ -6,7 +6,7 @@ All axes go side by side, each with its own sets: they share the simulated time 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -230,7 +230,7 @@ class _Pool:
             y = residual[i, 0] + f.spec.theta[list(f.spec.flat)] @ own[i, 0, :m]
             x = torch.cat([own[i, 0, :m], new[i]])
             grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
-            base_groups = _groups(f.spec.active)
+            base_groups = f.spec.groups
             sets, kept, place = [], [], m
             for v in variants:
                 width = len(v.active)
@@ -258,11 +258,3 @@ def without(library: Library, spec: Spec, place: int) -> Spec:
         spec.log_prior,
         tuple(p for p in spec.free if p not in held),
     )
-
-
-def _groups(active: Iterable[tuple[int, ...]]) -> list[Tensor]:
-    groups, begin = [], 0
-    for group in active:
-        groups.append(torch.arange(begin, begin + len(group)))
-        begin += len(group)
-    return groups

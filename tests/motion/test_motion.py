@@ -111,7 +111,7 @@ def test_a_mujoco_model_is_a_model(tmp_path: Path) -> None:
     found = diagnose_motion(load_logs([log]), nominal_of(str(model), {}, ["rad"]), ["gravity", "delay"]).content
     assert found["verdict"]["effects"] == ["gravity"]
     sag = next(e for e in found["effects"] if e["name"] == "gravity")["parameters"]["q1 sin"]
-    assert sag["value"] == pytest.approx(0.3 / GAIN, rel=0.15)
+    assert sag["value"] == pytest.approx(0.3, rel=0.03) and sag["unit"] == "N*m"
     model.write_text(text.format(body.replace("<joint ", '<joint name="q" '), '<motor joint="q"/>'))
     with pytest.raises(InputError, match="<position joint=…/> for each command"):
         nominal_of(str(model), {}, ["rad"])
