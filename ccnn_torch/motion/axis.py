@@ -196,33 +196,36 @@ class _Rule:
         mass = a["inertia"] / h
         motor = gain * (u - q)
         free = mass * v
-        load = np.minimum(np.maximum(motor, -limit), limit) if self.has["weakness"] else motor
+        # What the gear carries beside the motor's torque.
+        carried: Array | float = 0.0
         if self.heavy:
-            pull = self.weight * np.sin(q + self.hang)
-            free = free - pull
-            load = motor + pull
+            carried = self.weight * np.sin(q + self.hang)
         if push is not None:
-            free = free - push
-            load = load + push
+            carried = carried + push
+        free = free - carried
         if self.waves:
             free = free - self.wave * np.sin(a["cogging_order"] * q + self.phase)
         friction = dry
         if self.has["stribeck"]:
             friction = friction + a["stribeck"] * np.exp(-np.square(v / a["stribeck_speed"]))
-        if self.has["load_friction"]:
-            friction = friction + a["load_friction"] * np.abs(load)
         light = np.maximum(mass + a["viscous"], _TINY)
-        speed = self.solved(free + motor, friction, light + gain * h)
+        speed = self.solved(free + motor, friction, motor + carried, light, gain * h)
         if self.has["weakness"]:
             torque = motor - gain * h * speed
             held = np.minimum(np.maximum(torque, -limit), limit)
             if not np.array_equal(held, torque):
-                speed = np.where(torque == held, speed, self.solved(free + held, friction, light))
+                weak = self.solved(free + held, friction, held + carried, light, 0 * held)
+                speed = np.where(torque == held, speed, weak)
         speed = np.minimum(np.maximum(speed, -_FASTEST), _FASTEST)
         return q + h * speed, speed
 
-    def solved(self, push: Array, friction: Array, resistance: Array) -> Array:
-        """Speed under a push against dry friction."""
+    def solved(self, push: Array, friction: Array, load: Array, light: Array, stiff: Array) -> Array:
+        """Speed under a push against dry friction; stiff: how fast the motor's part of the load falls with the speed."""
+        resistance = light + stiff
+        if self.has["load_friction"]:
+            share = self.a["load_friction"]
+            friction = friction + share * np.abs(load)
+            resistance = resistance - share * stiff * np.sign(push * load)
         if self.dry:
             push = push - np.minimum(np.maximum(push, -friction), friction)
         return push / resistance

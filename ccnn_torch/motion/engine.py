@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from ccnn_torch.diagnosis.verdict.text import listed, unseen_text, verdict_text
 from ccnn_torch.display import number_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion.effects import Facts, MotionEffect, motion_effects
+from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.fit import Fit, Spec
 from ccnn_torch.motion.held_out import Spread, folds_of, held_out, resampled, shrink_of
 from ccnn_torch.motion.judge import AxisVerdict, judge_axes
@@ -39,6 +40,8 @@ _NEARLY = 0.98
 # Names are added as long as they take the held-out gap to less than this share of itself; a verdict that loses one is
 # no surer than the second number.
 _NEARLY_LEAST, _DOUBTED = 1.02, 0.9
+# Searches about a simulator's parameters as found.
+_RECENTRED = 2
 # Marginal probability from which something is there even where no names hold, which are then no surer than that.
 _CONFIRMED = 0.5
 
@@ -93,7 +96,7 @@ def problem_of(
         raise InputError(f"effects: these logs can show none of the candidates: {need}")
     step = float(data.time.diff(dim=-1).median())
     pool = max(round(_POOLED / step), 1)
-    return Problem(data, library, driven.followed, supply, warm, pool, driven.torque, driven.simulated)
+    return Problem(data, library, driven.followed, supply, warm, pool, driven.torque, driven.simulated, driven.own)
 
 
 @torch.no_grad()
@@ -117,8 +120,17 @@ def diagnose_motion(
         InputError: the logs cannot be diagnosed.
     """
     at_step("searching the effects")
-    problem = problem_of(logs, nominal, motion_effects(effects))
+    problem = problem_of(logs, nominal, [*motion_effects(effects), *nominal.own_effects])
+    nothing = problem.residual(torch.zeros(1, len(nominal.axes), problem.library.size, dtype=torch.float64))[0]
     found = search(problem)
+    for _ in range(_RECENTRED):
+        about = _own_values(found)
+        if not about:
+            break
+        # A simulator is linearised in its own parameters: about those that were found.
+        driven = nominal.driven(logs, problem.data, about)
+        problem = replace(problem, followed=driven.followed, own=driven.own)
+        found = search(problem)
     verdicts = judge_axes(found)
     at_step("judging on held-out rows")
     library, data = problem.library, problem.data
@@ -131,6 +143,8 @@ def diagnose_motion(
     ]
     sets = [none, *steps, *singles.values()]
     residuals = held_out(problem, found.whitening, sets)
+    # Of the model itself, also where it was linearised elsewhere.
+    residuals[0] = nothing
     spread = Spread(problem, seed)
     squares = [spread.squares(r) for r in residuals]
     floor = noise**2 * len(whole) if noise else _floor(problem, found, verdicts)
@@ -211,6 +225,13 @@ def diagnose_motion(
     return MotionDiagnosis(content, problem, found, verdicts, residuals[0], after, proposed)
 
 
+def _own_values(found: Search) -> dict[str, float]:
+    """What is added to a simulator's own parameters: the mean over the axes whose best set has them."""
+    theta = torch.stack([fits[0].spec.theta for fits in found.found])
+    values = {n: v[v != 0] for n, v in found.problem.library.parameters(theta).items() if n.startswith(OWN)}
+    return {name.removeprefix(OWN): float(v.mean()) for name, v in values.items() if len(v)}
+
+
 def _facts(data: Stretches, i: int, nominal: Nominal, followed: Tensor, supply: Tensor, warm: Tensor) -> Facts:
     judged = data.judged
     step = data.time.diff(dim=-1)
@@ -228,6 +249,7 @@ def _facts(data: Stretches, i: int, nominal: Nominal, followed: Tensor, supply: 
         nominal=nominal.axes[i],
         gain=nominal.gains[i],
         length=nominal.lengths[i],
+        weight=nominal.weights[i] if nominal.weights else None,
         span=span or 1.0,
         speed=most,
         acceleration=nearly(rise[judged[:, 1:]]) or 1.0,

@@ -17,7 +17,7 @@ __all__ = ["Library", "Variant", "library_of"]
 
 # What may not be below 0, and what not above.
 _POSITIVE = (
-    *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "delay", "play"),
+    *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "play"),
     *("flexibility", "gain"),
 )
 _MOST = {"load_friction": 0.9}
@@ -120,7 +120,7 @@ class Library(NamedTuple):
                 continue
             for a, (name, _, how) in enumerate(self.numbers[0][j].acts):
                 amount = theta[..., j] * theta.new_tensor([axis[j].scale * axis[j].acts[a][1] for axis in self.numbers])
-                before = found.get(name, torch.full_like(amount, ABSENT[name]))
+                before = found.get(name, torch.full_like(amount, ABSENT.get(name, 0.0)))
                 found[name] = before + amount if how == "add" else before * amount.clamp(-5, 5).exp()
         for name, place in self.held.items():
             value = theta[..., place]

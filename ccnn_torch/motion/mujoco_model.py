@@ -64,6 +64,7 @@ def mujoco_simulator(path: str, keys: Mapping[str, Any], units: Sequence[str]) -
         "coulomb": model.dof_frictionloss[dofs] / gain,
         "weakness": model.actuator_forcelimited[position] * gain / np.maximum(limit, _TINY),
     }
+    levers = [_lever(model, j) for j in joints]
     return Simulator(
         path,
         lambda time, commands, parameters: _moved(model, joints, values, time, commands)[0],
@@ -71,8 +72,30 @@ def mujoco_simulator(path: str, keys: Mapping[str, Any], units: Sequence[str]) -
         (f"{Path(path).name}: simulated from rest at each log's first command",),
         tuple({name: float(v[i]) for name, v in values.items() if v[i]} for i in range(len(joints))),
         tuple(gain.tolist()),
+        tuple(lever and lever[0] for lever in levers),
+        tuple(lever and lever[1] for lever in levers),
         lambda time, commands: _moved(model, joints, values, time, commands),
     )
+
+
+def _lever(model: Any, joint: int) -> tuple[float, tuple[float, float]] | None:
+    """From a hinge to the centre of mass of its body [m], and what 1 kg there weighs, as of `Facts`; None of a joint
+    whose weight follows the positions of others, too."""
+    import mujoco
+
+    body = int(model.jnt_bodyid[joint])
+    chain = [body]
+    while chain[-1]:
+        chain.append(int(model.body_parentid[chain[-1]]))
+    if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE or sum(model.body_jntnum[b] for b in chain) != 1:
+        return None
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    axis, arm = data.xaxis[joint], data.xipos[body] - data.xanchor[joint]
+    turned = np.cross(axis, arm)
+    lever = float(np.linalg.norm(turned))
+    cosine, sine = (-float(model.opt.gravity @ v) for v in (turned, np.cross(axis, turned)))
+    return (lever, (sine, cosine)) if lever > _TINY else None
 
 
 def _moved(

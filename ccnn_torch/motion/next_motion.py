@@ -190,6 +190,7 @@ def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
         warm=still,
         torque=None,
         simulated=None,
+        own={},
         pool=max(round(step / _STEP), 1),
     )
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.motion.axis import Drive, simulate_axes
+from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.stretches import Stretches
 
@@ -48,6 +50,7 @@ class Problem:
         followed: what the axes follow, `n x b x s`: the commands, or what a simulator makes of them.
         torque, simulated: as of `Driven`.
         supply, warm: as of `Drive`, `b x s`.
+        own: what a unit of each of a simulator's own parameters changes in its positions, by name, `n x b x s`.
         pool: so many samples are averaged before they are judged: what is faster than the motion is noise.
     """
 
@@ -59,6 +62,7 @@ class Problem:
     pool: int = 1
     torque: Tensor | None = None
     simulated: Tensor | None = None
+    own: Mapping[str, Tensor] = field(default_factory=dict)
 
     def positions(self, theta: Tensor, chosen: Tensor | None = None) -> Tensor:
         """Simulated positions, `p x n x b x s`; theta: `p x n x k`; chosen: stretches, all when None."""
@@ -88,11 +92,16 @@ class Problem:
             self.warm[rows].expand(n, -1, -1).reshape(n * b, -1),
             None if self.torque is None else self.torque[:, rows].reshape(n * b, -1),
         )
+        parameters = self.library.parameters(theta)
+        own = {name: parameters.pop(f"{OWN}{name}", None) for name in self.own}
         values = {
             name: value[..., None].expand(*value.shape, b).reshape(len(theta), n * b)
-            for name, value in self.library.parameters(theta).items()
+            for name, value in parameters.items()
         }
         moved = simulate_axes(drive, values).reshape(-1, n, b, time.shape[-1])
+        for name, value in own.items():
+            if value is not None:
+                moved = moved + value[..., None, None] * self.own[name][:, rows]
         return moved.expand(len(theta), -1, -1, -1)
 
     def residual(self, theta: Tensor, chosen: Tensor | None = None) -> Tensor:
