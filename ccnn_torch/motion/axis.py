@@ -220,7 +220,7 @@ class _Rule:
         return q + h * speed, speed
 
     def solved(self, push: Array, friction: Array, load: Array, light: Array, stiff: Array) -> Array:
-        """Speed under a push against dry friction; stiff: how fast the motor's part of the load falls with the speed."""
+        """Speed under a push against dry friction; stiff: how fast the motor's part of the load falls with it."""
         resistance = light + stiff
         if self.has["load_friction"]:
             share = self.a["load_friction"]

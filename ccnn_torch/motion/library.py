@@ -21,6 +21,8 @@ _POSITIVE = (
     *("flexibility", "gain"),
 )
 _MOST = {"load_friction": 0.9}
+# Share of the largest speed up to which friction may fall with the speed: what falls later is plain dry friction.
+_SLOW = 0.5
 # Plausible sizes: no number is larger.
 _WIDEST = 1e3
 # Log odds against what is seen less often than the rest, and can take the form of nearly anything.
@@ -94,6 +96,8 @@ class Library(NamedTuple):
                         high[i, j] = min(float(high[i, j]), (_MOST.get(name, math.inf) - nominal) / number.scale)
         # 0 stands for a shape that is not used.
         low[:, list(self.held.values())] = 0.0
+        if "stribeck_speed" in self.held:
+            high[:, self.held["stribeck_speed"]] = torch.tensor([_SLOW * axis.speed for axis in self.facts])
         return low, high
 
     @property

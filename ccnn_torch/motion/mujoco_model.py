@@ -101,8 +101,8 @@ def _lever(model: Any, joint: int) -> tuple[float, tuple[float, float]] | None:
 def _moved(
     model: Any, joints: Sequence[int], own: Mapping[str, Array], time: Array, commands: Array
 ) -> tuple[Array, Array]:
-    """Positions, and what resists each actuator beside its own joint's friction and mean inertia, over its gain, `s x n`
-    each: weights, and the other joints."""
+    """Positions, and what resists each actuator beside its joint's friction and inertia, over its gain, `s x n` each:
+    weights, and the other joints."""
     import mujoco
 
     data = mujoco.MjData(model)

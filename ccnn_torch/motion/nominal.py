@@ -53,9 +53,7 @@ KEYS: dict[str, str] = {
 }
 """Keys of the built-in servo; a number for all axes, or a list with one for each."""
 
-TORQUES = (
-    *("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos"),
-)
+TORQUES = (*("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos"),)
 """Parameters that are torques, which an axis has over the gain."""
 _SIGNED = ("delay", "offset", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
 # Of a simulator's parameter, for a difference quotient.
@@ -129,7 +127,6 @@ class Nominal:
         if simulator is None:
             return Driven(data.command)
         if simulator.loaded is None:
-
             centre = {name: value + (about or {}).get(name, 0.0) for name, value in simulator.parameters.items()}
 
             def made_with(**other: float) -> Tensor:
