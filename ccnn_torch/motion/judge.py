@@ -8,18 +8,17 @@ stamps of the log can tell are left out of a set before it counts.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.dictionary import CERTAIN
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of, scaled
-from ccnn_torch.diagnosis.search.form_error import LEVELS, OF_EXACT, OF_FORM, form_variance
-from ccnn_torch.motion.drivers import driver_columns
-from ccnn_torch.motion.effects import EXACT
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, grams_of
+from ccnn_torch.diagnosis.search.form_error import LEVELS
+from ccnn_torch.motion.drivers import Driver, driver_columns
 from ccnn_torch.motion.fit import Fit, sensitivities
+from ccnn_torch.motion.form import weighed
 from ccnn_torch.motion.problem import Problem, Whitening
 from ccnn_torch.motion.search import CROWD, Search, log_posterior
 
@@ -29,8 +28,6 @@ __all__ = ["AxisVerdict", "judge_axes"]
 _OUTSIDE = math.log(0.001)
 # Odds up to which the logs do not distinguish one name from another.
 _LIKE = 20.0
-# Share φ of what the nominal model makes of the command: as of an effect, but most of it is right.
-_OF_NOMINAL = 1e-5
 # Share of a sampling step by which the time stamps of commands and positions may differ.
 _STAMP = 0.1
 # Sets beside which drivers are tried, besides those that lead from the best one to none.
@@ -74,15 +71,15 @@ def judge_axes(found: Search) -> list[AxisVerdict]:
     return [_judged(found, i, drivers) for i in range(len(found.found))]
 
 
-def _judged(found: Search, axis: int, drivers: Mapping[str, Tensor]) -> AxisVerdict:
+def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     problem, fits = found.problem, found.found[axis]
     by_members = {f.members: f for f in fits}
     slight = _slight(problem, axis)
     sets = [_Set((_essential(f, by_members, slight).members, None), f.grams, f.spec.groups, _prior(f)) for f in fits]
     sets += _with_drivers(found, axis, drivers, by_members, slight)
     share: dict[tuple[Members, str | None], float] = {}
-    for variance in _variances(found, axis):
-        weights = [float(_weighed(one, variance).log_evidence[0]) + one.log_prior for one in sets]
+    for variance in (fits[0].noise + level * found.form[axis] for level in LEVELS):
+        weights = [float(weighed(one.grams, one.groups, variance).log_evidence[0]) + one.log_prior for one in sets]
         top = max(weights)
         total = math.fsum(math.exp(w - top) for w in weights)
         for one, w in zip(sets, weights, strict=True):
@@ -106,25 +103,6 @@ def _judged(found: Search, axis: int, drivers: Mapping[str, Tensor]) -> AxisVerd
 
 def _prior(fit: Fit) -> float:
     return log_posterior(fit) - fit.log_evidence
-
-
-def _weighed(one: _Set, variance: float) -> Fits:
-    """The set under a noise that is known."""
-    return fit_sets(scaled(one.grams, variance), [one.groups], CERTAIN * one.grams.values)
-
-
-def _variances(found: Search, axis: int) -> list[float]:
-    """Of noise and form errors of the best set and the nominal model at each level, of the whitened values."""
-    problem, best = found.problem, found.found[axis][0]
-    theta = torch.zeros(1, len(found.found), problem.library.size, dtype=torch.float64)
-    nominal = problem.positions(theta)[:, axis : axis + 1] - problem.data.command[axis]
-    measured = problem.data.position[axis] - problem.data.command[axis]
-    does, most = (float(problem.whitened(v, _one(found, axis)).square().sum()) for v in (nominal, measured[None, None]))
-    names = problem.library.names
-    shares = [OF_EXACT if names[m] in EXACT else OF_FORM for m in best.members]
-    energy = (fit_sets(best.grams, [best.spec.groups], 0.0).energy[0]).tolist()[: len(shares)]
-    form = form_variance([*shares, _OF_NOMINAL], [*energy, does], max(most, does))
-    return [best.noise + level * form for level in LEVELS]
 
 
 def _slight(problem: Problem, axis: int) -> float:
@@ -163,12 +141,12 @@ def _equals(own: Members, named: Members, classes: Mapping[int, tuple[int, ...]]
 
 
 def _with_drivers(
-    found: Search, axis: int, drivers: Mapping[str, Tensor], fits: Mapping[Members, Fit], slight: float
+    found: Search, axis: int, drivers: Sequence[Driver], fits: Mapping[Members, Fit], slight: float
 ) -> list[_Set]:
     """Drivers beside the most probable sets, and those that lead from the best one to none."""
     problem, judged, one = found.problem, found.problem.data.judged, _one(found, axis)
     values = float(problem.judged.sum())
-    white = {name: problem.whitened(columns[axis][:, None], one)[0] for name, columns in drivers.items()}
+    white = [problem.whitened(driver.columns[axis][:, None], one)[0] for driver in drivers]
     chain = [found.found[axis][0]]
     while chain[-1].members:
         rest = [tuple(m for m in chain[-1].members if m != e) for e in chain[-1].members]
@@ -183,16 +161,16 @@ def _with_drivers(
         plain = problem.residual(theta[None])[0, axis]
         y = residual[axis, 0] + base.spec.theta[flat] @ own[axis, 0]
         prior = _prior(base) + _OUTSIDE + (CROWD if len(base.members) >= 2 else 0.0)
-        for name, columns in white.items():
+        for driver, columns in zip(drivers, white, strict=True):
             x = torch.cat([own[axis, 0], columns])
             grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
             groups = [*base.spec.groups, torch.arange(len(flat), len(x))]
             # What it takes away of the position itself, not of its whitened form.
             mean = fit_sets(grams, [groups], 0.0).mean[0, len(flat) :]
-            left = plain - (mean[:, None, None] * drivers[name][axis]).sum(0)
+            left = plain - (mean[:, None, None] * driver.columns[axis]).sum(0)
             taken = float(plain[judged].square().mean() - left[judged].square().mean())
             members = _essential(base, fits, slight).members
-            sets.append(_Set((members, name if taken >= slight else None), grams, groups, prior))
+            sets.append(_Set((members, driver.name if taken >= slight else None), grams, groups, prior))
     return sets
 
 

@@ -23,6 +23,8 @@ _POSITIVE = (
 _MOST = {"load_friction": 0.9}
 # Share of the largest speed up to which friction may fall with the speed: what falls later is plain dry friction.
 _SLOW = 0.5
+# Fewer periods in a turn are a weight or an offset.
+_LEAST = {"cogging_order": 2.0}
 # Plausible sizes: no number is larger.
 _WIDEST = 1e3
 # Log odds against what is seen less often than the rest, and can take the form of nearly anything.
@@ -128,6 +130,7 @@ class Library(NamedTuple):
                 found[name] = before + amount if how == "add" else before * amount.clamp(-5, 5).exp()
         for name, place in self.held.items():
             value = theta[..., place]
+            value = torch.where(value != 0, value.clamp_min(_LEAST.get(name, 0.0)), value)
             if bool((value != 0).any()):
                 found[name] = torch.where(value != 0, value, found.get(name, torch.full_like(value, ABSENT[name])))
         for name in _POSITIVE:

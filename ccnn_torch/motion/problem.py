@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -80,6 +80,42 @@ class Problem:
         speed = begin.diff(dim=-1) / self.data.time[:, :2].diff(dim=-1)
         theta = torch.zeros(1, len(begin), self.library.size, dtype=torch.float64)
         return self.simulated - self._moved(theta, rows, torch.cat([begin[..., :1], speed], -1))[0]
+
+    def pushed(self, theta: Tensor, torque: Tensor) -> Tensor:
+        """Positions under torques that resist the motors, over the gain, one after the other.
+
+        Args:
+            theta: `n x k`.
+            torque: `n x m x b x s` [rad or m].
+
+        Returns:
+            `n x m x b x s`.
+        """
+        n, m, b, s = torque.shape
+        already = 0.0 if self.torque is None else self.torque[:, None]
+        every = torque + already
+
+        def many(values: Tensor) -> Tensor:
+            return values.repeat(m, *[1] * (values.dim() - 1))
+
+        # A stretch for every torque.
+        data = self.data._replace(
+            time=many(self.data.time),
+            position=self.data.position.repeat(1, m, 1),
+            speed=self.data.speed.repeat(1, m, 1),
+        )
+        wide = replace(
+            self,
+            data=data,
+            followed=self.followed.repeat(1, m, 1),
+            supply=many(self.supply),
+            warm=many(self.warm),
+            torque=every.reshape(n, m * b, s),
+            simulated=None,
+            own={name: v.repeat(1, m, 1) for name, v in self.own.items()},
+        )
+        moved = wide.positions(theta[None])[0].reshape(n, m, b, s)
+        return moved if self.simulated is None else moved + self._beyond[:, None]
 
     def _moved(self, theta: Tensor, rows: Tensor, start: Tensor) -> Tensor:
         data, n, b = self.data, len(self.followed), len(rows)

@@ -27,6 +27,8 @@ class _Payload:
             add("gravity_sin", sine / gain),
             add("gravity_cos", cosine / gain),
             add("inertia", lever**2 / gain),
+            # The model knows which part of the inertia is behind the gear.
+            add("load", lever**2 / gain if axis.nominal.get("load") else 0.0),
         )
         # A mass whose weight differs the command and the position by a tenth of a radian.
         return (Number("mass", "kg", 0.1 * gain / (STANDARD_GRAVITY * lever), acts),)
