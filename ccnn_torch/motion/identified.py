@@ -16,9 +16,10 @@ from ccnn_torch.motion.axis import ABSENT
 from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.engine import MotionDiagnosis
 from ccnn_torch.motion.nominal import TORQUES, Nominal, axis_keys, nominal_of
+from ccnn_torch.plugins import code_refused
 from ccnn_torch.report.json_files import read_json, write_json
 
-__all__ = ["IDENTIFIED", "Identified", "identified_of", "load_identified", "write_identified"]
+__all__ = ["IDENTIFIED", "Identified", "is_identified", "load_identified", "write_identified"]
 
 IDENTIFIED, _MODEL = "identified_motion.json", "identified.xml"
 # What an MJCF can hold of an axis.
@@ -36,14 +37,16 @@ class Identified(NamedTuple):
     Attributes:
         nominal: the model with the new values.
         axes: parameters of its axes, with what the model itself does not hold.
-        left: RMS that it left on runs that were not fitted [rad or m].
+        left: RMS that it left on runs that were not fitted, of each joint [rad or m].
         effects: names of the verdict.
+        units: of the joints.
     """
 
     nominal: Nominal
     axes: tuple[Axis, ...]
-    left: float
+    left: tuple[float, ...]
     effects: tuple[str, ...]
+    units: tuple[str, ...]
 
 
 def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, keys: Mapping[str, Any]) -> list[str]:
@@ -66,7 +69,7 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
         "mechanism_keys": dict(keys),
         "units": list(found.problem.data.units),
         "effects": list(found.content["verdict"]["effects"]),
-        "left": found.content["gap"]["after"],
+        "left": [float(own[found.problem.data.judged].square().mean().sqrt()) for own in found.after],
         "axes": axes,
     }
     files = [IDENTIFIED]
@@ -90,35 +93,44 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
     return files
 
 
-def load_identified(path: Path) -> Identified:
+def is_identified(path: Path) -> bool:
+    """Whether a file is one that `ccnn diagnose --motion` writes for commands to be corrected by."""
+    return path.suffix == ".json" and path.is_file() and {"axes", "mechanism", "left"} <= {*read_json(path)}
+
+
+def load_identified(path: Path, allow_code: bool = False) -> Identified:
     """The model of a file that `ccnn diagnose --motion` has written.
 
+    Args:
+        path: the file.
+        allow_code: whether the Python file that it may name as its simulator runs.
+
     Raises:
-        InputError: it is not there, is no such file, or names a model that is not there.
+        InputError: it is not there, is no such file, or names a model that is not there or may not run.
     """
     content = read_json(path)
     try:
         mechanism, keys, units = content["mechanism"], content["mechanism_keys"], list(content["units"])
         axes = tuple({str(n): float(v) for n, v in axis.items()} for axis in content["axes"])
-        left, effects = float(content["left"]), tuple(map(str, content["effects"]))
+        left, effects = tuple(map(float, content["left"])), tuple(map(str, content["effects"]))
         unknown = next((n for axis in axes for n in axis if n not in ABSENT), None)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: is no {IDENTIFIED}, which ccnn diagnose --motion writes ({error})") from None
-    if unknown is not None or len(axes) != len(units):
+    if unknown is not None or not len(axes) == len(units) == len(left):
         what = f"an axis has no parameter '{unknown}'" if unknown else f"{len(axes)} axes for {len(units)} joints"
         raise InputError(f"{path}: {what}; write it anew with ccnn diagnose --motion")
     beside = path.parent / str(mechanism)
     name = str(beside) if mechanism == _MODEL else str(mechanism)
-    return identified_of(nominal_of(name, keys, units), axes, left, effects)
+    with code_refused(f"{path}: its simulator", allow_code):
+        nominal = nominal_of(name, keys, units)
+    return Identified(nominal, _axes_of(nominal, axes), left, effects, tuple(units))
 
 
-def identified_of(nominal: Nominal, axes: Sequence[Axis], left: float, effects: Sequence[str]) -> Identified:
-    """A model whose axes have the parameters found; what an MJCF holds is that of the file."""
+def _axes_of(nominal: Nominal, axes: Sequence[Axis]) -> tuple[Axis, ...]:
+    """Parameters of the axes of a model with the new values in it."""
     if nominal.name == "servo":
-        axes = nominal.axes
-    elif nominal.simulator is not None and nominal.simulator.loaded is not None:
-        axes = [{**axis, **own} for axis, own in zip(axes, nominal.axes, strict=True)]
-    return Identified(nominal, tuple(axes), left, tuple(effects))
+        return nominal.axes
+    return tuple({**axis, **own} for axis, own in zip(axes, nominal.axes, strict=True))
 
 
 def _beside(nominal: Nominal, i: int, axis: Axis, mass: float) -> dict[str, float]:

@@ -75,7 +75,8 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     problem, fits = found.problem, found.found[axis]
     by_members = {f.members: f for f in fits}
     slight = _slight(problem, axis)
-    sets = [_Set((_essential(f, by_members, slight).members, None), f.grams, f.spec.groups, _prior(f)) for f in fits]
+    left = {f.members: f.left for f in fits}
+    sets = [_Set((_essential(f.members, left, slight), None), f.grams, f.spec.groups, _prior(f)) for f in fits]
     sets += _with_drivers(found, axis, drivers, by_members, slight)
     share: dict[tuple[Members, str | None], float] = {}
     for variance in (fits[0].noise + level * found.form[axis] for level in LEVELS):
@@ -111,15 +112,15 @@ def _slight(problem: Problem, axis: int) -> float:
     return (_STAMP * step) ** 2 * float(problem.data.speed[axis][problem.data.judged].square().mean())
 
 
-def _essential(best: Fit, fits: Mapping[Members, Fit], slight: float) -> Fit:
-    """The set without members that do next to nothing, the least first."""
-    while best.members:
-        rest = [tuple(m for m in best.members if m != e) for e in best.members]
-        least = min((fits[r] for r in rest if r in fits), key=lambda f: f.left, default=None)
-        if least is None or least.left - best.left >= slight:
+def _essential(members: Members, left: Mapping[Members, float], slight: float) -> Members:
+    """The set without members that do next to nothing, the least first; left: mean square that each set leaves."""
+    while members:
+        rest = [tuple(m for m in members if m != e) for e in members]
+        least = min((r for r in rest if r in left), key=lambda r: left[r], default=None)
+        if least is None or left[least] - left[members] >= slight:
             break
-        best = least
-    return best
+        members = least
+    return members
 
 
 def _classes(members: Members, inside: Mapping[Members, float]) -> dict[int, tuple[int, ...]]:
@@ -151,7 +152,9 @@ def _with_drivers(
     while chain[-1].members:
         rest = [tuple(m for m in chain[-1].members if m != e) for e in chain[-1].members]
         chain.append(min((fits[r] for r in rest if r in fits), key=lambda f: f.left))
-    sets = []
+    sets: list[tuple[int, _Set]] = []
+    taken: list[dict[Members, float]] = [{} for _ in drivers]
+    left = {members: fit.left for members, fit in fits.items()}
     for base in {f.members: f for f in [*found.found[axis][:_BASES], *chain]}.values():
         theta = torch.stack([base.spec.theta if i == axis else own[0].spec.theta for i, own in enumerate(found.found)])
         flat = list(base.spec.flat)
@@ -161,17 +164,21 @@ def _with_drivers(
         plain = problem.residual(theta[None])[0, axis]
         y = residual[axis, 0] + base.spec.theta[flat] @ own[axis, 0]
         prior = _prior(base) + _OUTSIDE + (CROWD if len(base.members) >= 2 else 0.0)
-        for driver, columns in zip(drivers, white, strict=True):
+        for k, (driver, columns) in enumerate(zip(drivers, white, strict=True)):
             x = torch.cat([own[axis, 0], columns])
             grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
             groups = [*base.spec.groups, torch.arange(len(flat), len(x))]
             # What it takes away of the position itself, not of its whitened form.
             mean = fit_sets(grams, [groups], 0.0).mean[0, len(flat) :]
-            left = plain - (mean[:, None, None] * driver.columns[axis]).sum(0)
-            taken = float(plain[judged].square().mean() - left[judged].square().mean())
-            members = _essential(base, fits, slight).members
-            sets.append(_Set((members, driver.name if taken >= slight else None), grams, groups, prior))
-    return sets
+            rest = (plain - (mean[:, None, None] * driver.columns[axis]).sum(0))[judged].square().mean()
+            taken[k][base.members] = float(rest)
+            there = driver.name if float(plain[judged].square().mean() - rest) >= slight else None
+            sets.append((k, _Set((base.members, there), grams, groups, prior)))
+    # Beside a driver a name has to do what the driver does not do as well.
+    return [
+        one._replace(key=(_essential(one.key[0], taken[k] if one.key[1] else left, slight), one.key[1]))
+        for k, one in sets
+    ]
 
 
 def _one(found: Search, axis: int) -> Whitening:
