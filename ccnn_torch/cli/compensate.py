@@ -32,9 +32,7 @@ _STARTS = 64
 
 
 def compensate(
-    model: Annotated[
-        Path, typer.Argument(help=".safetensors, .onnx, identified.yaml or identified_motion.json.")
-    ],
+    model: Annotated[Path, typer.Argument(help=".safetensors, .onnx, identified.yaml or identified_motion.json.")],
     input: Annotated[Path, typer.Argument(metavar="IN.csv", help="Ideal joints; columns are name[unit].")],
     output: Annotated[Path, typer.Argument(metavar="OUT.csv", help="IN's columns and the commands.")],
     pose: Annotated[bool, typer.Option("--pose", help="IN has wanted poses instead of joints.")] = False,
