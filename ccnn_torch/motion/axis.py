@@ -116,8 +116,8 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     u, torque = drive.command, drive.torque
     if bool((tensors["delay"] != 0).any()):
         # Weights and the other joints are late as well, as the motion is.
-        u, torque = (None if x is None else delayed(drive.time, x, tensors["delay"]) for x in (u, torque))
-    assert u is not None
+        u = delayed(drive.time, u, tensors["delay"])
+        torque = None if torque is None else delayed(drive.time, torque, tensors["delay"])
     u = u.expand(*shape, -1) + tensors["offset"][..., None]
     a = {n: v.numpy() for n, v in tensors.items()}
     steps = drive.time.diff(dim=-1).numpy().T
@@ -169,7 +169,7 @@ def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[
 
 
 def _between(values: Array, k: int, share: float) -> Array:
-    return values[k] + share * (values[k + 1] - values[k])
+    return np.asarray(values[k] + share * (values[k + 1] - values[k]))
 
 
 class _Rule:

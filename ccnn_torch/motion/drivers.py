@@ -79,7 +79,7 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
     under = problem.pushed(theta[0], torch.cat([_STEP * span * columns for _, columns in pushed], 1))
     columns = (under - moved[:, None]) * (_SIZE / _STEP)
     widths = [c.shape[1] for _, c in pushed]
-    return found + [Driver(n, c) for (n, _), c in zip(pushed, columns.split(widths, 1), strict=True)]
+    return found + [Driver(n, c) for (n, _), c in zip(pushed, torch.split(columns, widths, 1), strict=True)]
 
 
 def _direction(speed: Tensor) -> Tensor:

@@ -150,8 +150,8 @@ def _with_drivers(
     white = [problem.whitened(driver.columns[axis][:, None], one)[0] for driver in drivers]
     chain = [found.found[axis][0]]
     while chain[-1].members:
-        rest = [tuple(m for m in chain[-1].members if m != e) for e in chain[-1].members]
-        chain.append(min((fits[r] for r in rest if r in fits), key=lambda f: f.left))
+        less = [tuple(m for m in chain[-1].members if m != e) for e in chain[-1].members]
+        chain.append(min((fits[r] for r in less if r in fits), key=lambda f: f.left))
     sets: list[tuple[int, _Set]] = []
     taken: list[dict[Members, float]] = [{} for _ in drivers]
     left = {members: fit.left for members, fit in fits.items()}

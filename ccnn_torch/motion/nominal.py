@@ -139,8 +139,8 @@ class Nominal:
                 own[name] = (made_with(**{name: value + step}) - made_with(**{name: value - step})) / (2 * step)
                 made = made - (value - simulator.parameters[name]) * own[name]
             return Driven(made, own=own)
-        made = [simulator.loaded(log.time, log.command) for log in logs]
-        simulated, torque = (_along([m[k] for m in made], data) for k in range(2))
+        pairs = [simulator.loaded(log.time, log.command) for log in logs]
+        simulated, torque = (_along([pair[k] for pair in pairs], data) for k in range(2))
         return Driven(data.command, torque, simulated)
 
 

@@ -158,6 +158,7 @@ def test_a_simulator_of_ones_own_is_a_model_whose_parameters_are_causes(tmp_path
     with pytest.raises(InputError, match="names Python code, "):
         load_identified(tmp_path / "identified_motion.json")
     better = load_identified(tmp_path / "identified_motion.json", allow_code=True)
+    assert better.nominal.simulator is not None
     assert better.nominal.simulator.parameters["viscous"] == pytest.approx(KEYS["viscous"], rel=0.1)
     assert left_on(2, better.nominal, better.axes) < 0.2 * left_on(2, nominal, nominal.axes)
     with pytest.raises(InputError, match="must return a position for each"):

@@ -43,7 +43,7 @@ def write_page(
     facts: str,
     notes: Sequence[str],
     markdown: str,
-) -> dict[str, bytes]:
+) -> dict[str, Path]:
     """Write `report.html`, `diagnosis.md` and `plots/`; the pictures by name.
 
     Args:
