@@ -14,7 +14,7 @@ from ccnn_torch.display import short_path
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.motion.engine import MotionDiagnosis, diagnose_motion
-from ccnn_torch.motion.identified import write_identified
+from ccnn_torch.motion.identified import IDENTIFIED, write_identified
 from ccnn_torch.motion.log import load_logs
 from ccnn_torch.motion.nominal import Nominal, nominal_of
 from ccnn_torch.motion.page import print_motion, write_motion_report, write_next_motion
@@ -118,7 +118,10 @@ def _about(config: DiagnoseConfig, folder: Path, found: MotionDiagnosis) -> dict
         if config.noise is not None
         else ("The noise is what the most probable model leaves; it may hold another cause.")
     )
+    line = f"ccnn compensate {typed_path(str(folder / IDENTIFIED))} MOTION.csv COMMANDS.csv"
+    named = bool(found.content["verdict"]["effects"])
     return {
+        "compensate": ["A wanted motion becomes the commands at which the machine follows it.", line] if named else [],
         "name": folder.name,
         "mechanism": short_path(str(config.mechanism)),
         "records": ", ".join(short_path(str(file)) for file in files),
