@@ -111,8 +111,8 @@ def diagnose_motion(
     if unconfirmed:
         # More is seen than chance, and what it takes away elsewhere is little: the names that take most.
         kept = 1 + min(range(len(names)), key=lambda k: float(squares[k + 1].sum()))
-    dropped = [] if outside else names[kept:]
-    if kept < len(names) and not outside:
+    dropped = names[kept:]
+    if dropped:
         # A name has to take something away on runs that no fit saw.
         verdicts = [reduced(library, found.found[i], v, names[:kept]) for i, v in enumerate(verdicts)]
         names, steps = names[:kept], steps[:kept]

@@ -70,4 +70,6 @@ def reduced(library: Library, fits: Sequence[Fit], verdict: AxisVerdict, names: 
         best = old._replace(spec=spec, mean=old.mean[place], covariance=old.covariance[place][:, place])
     like = {m: verdict.classes[m] for m in members}
     each = [verdict.marginal.get(m, 1.0) for m in members] or [1 - max(verdict.marginal.values(), default=0.0)]
-    return AxisVerdict(best, min([verdict.probability, _DOUBTED, *each]), verdict.marginal, like, verdict.driver)
+    # Of a cause outside the library it is the probability of that.
+    doubted = verdict.probability if verdict.driver else min([verdict.probability, _DOUBTED, *each])
+    return AxisVerdict(best, doubted, verdict.marginal, like, verdict.driver)
