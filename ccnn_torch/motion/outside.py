@@ -68,7 +68,7 @@ def with_drivers(
     chain = [found.found[axis][0]]
     while chain[-1].members:
         less = [tuple(m for m in chain[-1].members if m != e) for e in chain[-1].members]
-        chain.append(min((fits[r] for r in less if r in fits), key=lambda f: f.left))
+        chain.append(min((fits[r] for r in less if r in fits), key=lambda f: f.left, default=fits[()]))
     sets: list[tuple[int, Candidate]] = []
     taken: list[dict[Members, float]] = [{} for _ in drivers]
     left = {members: fit.left for members, fit in fits.items()}

@@ -87,6 +87,7 @@ def search(problem: Problem) -> Search:
     final.neighbours()
     form = form_errors(problem, final.whitening, final.best())
     final.variance = None
+    final.reduced()
     return Search(problem, final.whitening, tuple(tuple(p) for p in final.ranked()), rich, tuple(form))
 
 
