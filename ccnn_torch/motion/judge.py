@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from ccnn_torch.diagnosis.search.form_error import LEVELS
+from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN
 from ccnn_torch.motion.drivers import Driver, driver_columns
 from ccnn_torch.motion.fit import Fit
 from ccnn_torch.motion.form import weighed
@@ -78,13 +79,14 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
         members, driver = key = next(key for key, _ in ranked if key[1] is not None)
         likeliest = max((k for k, one in enumerate(sets) if one.key == key), key=usual.__getitem__)
         outside = outside if holds(problem, sets[likeliest]) else min(outside, _UNCONFIRMED)
+        outside = min(outside, BESIDE_UNKNOWN) if members else outside
         return AxisVerdict(by_members[members], outside, marginal, dict.fromkeys(members, ()), driver)
     inside = {members: p for (members, driver), p in ranked if driver is None}
     members = next(iter(inside))
     classes = _classes(members, inside)
     like = {m: {m, *classes[m]} for m in members}
     sure = tuple(m for m in members if sum(p for (own, _), p in ranked if like[m] & {*own}) >= _NAMED)
-    if sure in inside:
+    if inside.get(sure, 0.0) * _LIKE > inside[members]:
         members, classes = sure, _classes(sure, inside)
     same = sum(p for own, p in inside.items() if _equals(own, members, classes))
     return AxisVerdict(by_members[members], same, marginal, classes, None)
