@@ -184,9 +184,7 @@ def test_a_mujoco_model_is_a_model_and_gets_the_new_values(tmp_path: Path) -> No
         nominal_of(str(model), {}, ["rad"])
 
 
-def test_causes_are_named_with_their_values_and_a_corrected_command_makes_the_machine_follow(
-    tmp_path: Path, cli: Cli
-) -> None:
+def test_causes_have_their_values_and_a_corrected_command_is_followed(tmp_path: Path, cli: Cli) -> None:
     real = {"dry": 0.1, "delay": 0.03, "weight": 0.3}
     log, out = write_log(tmp_path / "log.csv", (0, 1), 2.4, **real), tmp_path / "out"
     keys = "{gain: 2.0, inertia: 0.004, viscous: 0.09}"
