@@ -5,6 +5,7 @@ What a model cannot hold (a delay, a play, ...) stands beside it, as parameters 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -110,14 +111,16 @@ def load_identified(path: Path, allow_code: bool = False) -> Identified:
     """
     content = read_json(path)
     try:
-        mechanism, keys, units = content["mechanism"], content["mechanism_keys"], list(content["units"])
+        mechanism, keys, units = content["mechanism"], dict(content["mechanism_keys"]), list(content["units"])
         axes = tuple({str(n): float(v) for n, v in axis.items()} for axis in content["axes"])
         left, effects = tuple(map(float, content["left"])), tuple(map(str, content["effects"]))
-        unknown = next((n for axis in axes for n in axis if n not in ABSENT), None)
+        unknown = next((n for axis in axes for n, v in axis.items() if n not in ABSENT or not math.isfinite(v)), None)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: is no {IDENTIFIED}, which ccnn diagnose --motion writes ({error})") from None
-    if unknown is not None or not len(axes) == len(units) == len(left):
-        what = f"an axis has no parameter '{unknown}'" if unknown else f"{len(axes)} axes for {len(units)} joints"
+    if unknown is not None or not len(axes) == len(units) == len(left) or not {*map(str, units)} <= {"rad", "m"}:
+        what = (
+            f"an axis has no number '{unknown}'" if unknown else f"{len(axes)} axes for {len(units)} joints in rad or m"
+        )
         raise InputError(f"{path}: {what}; write it anew with ccnn diagnose --motion")
     beside = path.parent / str(mechanism)
     name = str(beside) if mechanism == _MODEL else str(mechanism)

@@ -216,8 +216,15 @@ def test_causes_have_their_values_and_a_corrected_command_is_followed(tmp_path: 
     for arguments, sentence in {(): "time does not increase", ("--back",): "takes none of --pose"}.items():
         code, _, error = cli("compensate", model, tmp_path / "in.csv", sent, *arguments)
         assert code == 2 and sentence in error and error.count("\n") == 1
-    model.write_text(model.read_text().replace('"units"', '"unit"'))
-    assert cli("compensate", model, tmp_path / "in.csv", sent)[0] == 2
+    good = json.loads(model.read_text())
+    for change, sentence in {
+        "units": (["K"], "joints in rad or m"),
+        "mechanism_keys": (3, "is no identified_motion.json"),
+        "axes": ([{"delay": "nan"}], "no number 'delay'"),
+    }.items():
+        model.write_text(json.dumps(good | {change: sentence[0]}))
+        code, _, error = cli("compensate", model, tmp_path / "in.csv", sent)
+        assert code == 2 and str(sentence[1]) in error and error.count("\n") == 1
 
 
 def test_a_file_that_cannot_be_is_refused_in_one_sentence(tmp_path: Path, cli: Cli) -> None:
