@@ -15,7 +15,7 @@ from benchmarks.measure import Row, compare
 from ccnn_torch.motion import diagnose_motion, load_logs, nominal_of
 from ccnn_torch.motion.axis import Drive, simulate_axes
 from ccnn_torch.motion.effects import motion_effects
-from ccnn_torch.motion.engine import problem_of
+from ccnn_torch.motion.setting import problem_of
 
 KEYS = {"gain": 2.0, "inertia": 0.004, "viscous": 0.09}
 REAL = {"inertia": 0.002, "viscous": 0.045, "coulomb": 0.05, "delay": 0.03}

@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from ccnn_torch.motion import diagnose_motion, load_logs, nominal_of
 from ccnn_torch.motion.effects import motion_effects
-from ccnn_torch.motion.engine import problem_of
+from ccnn_torch.motion.setting import problem_of
 
 MASS, LENGTH, VOLTS = 0.49, 0.1, 7.4
 SPLITS = (("sin_time_square", "up_and_down"), ("sin_sin", "lift_and_drop"))

@@ -32,7 +32,7 @@ _STARTS = 64
 
 
 def compensate(
-    model: Annotated[Path, typer.Argument(help="A .safetensors or .onnx file, or identified.yaml.")],
+    model: Annotated[Path, typer.Argument(help=".safetensors, .onnx, identified.yaml or identified_motion.json.")],
     input: Annotated[Path, typer.Argument(metavar="IN.csv", help="Ideal joints; columns are name[unit].")],
     output: Annotated[Path, typer.Argument(metavar="OUT.csv", help="IN's columns and the commands.")],
     pose: Annotated[bool, typer.Option("--pose", help="IN has wanted poses instead of joints.")] = False,
@@ -55,6 +55,10 @@ def compensate(
     deviation_sd_q1[unit]…: inside the domain, about 95 % of new measurements are within 1.96 times it of the predicted
     deviation. With identified.yaml, which ccnn identify writes, the commands are those of the identified kinematics.
 
+    With identified_motion.json, which ccnn diagnose --motion writes, IN.csv has time[s] and command1[unit]…, the
+    motion that is wanted, and OUT.csv gets corrected1[unit]…, the commands at which the machine follows it, and
+    predicted1[unit]…, where it then goes.
+
     Every row is checked against the limits in the model's card. Where the model violates them (a number that is not
     finite, a deviation above the limit), the row has command = joints and inside_domain = 0, and the exit code is 2.
 
@@ -70,6 +74,8 @@ def compensate(
 
     ccnn compensate runs/five_bar/identified.yaml poses.csv commands.csv --pose
 
+    ccnn compensate runs/axis/identified_motion.json motion.csv commands.csv
+
     ccnn compensate from_a_stranger/model.onnx joints.csv commands.csv --public-key theirs.public.pem
     """
     if pose and back:
@@ -81,6 +87,13 @@ def compensate(
     for file, what in ((input, "IN.csv"), (model, "the model")):
         if os.path.realpath(output) == os.path.realpath(file):
             raise InputError(f"{output}: OUT.csv is {what} itself, which would be overwritten; name another file")
+    from ccnn_torch.motion.identified import is_identified
+
+    if is_identified(model):
+        if pose or back or sd or public_key:
+            raise InputError(f"{model}: a model of a motion takes none of --pose, --back, --sd and --public-key")
+        _motion(model, input, output, allow_code, quiet)
+        return
     import numpy as np
 
     from ccnn_torch.compensation import load_compensation
@@ -129,6 +142,15 @@ def compensate(
             f"{input}, {model} violates the limits in its card (finite numbers, |deviation| within the limit); they "
             "were written without any correction and with inside_domain = 0: do not use this model"
         )
+
+
+def _motion(model: Path, input: Path, output: Path, allow_code: bool, quiet: bool) -> None:
+    from ccnn_torch.motion.compensate import compensate_motion
+    from ccnn_torch.report.screen import say
+
+    for sentence in compensate_motion(model, input, output, allow_code):
+        if not quiet:
+            say(f"{sentence}.")
 
 
 def _mechanism_of(loaded: Model, allow_code: bool) -> Mechanism:

@@ -68,6 +68,7 @@ class Drive(NamedTuple):
         start: position and speed of the first sample, `b x 2`.
         supply: supply voltage over the nominal one, less 1, `b x s`.
         warm: temperature less that of the first sample, `b x s` [K].
+        torque: what else resists the motor, over the nominal gain, `b x s` [rad or m]; it comes as late as the command.
     """
 
     time: Tensor
@@ -75,6 +76,7 @@ class Drive(NamedTuple):
     start: Tensor
     supply: Tensor
     warm: Tensor
+    torque: Tensor | None = None
 
 
 def delayed(time: Tensor, values: Tensor, delay: Tensor) -> Tensor:
@@ -111,9 +113,11 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     # Every entry has the same first dimension then, also where a single value stands for all.
     shape = torch.Size([max([1, *(len(v) for v in parameters.values())]), len(like)])
     tensors = {n: parameters.get(n, like.new_full((1, 1), v)).expand(shape) for n, v in ABSENT.items()}
-    u = drive.command
+    u, torque = drive.command, drive.torque
     if bool((tensors["delay"] != 0).any()):
+        # Weights and the other joints are late as well, as the motion is.
         u = delayed(drive.time, u, tensors["delay"])
+        torque = None if torque is None else delayed(drive.time, torque, tensors["delay"])
     u = u.expand(*shape, -1) + tensors["offset"][..., None]
     a = {n: v.numpy() for n, v in tensors.items()}
     steps = drive.time.diff(dim=-1).numpy().T
@@ -121,7 +125,8 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     commands = np.ascontiguousarray(u.permute(2, 0, 1).numpy())
     if np.any(a["slowness"] > 0):
         commands = _limited(steps, commands, 1 / np.maximum(a["slowness"], _TINY))
-    moved = _moved(drive, steps, commands, a)
+    push = None if torque is None else np.ascontiguousarray(torque.expand(*shape, -1).permute(2, 0, 1).numpy())
+    moved = _moved(drive, steps, commands, push, a)
     if np.any(a["flexibility"] > 0):
         moved = _flexed(steps, moved, a)
     if np.any(a["play"] > 0):
@@ -133,7 +138,7 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     return torch.from_numpy(moved).permute(1, 2, 0)
 
 
-def _moved(drive: Drive, steps: Array, u: Array, a: Mapping[str, Array]) -> Array:
+def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[str, Array]) -> Array:
     """The motor's side, `s x p x b`."""
     # The fastest motion of the axis is that of its mass on the gain.
     masses = a["inertia"] / np.maximum(a["gain"], _TINY)
@@ -156,10 +161,15 @@ def _moved(drive: Drive, steps: Array, u: Array, a: Mapping[str, Array]) -> Arra
         slope = (u[k + 1] - u[k]) / parts
         for i in range(parts):
             before = u[k] + i * slope
-            q1, v1 = rule.step(q, v, before + _GAMMA * slope, h, strength, dry)
-            q, v = rule.step(q + ahead * (q1 - q), v + ahead * (v1 - v), before + slope, h, strength, dry)
+            against = (None, None) if push is None else tuple(_between(push, k, (i + c) / parts) for c in (_GAMMA, 1.0))
+            q1, v1 = rule.step(q, v, before + _GAMMA * slope, h, strength, dry, against[0])
+            q, v = rule.step(q + ahead * (q1 - q), v + ahead * (v1 - v), before + slope, h, strength, dry, against[1])
         found[k + 1] = q
     return found
+
+
+def _between(values: Array, k: int, share: float) -> Array:
+    return np.asarray(values[k] + share * (values[k + 1] - values[k]))
 
 
 class _Rule:
@@ -176,7 +186,9 @@ class _Rule:
         self.weight, self.hang = _wave(a["gravity_sin"], a["gravity_cos"])
         self.wave, self.phase = _wave(a["cogging_sin"], a["cogging_cos"])
 
-    def step(self, q: Array, v: Array, u: Array, h: Array, share: Array | None, dry: Array) -> tuple[Array, Array]:
+    def step(
+        self, q: Array, v: Array, u: Array, h: Array, share: Array | None, dry: Array, push: Array | None
+    ) -> tuple[Array, Array]:
         """Position and speed at the end; share: of the motor's nominal strength that the supply allows."""
         a, gain, limit = self.a, self.a["gain"], self.limit
         if share is not None:
@@ -184,30 +196,36 @@ class _Rule:
         mass = a["inertia"] / h
         motor = gain * (u - q)
         free = mass * v
-        load = np.minimum(np.maximum(motor, -limit), limit) if self.has["weakness"] else motor
+        # What the gear carries beside the motor's torque.
+        carried: Array | float = 0.0
         if self.heavy:
-            pull = self.weight * np.sin(q + self.hang)
-            free = free - pull
-            load = motor + pull
+            carried = self.weight * np.sin(q + self.hang)
+        if push is not None:
+            carried = carried + push
+        free = free - carried
         if self.waves:
             free = free - self.wave * np.sin(a["cogging_order"] * q + self.phase)
         friction = dry
         if self.has["stribeck"]:
             friction = friction + a["stribeck"] * np.exp(-np.square(v / a["stribeck_speed"]))
-        if self.has["load_friction"]:
-            friction = friction + a["load_friction"] * np.abs(load)
         light = np.maximum(mass + a["viscous"], _TINY)
-        speed = self.solved(free + motor, friction, light + gain * h)
+        speed = self.solved(free + motor, friction, motor + carried, light, gain * h)
         if self.has["weakness"]:
             torque = motor - gain * h * speed
             held = np.minimum(np.maximum(torque, -limit), limit)
             if not np.array_equal(held, torque):
-                speed = np.where(torque == held, speed, self.solved(free + held, friction, light))
+                weak = self.solved(free + held, friction, held + carried, light, 0 * held)
+                speed = np.where(torque == held, speed, weak)
         speed = np.minimum(np.maximum(speed, -_FASTEST), _FASTEST)
         return q + h * speed, speed
 
-    def solved(self, push: Array, friction: Array, resistance: Array) -> Array:
-        """Speed under a push against dry friction."""
+    def solved(self, push: Array, friction: Array, load: Array, light: Array, stiff: Array) -> Array:
+        """Speed under a push against dry friction; stiff: how fast the motor's part of the load falls with it."""
+        resistance = light + stiff
+        if self.has["load_friction"]:
+            share = self.a["load_friction"]
+            friction = friction + share * np.abs(load)
+            resistance = resistance - share * stiff * np.sign(push * load)
         if self.dry:
             push = push - np.minimum(np.maximum(push, -friction), friction)
         return push / resistance

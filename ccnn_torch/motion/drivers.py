@@ -1,11 +1,13 @@
 """What a residual may follow that no effect describes: speed, acceleration, reversal, position, torque, time and
 temperature.
 
-Each is a group of columns that are added to the simulated position. Where one of them is part of the most probable set,
-the cause is outside the library, and its driver says where to look.
+Each is a group of columns that are added to the simulated position, or a torque that the axis moves under. Where one of
+them is part of the most probable set, the cause is outside the library, and its driver says where to look.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,11 +15,10 @@ from torch import Tensor
 from ccnn_torch.motion.fit import Spec
 from ccnn_torch.motion.problem import Problem
 
-__all__ = ["DRIVERS", "driver_columns"]
+__all__ = ["Driver", "driver_columns"]
 
-DRIVERS = ("speed", "acceleration", "reversal", "position", "torque", "time", "temperature")
 # Knots of a piecewise linear function of a driver, and of one of the time.
-_KNOTS, _TIMES = 7, 5
+_KNOTS, _TIMES = 7, 9
 # Time constants of what fades after a reversal [s].
 _FADING = (0.03, 0.1, 0.3)
 # Share of the mean speed at which a direction is settled.
@@ -26,12 +27,22 @@ _SOFT = 0.1
 _WARMER = 5.0
 # Share of the motion from which the lead of the command over the position is a torque.
 _LOADED = 1e-4
-# Quantiles between which the knots lie.
+# Quantiles between which the knots lie; those of a position are evenly spaced.
 _ENDS = (0.02, 0.98)
+_EVENLY = 9
+# Share of the motion by which a torque moves the axis for its columns, and how far the columns reach.
+_STEP, _SIZE = 1e-3, 0.05
 
 
-def driver_columns(problem: Problem, specs: list[Spec]) -> dict[str, Tensor]:
-    """Columns of each driver in plausible sizes [rad or m], `n x m x b x s`; drivers that do not vary are left out.
+class Driver(NamedTuple):
+    """A driver and its columns in plausible sizes [rad or m], `n x m x b x s`."""
+
+    name: str
+    columns: Tensor
+
+
+def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
+    """Columns of each driver, and those of a torque that follows it; drivers that do not vary are left out.
 
     Args:
         problem: the data.
@@ -45,22 +56,30 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> dict[str, Tensor]:
     acceleration = _slope(speed, step)
     error = problem.followed - moved
     # An axis that follows exactly has no torque, and what rounding leaves of it has the sign of the speed.
-    span = data.position.amax((-1, -2)) - data.position.amin((-1, -2))
-    loaded = error.abs().amax((-1, -2)) > _LOADED * span
-    size = 0.05 * span[:, None, None, None]
-    found = {
+    span = (data.position.amax((-1, -2)) - data.position.amin((-1, -2)))[:, None, None, None]
+    loaded = error.abs().amax((-1, -2))[:, None, None, None] > _LOADED * span
+    place, over = _evenly(moved, data.judged), _over_time(problem)
+    sign = _direction(speed)[:, None]
+    direct = {
         "speed": _hats(speed, data.judged),
         "acceleration": _hats(acceleration, data.judged),
         "reversal": _fading(speed, data.time),
-        "position": _hats(moved, data.judged),
-        "torque": _hats(error, data.judged) * loaded[:, None, None, None],
-        # What comes and goes with time, and friction that does.
-        "time": torch.cat([(over := _over_time(problem)), over * _direction(speed)[:, None]], 1),
+        "position": place,
+        "torque": _hats(error, data.judged) * loaded,
+        # A constant of its own: what drifts begins somewhere.
+        "time": torch.cat([torch.ones_like(over[:, :1]), over], 1),
     }
+    # Friction comes and goes with the place, the time and the temperature as well.
+    pushed = [("position", place), ("position", place * sign), ("time", over * sign)]
     if float(problem.warm.abs().max()) >= _WARMER:
-        warm = (problem.warm / problem.warm.abs().max()).expand(len(moved), -1, -1)
-        found["temperature"] = torch.stack([warm, warm * torch.sign(speed)], 1)
-    return {name: size * columns for name, columns in found.items() if name in DRIVERS}
+        warm = (problem.warm / problem.warm.abs().max()).expand(len(moved), -1, -1)[:, None]
+        pushed.append(("temperature", warm * sign))
+        direct["temperature"] = warm
+    found = [Driver(name, _SIZE * span * columns) for name, columns in direct.items()]
+    under = problem.pushed(theta[0], torch.cat([_STEP * span * columns for _, columns in pushed], 1))
+    columns = (under - moved[:, None]) * (_SIZE / _STEP)
+    widths = [c.shape[1] for _, c in pushed]
+    return found + [Driver(n, c) for (n, _), c in zip(pushed, torch.split(columns, widths, 1), strict=True)]
 
 
 def _direction(speed: Tensor) -> Tensor:
@@ -90,6 +109,15 @@ def _hats(driver: Tensor, judged: Tensor) -> Tensor:
         hats.scatter_(0, place[None] + 1, share[None])
         found.append(hats)
     return torch.stack(found)
+
+
+def _evenly(driver: Tensor, judged: Tensor) -> Tensor:
+    """Piecewise linear functions with evenly spaced knots, `n x m x b x s`."""
+    low = torch.stack([one[judged].min() for one in driver])[:, None, None]
+    high = torch.stack([one[judged].max() for one in driver])[:, None, None]
+    share = (driver - low) / (high - low).clamp_min(1e-12)
+    knots = torch.linspace(0, 1, _EVENLY, dtype=driver.dtype)[:, None, None]
+    return (1 - (share[:, None] - knots).abs() * (_EVENLY - 1)).clamp_min(0)
 
 
 def _few(values: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, grams_of
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening
 
@@ -56,6 +56,12 @@ class Spec(NamedTuple):
     def flat(self) -> tuple[int, ...]:
         return tuple(j for group in self.active for j in group)
 
+    @property
+    def groups(self) -> list[Tensor]:
+        """Columns of each effect among those of `flat`."""
+        places = iter(range(len(self.flat)))
+        return [torch.tensor([next(places) for _ in group]) for group in self.active]
+
 
 class Fit(NamedTuple):
     """A fitted set of one axis.
@@ -69,6 +75,7 @@ class Fit(NamedTuple):
         rss: their sum.
         effective: number of coefficients that the data determine.
         left: mean square of the residual itself [rad^2 or m^2].
+        grams: of the linearised model's whitened columns, in plausible sizes.
     """
 
     spec: Spec
@@ -80,6 +87,7 @@ class Fit(NamedTuple):
     rss: float
     effective: float
     left: float
+    grams: Grams
 
     @property
     def members(self) -> tuple[int, ...]:
@@ -210,11 +218,7 @@ def evidence_of(
     own = spec.theta[list(spec.flat)]
     y = residual + own @ columns
     grams = grams_of(columns.mT[:, None, :], y[:, None])._replace(values=values)
-    groups, begin = [], 0
-    for group in spec.active:
-        groups.append(torch.arange(begin, begin + len(group)))
-        begin += len(group)
-    fit = fit_sets(grams, [groups], 0.0)
+    fit = fit_sets(grams, [spec.groups], 0.0)
     m = len(own)
     evidence = float(fit.log_evidence[0])
     return Fit(
@@ -227,6 +231,7 @@ def evidence_of(
         float(residual.square().sum()),
         float(fit.effective[0]),
         left,
+        grams,
     )
 
 

@@ -14,8 +14,9 @@ from ccnn_torch.display import short_path
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.motion.engine import MotionDiagnosis, diagnose_motion
+from ccnn_torch.motion.identified import IDENTIFIED, write_identified
 from ccnn_torch.motion.log import load_logs
-from ccnn_torch.motion.nominal import nominal_of
+from ccnn_torch.motion.nominal import Nominal, nominal_of
 from ccnn_torch.motion.page import print_motion, write_motion_report, write_next_motion
 from ccnn_torch.motion.phases import phases_of
 from ccnn_torch.report.json_files import plain, write_json
@@ -49,7 +50,7 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
         raise InputError("name the folder to write with --out DIR")
     stopped = if_stopped("interrupted before there was a verdict; nothing was written")
     with stopped, step_bar(_STEPS, quiet) as tell:
-        found = verdict_of(config, tell)
+        found, nominal = _diagnosed(config, tell)
     folder, results = Path(config.out), dict(plain(found.to_json()))
     with locked(folder):
         sweep(folder)
@@ -59,16 +60,21 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
             if not quiet:
                 print_text(results["verdict"]["text"], stdout, "bold")
             write_next_motion(folder / NEXT, list(found.proposed), results["next_measurements"], results["gap"]["unit"])
+            written = write_identified(folder, found, nominal, config.mechanism_keys)
             labels = {"about": _about(config, folder, found)}
             write_motion_report(folder, results, motion_arrays(found), labels)
             if not quiet:
                 print_motion(results, stdout, about_of(load_labels(folder)), verdict=False, details=details)
-                say_place(f"Written: {folder / RESULT} and report.html beside it")
+                say_place(f"Written: {folder / RESULT}, and beside it report.html, {', '.join(written)}")
     return folder
 
 
 def verdict_of(config: DiagnoseConfig, tell: Callable[..., None] | None = None) -> MotionDiagnosis:
     """Diagnose what a config names; nothing is written."""
+    return _diagnosed(config, tell)[0]
+
+
+def _diagnosed(config: DiagnoseConfig, tell: Callable[..., None] | None) -> tuple[MotionDiagnosis, Nominal]:
     if not config.motion:
         raise InputError("motion: is missing; give --motion LOG.csv")
     if config.mechanism is None:
@@ -87,7 +93,7 @@ def verdict_of(config: DiagnoseConfig, tell: Callable[..., None] | None = None) 
 
     deviation = None if noise is None else size(noise, None, "noise")
     with watched(tell or (lambda step, share: None)):
-        return diagnose_motion(logs, nominal, config.effects, deviation, config.seed)
+        return diagnose_motion(logs, nominal, config.effects, deviation, config.seed), nominal
 
 
 def motion_arrays(found: MotionDiagnosis) -> dict[str, Any]:
@@ -112,7 +118,10 @@ def _about(config: DiagnoseConfig, folder: Path, found: MotionDiagnosis) -> dict
         if config.noise is not None
         else ("The noise is what the most probable model leaves; it may hold another cause.")
     )
+    line = f"ccnn compensate {typed_path(str(folder / IDENTIFIED))} MOTION.csv COMMANDS.csv"
+    named = bool(found.content["verdict"]["effects"])
     return {
+        "compensate": ["A wanted motion becomes the commands at which the machine follows it.", line] if named else [],
         "name": folder.name,
         "mechanism": short_path(str(config.mechanism)),
         "records": ", ".join(short_path(str(file)) for file in files),

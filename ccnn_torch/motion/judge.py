@@ -1,42 +1,35 @@
-"""From fitted sets to a verdict on each axis: tempered posterior, classes, and what is outside the library.
+"""From fitted sets to a verdict on each axis.
 
-Evidence counts every sample as new information about one right model. The model is never right, so that log odds are
-tempered by the stretches of the logs. Of a difference of log likelihoods, D over all stretches, those that speak
-against it, d < 0, show how far chance reaches: a normal variable with the mean D and twice their sum of squares as its
-variance has log odds D^2 / sum(d^2). And no stretch alone bears a verdict: odds are at most twice those without the
-stretch that speaks most for it. The smallest of the three counts.
+The forms of effects, and that of the nominal model, are those of the machine only nearly: sets are weighed again under
+a noise with their form errors in it (`diagnosis.search.form_error`). Members that move the axis by less than the time
+stamps of the log can tell are left out of a set before it counts.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import torch
-from torch import Tensor
-
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
-from ccnn_torch.motion.drivers import driver_columns
-from ccnn_torch.motion.fit import Fit, sensitivities
-from ccnn_torch.motion.problem import Whitening
-from ccnn_torch.motion.search import CROWD, Search, log_posterior
+from ccnn_torch.diagnosis.search.form_error import LEVELS
+from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN
+from ccnn_torch.motion.drivers import Driver, driver_columns
+from ccnn_torch.motion.fit import Fit
+from ccnn_torch.motion.form import weighed
+from ccnn_torch.motion.outside import Candidate, Members, essential, holds, prior_of, with_drivers
+from ccnn_torch.motion.problem import Problem
+from ccnn_torch.motion.search import Search
 
 __all__ = ["AxisVerdict", "judge_axes"]
 
-# Log prior odds of a driver.
-_OUTSIDE = math.log(0.001)
-# Log odds below which one effect can stand in the place of another.
-_LIKE = math.log(20.0)
-# A driver is part of the cause where it takes away this share of the mean square that the best set leaves, unwhitened.
-_SHARE = 0.1
-# And this share of that of the gap: less is the form of an effect that is named.
-_OF_GAP = 0.03
-# An effect without which the mean square grows by less than this share of the gap's only corrects the form of others.
-# Or, since the nominal model has a form that is not right either, by the square of this share of what the position
-# differs from the command.
-_FORM, _FORM_NOMINAL = 0.01, 0.01
-# Claims are never surer: of those of 0.95 and more on simulated motions, before this limit, 19 of 28 were right.
-_MOST = 0.9
+# Odds up to which the logs do not distinguish one name from another.
+_LIKE = 20.0
+# Share of a sampling step by which the time stamps of commands and positions may differ.
+_STAMP = 0.1
+# Probability from which a member of the most probable set is named, where the set without it is probable, too.
+_NAMED = 0.9
+# Probability of something outside that takes nothing away on runs that no fit saw.
+_UNCONFIRMED = 0.5
 
 
 class AxisVerdict(NamedTuple):
@@ -59,156 +52,65 @@ class AxisVerdict(NamedTuple):
 
 def judge_axes(found: Search) -> list[AxisVerdict]:
     """The verdict on each axis."""
-    verdicts = []
     drivers = driver_columns(found.problem, [fits[0].spec for fits in found.found])
-    for i, fits in enumerate(found.found):
-        best = fits[0]
-        odds = {f.members: _odds(best, f) for f in fits}
-        by_members = {f.members: f for f in fits}
-        slight = _slight(found, i, by_members[()])
-        named = _essential(best, by_members, slight)
-        weight = {m: math.exp(-value) for m, value in odds.items()}
-        outside = _outside(found, i, drivers)
-        extra = math.exp(min(outside.odds, 50.0))
-        total = sum(weight.values()) + extra
-        classes = {m: _class(best, m, odds) for m in best.members}
-        same = sum(
-            w
-            for members, w in weight.items()
-            if _holds(members, named.members, classes)
-            and (len(members) == len(named.members) or named.left - by_members[members].left < slight)
-        )
-        marginal = {
-            e: sum(w for members, w in weight.items() if e in members) / sum(weight.values())
-            for e in {e for f in fits for e in f.members}
-        }
-        wild = extra / total > 0.5
-        probability = extra / total if wild else same / total
-        if wild:
-            named = _essential(outside.beside, by_members, slight)
-        like = {m: classes.get(m, ()) for m in named.members}
-        verdicts.append(AxisVerdict(named, min(probability, _MOST), marginal, like, outside.driver if wild else None))
-    return verdicts
+    return [_judged(found, i, drivers) for i in range(len(found.found))]
 
 
-def _odds(best: Fit, other: Fit) -> float:
-    """Tempered log odds of the best set against another, at least 0."""
-    evidence = best.log_evidence - other.log_evidence
-    prior = log_posterior(best) - log_posterior(other) - evidence
-    gained = 0.5 * (other.squares - best.squares) / best.noise
-    return max(_tempered(evidence, gained) + prior, 0.0)
-
-
-def _tempered(evidence: float, gained: Tensor) -> float:
-    """The log odds that count; gained: difference of log likelihoods by stretch."""
-    whole = float(gained.sum())
-    if evidence <= 0 or whole <= 0 or len(gained) < 3:
-        return evidence
-    against = float(gained.clamp_max(0).square().sum())
-    rest = whole - float(gained.max())
-    return max(min(evidence, whole**2 / max(against, 1e-300), 2 * rest), 0.0)
-
-
-def _class(best: Fit, member: int, odds: dict[tuple[int, ...], float]) -> tuple[int, ...]:
-    """Effects that can stand in the place of a member."""
-    rest = set(best.members) - {member}
-    like = []
-    for members, value in odds.items():
-        new = set(members) - rest
-        if rest <= set(members) and len(new) == 1 and member not in new and value < _LIKE:
-            like.append((value, new.pop()))
-    return tuple(e for _, e in sorted(like))
-
-
-def _slight(found: Search, axis: int, nothing: Fit) -> float:
-    """Mean square [rad^2 or m^2] below which nothing is named."""
-    data = found.problem.data
-    error = (data.command[axis] - data.position[axis])[data.judged].square().mean()
-    return max(_FORM * nothing.left, _FORM_NOMINAL**2 * float(error))
-
-
-def _essential(best: Fit, fits: dict[tuple[int, ...], Fit], slight: float) -> Fit:
-    """The set without members that only correct the form of others, the least first."""
-    while best.members:
-        rest = [tuple(m for m in best.members if m != e) for e in best.members]
-        least = min((fits[r] for r in rest if r in fits), key=lambda f: f.left)
-        if least.left - best.left > slight:
-            break
-        best = least
-    return best
-
-
-def _holds(members: tuple[int, ...], named: tuple[int, ...], classes: dict[int, tuple[int, ...]]) -> bool:
-    """Whether a set has every named effect, or one of its class in its place."""
-    left = set(members)
-    for m in named:
-        one = next((e for e in (m, *classes[m]) if e in left), None)
-        if one is None:
-            return False
-        left.remove(one)
-    return True
-
-
-class _Wild(NamedTuple):
-    """The most probable set with a driver beside it, and its tempered log odds against the best set of the library."""
-
-    driver: str | None
-    beside: Fit
-    odds: float
-
-
-def _outside(found: Search, axis: int, drivers: dict[str, Tensor]) -> _Wild:
-    """Drivers beside the sets that lead from none to the best one: with one, the best set may be smaller."""
+def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     problem, fits = found.problem, found.found[axis]
-    best, by_members = fits[0], {f.members: f for f in fits}
-    slight = _slight(found, axis, by_members[()])
-    values, blocks, judged = float(problem.judged.sum()), problem.judged.shape, problem.data.judged
-    top = _Wild(None, best, -math.inf)
-    for base in _chain(best, by_members):
-        specs = [base.spec if i == axis else own[0].spec for i, own in enumerate(found.found)]
-        theta = torch.stack([s.theta for s in specs])[None]
-        flat = base.spec.flat
-        m = len(flat)
-        active = torch.full((1, len(specs), m), -1)
-        active[0, axis] = torch.tensor(flat, dtype=torch.int64)
-        residual, own = sensitivities(problem, found.whitening, theta, active)
-        plain = problem.residual(theta)[0, axis]
-        x0, y = own[axis, 0], residual[axis, 0] + base.spec.theta[list(flat)] @ own[axis, 0]
-        starts, begin = [], 0
-        for group in base.spec.active:
-            starts.append(torch.arange(begin, begin + len(group)))
-            begin += len(group)
-        prior = log_posterior(base) - base.log_evidence + _OUTSIDE + (CROWD if len(base.members) >= 2 else 0.0)
-        for name, columns in drivers.items():
-            white = problem.whitened(columns[axis][:, None], _one(found, axis))[0]
-            x = torch.cat([x0, white])
-            grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
-            fit = fit_sets(grams, [[*starts, torch.arange(m, len(x))]], 0.0)
-            mean = fit.mean[0]
-            after = (y - mean @ x).square().reshape(blocks).sum(-1)
-            gained = 0.5 * (best.squares - after) / best.noise
-            evidence = float(fit.log_evidence[0]) - best.log_evidence
-            odds = _tempered(evidence, gained) + prior - (log_posterior(best) - best.log_evidence)
-            # What it takes away of the position itself, not of its whitened form.
-            taken = plain - (mean[m:, None, None] * columns[axis]).sum(0)
-            before2, after2 = (float(v[judged].square().mean()) for v in (plain, taken))
-            if before2 - after2 < max(_SHARE * before2, _OF_GAP * by_members[()].left, slight):
-                odds = min(odds, _OUTSIDE)
-            if odds > top.odds:
-                top = _Wild(name, base, odds)
-    return top
+    by_members = {f.members: f for f in fits}
+    slight = _slight(problem, axis)
+    left = {f.members: f.left for f in fits}
+    sets = [Candidate((essential(f.members, left, slight), None), f.grams, f.spec.groups, prior_of(f)) for f in fits]
+    sets += with_drivers(found, axis, drivers, by_members, slight)
+    share: dict[tuple[Members, str | None], float] = {}
+    usual: list[float] = []
+    for variance in (fits[0].noise + level * found.form[axis] for level in LEVELS):
+        weights = [float(weighed(one.grams, one.groups, variance).log_evidence[0]) + one.log_prior for one in sets]
+        usual = usual or weights
+        top = max(weights)
+        total = math.fsum(math.exp(w - top) for w in weights)
+        for one, w in zip(sets, weights, strict=True):
+            share[one.key] = share.get(one.key, 0.0) + math.exp(w - top) / total / len(LEVELS)
+    ranked = sorted(share.items(), key=lambda item: -item[1])
+    marginal = {e: sum(p for (members, _), p in ranked if e in members) for e in {e for f in fits for e in f.members}}
+    outside = sum(p for (_, driver), p in ranked if driver is not None)
+    if outside > 0.5:
+        members, driver = key = next(key for key, _ in ranked if key[1] is not None)
+        likeliest = max((k for k, one in enumerate(sets) if one.key == key), key=usual.__getitem__)
+        outside = outside if holds(problem, sets[likeliest]) else min(outside, _UNCONFIRMED)
+        outside = min(outside, BESIDE_UNKNOWN) if members else outside
+        return AxisVerdict(by_members[members], outside, marginal, dict.fromkeys(members, ()), driver)
+    inside = {members: p for (members, driver), p in ranked if driver is None}
+    members = next(iter(inside))
+    classes = _classes(members, inside)
+    like = {m: {m, *classes[m]} for m in members}
+    sure = tuple(m for m in members if sum(p for (own, _), p in ranked if like[m] & {*own}) >= _NAMED)
+    if inside.get(sure, 0.0) * _LIKE > inside[members]:
+        members, classes = sure, _classes(sure, inside)
+    same = sum(p for own, p in inside.items() if _equals(own, members, classes))
+    return AxisVerdict(by_members[members], same, marginal, classes, None)
 
 
-def _chain(best: Fit, fits: dict[tuple[int, ...], Fit]) -> list[Fit]:
-    """The best set, it without its least member, and so on to none."""
-    found = [best]
-    while found[-1].members:
-        now = found[-1].members
-        rest = [tuple(m for m in now if m != e) for e in now]
-        found.append(min((fits[r] for r in rest if r in fits), key=lambda f: f.left))
+def _slight(problem: Problem, axis: int) -> float:
+    """Mean square of what a shift of the time stamps moves the axis by [rad^2 or m^2]: less is no effect."""
+    step = float(problem.data.time.diff(dim=-1).median())
+    return (_STAMP * step) ** 2 * float(problem.data.speed[axis][problem.data.judged].square().mean())
+
+
+def _classes(members: Members, inside: Mapping[Members, float]) -> dict[int, tuple[int, ...]]:
+    """Of each member the effects that can stand in its place, the most probable first."""
+    found = {}
+    for m in members:
+        rest = {*members} - {m}
+        others = [(own, {*own} - rest) for own, p in inside.items() if rest <= {*own} and p * _LIKE > inside[members]]
+        found[m] = tuple(new.pop() for own, new in others if len(new) == 1 and m not in own)
     return found
 
 
-def _one(found: Search, axis: int) -> Whitening:
-    """The whitening of one axis."""
-    return Whitening(found.whitening.coefficients[axis : axis + 1])
+def _equals(own: Members, named: Members, classes: Mapping[int, tuple[int, ...]]) -> bool:
+    """Whether a set has every named effect, or one of its class in its place, and nothing else."""
+    left = {*own}
+    for m in named:
+        left.discard(next((e for e in (m, *classes[m]) if e in left), m))
+    return not left and len(own) == len(named)

@@ -17,10 +17,14 @@ __all__ = ["Library", "Variant", "library_of"]
 
 # What may not be below 0, and what not above.
 _POSITIVE = (
-    *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "delay", "play"),
+    *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "play"),
     *("flexibility", "gain"),
 )
 _MOST = {"load_friction": 0.9}
+# Share of the largest speed up to which friction may fall with the speed: what falls later is plain dry friction.
+_SLOW = 0.5
+# Fewer periods in a turn are a weight or an offset.
+_LEAST = {"cogging_order": 2.0}
 # Plausible sizes: no number is larger.
 _WIDEST = 1e3
 # Log odds against what is seen less often than the rest, and can take the form of nearly anything.
@@ -94,6 +98,8 @@ class Library(NamedTuple):
                         high[i, j] = min(float(high[i, j]), (_MOST.get(name, math.inf) - nominal) / number.scale)
         # 0 stands for a shape that is not used.
         low[:, list(self.held.values())] = 0.0
+        if "stribeck_speed" in self.held:
+            high[:, self.held["stribeck_speed"]] = torch.tensor([_SLOW * axis.speed for axis in self.facts])
         return low, high
 
     @property
@@ -120,10 +126,11 @@ class Library(NamedTuple):
                 continue
             for a, (name, _, how) in enumerate(self.numbers[0][j].acts):
                 amount = theta[..., j] * theta.new_tensor([axis[j].scale * axis[j].acts[a][1] for axis in self.numbers])
-                before = found.get(name, torch.full_like(amount, ABSENT[name]))
+                before = found.get(name, torch.full_like(amount, ABSENT.get(name, 0.0)))
                 found[name] = before + amount if how == "add" else before * amount.clamp(-5, 5).exp()
         for name, place in self.held.items():
             value = theta[..., place]
+            value = torch.where(value != 0, value.clamp_min(_LEAST.get(name, 0.0)), value)
             if bool((value != 0).any()):
                 found[name] = torch.where(value != 0, value, found.get(name, torch.full_like(value, ABSENT[name])))
         for name in _POSITIVE:

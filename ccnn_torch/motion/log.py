@@ -17,7 +17,7 @@ from ccnn_torch.records.read_table import Frame, read_frame, read_table
 from ccnn_torch.records.table import Table
 from ccnn_torch.units import si_unit_of
 
-__all__ = ["Log", "load_logs"]
+__all__ = ["Log", "load_logs", "refuse_time", "runs_of"]
 
 Array = NDArray[np.float64]
 _RUN, _POSITION = "run", re.compile(r"q(\d+)")
@@ -111,17 +111,19 @@ def _of_table(table: Table) -> list[Log]:
         for i in range(1, count + 1):
             if (name := f"{kind}{i}") in table:
                 beside[name] = table.column(name, unit if kind != "speed" else f"{units[i - 1]}/s")
-    if _RUN not in table:
-        parts = [(str(table.path), np.arange(len(table)))]
-    else:
-        number = table.column(_RUN, "1")
-        begins = np.flatnonzero(np.diff(number, prepend=number[:1] - 1))
-        parts = [
-            (f"{table.path} run {number[rows[0]]:g}", rows) for rows in np.split(np.arange(len(number)), begins[1:])
-        ]
+    parts = runs_of(table)
     return [
         _log(table, name, rows, time[rows], stacked[0][rows], stacked[1][rows], units, beside) for name, rows in parts
     ]
+
+
+def runs_of(table: Table) -> list[tuple[str, NDArray[np.int64]]]:
+    """Name and rows of each run in a table."""
+    if _RUN not in table:
+        return [(str(table.path), np.arange(len(table)))]
+    number = table.column(_RUN, "1")
+    begins = np.flatnonzero(np.diff(number, prepend=number[:1] - 1))
+    return [(f"{table.path} run {number[rows[0]]:g}", rows) for rows in np.split(np.arange(len(number)), begins[1:])]
 
 
 def _joints(table: Table) -> int:
@@ -168,14 +170,8 @@ def _log(
     units: tuple[str, ...],
     beside: Mapping[str, Array],
 ) -> Log:
+    refuse_time(table, rows, time)
     steps = np.diff(time)
-    back = np.flatnonzero(steps <= 0)
-    if len(back):
-        more = f", and {len(back) - 1} times more" if len(back) > 1 else ""
-        raise InputError(
-            f"{table.path}: time does not increase at {table.name_rows([int(rows[back[0] + 1])])}{more}; sort the "
-            "rows, and write one row for each time"
-        )
     own = {n: v[rows] for n, v in beside.items()}
     notes: list[str] = []
     cut = np.zeros(len(time), dtype=np.bool_)
@@ -207,6 +203,18 @@ def _log(
     on = _drive_on(name, time, command, position, own, notes)
     cut[1:] |= on[1:] & ~on[:-1]
     return Log(name, time, command, position, units, own, on, cut, table.lines[rows], tuple(notes))
+
+
+def refuse_time(table: Table, rows: NDArray[np.int64], time: Array) -> None:
+    """Raise `InputError` where the time of some rows of a table does not increase."""
+    steps = np.diff(time)
+    back = np.flatnonzero(steps <= 0)
+    if len(back):
+        more = f", and {len(back) - 1} times more" if len(back) > 1 else ""
+        raise InputError(
+            f"{table.path}: time does not increase at {table.name_rows([int(rows[back[0] + 1])])}{more}; sort the "
+            "rows, and write one row for each time"
+        )
 
 
 def _drive_on(

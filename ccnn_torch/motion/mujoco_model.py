@@ -18,6 +18,8 @@ __all__ = ["is_mjcf", "mujoco_simulator"]
 Array = NDArray[np.float64]
 # Seconds at the first command before a log begins: the machine rests there.
 _SETTLING = 1.0
+# A limit of 1/this or more is none.
+_TINY = 1e-9
 
 
 def is_mjcf(path: Path) -> bool:
@@ -52,21 +54,76 @@ def mujoco_simulator(path: str, keys: Mapping[str, Any], units: Sequence[str]) -
     own = ["m" if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE else "rad" for j in joints]
     if own != list(units):
         raise InputError(f"{path}: its joints are in {', '.join(own)}, and the logs in {', '.join(units)}")
-    address = [int(model.jnt_qposadr[j]) for j in joints]
+    if any(model.actuator_gear[k, 0] != 1 for k in position):
+        raise InputError(f"{path}: an actuator has a gear; give it gear 1, so that its command is the joint's position")
+    dofs = [int(model.jnt_dofadr[j]) for j in joints]
+    gain, limit = model.actuator_gainprm[position, 0], model.actuator_forcerange[position, 1]
+    values = {
+        "inertia": model.dof_M0[dofs] / gain,
+        "viscous": (model.dof_damping[dofs] - model.actuator_biasprm[position, 2]) / gain,
+        "coulomb": model.dof_frictionloss[dofs] / gain,
+        "weakness": model.actuator_forcelimited[position] * gain / np.maximum(limit, _TINY),
+    }
+    levers = [_lever(model, j) for j in joints]
+    return Simulator(
+        path,
+        lambda time, commands, parameters: _moved(model, joints, values, time, commands)[0],
+        {},
+        (f"{Path(path).name}: simulated from rest at each log's first command",),
+        tuple({name: float(v[i]) for name, v in values.items() if v[i]} for i in range(len(joints))),
+        tuple(gain.tolist()),
+        tuple(lever and lever[0] for lever in levers),
+        tuple(lever and lever[1] for lever in levers),
+        lambda time, commands: _moved(model, joints, values, time, commands),
+    )
 
-    def simulate(time: Array, commands: Array, parameters: dict[str, float]) -> Array:
-        data = mujoco.MjData(model)
-        data.qpos[address] = commands[0]
-        mujoco.mj_forward(model, data)
-        step = float(model.opt.timestep)
-        clock = np.arange(time[0] - _SETTLING, time[-1] + step, step)
-        controls = np.stack([np.interp(clock, time, c) for c in commands.T], -1)
-        found = np.empty_like(controls)
-        for k, control in enumerate(controls):
-            found[k] = data.qpos[address]
-            data.ctrl[:] = control
-            mujoco.mj_step(model, data)
-        return np.stack([np.interp(time, clock, q) for q in found.T], -1)
 
-    notes = (f"{Path(path).name}: simulated from rest at each log's first command",)
-    return Simulator(path, simulate, {}, notes)
+def _lever(model: Any, joint: int) -> tuple[float, tuple[float, float]] | None:
+    """From a hinge to the centre of mass of its body [m], and what 1 kg there weighs, as of `Facts`; None of a joint
+    whose weight follows the positions of others, too."""
+    import mujoco
+
+    body = int(model.jnt_bodyid[joint])
+    chain = [body]
+    while chain[-1]:
+        chain.append(int(model.body_parentid[chain[-1]]))
+    if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE or sum(model.body_jntnum[b] for b in chain) != 1:
+        return None
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    axis, arm = data.xaxis[joint], data.xipos[body] - data.xanchor[joint]
+    turned = np.cross(axis, arm)
+    lever = float(np.linalg.norm(turned))
+    cosine, sine = (-float(model.opt.gravity @ v) for v in (turned, np.cross(axis, turned)))
+    return (lever, (sine, cosine)) if lever > _TINY else None
+
+
+def _moved(
+    model: Any, joints: Sequence[int], own: Mapping[str, Array], time: Array, commands: Array
+) -> tuple[Array, Array]:
+    """Positions, and what resists each actuator beside its joint's friction and inertia, over its gain, `s x n` each:
+    weights, and the other joints."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    address, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+    data.qpos[address] = commands[0]
+    mujoco.mj_forward(model, data)
+    step = float(model.opt.timestep)
+    clock = np.arange(time[0] - _SETTLING, time[-1] + step, step)
+    controls = np.stack([np.interp(clock, time, c) for c in commands.T], -1)
+    found, torque = np.empty_like(controls), np.empty_like(controls)
+    gain = model.actuator_gainprm[: len(joints), 0]
+    limit = 1 / np.maximum(own["weakness"], _TINY)
+    for k, control in enumerate(controls):
+        q, v = data.qpos[address].copy(), data.qvel[dofs].copy()
+        found[k] = q
+        data.ctrl[:] = control
+        mujoco.mj_step(model, data)
+        after = data.qvel[dofs]
+        motor = np.clip(control - q, -limit, limit)
+        # What a joint's own friction takes, up to all that holds it.
+        dry = np.clip(-data.qfrc_constraint[dofs] / gain, -own["coulomb"], own["coulomb"])
+        torque[k] = motor - own["viscous"] * after - dry - own["inertia"] * (after - v) / step
+    at = [np.stack([np.interp(time, clock, x) for x in table.T], -1) for table in (found, torque)]
+    return at[0], at[1]

@@ -188,6 +188,9 @@ def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
         followed=row[None],
         supply=still,
         warm=still,
+        torque=None,
+        simulated=None,
+        own={},
         pool=max(round(step / _STEP), 1),
     )
 

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.motion.axis import ABSENT
+from ccnn_torch.motion.effects import MotionEffect
+from ccnn_torch.motion.effects.own_parameter import OwnParameter
 from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
 from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.simulators import Simulator, simulator_of
 from ccnn_torch.motion.stretches import Stretches
 from ccnn_torch.spelling import nearest
 
-__all__ = ["KEYS", "Nominal", "nominal_of"]
+__all__ = ["KEYS", "TORQUES", "Driven", "Nominal", "axis_keys", "nominal_of"]
 
 KEYS: dict[str, str] = {
     "gain": "proportional gain [N*m/rad]; without it torques are told as angles",
@@ -31,18 +36,50 @@ KEYS: dict[str, str] = {
     "stribeck_speed": "speed at which that has fallen to 1/e [rad/s]",
     "gravity_sin": "torque of the weight at 90 degrees beyond that of the load [N*m]",
     "gravity_cos": "torque of the weight at 0 [N*m]",
+    "cogging_sin": "torque that repeats with the angle, times the sine of cogging_order times the angle [N*m]",
+    "cogging_cos": "the same with the cosine [N*m]",
+    "cogging_order": "periods of that torque in a turn [1]",
+    "flexibility": "inertia of the driven side over the stiffness of the joint [s^2]",
+    "flexible_damping": "damping ratio of that spring [1]",
+    "thermal": "change of the dry friction with the temperature [1/K]",
     "delay": "from command to motor [s]",
     "offset": "of the position from the command [rad]",
     "backlash": "whole width of the play [rad]",
+    "backlash_loaded": "1 where the load presses the play to one side [1]",
     "speed_limit": "[rad/s]",
     "torque_limit": "of the motor at the nominal supply [N*m]",
     "supply": "nominal supply voltage, at which gain and torque_limit hold [V]",
+    "supply_share": "how far the motor's strength follows the supply [1]; 1 where supply is given",
 }
 """Keys of the built-in servo; a number for all axes, or a list with one for each."""
 
-# Torques, which are divided by the gain.
-_TORQUES = ("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity_cos")
-_SAME = {"delay": "delay", "offset": "offset", "backlash": "play", "load_friction": "load_friction"}
+TORQUES = (*("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos"),)
+"""Parameters that are torques, which an axis has over the gain."""
+_SIGNED = ("delay", "offset", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
+# Of a simulator's parameter, for a difference quotient.
+_STEP = 0.02
+_SAME = {
+    **{"delay": "delay", "offset": "offset", "backlash": "play", "backlash_loaded": "play_loaded"},
+    **{"load_friction": "load_friction", "stribeck_speed": "stribeck_speed", "cogging_order": "cogging_order"},
+    **{"flexibility": "flexibility", "flexible_damping": "flexible_damping", "thermal": "thermal"},
+    "supply_share": "supply",
+}
+
+
+class Driven(NamedTuple):
+    """What drives the axes, `n x b x s` each.
+
+    Attributes:
+        followed: positions that they follow [rad or m].
+        torque: what resists their motors, over the gain [rad or m]; None = nothing.
+        simulated: positions of the nominal model; None where the nominal axes tell them.
+        own: as of `Problem`.
+    """
+
+    followed: Tensor
+    torque: Tensor | None = None
+    simulated: Tensor | None = None
+    own: Mapping[str, Tensor] = {}
 
 
 @dataclass(frozen=True)
@@ -54,6 +91,7 @@ class Nominal:
         axes: parameters of each axis, as in `ABSENT`.
         gains: N m/rad of each axis, None where it is not known.
         lengths: lever of each axis' load [m].
+        weights: of 1 kg there, as of `Facts`.
         supply: nominal supply voltage; None where the motor's strength is not known to follow it.
         simulator: makes the positions that the axes follow; None where they follow the commands.
         notes: sentences without a full stop.
@@ -66,23 +104,55 @@ class Nominal:
     supply: float | None = None
     simulator: Simulator | None = None
     notes: tuple[str, ...] = field(default=())
+    weights: tuple[tuple[float, float] | None, ...] = ()
 
-    def followed(self, logs: Sequence[Log], data: Stretches) -> Tensor:
-        """What the axes follow, `n x b x s`: the commands, or what a simulator makes of them from each log's start on.
+    @property
+    def own_effects(self) -> list[MotionEffect]:
+        """Wrong values of a simulator's own parameters."""
+        own = self.simulator.parameters if self.simulator is not None and self.simulator.loaded is None else {}
+        return [OwnParameter(name, value) for name, value in own.items()]
+
+    def driven(self, logs: Sequence[Log], data: Stretches, about: Mapping[str, float] | None = None) -> Driven:
+        """What drives the axes: the commands, or where a simulator tells no more than positions these.
+
+        Args:
+            logs: runs.
+            data: their stretches.
+            about: what is added to a simulator's parameters where its positions are linearised in them.
 
         Raises:
             InputError: the simulator fails.
         """
-        if self.simulator is None:
-            return data.command
-        made = [self.simulator.positions(log.time, log.command) for log in logs]
-        found = data.command.clone()
-        for k, number in enumerate(data.run.tolist()):
-            rows = data.log[k]
-            here = torch.from_numpy(made[number])[rows.clamp_min(0)].mT
-            last = int((rows >= 0).sum()) - 1
-            found[:, k] = torch.where(rows >= 0, here, here[:, last : last + 1])
-        return found
+        simulator = self.simulator
+        if simulator is None:
+            return Driven(data.command)
+        if simulator.loaded is None:
+            centre = {name: value + (about or {}).get(name, 0.0) for name, value in simulator.parameters.items()}
+
+            def made_with(**other: float) -> Tensor:
+                own = replace(simulator, parameters={**centre, **other})
+                return _along([own.positions(log.time, log.command) for log in logs], data)
+
+            made, own = made_with(), {}
+            for name, value in centre.items():
+                step = _STEP * (abs(value) or 1.0)
+                own[name] = (made_with(**{name: value + step}) - made_with(**{name: value - step})) / (2 * step)
+                made = made - (value - simulator.parameters[name]) * own[name]
+            return Driven(made, own=own)
+        pairs = [simulator.loaded(log.time, log.command) for log in logs]
+        simulated, torque = (_along([pair[k] for pair in pairs], data) for k in range(2))
+        return Driven(data.command, torque, simulated)
+
+
+def _along(made: Sequence[NDArray[np.float64]], data: Stretches) -> Tensor:
+    """What was made for each log, at the samples of the stretches, `n x b x s`."""
+    found = data.command.clone()
+    for k, number in enumerate(data.run.tolist()):
+        rows = data.log[k]
+        here = torch.from_numpy(made[number])[rows.clamp_min(0)].mT
+        last = int((rows >= 0).sum()) - 1
+        found[:, k] = torch.where(rows >= 0, here, here[:, last : last + 1])
+    return found
 
 
 def nominal_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) -> Nominal:
@@ -100,9 +170,11 @@ def nominal_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) ->
     if mechanism == "servo":
         return _servo(keys, n)
     simulator = simulator_of(mechanism, keys, units)
-    return Nominal(
-        mechanism, ({},) * n, (None,) * n, (None,) * n, None, simulator, simulator.notes if simulator else ()
-    )
+    if simulator is None:
+        return Nominal(mechanism, ({},) * n, (None,) * n, (None,) * n)
+    axes, gains = simulator.axes or ({},) * n, simulator.gains or (None,) * n
+    lengths = simulator.lengths or (None,) * n
+    return Nominal(mechanism, axes, gains, lengths, None, simulator, simulator.notes, simulator.weights)
 
 
 def _servo(keys: Mapping[str, Any], n: int) -> Nominal:
@@ -118,26 +190,24 @@ def _servo(keys: Mapping[str, Any], n: int) -> Nominal:
     for i in range(n):
         own = {key: values[i] for key, values in each.items()}
         gain = own.get("gain")
-        needs = [k for k in (*_TORQUES, "mass", "torque_limit") if own.get(k)]
+        needs = [k for k in (*TORQUES, "mass", "torque_limit") if own.get(k)]
         if gain is None and needs:
             raise InputError(f"mechanism_keys: {needs[0]} is given without gain; give gain [N*m/rad] as well")
         if own.get("mass") and not own.get("length"):
             raise InputError("mechanism_keys: mass is given without length; give the lever of the load [m] as well")
         unit = gain or 1.0
-        axis = {name: own[name] / unit for name in _TORQUES if name in own}
+        axis = {name: own[name] / unit for name in TORQUES if name in own}
         load, lever = own.get("mass", 0.0), own.get("length", 0.0)
         axis["inertia"] = axis.get("inertia", 0.0) + load * lever**2 / unit
         axis["load"] = load * lever**2 / unit
         axis["gravity_sin"] = axis.get("gravity_sin", 0.0) + load * STANDARD_GRAVITY * lever / unit
         axis |= {name: own[key] for key, name in _SAME.items() if key in own}
-        if own.get("stribeck_speed"):
-            axis["stribeck_speed"] = own["stribeck_speed"]
         if own.get("torque_limit"):
             axis["weakness"] = unit / own["torque_limit"]
         if own.get("speed_limit"):
             axis["slowness"] = 1 / own["speed_limit"]
         if own.get("supply"):
-            axis["supply"] = 1.0
+            axis.setdefault("supply", 1.0)
         axes.append({name: value for name, value in axis.items() if value})
         gains.append(gain)
         lengths.append(own.get("length"))
@@ -145,9 +215,34 @@ def _servo(keys: Mapping[str, Any], n: int) -> Nominal:
     return Nominal("servo", tuple(axes), tuple(gains), tuple(lengths), supply)
 
 
+def axis_keys(nominal: Nominal, axes: Sequence[Mapping[str, float]], added: Sequence[float]) -> dict[str, Any]:
+    """Keys of the servo whose axes have these parameters; a gain that is not known is 1, and torques are then angles.
+
+    Args:
+        nominal: the servo that they are parameters of.
+        axes: as in `ABSENT`.
+        added: mass at the end of each lever beyond that of the model [kg].
+    """
+    each = []
+    for i, axis in enumerate(axes):
+        unit, lever = nominal.gains[i] or 1.0, nominal.lengths[i] or 0.0
+        mass = max(nominal.axes[i].get("load", 0.0) * unit / lever**2 + added[i], 0.0) if lever else 0.0
+        own = {name: unit * axis.get(name, 0.0) for name in TORQUES}
+        own["inertia"] = max(own["inertia"] - mass * lever**2, 0.0)
+        own["gravity_sin"] -= mass * STANDARD_GRAVITY * lever
+        own |= {"gain": unit * axis.get("gain", 1.0), "mass": mass, "length": lever or 1.0}
+        own |= {key: axis.get(name, ABSENT[name]) for key, name in _SAME.items()}
+        own["speed_limit"] = 1 / axis["slowness"] if axis.get("slowness") else 0.0
+        own["torque_limit"] = unit / axis["weakness"] if axis.get("weakness") else 0.0
+        each.append(own)
+    usual = {key: ABSENT.get(name, 0.0) for key, name in _SAME.items()}
+    found = {key: [own[key] for own in each] for key in each[0] if any(own[key] != usual.get(key, 0.0) for own in each)}
+    return found | ({"supply": nominal.supply} if nominal.supply else {})
+
+
 def _numbers(key: str, value: Any, n: int) -> list[float]:
     values = value if isinstance(value, list | tuple) else [value] * n
-    signed = key in ("offset", "gravity_sin", "gravity_cos")
+    signed = key in _SIGNED
     fine = len(values) == n and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and (signed or v >= 0)
         for v in values

@@ -12,8 +12,6 @@ from rich.console import Console
 from torch import Tensor
 
 from ccnn_torch.diagnosis.page.data import (
-    ARRAYS,
-    LABELS,
     NEXT,
     RESULT,
     About,
@@ -22,14 +20,7 @@ from ccnn_torch.diagnosis.page.data import (
     load_labels,
     save_diagnosis_arrays,
 )
-from ccnn_torch.diagnosis.page.first_screen import (
-    ON_PAGE,
-    first_screen,
-    first_screen_markdown,
-    print_first_screen,
-)
-from ccnn_torch.diagnosis.page.numbers import numbers_table
-from ccnn_torch.diagnosis.page.report import Section
+from ccnn_torch.diagnosis.page.layout import Section, markdown_of, notes_of, print_page, sections_of, write_page
 from ccnn_torch.diagnosis.page.tables import (
     confusable_table,
     effect_table,
@@ -38,23 +29,19 @@ from ccnn_torch.diagnosis.page.tables import (
     parameter_table,
     unseen_table,
 )
-from ccnn_torch.diagnosis.verdict.text import unseen_text, verdict_text
 from ccnn_torch.display import number_text
-from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.csv_file import write_rows
-from ccnn_torch.report.html import InlineFigure, render, trusted
+from ccnn_torch.report.html import InlineFigure
 from ccnn_torch.report.json_files import read_json
-from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
+from ccnn_torch.report.table import Table, print_table
 
 if TYPE_CHECKING:
     from ccnn_torch.motion.next_motion import Motion
-    from ccnn_torch.report.figures.style import Plot
 
-__all__ = ["motion_markdown", "print_motion", "write_motion_report", "write_next_motion"]
+__all__ = ["print_motion", "write_motion_report", "write_next_motion"]
 
 Block = Mapping[str, Any]
 Arrays = Mapping[str, NDArray[np.float64]]
-_MARKDOWN = "diagnosis.md"
 _LEAST = 0.01
 
 
@@ -77,37 +64,23 @@ def write_motion_report(
     """
     from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
     from ccnn_torch.motion.figure import course_plot
-    from ccnn_torch.report.figures.style import inline_svg, save_figure
 
     results = read_json(folder / RESULT) if results is None else results
     if arrays is not None:
         save_diagnosis_arrays(folder, arrays, labels or {})
     numbers, about = load_diagnosis_arrays(folder), about_of(load_labels(folder))
-    write_whole(folder / _MARKDOWN, motion_markdown(results, about))
-    plots: list[Plot | None] = [gap_plot(results), probability_plot(results), course_plot(results, numbers)]
-    figures = {}
-    for plot in plots:
-        if plot is not None:
-            _, svg = save_figure(plot.figure, folder / "plots" / plot.name)
-            text = inline_svg(svg.read_text(encoding="utf-8"), plot.name)
-            figures[plot.name] = InlineFigure(plot.name, plot.caption, text)
-    page = render(
-        "diagnosis",
-        results={"name": about.name, "notes": _notes(results), "versions": {}},
-        facts=" · ".join(text for text in (about.mechanism, about.records) if text),
-        verdict=verdict_text(results),
-        failures=[],
-        answers=first_screen(results, about),
-        numbers=numbers_table(results, ON_PAGE),
-        machine=trusted([]),
-        sections=_sections(results, about, figures),
-        files=[f for f in (RESULT, _MARKDOWN, NEXT, ARRAYS, LABELS) if f == RESULT or (folder / f).is_file()],
-        config="",
-        best=None,
+    plots = [gap_plot(results), probability_plot(results), course_plot(results, numbers)]
+    write_page(
+        folder,
+        results,
+        about,
+        lambda figures: _sections(results, about, figures),
+        [plot for plot in plots if plot is not None],
+        " · ".join(text for text in (about.mechanism, about.records) if text),
+        notes_of(results),
+        markdown_of(results, about, _sections(results, about, {}), notes_of(results)),
     )
-    path = folder / "report.html"
-    write_whole(path, page)
-    return path
+    return folder / "report.html"
 
 
 def write_next_motion(path: Path, motions: list[Motion], entries: list[Block], unit: str) -> None:
@@ -126,31 +99,18 @@ def write_next_motion(path: Path, motions: list[Motion], entries: list[Block], u
     write_rows(path, ["time[s]", f"command{number}[{unit}]"], [list(row) for row in rows])
 
 
-def motion_markdown(results: Block, about: About) -> str:
-    """Verdict and tables as Markdown (`diagnosis.md`)."""
-    tables = [table for section in _sections(results, about, {}) for table in section.tables]
-    first = [verdict_text(results), *first_screen_markdown(results, about)]
-    return "\n\n".join([f"# {about.name}", *first, *map(markdown_table, tables), *_notes(results)]) + "\n"
-
-
 def print_motion(
     results: Block, console: Console, about: About | None = None, *, verdict: bool = True, details: bool = False
 ) -> None:
     """Show on a terminal what a technician needs first; arguments as of `print_diagnosis`."""
     about = about or About()
-    if verdict:
-        print_text(verdict_text(results), console, "bold")
-    print_first_screen(results, console, about)
-    if details:
+
+    def tables() -> None:
         for section in _sections(results, about, {}, _LEAST):
             for table in section.tables:
                 print_table(table, console)
-    for sentence in _notes(results):
-        print_text(sentence, console, "yellow")
-    if not details:
-        print_text(
-            "All tables are in report.html, diagnosis.md and diagnosis.json; --details shows them here.", console, "dim"
-        )
+
+    print_page(results, console, about, verdict, tables if details else None, notes_of(results))
 
 
 def _sections(results: Block, about: About, figures: Mapping[str, InlineFigure], least: float = 0.0) -> list[Section]:
@@ -162,13 +122,7 @@ def _sections(results: Block, about: About, figures: Mapping[str, InlineFigure],
         ("What can these logs not show?", (), (unseen_table(results),)),
         ("What should be recorded next?", (), (_next_table(results),)),
     ]
-    sections = []
-    for title, names, tables in planned:
-        shown = [figures[name] for name in names if name in figures]
-        there = [table for table in tables if table is not None]
-        if shown or there:
-            sections.append(Section(title, trusted(shown), there))
-    return sections
+    return sections_of(planned, figures)
 
 
 def _phase_table(results: Block) -> Table | None:
@@ -209,8 +163,3 @@ def _next_table(results: Block) -> Table | None:
     )
     columns = ("number", "joint", "motion", "separates", "gain [nat]")
     return Table("What should be recorded next?", columns, rows, note, ("motion", "separates")) if rows else None
-
-
-def _notes(results: Block) -> list[str]:
-    shown = {unseen_text(name, why) for name, why in results.get("not_seen", {}).items()}
-    return [note if note.endswith(".") else f"{note}." for note in results["notes"] if note not in shown]

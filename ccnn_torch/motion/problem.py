@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.motion.axis import Drive, simulate_axes
+from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.stretches import Stretches
 
@@ -45,7 +48,9 @@ class Problem:
         data: `n` joints, `b` stretches, `s` samples.
         library: effects.
         followed: what the axes follow, `n x b x s`: the commands, or what a simulator makes of them.
+        torque, simulated: as of `Driven`.
         supply, warm: as of `Drive`, `b x s`.
+        own: what a unit of each of a simulator's own parameters changes in its positions, by name, `n x b x s`.
         pool: so many samples are averaged before they are judged: what is faster than the motion is noise.
     """
 
@@ -55,26 +60,84 @@ class Problem:
     supply: Tensor
     warm: Tensor
     pool: int = 1
+    torque: Tensor | None = None
+    simulated: Tensor | None = None
+    own: Mapping[str, Tensor] = field(default_factory=dict)
 
     def positions(self, theta: Tensor, chosen: Tensor | None = None) -> Tensor:
         """Simulated positions, `p x n x b x s`; theta: `p x n x k`; chosen: stretches, all when None."""
         data = self.data
         rows = torch.arange(len(data.time)) if chosen is None else chosen
-        n, b = len(self.followed), len(rows)
+        start = torch.stack([data.position[:, :, 0], data.speed[:, :, 0]], -1)
+        moved = self._moved(theta, rows, start)
+        return moved if self.simulated is None else moved + self._beyond[:, rows]
+
+    @cached_property
+    def _beyond(self) -> Tensor:
+        """What a simulator makes of the commands less what its axes make of them, `n x b x s`."""
+        assert self.simulated is not None
+        begin, rows = self.simulated[..., :2], torch.arange(len(self.data.time))
+        speed = begin.diff(dim=-1) / self.data.time[:, :2].diff(dim=-1)
+        theta = torch.zeros(1, len(begin), self.library.size, dtype=torch.float64)
+        return self.simulated - self._moved(theta, rows, torch.cat([begin[..., :1], speed], -1))[0]
+
+    def pushed(self, theta: Tensor, torque: Tensor) -> Tensor:
+        """Positions under torques that resist the motors, over the gain, one after the other.
+
+        Args:
+            theta: `n x k`.
+            torque: `n x m x b x s` [rad or m].
+
+        Returns:
+            `n x m x b x s`.
+        """
+        n, m, b, s = torque.shape
+        already = 0.0 if self.torque is None else self.torque[:, None]
+        every = torque + already
+
+        def many(values: Tensor) -> Tensor:
+            return values.repeat(m, *[1] * (values.dim() - 1))
+
+        # A stretch for every torque.
+        data = self.data._replace(
+            time=many(self.data.time),
+            position=self.data.position.repeat(1, m, 1),
+            speed=self.data.speed.repeat(1, m, 1),
+        )
+        wide = replace(
+            self,
+            data=data,
+            followed=self.followed.repeat(1, m, 1),
+            supply=many(self.supply),
+            warm=many(self.warm),
+            torque=every.reshape(n, m * b, s),
+            simulated=None,
+            own={name: v.repeat(1, m, 1) for name, v in self.own.items()},
+        )
+        moved = wide.positions(theta[None])[0].reshape(n, m, b, s)
+        return moved if self.simulated is None else moved + self._beyond[:, None]
+
+    def _moved(self, theta: Tensor, rows: Tensor, start: Tensor) -> Tensor:
+        data, n, b = self.data, len(self.followed), len(rows)
         time = data.time[rows].expand(n, -1, -1).reshape(n * b, -1)
-        start = torch.stack([data.position[:, rows, 0], data.speed[:, rows, 0]], -1).reshape(n * b, 2)
         drive = Drive(
             time,
             self.followed[:, rows].reshape(n * b, -1),
-            start,
+            start[:, rows].reshape(n * b, 2),
             self.supply[rows].expand(n, -1, -1).reshape(n * b, -1),
             self.warm[rows].expand(n, -1, -1).reshape(n * b, -1),
+            None if self.torque is None else self.torque[:, rows].reshape(n * b, -1),
         )
+        parameters = self.library.parameters(theta)
+        own = {name: parameters.pop(f"{OWN}{name}", None) for name in self.own}
         values = {
             name: value[..., None].expand(*value.shape, b).reshape(len(theta), n * b)
-            for name, value in self.library.parameters(theta).items()
+            for name, value in parameters.items()
         }
         moved = simulate_axes(drive, values).reshape(-1, n, b, time.shape[-1])
+        for name, value in own.items():
+            if value is not None:
+                moved = moved + value[..., None, None] * self.own[name][:, rows]
         return moved.expand(len(theta), -1, -1, -1)
 
     def residual(self, theta: Tensor, chosen: Tensor | None = None) -> Tensor:

@@ -6,14 +6,16 @@ All axes go side by side, each with its own sets: they share the simulated time 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.diagnosis.evidence.dictionary import CERTAIN
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of, scaled
 from ccnn_torch.motion.fit import Fit, Spec, fit_many, sensitivities, started
+from ccnn_torch.motion.form import form_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening, white_noise
 from ccnn_torch.motion.whiten import fitted_whitening
@@ -41,12 +43,14 @@ class Search(NamedTuple):
         whitening: of the residual of each axis.
         found: of each axis the fits of all sets, most probable first.
         rich: residual of each axis under the white fit with the most effects, `n x b x s` [rad or m].
+        form: variance of the form errors of each axis, as of `form_errors`.
     """
 
     problem: Problem
     whitening: Whitening
     found: tuple[tuple[Fit, ...], ...]
     rich: Tensor
+    form: tuple[float, ...]
 
 
 def log_posterior(fit: Fit) -> float:
@@ -73,7 +77,18 @@ def search(problem: Problem) -> Search:
     final.again(pool)
     final.neighbours()
     final.reduced()
-    return Search(problem, final.whitening, tuple(tuple(p) for p in final.ranked()), rich)
+    ranked = tuple(tuple(p) for p in final.ranked())
+    # Sets that are probable although forms are wrong are smaller than those above.
+    noise = [fits[0].noise for fits in ranked]
+    for _ in range(2):
+        form = form_errors(problem, final.whitening, final.best())
+        final.variance = [a + b for a, b in zip(noise, form, strict=True)]
+    final.forward()
+    final.neighbours()
+    form = form_errors(problem, final.whitening, final.best())
+    final.variance = None
+    final.reduced()
+    return Search(problem, final.whitening, tuple(tuple(p) for p in final.ranked()), rich, tuple(form))
 
 
 class _Pool:
@@ -84,6 +99,9 @@ class _Pool:
         self.library: Library = problem.library
         self.axes = len(problem.followed)
         zero = torch.zeros(self.library.size, dtype=torch.float64)
+        # Of noise and form errors of each axis; None: the noise that each set leaves.
+        self.variance: list[float] | None = None
+        self.scores: dict[tuple[int, tuple[int, ...], float], tuple[Fit, float]] = {}
         self.found: list[dict[tuple[int, ...], Fit]] = [{} for _ in range(self.axes)]
         self.fit([[Spec((), zero, (), 0.0)] for _ in range(self.axes)], 0)
 
@@ -91,7 +109,18 @@ class _Pool:
         return [self.ranked()[i][0] for i in range(self.axes)]
 
     def ranked(self) -> list[list[Fit]]:
-        return [sorted(found.values(), key=lambda f: -log_posterior(f)) for found in self.found]
+        return [sorted(own.values(), key=lambda f: -self.score(i, f)) for i, own in enumerate(self.found)]
+
+    def score(self, axis: int, fit: Fit) -> float:
+        """Log posterior under the noise that counts."""
+        if self.variance is None:
+            return log_posterior(fit)
+        key = (axis, fit.members, self.variance[axis])
+        old = self.scores.get(key)
+        if old is None or old[0] is not fit:
+            evidence = float(weighed(fit.grams, fit.spec.groups, self.variance[axis]).log_evidence[0])
+            old = self.scores[key] = fit, evidence + log_posterior(fit) - fit.log_evidence
+        return old[1]
 
     def fit(self, wanted: Sequence[Sequence[Spec]], steps: int) -> None:
         """Fit sets of each axis; one that was fitted before stays if it was better."""
@@ -118,7 +147,7 @@ class _Pool:
         """Add effects one after the other, as long as that brings evidence."""
         done: list[set[tuple[int, ...]]] = [set() for _ in range(self.axes)]
         for _ in range(_MOST):
-            before = [log_posterior(f) for f in self.best()]
+            before = [self.score(i, f) for i, f in enumerate(self.best())]
             bases = [
                 [f for f in ranked[:_BEAM] if f.members not in d and len(f.members) < _MOST]
                 for ranked, d in zip(self.ranked(), done, strict=True)
@@ -131,7 +160,7 @@ class _Pool:
             alone = all(not f.members for own in bases for f in own)
             self.fit(self.screened(bases, len(self.library.effects) if alone else _FITTED), _SHORT)
             self.fit([[f.spec for f in ranked[:_BEAM] if f.members] for ranked in self.ranked()], _SHORT)
-            after = [log_posterior(f) for f in self.best()]
+            after = [self.score(i, f) for i, f in enumerate(self.best())]
             if all(a < b + _GAINED for a, b in zip(after, before, strict=True)):
                 return
 
@@ -230,7 +259,7 @@ class _Pool:
             y = residual[i, 0] + f.spec.theta[list(f.spec.flat)] @ own[i, 0, :m]
             x = torch.cat([own[i, 0, :m], new[i]])
             grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
-            base_groups = _groups(f.spec.active)
+            base_groups = f.spec.groups
             sets, kept, place = [], [], m
             for v in variants:
                 width = len(v.active)
@@ -238,7 +267,10 @@ class _Pool:
                     sets.append([*base_groups, torch.arange(place, place + width)])
                     kept.append(v)
                 place += width
-            scores = fit_sets(grams, sets, 0.0).log_evidence.tolist() if sets else []
+            known = 0.0
+            if self.variance is not None:
+                grams, known = scaled(grams, self.variance[i]), CERTAIN * values
+            scores = fit_sets(grams, sets, known).log_evidence.tolist() if sets else []
             found.append(
                 [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, kept, strict=True)]
             )
@@ -258,11 +290,3 @@ def without(library: Library, spec: Spec, place: int) -> Spec:
         spec.log_prior,
         tuple(p for p in spec.free if p not in held),
     )
-
-
-def _groups(active: Iterable[tuple[int, ...]]) -> list[Tensor]:
-    groups, begin = [], 0
-    for group in active:
-        groups.append(torch.arange(begin, begin + len(group)))
-        begin += len(group)
-    return groups

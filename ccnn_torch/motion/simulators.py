@@ -29,12 +29,20 @@ class Simulator:
         simulate: `simulate(time, commands, parameters)`: `s`, `s x n`, a dict, and `s x n` back.
         parameters: what it is given.
         notes: sentences without a full stop.
+        axes, gains: parameters of each axis as in `ABSENT`, and its gain [N m/rad], where it tells them.
+        lengths, weights: of a load at each joint, as of `Facts`, where it tells them.
+        loaded: where it does, positions and what resists the motors beside those, over the gains, `s x n` each.
     """
 
     name: str
     simulate: Callable[[Array, Array, dict[str, float]], Array]
     parameters: Mapping[str, float]
     notes: tuple[str, ...] = ()
+    axes: tuple[Mapping[str, float], ...] = ()
+    gains: tuple[float, ...] = ()
+    lengths: tuple[float | None, ...] = ()
+    weights: tuple[tuple[float, float] | None, ...] = ()
+    loaded: Callable[[Array, Array], tuple[Array, Array]] | None = None
 
     def positions(self, time: Array, command: Array) -> Array:
         """Positions of one run, `s x n`; time `s`, command `s x n`.

@@ -45,6 +45,8 @@ def test_each_law_does_what_its_name_says() -> None:
     assert np.abs(stuck - np.maximum(ramp - 0.1, 0)).max() < 1e-7
     # A share of the load is friction too: it holds a weight at rest, and more lead is needed.
     assert axis(TIME, ramp, coulomb=0.1, load_friction=0.5)[-1] < stuck[-1] - 0.09
+    # Of an axis that carries nothing it is a share of nothing.
+    assert np.abs(axis(TIME, ramp, load_friction=0.9) - ramp).max() < 1e-6
     # The driven side of a play comes half of it late, on either way.
     wave = np.sin(2 * TIME)
     late = wave - axis(TIME, wave, play=0.1)

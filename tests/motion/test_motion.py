@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pytest
-from motion.servo import GAIN, KEYS, write_log
+from motion.servo import GAIN, KEYS, command, moved, write_log
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion import diagnose_motion, load_logs, nominal_of
+from ccnn_torch.motion import (
+    Nominal,
+    diagnose_motion,
+    feed_forward,
+    load_identified,
+    load_logs,
+    nominal_of,
+    write_identified,
+)
+from ccnn_torch.motion.mujoco_write import write_mjcf as write_new_values
+from ccnn_torch.records import read_table
 from ccnn_torch.report.json_files import load_schema
 
 Cli = Callable[..., tuple[int, str, str]]
@@ -20,19 +30,8 @@ DATA = Path(__file__).parents[2] / "experiments" / "data"
 FEW = ["delay", "coulomb", "offset", "backlash"]
 
 
-def test_two_causes_are_named_with_their_values(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", (0, 1), 4.0, dry=0.1, delay=0.03)
-    found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), FEW).content
-    assert sorted(found["verdict"]["effects"]) == ["coulomb", "delay"] and found["verdict"]["probability"] >= 0.9
-    values = {e["name"]: e["parameters"] for e in found["effects"]}
-    assert values["delay"]["q1 delay"]["value"] == pytest.approx(0.03, rel=0.05)
-    assert values["coulomb"]["q1 coulomb"]["value"] == pytest.approx(0.1, rel=0.1)
-    assert values["coulomb"]["q1 coulomb"]["unit"] == "N*m"
-    assert found["verdict"]["shrink"] > 0.99 and found["gap"]["after"] < 0.05 * found["gap"]["before"]
-
-
 def test_a_right_model_leaves_no_claim_and_its_error_says_where(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", (0, 1), 4.0, dry=0.02 * GAIN)
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, dry=0.02 * GAIN)
     right = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS | {"coulomb": 0.02 * GAIN}, ["rad"]), FEW)
     assert right.content["verdict"]["none"] and right.content["verdict"]["effects"] == []
 
@@ -60,7 +59,7 @@ def test_a_drift_of_the_encoder_is_outside_the_library(tmp_path: Path) -> None:
 def test_the_command_on_a_real_servo(tmp_path: Path, cli: Cli) -> None:
     logs = [w for name in ("sin_sin", "up_and_down") for w in ("--motion", DATA / f"servo_{name}.csv")]
     out = tmp_path / "out"
-    effects = "delay,gravity,viscous,coulomb"
+    effects = "gravity,viscous,coulomb"
     code, said, error = cli("diagnose", *logs, "--mechanism", "servo", "--effects", effects, "--out", out)
     assert code == 0 and not error
     results = json.loads((out / "diagnosis.json").read_text())
@@ -77,44 +76,155 @@ def test_the_command_on_a_real_servo(tmp_path: Path, cli: Cli) -> None:
     assert (out / "diagnosis.md").is_file()
 
 
-def test_a_simulator_of_ones_own_is_a_model(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", (0, 1), 3.0, delay=0.05)
-    own = tmp_path / "mine.py"
-    own.write_text(
-        "import numpy as np\n"
-        "class SERVO:\n"
-        "    parameters = {'lag': 0.045}\n"
-        "    def simulate(self, time, commands, parameters):\n"
-        "        q = commands.copy()\n"
-        "        for k in range(1, len(time)):\n"
-        "            h = time[k] - time[k - 1]\n"
-        "            q[k] = q[k - 1] + (commands[k] - q[k - 1]) * h / (h + parameters['lag'])\n"
-        "        return q\n"
-        "class BROKEN:\n"
-        "    def simulate(self, time, commands, parameters):\n"
-        "        return commands[1:]\n"
+def test_a_mechanism_file_gives_joints_that_follow_their_commands(tmp_path: Path) -> None:
+    arm = tmp_path / "arm.yaml"
+    arm.write_text(
+        "dof: 2\nconvention: standard Denavit-Hartenberg\nunits: {length: m, angle: rad}\na: [0.3, 0.2]\n"
+        "alpha: [0, 0]\nd: [0, 0]\ntheta: [0, 0]\njoint_sign: [1, 1]\nbase_frame: identity\ntool_frame: identity\n"
     )
-    logs = load_logs([log])
-    found = diagnose_motion(logs, nominal_of(f"{own}:SERVO", {}, ["rad"]), ["delay", "offset"]).content
-    assert found["verdict"]["effects"] == ["delay"]
+    time = np.arange(0, 2.4, 0.01)
+    asked, late = (np.stack([0.5 * np.sin((2 + i) * (time - t)) for i in range(2)], -1) for t in (0.0, 0.03))
+    rows = np.concatenate([time[:, None], asked, late], 1)
+    head = "time[s],command1[rad],command2[rad],q1[rad],q2[rad]"
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header=head, comments="")
+    logs = load_logs([tmp_path / "log.csv"])
+    found = diagnose_motion(logs, nominal_of(str(arm), {}, logs[0].units), ["delay"]).content
+    assert found["verdict"]["effects"] == ["delay"] and len(found["where"]["joints"]) == 2
+    values = next(e for e in found["effects"] if e["name"] == "delay")["parameters"]
+    assert [v["value"] for v in values.values()] == pytest.approx([0.03, 0.03], rel=0.02)
+
+
+OWN = """
+import numpy as np
+class SERVO:
+    parameters = {"gain": 2.0, "viscous": 0.05}
+    def simulate(self, time, commands, parameters):
+        q, v = commands.copy(), np.zeros(commands.shape[1])
+        for k in range(1, len(time)):
+            h = (time[k] - time[k - 1]) / 2
+            q[k] = q[k - 1]
+            for part in (0.5, 1.0):
+                u = commands[k - 1] + part * (commands[k] - commands[k - 1])
+                push = 0.004 / h * v + parameters["gain"] * (u - q[k])
+                v = push / (0.004 / h + parameters["viscous"] + parameters["gain"] * h)
+                q[k] = q[k] + h * v
+        return q
+class BROKEN:
+    def simulate(self, time, commands, parameters):
+        return commands[1:]
+"""
+
+
+def write_mjcf(
+    path: Path, joint: str = "", mass: float = 0.2, actuator: str = f'<position joint="q" kp="{GAIN}"/>'
+) -> Path:
+    """A pendulum of `mass` at 0.1 m whose inertia is that of the servo of the tests."""
+    armature, damping = KEYS["inertia"] - mass * 0.1**2, KEYS["viscous"]
+    path.write_text(
+        '<mujoco><compiler angle="radian"/><option timestep="0.001" integrator="implicitfast"/><worldbody><body>'
+        f'<joint name="q" axis="0 1 0" armature="{armature}" damping="{damping}"/>'
+        f'<geom type="sphere" size="0.001" pos="0 0 -0.1" mass="0.2"/></body></worldbody>'
+        f"<actuator>{actuator}</actuator></mujoco>"
+    )
+    return path
+
+
+def left_on(kind: int, nominal: Nominal, axes: Sequence[Mapping[str, float]], **real: float) -> float:
+    """RMS of a model on a motion that no diagnosis saw [rad]."""
+    time = np.arange(0, 4, 0.01)
+    asked = command(kind, time)
+    error = feed_forward.moved(nominal, axes, time, asked[None, :, None])[0, :, 0] - moved(time, asked, **real)
+    return float(np.sqrt(np.square(error).mean()))
+
+
+def test_a_simulator_of_ones_own_is_a_model_whose_parameters_are_causes(tmp_path: Path) -> None:
+    log, own = write_log(tmp_path / "log.csv", (0, 1), 2.0), tmp_path / "mine.py"
+    own.write_text(OWN)
+    logs, nominal = load_logs([log]), nominal_of(f"{own}:SERVO", {}, ["rad"])
+    found = diagnose_motion(logs, nominal, ["offset"])
+    assert found.content["verdict"]["effects"] == ["parameter viscous"]
+    write_identified(tmp_path, found, nominal, {})
+    with pytest.raises(InputError, match="names Python code, "):
+        load_identified(tmp_path / "identified_motion.json")
+    better = load_identified(tmp_path / "identified_motion.json", allow_code=True)
+    assert better.nominal.simulator is not None
+    assert better.nominal.simulator.parameters["viscous"] == pytest.approx(KEYS["viscous"], rel=0.1)
+    assert left_on(2, better.nominal, better.axes) < 0.2 * left_on(2, nominal, nominal.axes)
     with pytest.raises(InputError, match="must return a position for each"):
         diagnose_motion(logs, nominal_of(f"{own}:BROKEN", {}, ["rad"]), ["delay"])
 
 
-def test_a_mujoco_model_is_a_model(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.csv", (0,), seconds=4.0, weight=0.3)
-    model = tmp_path / "servo.xml"
-    joint = f'<joint axis="0 1 0" armature="{KEYS["inertia"]}" damping="{KEYS["viscous"]}"/>'
-    body = f'<body>{joint}<geom type="sphere" size="0.01" mass="1e-6"/></body>'
-    text = "<mujoco><worldbody>{}</worldbody><actuator>{}</actuator></mujoco>"
-    model.write_text(text.format(body.replace("<joint ", '<joint name="q" '), f'<position joint="q" kp="{GAIN}"/>'))
-    found = diagnose_motion(load_logs([log]), nominal_of(str(model), {}, ["rad"]), ["gravity", "delay"]).content
-    assert found["verdict"]["effects"] == ["gravity"]
-    sag = next(e for e in found["effects"] if e["name"] == "gravity")["parameters"]["q1 sin"]
-    assert sag["value"] == pytest.approx(0.3 / GAIN, rel=0.15)
-    model.write_text(text.format(body.replace("<joint ", '<joint name="q" '), '<motor joint="q"/>'))
+def test_a_mujoco_model_is_a_model_and_gets_the_new_values(tmp_path: Path) -> None:
+    # A load of 0.3 N m at 90 degrees, where the model has 0.2 kg at 0.1 m.
+    real = {"weight": 0.3, "dry": 0.06}
+    log, model = write_log(tmp_path / "log.csv", (0, 1), 2.4, **real), write_mjcf(tmp_path / "servo.xml")
+    nominal = nominal_of(str(model), {}, ["rad"])
+    found = diagnose_motion(load_logs([log]), nominal, ["gravity", "delay", "coulomb"])
+    assert sorted(found.content["verdict"]["effects"]) == ["coulomb", "gravity"]
+    sag = next(e for e in found.content["effects"] if e["name"] == "gravity")["parameters"]["q1 sin"]
+    assert sag["value"] == pytest.approx(0.3 - 0.2 * 9.80665 * 0.1, rel=0.15) and sag["unit"] == "N*m"
+    assert write_identified(tmp_path, found, nominal, {}) == ["identified_motion.json", "identified.xml"]
+    better = load_identified(tmp_path / "identified_motion.json")
+    before, after = left_on(2, nominal, nominal.axes, **real), left_on(2, better.nominal, better.axes, **real)
+    said = found.content["verdict"]["shrink"]
+    assert after < 0.15 * before and 1 - (after / before) ** 2 == pytest.approx(said, abs=0.02)
+    import mujoco
+
+    written = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml"))
+    assert written.dof_frictionloss[0] == pytest.approx(0.06, rel=0.1)
+    # A tenth of a kilogram more: the body is heavier, and the motor's armature as it was.
+    inertia = (KEYS["inertia"] + 0.1 * 0.1**2) / GAIN
+    axis = {"gain": 1.0, "inertia": inertia, "viscous": KEYS["viscous"] / GAIN, "coulomb": 0.0, "weakness": 0.0}
+    write_new_values(str(model), tmp_path / "identified.xml", [axis], nominal.gains, [0.1], nominal.lengths)
+    heavier = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml"))
+    assert heavier.body_mass[1] == pytest.approx(0.3) and heavier.dof_M0[0] == pytest.approx(inertia * GAIN)
+    assert heavier.dof_armature[0] == pytest.approx(KEYS["inertia"] - 0.2 * 0.1**2, abs=1e-6)
+    write_mjcf(model, actuator='<motor joint="q"/>')
     with pytest.raises(InputError, match="<position joint=…/> for each command"):
         nominal_of(str(model), {}, ["rad"])
+
+
+def test_causes_have_their_values_and_a_corrected_command_is_followed(tmp_path: Path, cli: Cli) -> None:
+    real = {"dry": 0.1, "delay": 0.03, "weight": 0.3}
+    log, out = write_log(tmp_path / "log.csv", (0, 1), 2.4, **real), tmp_path / "out"
+    keys = "{gain: 2.0, inertia: 0.004, viscous: 0.09}"
+    effects = "delay,coulomb,gravity"
+    given = ("--motion", log, "--mechanism", "servo", "--effects", effects, "--out", out, f"mechanism_keys={keys}")
+    code, said, error = cli("diagnose", *given)
+    assert code == 0 and not error and "ccnn compensate" in said
+    found = json.loads((out / "diagnosis.json").read_text())
+    assert sorted(found["verdict"]["effects"]) == ["coulomb", "delay", "gravity"]
+    assert found["verdict"]["probability"] >= 0.95 and found["verdict"]["shrink"] > 0.99
+    values = {e["name"]: e["parameters"] for e in found["effects"]}
+    assert values["delay"]["q1 delay"]["value"] == pytest.approx(0.03, rel=0.05)
+    assert values["coulomb"]["q1 coulomb"]["value"] == pytest.approx(0.1, rel=0.1)
+    assert values["coulomb"]["q1 coulomb"]["unit"] == "N*m"
+    assert values["gravity"]["q1 sin"]["value"] == pytest.approx(0.3, rel=0.05)
+    time = np.arange(0, 4, 0.01)
+    wanted = command(2, time)
+    lines = [f"{t:.12g},{np.degrees(u):.12g}" for t, u in zip(time, wanted, strict=True)]
+    (tmp_path / "in.csv").write_text("\n".join(["time[s],command1[deg]", *lines]) + "\n")
+    model, sent = out / "identified_motion.json", tmp_path / "out.csv"
+    code, said, error = cli("compensate", model, tmp_path / "in.csv", sent)
+    assert code == 0 and not error and "q1: predicted" in said
+    table = read_table(sent)
+    errors = [wanted - moved(time, u, **real) for u in (wanted, table.column("corrected1", "rad"))]
+    before, after = (float(np.sqrt(np.square(e).mean())) for e in errors)
+    predicted = float(np.sqrt(np.square(wanted - table.column("predicted1", "rad")).mean()))
+    assert after < 0.1 * before and predicted / 2 < after < 2 * predicted + load_identified(model).left[0]
+    (tmp_path / "in.csv").write_text("\n".join(["time[s],command1[deg]", lines[1], lines[0]]) + "\n")
+    for arguments, sentence in {(): "time does not increase", ("--back",): "takes none of --pose"}.items():
+        code, _, error = cli("compensate", model, tmp_path / "in.csv", sent, *arguments)
+        assert code == 2 and sentence in error and error.count("\n") == 1
+    good = json.loads(model.read_text())
+    for change, sentence in {
+        "units": (["K"], "joints in rad or m"),
+        "mechanism_keys": (3, "is no identified_motion.json"),
+        "axes": ([{"delay": "nan"}], "no number 'delay'"),
+    }.items():
+        model.write_text(json.dumps(good | {change: sentence[0]}))
+        code, _, error = cli("compensate", model, tmp_path / "in.csv", sent)
+        assert code == 2 and str(sentence[1]) in error and error.count("\n") == 1
 
 
 def test_a_file_that_cannot_be_is_refused_in_one_sentence(tmp_path: Path, cli: Cli) -> None:
@@ -123,6 +233,9 @@ def test_a_file_that_cannot_be_is_refused_in_one_sentence(tmp_path: Path, cli: C
     one = {"time[s]": t, "command1[rad]": u, "q1[rad]": 0.98 * u}
     both = {**one, "command2[rad]": w, "q2[rad]": w}
     swapped = both | {"q1[rad]": w, "q2[rad]": 0.98 * u}
+    early = t[:260]
+    bump = {lag: np.exp(-(((early - 1.0 - lag) / 0.3) ** 2)) for lag in (0.0, 0.5)}
+    short = {"time[s]": early, "command1[rad]": bump[0.0], "q1[rad]": bump[0.5]}
     back = t.copy()
     back[50] = t[48]
     cases = {
@@ -131,6 +244,7 @@ def test_a_file_that_cannot_be_is_refused_in_one_sentence(tmp_path: Path, cli: C
         "the columns of two joints are swapped": swapped,
         "the drive was off throughout": one | {"torque_on[1]": 0 * t},
         "too few; record at least 100 samples": {n: v[:80] for n, v in one.items()},
+        "and the log lasts 2.59 s; record at least 3.9 s": short,
         "no command moves": one | {"command1[rad]": 0 * t},
         "q1 never moves while command1 does": one | {"q1[rad]": 0 * t},
         "there is no column 'q1'": {n: v for n, v in one.items() if n != "q1[rad]"},
@@ -144,6 +258,15 @@ def test_a_file_that_cannot_be_is_refused_in_one_sentence(tmp_path: Path, cli: C
         assert code == 2 and sentence in error and error.count("\n") == 1, (sentence, error)
         assert not (tmp_path / "out").exists()
     assert cli("diagnose", "--motion", path, "--out", tmp_path / "out")[0] == 2
+    path = write_log(tmp_path / "log.csv", (0,))
+    for model, sentence in {
+        DATA / "ur10.yaml": "ur10.yaml: has 6 joints (rad, rad, rad, rad, rad, rad), and the logs 1 (rad)",
+        "five_bar": "five_bar: has 2 joints (rad, rad), and the logs 1 (rad)",
+        tmp_path / "none.xml": "none.xml",
+        f"{tmp_path / 'none.py'}:SERVO": "there is no file",
+    }.items():
+        code, _, error = cli("diagnose", "--motion", path, "--mechanism", model, "--out", tmp_path / "out")
+        assert code == 2 and sentence in error and error.count("\n") == 1, (sentence, error)
     with pytest.raises(InputError, match="'gian'; 'gain' is the nearest"):
         nominal_of("servo", {"gian": 2.0}, ["rad"])
     with pytest.raises(InputError, match="inertia is given without gain"):

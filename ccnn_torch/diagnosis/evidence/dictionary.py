@@ -12,15 +12,15 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import Atom
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, scaled
 from ccnn_torch.diagnosis.evidence.single_groups import NO_COLUMNS, GroupProducts, fit_single_groups, own_products
 
-__all__ = ["Dictionary", "FittedSet", "Singles", "covariance", "dictionary_of", "singles_of", "with_noise"]
+__all__ = ["CERTAIN", "Dictionary", "FittedSet", "Singles", "covariance", "dictionary_of", "singles_of", "with_noise"]
 
 # Columns from which their products with all others are worth a call of their own.
 _NARROW = 128
-# Weight of a noise that is certain, in multiples of the values.
-_CERTAIN = 100.0
+CERTAIN = 100.0
+"""Weight of a noise that is certain, in multiples of the values."""
 
 
 @dataclass(frozen=True)
@@ -157,9 +157,8 @@ def with_noise(dictionary: Dictionary, variance: float) -> Dictionary:
         dictionary: candidates.
         variance: of the noise, in units of the noise so far.
     """
-    grams, size = dictionary.grams, math.sqrt(variance)
-    grams = Grams(grams.xx / variance, grams.xy / variance, grams.yy / variance, grams.values)
-    known = _CERTAIN * grams.values
+    grams, size = scaled(dictionary.grams, variance), math.sqrt(variance)
+    known = CERTAIN * grams.values
     products = {i: GroupProducts(grams.xx[_run(g), _run(g)], grams.xy[_run(g)]) for i, g in dictionary.groups.items()}
     alone, axes = _alone(products, dictionary.atoms, grams.yy, grams.values, known)
     return replace(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.hyperparameters import FIRST_NOISE, LIMIT, SPREAD, Scales
 
-__all__ = ["Fits", "Grams", "fit_sets", "grams_of", "padded", "without"]
+__all__ = ["Fits", "Grams", "fit_sets", "grams_of", "padded", "scaled", "without"]
 
 # Columns up to which XᵀX is made as a whole.
 _NARROW = 128
@@ -62,6 +62,11 @@ def grams_of(x: Tensor, y: Tensor) -> Grams:
     """x: `s x c x P` whitened columns; y: `s x c`."""
     flat, value = x.flatten(0, 1), y.reshape(-1)
     return Grams(_squares(flat), flat.mT @ value, value @ value, float(len(value)))
+
+
+def scaled(grams: Grams, variance: float) -> Grams:
+    """In units of a variance."""
+    return Grams(grams.xx / variance, grams.xy / variance, grams.yy / variance, grams.values)
 
 
 def _squares(flat: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ E_g = |X_g θ_g|². It grows with the rows as E_g does, so that no number of row
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ccnn_torch.diagnosis.candidates.atom import Atom
@@ -17,15 +18,16 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.search.beam import probable_sets
 from ccnn_torch.effects import EXACT
 
-__all__ = ["Posterior", "is_unexplained", "with_form_error"]
+__all__ = ["LEVELS", "OF_EXACT", "OF_FORM", "OF_SMOOTH", "Posterior", "form_variance", "is_unexplained"]
+__all__ += ["with_form_error"]
 
-# Share φ of an effect's squares that its form error adds to the noise in every direction: where the form is exact, only
-# the second order; of other effects; and of a discrepancy term, which is smooth where the cause need not be.
-_EXACT, _FORM, _SMOOTH = 1e-6, 5e-5, 3e-4
+OF_EXACT, OF_FORM, OF_SMOOTH = 1e-6, 5e-5, 3e-4
+"""Share φ of an effect's squares that its form error adds to the noise in every direction: of an exact form only
+the second order; of other effects; and of a discrepancy term, which is smooth where the cause need not be."""
 # Directions that a form error has, so that all of it is this number times φ of the squares.
 _DIRECTIONS = 100
-# Levels of the form error, equally probable: it is known to a factor of four or so.
-_LEVELS = (1.0, 0.25, 4.0)
+LEVELS = (1.0, 0.25, 4.0)
+"""Levels of the form error, equally probable: it is known to a factor of four or so."""
 # Standard deviations of the noise's mean square that a remainder must exceed in any case; and within which it is none.
 _CLEARLY, _SLIGHTLY = 5.0, 3.0
 # Log prior odds that all forms are those of the textbook, and directions in which a form error is sure to show.
@@ -53,7 +55,7 @@ class Posterior:
 def with_form_error(analysis: Analysis) -> list[Posterior]:
     """The sets of an analysis, weighed again under the form error of the most probable one, at each of its levels, the
     usual one first."""
-    levels = [_at_level(analysis, level) for level in _LEVELS]
+    levels = [_at_level(analysis, level) for level in LEVELS]
     if not _is_known(analysis):
         return levels
     # Whether the forms are those of the textbook is to be seen where the noise is known: the best set leaves that, and
@@ -73,7 +75,7 @@ def _at_level(analysis: Analysis, level: float) -> Posterior:
     noise = max(analysis.floor, _mean_square(best, analysis.dictionary))
     variance = max(noise + level * _form_error(best, analysis.dictionary), math.ulp(1.0))
     dictionary = with_noise(analysis.dictionary, variance)
-    return Posterior(dictionary, probable_sets(dictionary), 1 / len(_LEVELS), variance)
+    return Posterior(dictionary, probable_sets(dictionary), 1 / len(LEVELS), variance)
 
 
 def _without_discrepancies(posterior: Posterior) -> Posterior:
@@ -90,10 +92,19 @@ def _is_known(analysis: Analysis) -> bool:
 
 def _form_error(found: FittedSet, dictionary: Dictionary) -> float:
     """Variance in every direction of what the effects of a set differ by, in units of the dictionary's noise."""
-    most = float(dictionary.grams.yy)
-    return sum(
-        _share(dictionary.atoms[i]) * min(energy, most) for i, energy in zip(found.members, found.energy, strict=True)
-    )
+    shares = [_share(dictionary.atoms[i]) for i in found.members]
+    return form_variance(shares, found.energy, float(dictionary.grams.yy))
+
+
+def form_variance(shares: Sequence[float], energies: Sequence[float], most: float) -> float:
+    """Variance in every direction of what effects differ by from their forms.
+
+    Args:
+        shares: φ of each.
+        energies: squares of each.
+        most: none does more than all there is.
+    """
+    return sum(share * min(energy, most) for share, energy in zip(shares, energies, strict=True))
 
 
 def is_unexplained(analysis: Analysis, found: FittedSet) -> bool:
@@ -105,7 +116,7 @@ def is_unexplained(analysis: Analysis, found: FittedSet) -> bool:
 
 
 def _share(atom: Atom) -> float:
-    return _SMOOTH if atom.is_discrepancy else _EXACT if atom.name in EXACT else _FORM
+    return OF_SMOOTH if atom.is_discrepancy else OF_EXACT if atom.name in EXACT else OF_FORM
 
 
 def _mean_square(found: FittedSet, dictionary: Dictionary) -> float:

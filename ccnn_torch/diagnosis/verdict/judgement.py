@@ -14,7 +14,7 @@ from ccnn_torch.diagnosis.search.form_error import Posterior, is_unexplained, wi
 from ccnn_torch.diagnosis.search.sets import scored
 from ccnn_torch.diagnosis.verdict.borrowed import borrowed_names
 
-__all__ = ["Judgement", "judge", "without_names"]
+__all__ = ["BESIDE_UNKNOWN", "Judgement", "judge", "without_names"]
 
 # Share of the gap that the best explanation must account for; below it no name is given.
 _LEAST_EXPLAINED = 0.5
@@ -24,9 +24,9 @@ _ODDS = math.log(20.0)
 _FAR = 12.0
 # Probability from which a member of the most probable set is named, where the set without it is probable, too.
 _NAMED = 0.9
-# Probability of a verdict that names effects beside a cause outside the library, which can look like a part of any
-# effect, and of one that knows of such a cause only by what is left.
-_BESIDE_UNKNOWN = 0.6
+BESIDE_UNKNOWN = 0.6
+"""Probability of a verdict that names effects beside a cause outside the library, which can look like a part of any
+effect, and of one that knows of such a cause only by what is left."""
 
 
 _Leading = list[tuple[frozenset[str], tuple[str, ...], float, FittedSet]]
@@ -104,7 +104,7 @@ def judge(analysis: Analysis) -> Judgement:
         fullest=max(more, key=lambda f: f.log_posterior, default=found),
         names=tuple(sorted(names, key=lambda n: -_energy(analysis, found, n))),
         classes=classes,
-        probability=_BESIDE_UNKNOWN if outside and (names or not told) else min(sum(told), 1.0),
+        probability=BESIDE_UNKNOWN if outside and (names or not told) else min(sum(told), 1.0),
         outside=outside,
         drivers=drivers,
         marginal={a.name: _marginal(leading, a.name) for a in analysis.dictionary.atoms if not a.is_discrepancy},

@@ -22,7 +22,14 @@ class _Payload:
 
     def numbers(self, axis: Facts) -> tuple[Number, ...]:
         lever, gain = axis.length or 1.0, axis.gain or 1.0
-        acts = (add("gravity_sin", STANDARD_GRAVITY * lever / gain), add("inertia", lever**2 / gain))
+        sine, cosine = axis.weight or (STANDARD_GRAVITY * lever, 0.0)
+        acts = (
+            add("gravity_sin", sine / gain),
+            add("gravity_cos", cosine / gain),
+            add("inertia", lever**2 / gain),
+            # The model knows which part of the inertia is behind the gear.
+            add("load", lever**2 / gain if axis.nominal.get("load") else 0.0),
+        )
         # A mass whose weight differs the command and the position by a tenth of a radian.
         return (Number("mass", "kg", 0.1 * gain / (STANDARD_GRAVITY * lever), acts),)
 

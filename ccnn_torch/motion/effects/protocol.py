@@ -19,6 +19,8 @@ class Facts:
         gain: N m/rad (N/m) of its position control; None where it is not known. Torques are then told as the angle (or
             length) by which the command and the position must differ for them.
         length: lever of a load [m]; None where it is not known.
+        weight: torque of the weight of 1 kg there, times the sine and the cosine of the position [N m]; None: that of a
+            lever that hangs down at 0.
         span: of the command [rad or m].
         speed, acceleration: nearly the largest ones of the command [per s, per s^2].
         error: nearly the largest difference of command and position [rad or m].
@@ -29,6 +31,7 @@ class Facts:
     nominal: Mapping[str, float]
     gain: float | None = None
     length: float | None = None
+    weight: tuple[float, float] | None = None
     span: float = 1.0
     speed: float = 1.0
     acceleration: float = 1.0

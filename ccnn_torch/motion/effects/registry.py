@@ -25,7 +25,7 @@ from ccnn_torch.motion.effects.viscous import VISCOUS
 from ccnn_torch.plugins import is_plugin, load_plugin
 from ccnn_torch.spelling import nearest
 
-__all__ = ["EFFECTS", "motion_effects"]
+__all__ = ["EFFECTS", "EXACT", "motion_effects"]
 
 EFFECTS: dict[str, MotionEffect] = {
     effect.name: effect
@@ -34,6 +34,9 @@ EFFECTS: dict[str, MotionEffect] = {
         *(FLEXIBLE_JOINT, SPEED_LIMIT, SATURATION, SUPPLY, COGGING, THERMAL_FRICTION),
     )
 }
+
+EXACT = frozenset({"delay", "servo_gain", "offset", "gravity", "payload", "inertia"})
+"""Effects whose form is that of rigid bodies and of the control loop; friction, play and limits differ from theirs."""
 
 
 def motion_effects(names: Sequence[str] | None = None) -> list[MotionEffect]:

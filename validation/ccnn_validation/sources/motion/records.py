@@ -5,7 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from ccnn_validation.sources.case import SourceCase
 from ccnn_validation.sources.motion.families import FAMILIES, truth_of
 from ccnn_validation.sources.motion.machine import Axis, arm_xml, drawn_axis, pendulum_xml
 
-__all__ = ["make"]
+__all__ = ["RealMachine", "log_of", "machine_of", "make"]
 
 Array = NDArray[np.float64]
 _SECONDS, _RATE, _RUNS = 8.0, 200.0, 4
@@ -38,39 +38,60 @@ def make(family: str, seed: int) -> SourceCase:
     return _arm(family, generator) if family.startswith("six_") else _pendulum(family, generator)
 
 
-def _pendulum(family: str, generator: np.random.Generator) -> SourceCase:
+class RealMachine(NamedTuple):
+    """One axis with a cause, and what is known of it.
+
+    Attributes:
+        nominal: the axis as the model has it.
+        commands: the motions that were recorded, `t -> rad`.
+        measure: `(time, command, run)` -> encoder positions `s`, and the supply [V], or None.
+    """
+
+    nominal: Axis
+    commands: list[Callable[[Array], Array]]
+    measure: Callable[[Array, Array, int], tuple[Array, Array | None]]
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        """Of the nominal servo."""
+        own = self.nominal
+        known = {"gain": own.kp, "mass": own.mass, "length": own.length, "inertia": own.armature}
+        return known | {"viscous": own.damping, "coulomb": own.dry}
+
+
+def machine_of(family: str, generator: np.random.Generator) -> RealMachine:
+    """A pendulum on a servo with the cause of a family."""
     nominal = drawn_axis(generator)
     commands = [_motion(k, generator, 1.2) for k in range(_RUNS)]
     # The largest torque of the nominal machine on these motions: a limit has to be below it to act.
     most = max(_torque(nominal, command) for command in commands)
     real, told, push, voltage, drift = _changed(family, nominal, generator, most)
-    columns: dict[str, list[Array]] = {"time[s]": [], "run[1]": [], "command1[rad]": [], "q1[rad]": []}
-    if voltage is not None:
-        columns["supply[V]"] = []
-    for run, command in enumerate(commands):
-        time = _times(generator)
-        asked = command(time)
-        sent = told(time, asked)
+
+    def measure(time: Array, asked: Array, run: int) -> tuple[Array, Array | None]:
         volts = None if voltage is None else voltage(time)
-        q = _simulated(pendulum_xml(real), time, sent[:, None], push, volts, real)[:, :1]
-        q = q + drift(time, run)[:, None]
-        columns["time[s]"].append(time)
-        columns["run[1]"].append(np.full(len(time), float(run)))
-        columns["command1[rad]"].append(asked)
-        columns["q1[rad]"].append(_read(q, generator)[:, 0])
-        if volts is not None:
-            columns["supply[V]"].append(volts)
-    keys: dict[str, Any] = {
-        "gain": nominal.kp,
-        "mass": nominal.mass,
-        "length": nominal.length,
-        "inertia": nominal.armature,
-        "viscous": nominal.damping,
-        "coulomb": nominal.dry,
-    }
-    return SourceCase(
-        family, "servo", {name: np.concatenate(parts) for name, parts in columns.items()}, None, truth_of(family), keys
-    )
+        q = _simulated(pendulum_xml(real), time, told(time, asked)[:, None], push, volts, real)[:, :1]
+        return _read(q + drift(time, run)[:, None], generator)[:, 0], volts
+
+    return RealMachine(nominal, commands, measure)
+
+
+def _pendulum(family: str, generator: np.random.Generator) -> SourceCase:
+    machine = machine_of(family, generator)
+    columns = log_of(machine, range(_RUNS), generator)
+    return SourceCase(family, "servo", columns, None, truth_of(family), machine.keys)
+
+
+def log_of(machine: RealMachine, runs: Sequence[int], generator: np.random.Generator) -> dict[str, Array]:
+    """The log of some runs, by header."""
+    columns: dict[str, list[Array]] = {}
+    for run in runs:
+        time = _times(generator)
+        asked = machine.commands[run](time)
+        q, volts = machine.measure(time, asked, run)
+        own = {"time[s]": time, "run[1]": np.full(len(time), float(run)), "command1[rad]": asked, "q1[rad]": q}
+        for name, values in (own | ({} if volts is None else {"supply[V]": volts})).items():
+            columns.setdefault(name, []).append(values)
+    return {name: np.concatenate(parts) for name, parts in columns.items()}
 
 
 def _changed(

@@ -1,0 +1,146 @@
+"""Parts of `diagnosis.json` of a motion: where the gap is, what each effect does, and notes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ccnn_torch.diagnosis.shrink.held_out import INTERVAL
+from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
+from ccnn_torch.display import number_text
+from ccnn_torch.motion.fit import Fit
+from ccnn_torch.motion.held_out import Spread, folds_of, resampled, shrink_of
+from ccnn_torch.motion.judge import AxisVerdict
+from ccnn_torch.motion.nominal import Nominal
+from ccnn_torch.motion.numbers import parameters_of
+from ccnn_torch.motion.phases import PHASES, phases_of
+from ccnn_torch.motion.problem import Problem
+from ccnn_torch.motion.search import Search
+from ccnn_torch.motion.stretches import Stretches
+
+__all__ = ["effects_of", "floor_of", "notes_of", "where_is"]
+
+
+def floor_of(problem: Problem, found: Search, verdicts: Sequence[AxisVerdict]) -> float:
+    """Mean square of what the best sets leave, or the richest fit where it leaves less, summed over the axes."""
+    theta = torch.stack([v.best.spec.theta for v in verdicts])[None]
+    judged = problem.data.judged
+    left = problem.residual(theta)[0]
+    each = torch.stack([left[:, judged].square().mean(-1), found.rich[:, judged].square().mean(-1)])
+    return float(each.amin(0).sum())
+
+
+def where_is(problem: Problem, before: Tensor, spread: Spread) -> dict[str, Any]:
+    """`where` and `where_ci95`: shares of the gap by joint and by phase of the motion."""
+    data = problem.data
+    squares = before.square() * data.judged
+    joints = {f"q{i + 1}": squares[i].sum(-1) for i in range(len(squares))}
+    phase = phases_of(data)
+    phases = {name: (squares * (phase == k)).sum((0, -1)) for k, name in enumerate(PHASES)}
+    whole = squares.sum((0, -1))
+
+    def shares(parts: Mapping[str, Tensor]) -> dict[str, float]:
+        return {name: float(v.sum() / whole.sum().clamp_min(1e-300)) for name, v in parts.items()}
+
+    def ends(parts: Mapping[str, Tensor]) -> dict[str, list[float]]:
+        drawn = resampled(spread, whole).clamp_min(1e-300)
+        q = torch.tensor(INTERVAL, dtype=torch.float64)
+        return {name: torch.quantile(resampled(spread, v) / drawn, q).clamp(0, 1).tolist() for name, v in parts.items()}
+
+    samples = {name: float(((phase == k) & data.judged).double().mean()) for k, name in enumerate(PHASES)}
+    all_ = sum(samples.values()) or 1.0
+    empty: dict[str, Any] = {"outputs": {}, "legs": {}, "regions": [], "covariates": {}}
+    return {
+        "where": empty
+        | {
+            "joints": shares(joints),
+            "phases": {n: {"share": s, "samples": samples[n] / all_} for n, s in shares(phases).items()},
+        },
+        "where_ci95": empty | {"joints": ends(joints), "phases": ends(phases)},
+    }
+
+
+def effects_of(
+    problem: Problem,
+    found: Search,
+    verdicts: Sequence[AxisVerdict],
+    spread: Spread,
+    before: Tensor,
+    alone: Mapping[str, Tensor],
+    floor: float,
+) -> list[dict[str, Any]]:
+    library = problem.library
+    rows = []
+    for name, squares in alone.items():
+        e = library.names.index(name)
+        own = shrink_of(spread, before, squares, floor)
+        like = dict.fromkeys(library.names[o] for v in verdicts for o in v.classes.get(e, ()))
+        parameters: dict[str, Any] = {}
+        for i, v in enumerate(verdicts):
+            fit = v.best if e in v.best.members else _alone(found.found[i], e)
+            if fit is not None and (e in v.best.members or not any(e in w.best.members for w in verdicts)):
+                parameters |= parameters_of(library, i, fit, e)
+        rows.append(
+            {
+                "name": name,
+                "probability": 1 - math.prod(1 - v.marginal.get(e, 0.0) for v in verdicts),
+                "parameters": parameters,
+                "gap_before": own[0],
+                "gap_after": own[1],
+                "shrink": own[2],
+                "shrink_ci95": own[3],
+                "indistinguishable_from": list(like),
+                "signatures": {},
+            }
+        )
+    return sorted(rows, key=lambda e: (-e["probability"], e["gap_after"], e["name"]))
+
+
+def _alone(fits: Sequence[Fit], effect: int) -> Fit | None:
+    return next((f for f in fits if f.members == (effect,)), None)
+
+
+def notes_of(
+    problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None, dropped: Sequence[str]
+) -> list[str]:
+    data = problem.data
+    notes = [*data.notes, *nominal.notes]
+    library = problem.library
+    notes += [unseen_text(n, why) for n, why in zip(library.names, library.lacking, strict=True) if why]
+    if dropped:
+        notes.append(
+            f"{listed(dropped)} fit these runs as well, and take nothing away on runs that were not fitted: not named"
+        )
+    runs = len(set(data.run.tolist()))
+    folds = int(folds_of(problem).max()) + 1
+    if runs > 1:
+        notes.append(f"held out were whole runs, {runs} of them in {folds} folds")
+    else:
+        notes.append(f"there is one run: its {folds} parts were held out in turn; record a second motion to be surer")
+    step = _resolution(data)
+    if noise is None and step and floor > 3 * step:
+        notes.append(
+            f"what the best model leaves is {number_text(floor / step, 2)} times the encoder's step of "
+            f"{number_text(step, 2)} {data.units[0]}: most of it is no noise of the encoder"
+        )
+    order = found.whitening.coefficients.shape[1]
+    notes.append(
+        f"residuals of a closed loop are correlated: they were whitened by an autoregressive model of order {order}, "
+        f"on means over {problem.pool * float(data.time.diff(dim=-1).median()) * 1e3:.0f} ms"
+    )
+    return notes
+
+
+def _resolution(data: Stretches) -> float:
+    """The encoder's step: the smallest change that is no rounding; 0 where every sample differs."""
+    values = np.unique(data.position[0][data.judged].numpy())
+    steps = np.diff(values)
+    steps = steps[steps > 1e-9]
+    if len(values) > 0.5 * int(data.judged.sum()) or not len(steps):
+        return 0.0
+    return float(np.quantile(steps, 0.1))

@@ -1,0 +1,150 @@
+"""Commands that make an identified machine go where it is asked: its simulator inverted step by step.
+
+u <- u + the smoothed (wanted - simulated position), as much earlier as the position comes late: iterative learning
+control (Arimoto 1984) with the simulator in the place of the machine. Of some shares of a step the best is taken, and
+none that takes a command farther from the wanted position than a bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ccnn_torch.motion.axis import ABSENT, Drive, simulate_axes
+from ccnn_torch.motion.nominal import Nominal
+
+__all__ = ["Corrected", "corrected_command", "moved"]
+
+Array = NDArray[np.float64]
+_STEPS, _SHARES = 30, (1.0, 0.5, 0.2)
+# Share of the error's RMS that a step must take away, or it is the last.
+_GAINED = 0.01
+# Seconds of the rest before the first command, and of the Gaussian that smooths a step.
+_REST, _SMOOTH = 1.0, 0.01
+# The bound, in largest errors of the machine as it is.
+_BOUND = 3.0
+
+
+class Corrected(NamedTuple):
+    """A corrected command, `s x n` each [rad or m].
+
+    Attributes:
+        command: to be sent.
+        plain, position: simulated positions without and with the correction.
+    """
+
+    command: Array
+    plain: Array
+    position: Array
+
+
+def moved(nominal: Nominal, axes: Sequence[Mapping[str, float]], time: Array, commands: Array) -> Array:
+    """Positions of a model whose axes have other parameters, from rest at the first command on.
+
+    Args:
+        nominal: the model.
+        axes: parameters of each axis as in `ABSENT`, in the place of the model's.
+        time: `s` [s].
+        commands: `p x s x n` [rad or m].
+
+    Returns:
+        `p x s x n`.
+    """
+    step = float(np.median(np.diff(time)))
+    before = np.arange(time[0] - _REST, time[0] - 0.5 * step, step)
+    clock = torch.from_numpy(np.concatenate([before, time]))
+    p, _, n = commands.shape
+    asked = np.concatenate([np.repeat(commands[:, :1], len(before), 1), commands], 1)
+    torque = simulated = None
+    followed = asked
+    if nominal.simulator is not None and nominal.simulator.loaded is not None:
+        made = [nominal.simulator.loaded(clock.numpy(), one) for one in asked]
+        simulated, torque = (np.stack([m[k] for m in made]) for k in range(2))
+    elif nominal.simulator is not None:
+        followed = np.stack([nominal.simulator.positions(clock.numpy(), one) for one in asked])
+
+    def rows(values: Array) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values.transpose(0, 2, 1).reshape(p * n, -1)))
+
+    still = torch.zeros(p * n, len(clock), dtype=torch.float64)
+    begin = rows(followed if simulated is None else simulated)[:, 0]
+    drive = Drive(
+        clock.expand(p * n, -1),
+        rows(followed),
+        torch.stack([begin, torch.zeros_like(begin)], -1),
+        still,
+        still,
+        None if torque is None else rows(torque),
+    )
+
+    def simulate(own: Sequence[Mapping[str, float]]) -> torch.Tensor:
+        names = {name for axis in own for name in axis}
+        values = {
+            name: torch.tensor([[axis.get(name, ABSENT[name]) for _ in range(p) for axis in own]], dtype=torch.float64)
+            for name in names
+        }
+        return simulate_axes(drive, values)[0]
+
+    found = simulate(axes)
+    if simulated is not None:
+        found = found + rows(simulated) - simulate(nominal.axes)
+    return found.reshape(p, n, -1).permute(0, 2, 1).numpy()[:, len(before) :]
+
+
+def corrected_command(
+    nominal: Nominal,
+    axes: Sequence[Mapping[str, float]],
+    time: Array,
+    wanted: Array,
+    bound: Sequence[float] | None = None,
+) -> Corrected:
+    """The commands at which a model goes where it is wanted, as near as the bound allows.
+
+    Args:
+        nominal, axes: the machine as identified, as of `moved`.
+        time: `s` [s], increasing.
+        wanted: positions, `s x n` [rad or m].
+        bound: largest difference of a command from the wanted position of each joint [rad or m]; None = three times
+            the largest error that the machine has without correction.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    step = float(np.median(np.diff(time)))
+    plain = moved(nominal, axes, time, wanted[None])[0]
+    error = wanted - plain
+    limit = _BOUND * np.abs(error).max(0) if bound is None else np.asarray(bound, dtype=np.float64)
+    late = [_lateness(time, wanted[:, i], plain[:, i]) for i in range(wanted.shape[1])]
+    command, position, left = wanted, plain, _rms(error)
+    for _ in range(_STEPS):
+        ahead = np.stack([np.interp(time + t, time, e) for t, e in zip(late, error.T, strict=True)], -1)
+        move = gaussian_filter1d(ahead, _SMOOTH / step, axis=0)
+        trials = np.stack([np.clip(command + share * move, wanted - limit, wanted + limit) for share in _SHARES])
+        found = moved(nominal, axes, time, trials)
+        lefts = np.stack([_rms(wanted - q) for q in found])
+        best = np.argmin(lefts, 0)
+        better = lefts.min(0) < left
+        pick = np.arange(wanted.shape[1])
+        # Every joint takes its own step; one that gains nothing stays.
+        command = np.where(better, trials[best, :, pick].T, command)
+        position = np.where(better, found[best, :, pick].T, position)
+        before, left = left, np.where(better, lefts.min(0), left)
+        error = wanted - position
+        if bool(np.all(left > (1 - _GAINED) * before)):
+            break
+    return Corrected(command, plain, position)
+
+
+def _rms(values: Array) -> Array:
+    return np.asarray(np.sqrt(np.square(values).mean(0)))
+
+
+def _lateness(time: Array, wanted: Array, position: Array) -> float:
+    """By how much a position is behind what is wanted [s], of shifts of up to 0.3 s the best."""
+    step = float(np.median(np.diff(time)))
+    shifts = np.arange(0, min(0.3, 0.25 * (time[-1] - time[0])), step)
+    left = [float(np.square(np.interp(time - s, time, wanted) - position).mean()) for s in shifts]
+    return float(shifts[int(np.argmin(left))]) if len(left) else 0.0

@@ -1,0 +1,44 @@
+"""Noise with the form errors of effects and of the nominal model in it, under which sets are weighed again."""
+
+from __future__ import annotations
+
+import torch
+
+from ccnn_torch.diagnosis.evidence.dictionary import CERTAIN
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, scaled
+from ccnn_torch.diagnosis.search.form_error import OF_EXACT, OF_FORM, form_variance
+from ccnn_torch.motion.effects import EXACT
+from ccnn_torch.motion.fit import Fit
+from ccnn_torch.motion.problem import Problem, Whitening
+
+__all__ = ["form_errors", "weighed"]
+
+# Share φ of what the nominal model makes of the command: as of an effect, but most of it is right.
+_OF_NOMINAL = 1e-5
+
+
+def form_errors(problem: Problem, whitening: Whitening, best: list[Fit]) -> list[float]:
+    """Variance in every direction by which the forms of each axis' set and of the nominal model may be wrong.
+
+    Args:
+        problem: the data.
+        whitening: of the residual.
+        best: a set of each axis.
+    """
+    theta = torch.zeros(1, len(best), problem.library.size, dtype=torch.float64)
+    command, names = problem.data.command, problem.library.names
+    does, most = (
+        problem.whitened(v - command, whitening)[:, 0].square().sum(-1).tolist()
+        for v in (problem.positions(theta), problem.data.position[None])
+    )
+    found = []
+    for i, fit in enumerate(best):
+        shares = [OF_EXACT if names[m] in EXACT else OF_FORM for m in fit.members]
+        energy = fit_sets(fit.grams, [fit.spec.groups], 0.0).energy[0].tolist()[: len(shares)]
+        found.append(form_variance([*shares, _OF_NOMINAL], [*energy, does[i]], max(most[i], does[i])))
+    return found
+
+
+def weighed(grams: Grams, groups: list[torch.Tensor], variance: float) -> Fits:
+    """A set under a noise that is known."""
+    return fit_sets(scaled(grams, variance), [groups], CERTAIN * grams.values)

@@ -1,0 +1,159 @@
+"""The simulator with what a diagnosis found written into it: a servo's keys, a simulator's parameters, or an MJCF.
+
+What a model cannot hold (a delay, a play, ...) stands beside it, as parameters of the axes that follow it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.motion.axis import ABSENT
+from ccnn_torch.motion.effects.own_parameter import OWN
+from ccnn_torch.motion.engine import MotionDiagnosis
+from ccnn_torch.motion.nominal import TORQUES, Nominal, axis_keys, nominal_of
+from ccnn_torch.plugins import code_refused
+from ccnn_torch.report.json_files import read_json, write_json
+
+__all__ = ["IDENTIFIED", "Identified", "is_identified", "load_identified", "write_identified"]
+
+IDENTIFIED, _MODEL = "identified_motion.json", "identified.xml"
+# What an MJCF can hold of an axis.
+_IN_MJCF = ("gain", "inertia", "viscous", "coulomb", "weakness")
+
+# Of what is left of a weight that the MJCF holds.
+_ROUNDING = 1e-12
+
+Axis = Mapping[str, float]
+
+
+class Identified(NamedTuple):
+    """A model as identified.
+
+    Attributes:
+        nominal: the model with the new values.
+        axes: parameters of its axes, with what the model itself does not hold.
+        left: RMS that it left on runs that were not fitted, of each joint [rad or m].
+        effects: names of the verdict.
+        units: of the joints.
+    """
+
+    nominal: Nominal
+    axes: tuple[Axis, ...]
+    left: tuple[float, ...]
+    effects: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, keys: Mapping[str, Any]) -> list[str]:
+    """Write `identified_motion.json`, and for a MuJoCo model `identified.xml`; names of the files.
+
+    Args:
+        folder: where to.
+        found: whose verdict names effects; with none, the model as it is.
+        nominal: the model that was diagnosed.
+        keys: of the mechanism, as given.
+    """
+    library = found.problem.library
+    axes: list[dict[str, float]] = []
+    values = library.parameters(torch.stack([v.best.spec.theta for v in found.verdicts]))
+    own = {name.removeprefix(OWN): values.pop(name) for name in [*values] if name.startswith(OWN)}
+    for i in range(len(found.verdicts)):
+        axes.append({name: float(v[i]) for name, v in values.items() if float(v[i]) != ABSENT[name]})
+    content: dict[str, Any] = {
+        "mechanism": nominal.name,
+        "mechanism_keys": dict(keys),
+        "units": list(found.problem.data.units),
+        "effects": list(found.content["verdict"]["effects"]),
+        "left": [float(own[found.problem.data.judged].square().mean().sqrt()) for own in found.after],
+        "axes": axes,
+    }
+    files = [IDENTIFIED]
+    if nominal.name == "servo":
+        content["mechanism_keys"] = axis_keys(nominal, axes, _mass(found))
+    elif nominal.simulator is not None and nominal.simulator.loaded is None:
+        parameters = dict(nominal.simulator.parameters)
+        for name, v in own.items():
+            parameters[name] += float(v.sum() / (v != 0).sum().clamp_min(1))
+        content["mechanism_keys"] = parameters
+    elif nominal.simulator is not None:
+        from ccnn_torch.motion.mujoco_write import write_mjcf
+
+        added = _mass(found)
+        written = [{name: axis.get(name, ABSENT[name]) for name in _IN_MJCF} for axis in axes]
+        write_mjcf(nominal.name, folder / _MODEL, written, nominal.gains, added, nominal.lengths)
+        content["mechanism"] = _MODEL
+        content["axes"] = [_beside(nominal, i, axis, added[i]) for i, axis in enumerate(axes)]
+        files.append(_MODEL)
+    write_json(folder / IDENTIFIED, content)
+    return files
+
+
+def is_identified(path: Path) -> bool:
+    """Whether a file is one that `ccnn diagnose --motion` writes for commands to be corrected by."""
+    return path.suffix == ".json" and path.is_file() and {"axes", "mechanism", "left"} <= {*read_json(path)}
+
+
+def load_identified(path: Path, allow_code: bool = False) -> Identified:
+    """The model of a file that `ccnn diagnose --motion` has written.
+
+    Args:
+        path: the file.
+        allow_code: whether the Python file that it may name as its simulator runs.
+
+    Raises:
+        InputError: it is not there, is no such file, or names a model that is not there or may not run.
+    """
+    content = read_json(path)
+    try:
+        mechanism, keys, units = content["mechanism"], dict(content["mechanism_keys"]), list(content["units"])
+        axes = tuple({str(n): float(v) for n, v in axis.items()} for axis in content["axes"])
+        left, effects = tuple(map(float, content["left"])), tuple(map(str, content["effects"]))
+        unknown = next((n for axis in axes for n, v in axis.items() if n not in ABSENT or not math.isfinite(v)), None)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: is no {IDENTIFIED}, which ccnn diagnose --motion writes ({error})") from None
+    if unknown is not None or not len(axes) == len(units) == len(left) or not {*map(str, units)} <= {"rad", "m"}:
+        what = (
+            f"an axis has no number '{unknown}'" if unknown else f"{len(axes)} axes for {len(units)} joints in rad or m"
+        )
+        raise InputError(f"{path}: {what}; write it anew with ccnn diagnose --motion")
+    beside = path.parent / str(mechanism)
+    name = str(beside) if mechanism == _MODEL else str(mechanism)
+    with code_refused(f"{path}: its simulator", allow_code):
+        nominal = nominal_of(name, keys, units)
+    return Identified(nominal, _axes_of(nominal, axes), left, effects, tuple(units))
+
+
+def _axes_of(nominal: Nominal, axes: Sequence[Axis]) -> tuple[Axis, ...]:
+    """Parameters of the axes of a model with the new values in it."""
+    if nominal.name == "servo":
+        return nominal.axes
+    return tuple({**axis, **own} for axis, own in zip(axes, nominal.axes, strict=True))
+
+
+def _beside(nominal: Nominal, i: int, axis: Axis, mass: float) -> dict[str, float]:
+    """What an axis has beside its MJCF, over the gain in that."""
+    found = {name: value for name, value in axis.items() if name not in _IN_MJCF}
+    weight = nominal.weights[i] if mass and nominal.weights else None
+    for name, own in zip(("gravity_sin", "gravity_cos"), weight or (0.0, 0.0), strict=True):
+        found[name] = found.get(name, 0.0) - mass * own / (nominal.gains[i] or 1.0)
+    gain = axis.get("gain", 1.0)
+    found |= {name: found[name] / gain for name in TORQUES if name in found}
+    return {name: value for name, value in found.items() if abs(value) > _ROUNDING}
+
+
+def _mass(found: MotionDiagnosis) -> list[float]:
+    """What a payload adds to each axis [kg]."""
+    library = found.problem.library
+    if "payload" not in library.names:
+        return [0.0] * len(found.verdicts)
+    places = library.places[library.names.index("payload")]
+    return [
+        sum(float(v.best.spec.theta[j]) * library.numbers[i][j].scale for j in places)
+        for i, v in enumerate(found.verdicts)
+    ]

@@ -1,0 +1,83 @@
+"""Logs and a nominal model as what is fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.motion.effects import Facts, MotionEffect
+from ccnn_torch.motion.library import library_of
+from ccnn_torch.motion.log import Log
+from ccnn_torch.motion.nominal import Nominal
+from ccnn_torch.motion.problem import Problem
+from ccnn_torch.motion.stretches import Stretches, cut_stretches
+
+__all__ = ["problem_of"]
+
+# Seconds over which samples are averaged before they are judged.
+_POOLED = 0.02
+# Quantile of what counts as nearly the largest.
+_NEARLY = 0.98
+
+
+def problem_of(
+    logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEffect], most: int | None = None
+) -> Problem:
+    """Logs and a nominal model as what is fitted.
+
+    Raises:
+        InputError: the logs cannot show any of the effects, or cannot be used.
+    """
+    data = cut_stretches(logs) if most is None else cut_stretches(logs, most=most)
+    driven = nominal.driven(logs, data)
+    supply = torch.zeros_like(data.time)
+    if "supply" in data.beside:
+        usual = nominal.supply or float(data.beside["supply"][data.judged].median())
+        supply = data.beside["supply"] / usual - 1 if usual else supply
+    warm = torch.zeros_like(data.time)
+    if "temperature" in data.beside:
+        warm = data.beside["temperature"] - data.beside["temperature"][data.judged].min()
+    facts = [_facts(data, i, nominal, driven.followed, supply, warm) for i in range(len(data.units))]
+    library = library_of(effects, facts)
+    if all(library.lacking):
+        need = "; ".join(f"{name} needs {why}" for name, why in zip(library.names, library.lacking, strict=True))
+        raise InputError(f"effects: these logs can show none of the candidates: {need}")
+    step = float(data.time.diff(dim=-1).median())
+    pool = max(round(_POOLED / step), 1)
+    return Problem(data, library, driven.followed, supply, warm, pool, driven.torque, driven.simulated, driven.own)
+
+
+def _facts(data: Stretches, i: int, nominal: Nominal, followed: Tensor, supply: Tensor, warm: Tensor) -> Facts:
+    judged = data.judged
+    step = data.time.diff(dim=-1)
+    speed = data.speed[i]
+    rise = speed.diff(dim=-1) / step
+
+    def nearly(values: Tensor) -> float:
+        kept = values.abs().flatten()
+        return float(torch.quantile(kept[:: max(len(kept) // 100_000, 1)], _NEARLY))
+
+    most = nearly(speed[judged]) or 1.0
+    span = float(data.command[i][judged].max() - data.command[i][judged].min())
+    return Facts(
+        unit=data.units[i],
+        nominal=nominal.axes[i],
+        gain=nominal.gains[i],
+        length=nominal.lengths[i],
+        weight=nominal.weights[i] if nominal.weights else None,
+        span=span or 1.0,
+        speed=most,
+        acceleration=nearly(rise[judged[:, 1:]]) or 1.0,
+        error=nearly((followed[i] - data.position[i])[judged]) or 1e-6,
+        supply=float(supply[judged].abs().max()) if "supply" in data.beside else 0.0,
+        temperature=_within_runs(data, warm),
+    )
+
+
+def _within_runs(data: Stretches, warm: Tensor) -> float:
+    """The largest change of the temperature in one run: between runs other things change as well."""
+    own = [warm[data.run == run][data.judged[data.run == run]] for run in set(data.run.tolist())]
+    return max(float(v.max() - v.min()) for v in own)
