@@ -14,8 +14,10 @@ from ccnn_torch.evolution.refinement import (
     RefinementSettings,
     RefinementState,
     finish_refinement,
+    log_evidence,
     pose_refinement,
     refine,
+    second_order,
     start_refinement,
     step_refinement,
 )
@@ -293,3 +295,16 @@ def test_a_descent_ends_where_its_evidence_does_and_keeps_the_highest() -> None:
     assert bool((early.log_evidence > late.log_evidence - 6).all())
     path = torch.stack([refined(n, 1000).log_evidence for n in range(6, 31, 4)])
     assert bool((path[1:] >= path[:-1] - 1e-9).all())
+
+
+def test_where_the_normal_matrix_has_no_factor_there_is_no_evidence() -> None:
+    inputs, targets = torch.zeros(3, 20, 2, dtype=torch.float64), torch.ones(3, 20, 1, dtype=torch.float64)
+    masks = [torch.ones(3, 4, 2, dtype=torch.bool), torch.ones(3, 1, 4, dtype=torch.bool)]
+    weights = [torch.ones(3, 4, 3, dtype=torch.float64), torch.ones(3, 1, 5, dtype=torch.float64)]
+    problem = pose_refinement(masks, weights, inputs, targets, torch.ones(3, 20, dtype=torch.float64))
+    state = start_refinement(problem, weights)
+    known = second_order(problem, state)
+    failed = torch.tensor([0, 3, 0], dtype=known.failed.dtype)
+    spoilt = known._replace(failed=failed, root=known.root.index_fill(0, torch.tensor(2), torch.nan))
+    assert torch.isfinite(log_evidence(problem, state, spoilt)).tolist() == [True, False, False]
+    assert not torch.isnan(log_evidence(problem, state, spoilt)).any()

@@ -277,14 +277,17 @@ def finish_refinement(problem: RefinementProblem, state: RefinementState, known:
 
 
 def log_evidence(problem: RefinementProblem, state: RefinementState, known: SecondOrder | None = None) -> Tensor:
-    """Log evidence of the weights' prior and the noise (Laplace's approximation), but for a constant: `b` [nat]."""
-    root = (known or second_order(problem, state)).root
-    log_determinant = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    """Log evidence of the weights' prior and the noise (Laplace's approximation), but for a constant: `b` [nat].
+
+    -inf where the normal matrix has no Cholesky factor, about which the approximation would be.
+    """
+    known = known or second_order(problem, state)
+    log_determinant = 2 * known.root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     counted = problem.network.active & (problem.groups != state.prior.shape[-1] - 1)
     log_prior = (state.prior.log()[:, problem.groups] * counted).sum(-1)
     log_noise = (state.noise.log() * _row_count(problem).unsqueeze(-1)).sum(-1)
-    evidence: Tensor = (log_prior + log_noise - log_determinant) / 2 - _objective(problem, state, state.weights)
-    return evidence
+    evidence = (log_prior + log_noise - log_determinant) / 2 - _objective(problem, state, state.weights)
+    return torch.where((known.failed == 0) & torch.isfinite(evidence), evidence, -torch.inf)
 
 
 def second_order(problem: RefinementProblem, state: RefinementState) -> SecondOrder:

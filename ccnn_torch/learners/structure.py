@@ -148,6 +148,12 @@ class Structure:
         )
         # With all precisions anew: those of the last descent hold the network where it is.
         candidate, evidence, precisions = self._descend(mapped(wider, lambda value: value[going]), index[going], None)
+        # A member whose descent failed is replaced by the best of its repeat, and costs the others nothing.
+        own = torch.arange(len(evidence), device=evidence.device).reshape(-1, each)
+        leader = own.gather(1, evidence.reshape(-1, each).argmax(1, keepdim=True))
+        taken_from = torch.where(evidence.reshape(-1, each) > -torch.inf, own, leader).flatten()
+        candidate, evidence = mapped(candidate, lambda value: value[taken_from]), evidence[taken_from]
+        precisions = Precisions(*(part[taken_from] for part in precisions))
         # Taken by all members of a repeat or by none, so that they go on sharing their slots.
         gain = (evidence - self.evidence[index[going]]).reshape(-1, each).sum(1).repeat_interleave(each)
         taken = gain > 0

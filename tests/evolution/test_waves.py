@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.gauss_newton import dense_jacobian, linearise, network_of, residual
+from ccnn_torch.evolution.refinement import Refined, refine
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves, wave_signal
-from ccnn_torch.learners import TrainingData
+from ccnn_torch.learners import TrainingData, structure
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
 
 QUICK = CCNNSettings(
@@ -111,6 +113,26 @@ def test_ccnn_learns_a_gear_that_sigmoids_cannot() -> None:
     assert torch.allclose(module.variance(fresh.inputs[1]), learner.variance(fresh.inputs)[1], rtol=1e-9)
     within = (learner.predict(fresh.inputs) - fresh.targets).abs() < 1.96 * learner.variance(fresh.inputs).sqrt()
     assert 0.85 < float(within.double().mean()) < 0.99
+
+
+def test_a_member_whose_descent_fails_costs_the_others_no_wave(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a normal matrix has no Cholesky factor."""
+
+    def failing(*arguments: Any) -> Refined:
+        found = refine(*arguments)
+        if arguments[-2] is None or not bool(arguments[-2].frequency.any()):
+            return found
+        found.log_evidence[1] = -torch.inf
+        return replace(found, weights=[weight.index_fill(0, torch.tensor(1), torch.nan) for weight in found.weights])
+
+    monkeypatch.setattr(structure, "refine", failing)
+    data, _ = gear_data()
+    fresh, truth = gear_data(rows=400)
+    learner = CCNN(QUICK)
+    learner.start(data)
+    while not learner.finished:
+        learner.step()
+    assert float((learner.predict(fresh.inputs) - truth).square().mean()) < 0.005
 
 
 def test_angles_are_read_by_waves_alone() -> None:

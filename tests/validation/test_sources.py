@@ -81,9 +81,9 @@ def test_the_command(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_constant_halved_and_doubled_is_set_back(tmp_path: Path) -> None:
     assert scaled((0.9, 4, 0.2), 2.0) == (pytest.approx(0.95), 8, 0.4) and scaled(1, 0.5) == 1
-    before = form_error._FORM
+    before = form_error.OF_FORM
     table = ablate(["adversarial"], 1, tmp_path, 3, "a factor of 4", "local")
-    assert [row[0] for row in table.rows] == ["search/form_error _EXACT, _FORM, _SMOOTH"]
-    assert before == form_error._FORM and len(list(tmp_path.glob("*.json"))) == 3
+    assert [row[0] for row in table.rows] == ["search/form_error OF_EXACT, OF_FORM, OF_SMOOTH"]
+    assert before == form_error.OF_FORM and len(list(tmp_path.glob("*.json"))) == 3
     with pytest.raises(InputError, match="no constant"):
         ablate(["adversarial"], 1, tmp_path, 3, "nobody", "local")
