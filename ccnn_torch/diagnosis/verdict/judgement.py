@@ -194,9 +194,14 @@ def _energy(analysis: Analysis, found: FittedSet, name: str) -> float:
 def _second_driver(analysis: Analysis, posterior: Posterior, found: FittedSet) -> tuple[str, ...]:
     """What a part of the remainder follows beside the set, where that is more probable than not."""
     dictionary, atoms, size = posterior.dictionary, analysis.dictionary.atoms, math.sqrt(posterior.variance)
-    there = {atoms[i].name for i in found.members if atoms[i].is_discrepancy}
-    more = [i for i in analysis.outside if atoms[i].name not in there and not atoms[i].name.endswith(ANY)]
-    if not there or not more:
+    first = next((atoms[i].name for i in found.members if atoms[i].is_discrepancy), None)
+    if first is None:
+        return ()
+    # All drivers of one kind are one driver.
+    kind = first.removesuffix(ANY) if first.endswith(ANY) else None
+    own = [n == first or n.endswith(ANY) or (kind is not None and n.startswith(kind)) for n in (a.name for a in atoms)]
+    more = [i for i in analysis.outside if not own[i]]
+    if not more:
         return ()
     known = _fits(dictionary, [found.members], {f.members: f for f in posterior.found})[0]
     gains = gain_beside(dictionary, known, [analysis.outside[i] / size for i in more], analysis.y / size)
