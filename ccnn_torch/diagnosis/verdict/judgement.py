@@ -16,8 +16,6 @@ from ccnn_torch.diagnosis.verdict.borrowed import borrowed_names
 
 __all__ = ["BESIDE_UNKNOWN", "Judgement", "judge", "without_names"]
 
-# Share of the gap that the best explanation must account for; below it no name is given.
-_LEAST_EXPLAINED = 0.5
 # Odds up to which the data do not distinguish one name from another.
 _ODDS = math.log(20.0)
 # Log odds against the most probable set beyond which sets are not considered.
@@ -91,8 +89,6 @@ def judge(analysis: Analysis) -> Judgement:
             (names, drivers, _, _), found = other
     if drivers:
         drivers += _second_driver(analysis, usual, found)
-    if outside and _little(analysis):
-        names, found = frozenset(), _empty(analysis)
     classes = {} if outside else _classes(analysis, likeliest, chosen, names)
     if outside:
         told = [p for _, some, p, _ in leading if some] if leading[0][1] else []
@@ -160,13 +156,6 @@ def _fits(
 
 def _empty(analysis: Analysis) -> FittedSet:
     return next(f for f in analysis.found if not f.members)
-
-
-def _little(analysis: Analysis) -> bool:
-    """Whether the best explanation of all accounts for little of the gap above the noise."""
-    best, count = analysis.found[0], analysis.dictionary.grams.values
-    left = best.rss / max(count - best.effective, 1.0) - analysis.floor
-    return left > (1 - _LEAST_EXPLAINED) * max(float(analysis.dictionary.grams.yy) / count - analysis.floor, 0.0)
 
 
 def _named(analysis: Analysis, found: FittedSet) -> tuple[frozenset[str], tuple[str, ...]]:
