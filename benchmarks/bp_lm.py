@@ -43,6 +43,6 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
             rows,
             "rows",
             lambda x=x, y=y, data=data: refine(masks, weights, x, y, data.weights, settings),
-            {"SciPy least_squares (MINPACK)": (scipy_fit, 1 / STARTS), "pyrenn": None},
+            {"SciPy least_squares (MINPACK)": (scipy_fit, 1 / STARTS)},
             rounds=1 if quick else 3,
         )

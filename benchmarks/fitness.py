@@ -42,8 +42,6 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
             {
                 "torch.func.vmap": lambda many=many, vmapped=vmapped: vmapped(*many),
                 "numpy loop": (loop, LOOP / count),
-                "EvoTorch": None,
-                "EvoX": None,
             },
             rounds=3 if quick or count > 24_000 else 5,
             flops=2.0 * ROWS * count * sum(a * b for a, b in pairwise(SIZES)),

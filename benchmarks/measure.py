@@ -6,7 +6,6 @@ over the rounds of peer / ours, both measured in the same round.
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import statistics
 import time
@@ -16,7 +15,7 @@ from typing import Any
 
 import torch
 
-__all__ = ["Row", "compare", "installed", "seconds_of"]
+__all__ = ["Row", "compare", "seconds_of"]
 
 Call = Callable[[], Any]
 
@@ -37,7 +36,7 @@ class Row:
         size, of: how much of what, such as 1000 "rows".
         seconds: of this package, the median.
         peer: the other's name; "" where there is none.
-        ratio: peer's seconds / ours; None where there is no peer, or it is not installed.
+        ratio: peer's seconds / ours; None where there is no peer.
         limit: share of the operations that a float64 matrix product of this machine makes in the same time; None where
             they are not counted.
         note: what else there is to know.
@@ -51,11 +50,6 @@ class Row:
     ratio: float | None = None
     limit: float | None = None
     note: str = ""
-
-
-def installed(module: str) -> bool:
-    """Whether a peer can be imported."""
-    return importlib.util.find_spec(module) is not None
 
 
 def seconds_of(call: Call) -> float:
@@ -72,7 +66,7 @@ def compare(
     size: int,
     of: str,
     ours: Call,
-    peers: Mapping[str, Call | tuple[Call, float] | None] | None = None,
+    peers: Mapping[str, Call | tuple[Call, float]] | None = None,
     *,
     rounds: int = 5,
     flops: float = 0.0,
@@ -81,14 +75,13 @@ def compare(
     """Measure one task: one row for each peer, or one.
 
     Args:
-        peers: by name what they do; (call, share) where they do a share of the task only; None = not installed.
+        peers: by name what they do; (call, share) where they do a share of the task only.
         rounds: in each, ours and every peer are measured once, one after the other.
         flops: floating point operations of the task in matrix products; 0 = not counted.
     """
     calls: dict[str, tuple[Call, float]] = {"": (ours, 1.0)}
     for name, peer in (peers or {}).items():
-        if peer is not None:
-            calls[name] = peer if isinstance(peer, tuple) else (peer, 1.0)
+        calls[name] = peer if isinstance(peer, tuple) else (peer, 1.0)
     if flops:
         square = torch.ones(_GEMM, _GEMM, dtype=torch.float64)
         calls["gemm"] = (lambda: square @ square, 1.0)
@@ -109,11 +102,7 @@ def compare(
         )
     own = statistics.median(times[""])
     rows = []
-    for name in peers or {"": None}:
-        ratio, said = None, note
-        if name in times and name:
-            ratio = statistics.median(t / o for t, o in zip(times[name], times[""], strict=True))
-        elif name:
-            said = "not installed"
-        rows.append(Row(task, size, of, own, name, ratio, limit, said))
+    for name in peers or ("",):
+        ratio = statistics.median(t / o for t, o in zip(times[name], times[""], strict=True)) if name else None
+        rows.append(Row(task, size, of, own, name, ratio, limit, note))
     return rows
