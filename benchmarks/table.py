@@ -109,9 +109,10 @@ def draw(rows: list[Row], curves: list[dict[str, object]]) -> Figure:
     figure = Figure(figsize=(5.0 * len(kinds), 6.0), layout="constrained")
     points = _by_task(rows)
     for axes, kind in zip(np.atleast_1d(figure.subplots(1, len(kinds))), kinds, strict=True):
-        for c in (c for c in curves if c["of"] == kind):
+        for k, c in enumerate(c for c in curves if c["of"] == kind):
             sizes, seconds = zip(*sorted(points[str(c["task"]), kind].items()), strict=True)
-            (line,) = axes.plot(sizes, seconds, "o-", label=str(c["task"]))
+            # The cycle of colours begins again after ten.
+            (line,) = axes.plot(sizes, seconds, "os^v"[k % 4] + "-", label=str(c["task"]))
             end = (c["size"], c["seconds"])
             axes.plot([sizes[-1], end[0]], [seconds[-1], end[1]], "--", color=line.get_color())
         axes.set(xscale="log", yscale="log", xlabel=kind, ylabel="processor time [s]")

@@ -3,13 +3,13 @@
 from ccnn_torch.compensation.compensator import Compensator as Compensator
 from ccnn_torch.compensation.compensator import Solution as Solution
 from ccnn_torch.compensation.compensator import default_limit as default_limit
-from ccnn_torch.compensation.compensator import fit_compensator as fit_compensator
 from ccnn_torch.compensation.domain import Domain as Domain
 from ccnn_torch.compensation.effects.effects import Care as Care
 from ccnn_torch.compensation.effects.effects import PhysicalEffects as PhysicalEffects
 from ccnn_torch.compensation.effects.effects import effect_deviation as effect_deviation
 from ccnn_torch.compensation.effects.effects import expand_effects as expand_effects
 from ccnn_torch.compensation.effects.settled import settled_effects as settled_effects
+from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
 from ccnn_torch.compensation.geometry.identified import Geometry as Geometry
 from ccnn_torch.compensation.geometry.identified import fit_geometry_module as fit_geometry_module
 from ccnn_torch.compensation.geometry.identified import geometric_deviation as geometric_deviation

@@ -63,7 +63,7 @@ def _advanced(compensator: Compensator, joints: Tensor, kept: int) -> Traced:
         correction, steps = compensator.next_correction(found, correction, steps)
         return correction, *(number for step in steps for number in step)
 
-    # Each of its own: what is traced is told apart by its tensor.
+    # A tensor of its own for each: the tracer takes equal tensors for one input.
     return Traced(function, *(joints.clone() for _ in range(2 + kept)))
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation.compensator import Compensator, default_limit, fit_compensator
+from ccnn_torch.compensation.compensator import Compensator, default_limit
 from ccnn_torch.compensation.contraction import STEEPEST_DEVIATION
+from ccnn_torch.compensation.fit import fit_compensator
 from ccnn_torch.compensation.geometry.identified import fit_geometry_module, settled_damping
 from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry
 from ccnn_torch.errors import MethodFailedError

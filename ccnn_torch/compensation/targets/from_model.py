@@ -86,7 +86,7 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     kept: list[list[str | None]] = [["deviation", "excess", None], *([[None, None, "sd"]] if sd else [])]
     secant = None
     if compensator.secant:
-        # Each of its own: what is traced is told apart by its tensor.
+        # A tensor of its own for each: the tracer takes equal tensors for one input.
         blank = [torch.zeros(1, k * n, dtype=torch.float64) for k in (1, 1, 2 * max(1, iterations - 1))]
         given = ("found", "correction", "steps")
         secant = traced_program(_Next(compensator), (*blank,), "secant", given, [*given[1:]])

@@ -1,0 +1,144 @@
+"""Fit a compensator to what a learner has learned: its limit, its domain, and a command that can be solved for."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from ccnn_torch.compensation.compensator import Compensator, default_limit
+from ccnn_torch.compensation.contraction import (
+    STEEPEST_DEVIATION,
+    TOLERANCE,
+    iterations_needed,
+    spread_points,
+    steepest,
+)
+from ccnn_torch.compensation.domain import Domain
+from ccnn_torch.compensation.effects.effects import PhysicalEffects
+from ccnn_torch.compensation.geometry.identified import Geometry
+from ccnn_torch.compensation.secant import secant_steps
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.training import Scaling
+
+__all__ = ["fit_compensator"]
+
+# Rounds of damping, and the share of what was learned below which a compensator is not worth having.
+_DAMPINGS = 6
+_LEAST_SHARE = 0.1
+# Where the fixed point takes more steps than this, Broyden's method takes fewer; below it its own operations cost more.
+_GENTLE_STEPS = 8
+# Training inputs among the points where its steps are counted.
+_COUNTED = 512
+
+
+def fit_compensator(
+    network: nn.Module,
+    scaling: Scaling,
+    inputs: Tensor,
+    deviations: Tensor,
+    joints: Sequence[Coordinate],
+    covariates: Sequence[Coordinate] = (),
+    limit: Tensor | None = None,
+    margin: float = 0.1,
+    transition: float = 0.5,
+    sd_scale: Tensor | None = None,
+    geometry: Geometry | None = None,
+    effects: PhysicalEffects | None = None,
+) -> Compensator:
+    """Put guard, limit and fixed point around a trained network, and identified geometry and effects beside it.
+
+    What the network learned is damped about its mean where δ is otherwise too steep for a command to be solved for.
+
+    Args:
+        network: features -> standardised deviation, of one repeat.
+        scaling: of that repeat, without the leading dimension.
+        inputs: training inputs, commanded joints and then covariates, `s x (n + m)` [SI].
+        deviations: training deviations of what the network learned, `s x n` [SI]; with `geometry` or `effects` what
+            these leave. The mean of the deviations that fade out is the safe correction outside the domain.
+        joints, covariates: coordinates in the order of the inputs.
+        limit: hard limit of |δ|, `n` [SI]; 1.5 times the largest training deviation of each joint, geometry included,
+            when None.
+        margin: how far beyond the training inputs δ is trusted, as a share of their half range.
+        transition: width over which it then fades into the safe correction, as a share of the half range.
+        sd_scale: what the network's standard deviation is multiplied by, `n` [1]; 1 when None.
+        geometry: deviation of the identified geometry, of one repeat.
+        effects: deviation of known effects, of one repeat.
+
+    Raises:
+        InputError: shapes do not fit together, or a limit or a scale is out of its range.
+        MethodFailedError: δ is too steep for that even where little of what was learned is left.
+    """
+    n = len(joints)
+    if inputs.shape[-1] != n + len(covariates) or deviations.shape != (len(inputs), n):
+        raise InputError(
+            f"training inputs {tuple(inputs.shape)} and deviations {tuple(deviations.shape)} do not fit "
+            f"{n} joints and {len(covariates)} covariates"
+        )
+    inputs, deviations = inputs.detach(), deviations.detach()
+    total = fading = deviations
+    with torch.no_grad():
+        if effects is not None:
+            effects = copy.deepcopy(effects)
+            total = fading = deviations + effects(inputs[:, :n] + deviations, inputs[:, n:])
+        if geometry is not None:
+            geometry = copy.deepcopy(geometry)
+            total = fading + geometry(inputs[:, :n] + fading)
+            fading = fading if geometry.extrapolates else total
+    limit = default_limit(total) if limit is None else limit.detach()
+    if limit.shape != (n,) or not bool((limit >= 0).all() & torch.isfinite(limit).all()):
+        raise InputError(f"limit must be one finite number of at least 0 for each of the {n} joints")
+    sd_scale = torch.ones_like(limit) if sd_scale is None else sd_scale.detach().clone()
+    if sd_scale.shape != (n,) or not bool((sd_scale > 0).all() & torch.isfinite(sd_scale).all()):
+        raise InputError(f"sd_scale must be one finite number above 0 for each of the {n} joints")
+    safe = torch.minimum(torch.maximum(fading.mean(0), -limit), limit)
+    safe_sd = (fading - safe).square().mean(0).sqrt()
+    reach = torch.cat([limit, limit.new_zeros(len(covariates))])
+    domain = Domain.fit(inputs, reach, margin, transition)
+    # A copy: what is compensated with does not change when the learner trains on.
+    frozen = copy.deepcopy(network).requires_grad_(False)
+    size = {} if geometry is None and effects is None else {"count": 512, "at_once": 1024}
+    share = 1.0
+    for _ in range(_DAMPINGS):
+        scaled = copy.deepcopy(scaling)
+        scaled.deviation.mul_(share)
+        compensator = Compensator(
+            *(frozen, scaled, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale / share, safe_sd),
+            *(geometry, effects),
+        )
+        found = steepest(compensator.deviation, inputs, domain, limit, **size)
+        if not math.isfinite(found.lipschitz):
+            raise MethodFailedError("the trained network gives values that are not finite within its domain")
+        if found.lipschitz <= STEEPEST_DEVIATION:
+            compensator.lipschitz, compensator.share = found.lipschitz, share
+            compensator.iterations = iterations_needed(found)
+            _accelerate(compensator, inputs)
+            return compensator
+        share *= 0.9 * STEEPEST_DEVIATION / found.lipschitz
+        if share < _LEAST_SHARE:
+            break
+    raise MethodFailedError(
+        f"the learned deviation changes by up to {found.lipschitz:.2g} of a joint's motion, and above "
+        f"{STEEPEST_DEVIATION:g} the command cannot be solved for safely; train with more rows, fewer nodes or "
+        "regularisation, and leave out rows near singular poses (max_condition)"
+    )
+
+
+def _accelerate(compensator: Compensator, inputs: Tensor) -> None:
+    """Let Broyden's method find the command where that takes fewer steps; inputs: training inputs, `s x (n + m)`."""
+    if compensator.iterations <= _GENTLE_STEPS:
+        return
+    points = spread_points(inputs, compensator.domain, torch.Generator().manual_seed(1), _COUNTED)
+    n = len(compensator.joints)
+    parts = (compensator.network, compensator.geometry, compensator.effects)
+    near = max(TOLERANCE, *(getattr(part, "export_tolerance", TOLERANCE) for part in parts))
+    steps = secant_steps(
+        lambda joints: compensator.deviation(joints, points[:, n:] if compensator.covariates else None),
+        points[:, :n], compensator.limit, compensator.iterations, near,
+    )  # fmt: skip
+    compensator.secant = steps < compensator.iterations
+    compensator.iterations = steps
