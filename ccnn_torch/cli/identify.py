@@ -33,7 +33,7 @@ def identify(
 
     ccnn identify experiments/overconstrained_2dof.yaml methods=[lm,tikhonov] simulate.machines=20
 
-    ccnn identify arm.yaml mechanism=ur10.yaml records=measured.csv out=runs/arm
+    ccnn identify mechanism=ur10.yaml records=measured.csv out=runs/arm
 
     ccnn identify experiments/sockets.yaml      without a measuring device: a ball in sockets
 
@@ -56,6 +56,8 @@ def identify(
     if config is None:
         raise InputError("name a config, for example: ccnn identify experiments/five_bar.yaml (or --resume DIR)")
     changes = list(overrides or [])
+    if "=" in str(config) and not config.is_file():
+        changes, config = [str(config), *changes], None
     changes += [f"out={out}"] if out is not None else []
     changes += [f"seed={seed}"] if seed is not None else []
     start_identification(load_identify_config(config, changes), quiet=quiet)

@@ -13,7 +13,16 @@ from pydantic import Field, field_validator, model_validator
 
 from ccnn_torch.config.keys import list_keys
 from ccnn_torch.config.split import HeldOutConfig
-from ccnn_torch.config.tree import Columns, Files, Names, Section, config_from_file, config_from_keys, written
+from ccnn_torch.config.tree import (
+    Columns,
+    Files,
+    Names,
+    Section,
+    config_from_file,
+    config_from_keys,
+    config_from_options,
+    written,
+)
 from ccnn_torch.spelling import nearest
 
 __all__ = [
@@ -292,12 +301,14 @@ def base_method(method: str) -> str:
     return method.removesuffix(PER_LEG)
 
 
-def load_identify_config(path: str | Path, overrides: Iterable[str] = ()) -> IdentifyConfig:
-    """Read a config file and put overrides ``key.sub=value`` over it.
+def load_identify_config(path: str | Path | None, overrides: Iterable[str] = ()) -> IdentifyConfig:
+    """Read a config file and put overrides ``key.sub=value`` over it; without a file these are all.
 
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
+    if path is None:
+        return config_from_options(IdentifyConfig, None, overrides)
     return config_from_file(IdentifyConfig, path, overrides)
 
 

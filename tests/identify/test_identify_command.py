@@ -148,6 +148,8 @@ def test_the_command_line(
     assert code == 2 and "has no standard deviation" in said
     code, said = ccnn("identify", folder / "config.yaml", "methods=lm_pr_leg", "--out", "x")
     assert code == 2 and len(said.splitlines()) == 1 and "did you mean 'lm_per_leg'" in said
+    code, said = ccnn("identify", "mechanism=five_bar", "records=in.csv", "--out", "x")
+    assert code == 2 and len(said.splitlines()) == 1 and "in.csv" in said and "there is no such file" not in said
     code, said = ccnn("identify", "--resume", folder, "seed=3")
     assert code == 2 and len(said.splitlines()) == 1
     assert ccnn(
