@@ -26,6 +26,8 @@ Progress = Callable[[float], None]
 """Told the share that is done, 0 to 1."""
 
 _FOLDS = 5
+# Networks of many values (rows times joints) are slow: they are trained without only so many of the folds.
+_MANY_VALUES, _FEW_FOLDS = 1500, 2
 # Updates of the fit of the effects in each fold.
 _UPDATES = 6
 # More rows than this, and more outputs (rows times joints), make the training slow: so many are drawn.
@@ -67,7 +69,8 @@ def remaining_gain(
     """The block `network` of diagnosis.json.
 
     The verdict's effects are fitted to four fifths of the rows, a CCNN to the joint deviations that make what they
-    leave there, over commanded joints and covariates; both are judged on the fifth that neither has seen, five times.
+    leave there, over commanded joints and covariates; both are judged on the fifth that neither has seen, five times
+    (twice where there are many values).
 
     Args:
         analysis: of the rows.
@@ -89,13 +92,15 @@ def remaining_gain(
     if len(rows) > most:
         drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
         rows = drawn[:most].sort().values
-    left = _left(analysis, judgement, fold)[:, rows]
-    here = (fold[rows], torch.arange(len(rows)))
+    trained = _FOLDS if len(rows) * len(analysis.situation.mechanism.joints) <= _MANY_VALUES else _FEW_FOLDS
+    left = _left(analysis, judgement, fold, trained)[:, rows]
+    judged = torch.nonzero(fold[rows] < trained).squeeze(-1)
+    here = (fold[rows][judged], judged)
     before = _squares(left[here], white.sigma, channels)
     noise = float(noise_floor(analysis)[channels].sum())
     block: dict[str, Any] = {
         "unit": "m" if bool(position.any()) else "rad",
-        "rows": len(rows),
+        "rows": len(judged),
         "gap_before": math.sqrt(float(before.mean())),
         **dict.fromkeys(("gap_after", "gap_after_ci95", "gain", "gain_ci95")),
         "reason": "",
@@ -106,7 +111,7 @@ def remaining_gain(
         return block | {"reason": "what the effects leave is no more than the noise"}
     said = _predicted(analysis, left, rows, fold, seed, progress)
     after = _squares((left - said)[here], white.sigma, channels)
-    many = resampled(len(rows), torch.Generator().manual_seed(seed))
+    many = resampled(len(judged), torch.Generator().manual_seed(seed))
     drawn = after[many].mean(-1).sqrt()
     gain = before[many].mean(-1).sqrt() - drawn
     ends = torch.tensor(INTERVAL, dtype=drawn.dtype)
@@ -119,8 +124,8 @@ def remaining_gain(
     }
 
 
-def _left(analysis: Analysis, judgement: Judgement, fold: Tensor) -> Tensor:
-    """What the effects, fitted without each fold, leave of all rows in units of the noise, `f x s x c`; fold: `s`."""
+def _left(analysis: Analysis, judgement: Judgement, fold: Tensor, count: int) -> Tensor:
+    """What the effects, fitted without each of the first folds, leave of all rows in units of the noise, `f x s x c`."""
     dictionary, white = analysis.dictionary, analysis.whitening
     keep = white.keep()
     chosen = [dictionary.groups[i] for i in judgement.found.members if not dictionary.atoms[i].is_discrepancy]
@@ -129,7 +134,7 @@ def _left(analysis: Analysis, judgement: Judgement, fold: Tensor) -> Tensor:
     weight = white.weight[keep].sqrt()[:, None]
     used = torch.cat([torch.arange(0), *chosen])
     left = []
-    for k in range(_FOLDS):
+    for k in range(count):
         rest = without(dictionary.grams, x[fold == k], y[fold == k], used)
         fit = fit_sets(rest, [chosen], dictionary.noise_dof, _UPDATES)
         index = fit.columns[0][fit.columns[0] >= 0]
@@ -150,23 +155,23 @@ def _predicted(
         seed: of the networks.
         progress: called with the share that is done.
     """
-    white, situation = analysis.whitening, analysis.situation
+    white, situation, count = analysis.whitening, analysis.situation, len(left)
     here = white.keep()[rows]
     slope = situation.jacobian[here][:, white.channels] / white.sigma[:, None]
     deviation = (torch.linalg.pinv(slope) @ left[..., None])[..., 0]
     joints = situation.joints[here]
     conditions = [v[here] for v in situation.covariates.values() if float(v[here].max() - v[here].min()) > 0]
-    inputs = torch.cat([joints, *(v[:, None] for v in conditions)], -1).expand(_FOLDS, -1, -1)
+    inputs = torch.cat([joints, *(v[:, None] for v in conditions)], -1).expand(count, -1, -1)
     turning = torch.tensor([j.unit == "rad" for j in situation.mechanism.joints])
     far = turning & (joints.amax(0) - joints.amin(0) > torch.pi / 2)
     periodic = torch.cat([far, torch.zeros(len(conditions), dtype=torch.bool)])
-    weights = torch.where(fold[rows] == torch.arange(_FOLDS)[:, None], 0.0, white.weight[here])
+    weights = torch.where(fold[rows] == torch.arange(count)[:, None], 0.0, white.weight[here])
     scaling = Scaling.fit(inputs, deviation, weights, periodic, angles=True)
     data = TrainingData(
         scaling.features(inputs),
         scaling.standardise(deviation),
         weights,
-        seed + torch.arange(_FOLDS),
+        seed + torch.arange(count),
         metric=slope * scaling.deviation[:, None, None, :],
         angles=scaling.angle_count,
         angle_step=scaling.angle_step,
