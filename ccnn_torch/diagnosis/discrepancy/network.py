@@ -125,7 +125,7 @@ def remaining_gain(
 
 
 def _left(analysis: Analysis, judgement: Judgement, fold: Tensor, count: int) -> Tensor:
-    """What the effects, fitted without each of the first folds, leave of all rows in units of the noise, `f x s x c`."""
+    """What the effects, fitted without each of `count` folds, leave of all rows in units of the noise, `f x s x c`."""
     dictionary, white = analysis.dictionary, analysis.whitening
     keep = white.keep()
     chosen = [dictionary.groups[i] for i in judgement.found.members if not dictionary.atoms[i].is_discrepancy]
