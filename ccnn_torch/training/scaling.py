@@ -1,4 +1,4 @@
-"""From SI inputs to features in [-1, 1], and from standardised outputs back to SI (DESIGN section 3)."""
+"""From SI inputs to features in [-1, 1], and from standardised outputs back to SI."""
 
 from __future__ import annotations
 

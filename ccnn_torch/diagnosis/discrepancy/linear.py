@@ -1,6 +1,6 @@
 """Linear and quadratic discrepancy terms of the drives, the base and the platform.
 
-The groups of `_catch_all` bend wherever they may, and the evidence charges them for all of it: where two effects of the
+The groups of `smooth` bend wherever they may, and the evidence charges them for all of it: where two effects of the
 library come near a plain cause that it lacks, they are the cheaper ones. These here are as plain as effects are.
 """
 

@@ -1,4 +1,4 @@
-"""Evidence of many sets of groups of columns side by side: as `_evidence.fit_sets`, with less to do.
+"""Evidence of many sets of groups of columns side by side: as `marginal_likelihood.fit_sets`, with less to do.
 
 With every group in its principal axes, the inner products of a set's widest group with itself are a diagonal. It is
 eliminated by dividing, and what is left to be factorised is a matrix of the other columns only (Schur's complement).

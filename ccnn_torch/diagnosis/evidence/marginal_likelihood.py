@@ -1,5 +1,5 @@
 """Evidence of many sets of groups of columns at once, from Gram matrices that are computed once; the model is that of
-`_scales`."""
+`hyperparameters`."""
 
 from __future__ import annotations
 
