@@ -1,4 +1,4 @@
-"""Evidence of many groups of columns, each alone: as `marginal_likelihood.fit_sets`, in the principal axes of every group.
+"""Evidence of many groups of columns, each alone: as `marginal_likelihood.fit_sets`, in each group's principal axes.
 
 There a group's inner products are numbers, not a matrix: however many groups there are and however wide, one update of
 all of them is a few operations on one table.
