@@ -80,7 +80,7 @@ def _attributes(text: str) -> dict[str, str]:
 
 
 def _yaml(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, default=str)
+    return value if isinstance(value, str) else json.dumps(value, default=str, ensure_ascii=False)
 
 
 def explain(error: ValidationError, model: type[BaseModel], file: str, given: Mapping[str, str]) -> str:

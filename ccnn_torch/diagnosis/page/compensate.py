@@ -30,7 +30,9 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
     if verdict["none"] or verdict["effects"] == [OUTLIER]:
         return ()
     keys = {"records": _records(config), "mechanism": typed_path(str(config.mechanism))}
-    keys |= {k: json.dumps(v) for k, v in (("columns", config.columns), ("mechanism_keys", config.mechanism_keys)) if v}
+    for key, value in (("columns", config.columns), ("mechanism_keys", config.mechanism_keys)):
+        if value:
+            keys[key] = json.dumps(value, ensure_ascii=False)
     covariates = config.covariates
     try:
         named = read_verdict(path, situation.mechanism.name, [j.name for j in situation.mechanism.joints])
