@@ -37,3 +37,8 @@ def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_th
     told = found.effects[0]["parameters"]
     # The tool frame stands for the last link's length: nothing of it is left for the geometry.
     assert abs(told["d6"]["value"]) < 1e-4, told["d6"]
+    # What is proposed lies where the arm has been: its joints do not turn many times, and hit nothing new.
+    low, high = situation.joints.amin(0).tolist(), situation.joints.amax(0).tolist()
+    proposed = [list(row["joints"].values()) for row in found.next_measurements]
+    assert len(proposed) == 8
+    assert all(a <= q <= b for row in proposed for a, q, b in zip(low, row, high, strict=True))

@@ -150,9 +150,9 @@ def test_the_file_is_read_back_as_commands(tmp_path: Path) -> None:
     write_next_csv(tmp_path / "next.csv", said.to_json(), About(units=units))
     table = read_table(tmp_path / "next.csv")
     read = torch.as_tensor(stack_columns(table, joints))
-    assert torch.equal(read, _proposed(said)[0])
+    assert torch.allclose(read, _proposed(said)[0], rtol=1e-14, atol=0.0)
     with (tmp_path / "next.csv").open(newline="") as file:
         header = next(csv.reader(file))
-    assert header[:4] == ["q1[rad]", "q2[rad]", "temperature[K]", "load_x[N]"] and header[-1] == "gain[1]"
+    assert header[:4] == ["q1[deg]", "q2[deg]", "temperature[degC]", "load_x[N]"] and header[-1] == "gain[1]"
     reached = rows.mechanism.forward_kinematics(read)
     assert bool(torch.isfinite(reached).all()) and bool(rows.mechanism.reachable(reached).all())

@@ -174,8 +174,9 @@ def test_next_measurements_as_table_and_as_records_for_the_machine(folder: Path)
     assert table.rows[0] == ("1", "0.6 rad", "1.4 rad", "100 N", "25.0 °C", "joint_offset or geometry", "0.420")
     with (folder / "next_measurements.csv").open(newline="") as file:
         header, first, second = csv.reader(file)
-    assert header == ["q1[rad]", "q2[rad]", "load_z[N]", "temperature[K]", "gain[1]"]
-    assert [float(v) for v in first] == [0.6, 1.4, 100.0, 298.15, 0.42] and second[3] == ""
+    assert header == ["q1[deg]", "q2[deg]", "load_z[N]", "temperature[degC]", "gain[1]"]
+    in_degrees = [math.degrees(0.6), math.degrees(1.4), 100.0, 25.0, 0.42]
+    assert [float(v) for v in first] == pytest.approx(in_degrees) and second[3] == ""
 
 
 def test_the_page_is_whole_and_fetches_nothing(folder: Path) -> None:

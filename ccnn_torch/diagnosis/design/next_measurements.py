@@ -11,16 +11,20 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import scaled_signature
 from ccnn_torch.diagnosis.evidence.dictionary import FittedSet, covariance
+from ccnn_torch.diagnosis.residual.rows import frame_columns
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.search.sets import scored
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Situation
+from ccnn_torch.mechanisms import Mechanism
 
 __all__ = ["next_measurements"]
 
 _CANDIDATES = 400
 _WANTED = 8
 _RIVALS = 3
+# Explanations less probable than this share of the first, and rows that say less [nat], are not worth a measurement.
+_RIVAL, _TELLING = 0.01, 0.01
 # Candidates are left out where the joints move the platform so many times as far as usual: no first order holds there.
 _GAIN = 3.0
 # Columns that change together from row to row; all others are one kind more.
@@ -49,9 +53,10 @@ def next_measurements(analysis: Analysis, judgement: Judgement, seed: int) -> li
     """The block `next_measurements` of diagnosis.json, the best first.
 
     Between explanations the gain of a row is the divergence of what they predict for it, in nats: half the square of
-    their difference in units of what noise and both posteriors leave open. Where one explanation has no rival, it is
-    the information on its coefficients, half the log determinant (Bayesian D-optimality, Chaloner and Verdinelli 1995).
-    Rows are chosen one after the other, each for what it adds to those before it; `gain` is that of the row alone.
+    their difference in units of what noise and both posteriors leave open. Where one explanation has no rival, or none
+    that a row tells from it, it is the information on its coefficients, half the log determinant (Bayesian
+    D-optimality, Chaloner and Verdinelli 1995). Rows are chosen one after the other, each for what it adds to those
+    before it; `gain` is that of the row alone.
     """
     rivals = _rivals(analysis, judgement)
     if not any(found.members for _, found in rivals):
@@ -65,9 +70,11 @@ def next_measurements(analysis: Analysis, judgement: Judgement, seed: int) -> li
         names = sorted(_names(analysis, first) ^ _names(analysis, other))
         mean = torch.cat([*first.mean, *other.mean])
         questions.append(_Question(both, mean, joint, weight / rivals[1][0], names, _divergence))
-    if not questions:
-        questions = [_Question(x, torch.cat(first.mean), own, 1.0, [], _information)]
-    return _chosen(situation, questions)
+    wanted = _chosen(situation, questions) if questions else []
+    if wanted or not first.members:
+        return wanted
+    # No row distinguishes them, so the numbers are made sharper.
+    return _chosen(situation, [_Question(x, torch.cat(first.mean), own, 1.0, [], _information)])
 
 
 def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, FittedSet]]:
@@ -99,7 +106,8 @@ def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Fitte
         if _names(analysis, one) not in known:
             known.append(_names(analysis, one))
             plain.append((plain[0][0] * math.exp(min(one.log_posterior - own.log_posterior, 0.0)), one))
-    return sorted(plain, key=lambda pair: -pair[0])[:_RIVALS]
+    plain.sort(key=lambda pair: -pair[0])
+    return [pair for pair in plain[:_RIVALS] if pair[0] >= _RIVAL * plain[0][0]]
 
 
 def _names(analysis: Analysis, found: FittedSet) -> set[str]:
@@ -107,19 +115,24 @@ def _names(analysis: Analysis, found: FittedSet) -> set[str]:
 
 
 def _candidates(analysis: Analysis, seed: int) -> Situation:
-    """Poses of the workspace under conditions as they were measured, the machine at rest.
+    """Poses of the workspace under conditions as they were measured, the machine at rest; of an arm or a simulator
+    joints between the lowest and the highest measured.
 
     Loads, directions, and time with temperature are drawn apart, each as some row had them: what always came together
     so far comes apart.
     """
     here = analysis.situation
-    generator = torch.Generator().manual_seed(seed)
+    mechanism, generator = here.mechanism, torch.Generator().manual_seed(seed)
     pose: Tensor | None = None
-    if _common(here):
-        pose = here.mechanism.sample_workspace(_CANDIDATES, generator)
-        joints = here.mechanism.solve_inverse(pose, here.parameters)
+    if type(mechanism).sample_joints is not Mechanism.sample_joints:
+        # Nothing tells what an arm may touch but where it has been; through its poses its joints would turn many times.
+        low, high = here.joints.amin(0), here.joints.amax(0)
+        joints = low + (high - low) * torch.rand(_CANDIDATES, len(low), generator=generator, dtype=low.dtype)
+    elif _common(here):
+        pose = mechanism.sample_workspace(_CANDIDATES, generator)
+        joints = mechanism.solve_inverse(pose, here.parameters)
     else:
-        joints = here.mechanism.sample_joints(_CANDIDATES, generator)
+        joints = mechanism.sample_joints(_CANDIDATES, generator)
     drawn = {k: torch.randint(len(here.joints), (len(joints),), generator=generator) for k in (*_KINDS, "")}
     covariates = {n: v[drawn[next((k for k in _KINDS if n.startswith(k)), "")]] for n, v in here.covariates.items()}
     if "time" in covariates:
@@ -128,7 +141,7 @@ def _candidates(analysis: Analysis, seed: int) -> Situation:
         covariates = {n: v[order] for n, v in covariates.items()}
         covariates["time"] = covariates["time"] + _APART * torch.arange(len(joints))
     parameters = here.parameters if _common(here) else None
-    return Situation(here.mechanism, joints, covariates, here.gravity, parameters, pose)
+    return Situation(mechanism, joints, covariates, here.gravity, parameters, pose)
 
 
 def _common(situation: Situation) -> bool:
@@ -136,16 +149,34 @@ def _common(situation: Situation) -> bool:
 
 
 def _columns(analysis: Analysis, found: FittedSet, there: Situation) -> Tensor:
-    """Deviation at the candidates per plausible size of each coefficient of a set, in units of the noise."""
-    columns = [there.jacobian[..., :0]]
+    """Deviation at the candidates per plausible size of each coefficient of a set, in units of the noise.
+
+    What frames that are fitted to the rows take up in these is taken up at the candidates, too, and shows nothing.
+    """
+    white, frames = analysis.whitening, frame_columns(there, torch.ones(len(there.joints), dtype=torch.bool))
+    columns = _signatures(analysis, found, there)
+    if frames.shape[-1]:
+        keep = white.keep()
+        before = white(_signatures(analysis, found, analysis.situation))[keep].flatten(0, 1)
+        taken = torch.linalg.lstsq(white(analysis.fitted)[keep].flatten(0, 1), before, driver="gelsd").solution
+        columns = columns - frames @ taken
+    return _whitened(analysis, columns)
+
+
+def _signatures(analysis: Analysis, found: FittedSet, situation: Situation) -> Tensor:
+    """Deviation per plausible size of each coefficient of a set, `s x c0 x m` [m, rad]."""
+    columns = [situation.jacobian[..., :0]]
     for i in found.members:
         atom = analysis.dictionary.atoms[i]
         assert atom.effect is not None
-        full = scaled_signature(there, atom.effect, atom.shape)
+        full = scaled_signature(situation, atom.effect, atom.shape)
         columns.append(full if atom.used is None else full[..., list(atom.used)])
-    white = analysis.whitening
-    noise = white.sigma * analysis.floor**0.5
-    whitened: Tensor = torch.cat(columns, -1)[:, white.channels] / noise[:, None]
+    return torch.cat(columns, -1)
+
+
+def _whitened(analysis: Analysis, columns: Tensor) -> Tensor:
+    noise = analysis.whitening.sigma * analysis.floor**0.5
+    whitened: Tensor = columns[:, analysis.whitening.channels] / noise[:, None]
     return whitened
 
 
@@ -170,7 +201,7 @@ def _chosen(situation: Situation, questions: list[_Question]) -> list[dict[str, 
     for _ in range(_WANTED):
         gains = torch.stack([_gains(q) for q in questions])
         alone = gains if alone is None else alone
-        worth = torch.where(possible, torch.nan_to_num(gains * _weights(questions)), 0.0)
+        worth = torch.where(possible & (gains >= _TELLING), torch.nan_to_num(gains * _weights(questions)), 0.0)
         best = int(worth.max(0).values.argmax())
         if not float(worth[:, best].max()) > 0:
             break

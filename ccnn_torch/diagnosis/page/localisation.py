@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ __all__ = [
 
 Block = Mapping[str, Any]
 _KELVIN = 273.15
+# Unit that a controller shows in the place of that of the SI, the factor and what is added.
+_SHOWN = {"m": ("mm", 1e3, 0.0), "rad": ("deg", 180 / math.pi, 0.0), "K": ("degC", 1.0, -_KELVIN)}
 _SHARES = ("share of the gap [%]", "95 % interval [%]")
 # More joints and conditions than this do not fit side by side on a page.
 _MOST_COLUMNS = 8
@@ -140,17 +143,19 @@ def next_table(results: Block, about: About) -> Table | None:
 
 
 def write_next_csv(path: Path, results: Block, about: About) -> None:
-    """Write `next_measurements.csv`: joints and covariates in SI with the header `name[unit]`, 17 significant digits.
+    """Write `next_measurements.csv` in a controller's units (mm, deg, degC), the header being `name[unit]`.
 
     A covariate that a measurement does not ask for is empty.
     """
     joints, covariates = _columns(results)
     names = (*joints, *covariates)
-    rows = [
-        [*({**entry["joints"], **entry["covariates"]}.get(name) for name in names), entry["gain"]]
-        for entry in results["next_measurements"]
-    ]
-    write_rows(path, [*(f"{name}[{about.unit(name)}]" for name in names), "gain[1]"], rows)
+    shown = {name: _SHOWN.get(about.unit(name), (about.unit(name), 1.0, 0.0)) for name in names}
+    rows: list[list[float | None]] = []
+    for entry in results["next_measurements"]:
+        values = {**entry["joints"], **entry["covariates"]}
+        scaled = {name: shown[name][1] * value + shown[name][2] for name, value in values.items()}
+        rows.append([*(scaled.get(name) for name in names), entry["gain"]])
+    write_rows(path, [*(f"{name}[{shown[name][0]}]" for name in names), "gain[1]"], rows)
 
 
 def _columns(results: Block) -> tuple[list[str], list[str]]:
