@@ -155,7 +155,7 @@ def diagnose_rows(
     why = why_set_aside(analysis, rows, chosen)
     source = "estimated" if known is None or (noise is None and analysis.instrument is None) else known.source
     content = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": texts}
-    verdict["text"] = verdict_text(content | {"noise": source, "rows_set_aside": sorted(why)})
+    verdict["text"] = verdict_text(content | {"noise": source, "rows_set_aside": sorted(why), "not_seen": unseen})
     places, intervals = localise(analysis, residual, seed)
     at_step("by block")
     far = by_block(made, residual)

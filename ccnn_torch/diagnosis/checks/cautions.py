@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.checks.column_mistakes import column_mistake
+from ccnn_torch.diagnosis.checks.joint_scatter import joint_scatter
 from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows
 from ccnn_torch.diagnosis.evidence.dictionary import covariance
 from ccnn_torch.diagnosis.residual.distance import distance, size_of
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import Gap
-from ccnn_torch.diagnosis.verdict.judgement import Judgement
+from ccnn_torch.diagnosis.verdict.findings import size_words
+from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN, Judgement
 from ccnn_torch.diagnosis.verdict.plausible import implausible_size
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Situation
@@ -68,6 +70,7 @@ def cautions(
         *_of_signs(analysis, judgement),
         *_of_columns(analysis, judgement),
         *_of_inputs(analysis, missing),
+        *_of_scatter(analysis, judgement),
     ]
 
 
@@ -205,6 +208,18 @@ def _of_signs(analysis: Analysis, judgement: Judgement) -> list[Caution]:
             wrong = f"{atom.name} would have to be negative ({where}), as in no machine"
             said.append(Caution(f"{wrong}: check the signs of the columns that it uses"))
     return said
+
+
+def _of_scatter(analysis: Analysis, judgement: Judgement) -> list[Caution]:
+    """A joint that scatters where its direction was not recorded: other names may stand for what it does."""
+    found = joint_scatter(analysis, judgement)
+    if found is None:
+        return []
+    text = (
+        f"what is left scatters as if joint {found.joint} stopped {size_words(found.size, found.unit, 2)} to either side, "
+        f"as with backlash or friction: record direction{found.joint}; other names may stand for it"
+    )
+    return [Caution(text, BESIDE_UNKNOWN)]
 
 
 def _of_columns(analysis: Analysis, judgement: Judgement) -> list[Caution]:

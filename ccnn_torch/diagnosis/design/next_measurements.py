@@ -158,7 +158,7 @@ def _columns(analysis: Analysis, found: FittedSet, there: Situation) -> Tensor:
     if frames.shape[-1]:
         keep = white.keep()
         before = white(_signatures(analysis, found, analysis.situation))[keep].flatten(0, 1)
-        taken = torch.linalg.lstsq(white(analysis.fitted)[keep].flatten(0, 1), before, driver="gelsd").solution
+        taken = torch.linalg.pinv(white(analysis.fitted)[keep].flatten(0, 1)) @ before
         columns = columns - frames @ taken
     return _whitened(analysis, columns)
 

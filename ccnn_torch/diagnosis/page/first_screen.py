@@ -12,7 +12,14 @@ from ccnn_torch.diagnosis.page.numbers import numbers_table
 from ccnn_torch.diagnosis.page.place_words import where_words
 from ccnn_torch.diagnosis.page.tables import columns_text
 from ccnn_torch.diagnosis.verdict.findings import findings
-from ccnn_torch.diagnosis.verdict.text import capital, follows_words, listed, probability_words, size_text
+from ccnn_torch.diagnosis.verdict.text import (
+    capital,
+    follows_words,
+    listed,
+    no_effect_words,
+    probability_words,
+    size_text,
+)
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.report.table import markdown_table, print_labelled, print_table, print_text
 
@@ -80,7 +87,7 @@ def _wrong(results: Block) -> str:
         return "Nothing: model and machine differ by no more than the noise."
     if verdict["outside_library"] or not found:
         rest = "a rest" if found else "an error"
-        found.append(f"{rest} that {follows_words(verdict)}, which no effect of the library describes")
+        found.append(f"{rest} that {follows_words(verdict)}, which {no_effect_words(results)} describes")
     return " ".join(f"{capital(text)}." for text in found)
 
 

@@ -27,6 +27,7 @@ __all__ = [
     "lacking_text",
     "listed",
     "network_text",
+    "no_effect_words",
     "noise_text",
     "probability_words",
     "size_text",
@@ -215,11 +216,16 @@ def network_text(results: Block) -> str:
     return f"{text}."
 
 
+def no_effect_words(results: Block) -> str:
+    """What is meant by none: of the library, or of what these records can show of it."""
+    return "no effect that these records can show" if results.get("not_seen") else "no effect of the library"
+
+
 def _none_of(results: Block) -> str:
     """Effects that were tried without support, the first few by name."""
     tried = sorted(e["name"] for e in results["effects"])
     if len(tried) > _FEW_TRIED:
-        return "No effect of the library" if not results.get("not_seen") else "No effect that these records can show"
+        return capital(no_effect_words(results))
     return f"None of the effects that were tried ({', '.join(tried)})" if tried else "Nothing that was tried"
 
 
@@ -235,7 +241,7 @@ def _cause(results: Block) -> str:
             return f"{_none_of(results)} explains it: the residual {follows} ({_probability(verdict)})."
         verb = "explains" if len(names) == 1 else "together explain"
         text = f"{capital(listed([effect_words(n) for n in names]))} {verb} part of it{_removed(results, ', ')}; "
-        return f"{text}the rest {follows}, and no effect of the library describes it ({_probability(verdict)})."
+        return f"{text}the rest {follows}, and {no_effect_words(results)} describes it ({_probability(verdict)})."
     by_name = {e["name"]: e for e in results["effects"]}
     classes = {e["name"]: [n for n in e["indistinguishable_from"] if n not in names] for e in results["effects"]}
     likes = [classes.get(name, []) for name in names]
