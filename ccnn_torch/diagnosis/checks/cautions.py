@@ -215,9 +215,10 @@ def _of_scatter(analysis: Analysis, judgement: Judgement) -> list[Caution]:
     found = joint_scatter(analysis, judgement)
     if found is None:
         return []
+    size = size_words(found.size, found.unit, 2)
     text = (
-        f"what is left scatters as if joint {found.joint} stopped {size_words(found.size, found.unit, 2)} to either side, "
-        f"as with backlash or friction: record direction{found.joint}; other names may stand for it"
+        f"what is left scatters as if joint {found.joint} stopped {size} to either side, as with backlash or friction: "
+        f"record direction{found.joint}; other names may stand for it"
     )
     return [Caution(text, BESIDE_UNKNOWN)]
 
