@@ -16,6 +16,8 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm
 __all__ = ["Gravity"]
 
 _SECONDARY = 0.3
+# What an arm may carry elsewhere than evenly: no correction of a form.
+_MASSES = ("tool", "inner links")
 # Lever by which a turning joint carries weight, by and large [m]; a sliding one carries a share of it [1].
 _LEVER = 0.3
 # Weight times the way from the measured point to the centre of mass [N·m].
@@ -28,9 +30,9 @@ class Gravity:
     For an arm the newton is spread evenly over the origins of its links and the tool; for other machines it hangs on
     the measured point of the platform. c is compliance times weight: a sag for each metre of lever (turning joints), or
     along a joint that carries all (sliding ones). Secondary: a joint that stiffens, d τ|τ| / 0.3 m (or / 1); what
-    another mass distribution does: for an arm a weight at the tool; for a turning drive of another machine its crank,
-    whose weight acts in proportion to cos q and sin q, and for a platform that turns the moment of its weight about
-    the measured point, in its own axes, on drives of plausible compliance.
+    another mass distribution does: for an arm a weight at the tool, and one that is larger towards the base; for a
+    turning drive of another machine its crank, whose weight acts in proportion to cos q and sin q, and for a platform
+    that turns the moment of its weight about the measured point, in its own axes, on drives of plausible compliance.
     """
 
     name = "gravity"
@@ -51,13 +53,18 @@ class Gravity:
             found.append(Coefficient(joint.name, unit, size, joint=joint.name, positive=True))
             parts = [("stiffening", unit, size)]
             if isinstance(mechanism, SerialArm):
-                parts.append(("tool", unit, size))
+                parts += [("tool", unit, size), ("inner links", unit, size)]
             elif turning:
                 parts += [(f"crank {wave}", "rad", size * _LEVER) for wave in ("cos", "sin")]
             # No input link weighs many times as much as the platform; a tool may.
             found += [
                 Coefficient(
-                    f"{joint.name} {part}", u, _SECONDARY * v, joint=joint.name, secondary=True, mends=part != "tool"
+                    f"{joint.name} {part}",
+                    u,
+                    _SECONDARY * v,
+                    joint=joint.name,
+                    secondary=True,
+                    mends=part not in _MASSES,
                 )
                 for part, u, v in parts
             ]
@@ -77,7 +84,10 @@ class Gravity:
         arm = isinstance(mechanism, SerialArm)
         weight = situation.own_weight_torque
         parts = [weight, weight * weight.abs() / lever]
-        parts += [situation.weight_torque] if arm else [torch.cos(joints), torch.sin(joints)]
+        if arm:
+            parts += [situation.weight_torque, situation.inner_weight_torque]
+        else:
+            parts += [torch.cos(joints), torch.sin(joints)]
         columns = by_joint(torch.stack(parts, -1))
         if not arm:
             kept = [4 * i + k for i, turns in enumerate(turning) for k in (range(4) if turns else range(2))]

@@ -187,19 +187,34 @@ class Situation:
         Of an arm it is spread evenly over the origins of its links and the tool; of others it is the platform's.
         """
         arm = self.mechanism
-        if not isinstance(arm, SerialArm):
-            return self.weight_torque
+        return (
+            self._links_torque(lambda far: torch.ones_like(far)) if isinstance(arm, SerialArm) else self.weight_torque
+        )
+
+    @cached_property
+    def inner_weight_torque(self) -> Tensor:
+        """As `own_weight_torque` of an arm whose links are the heavier the nearer they are to its base: the weight at
+        an origin falls linearly to 0 at the tool."""
+        return self._links_torque(lambda far: 1 - far)
+
+    def _links_torque(self, heavy: Callable[[Tensor], Tensor]) -> Tensor:
+        """Torques of 1 N over the origins of an arm's links and the tool, `... x s x n`; heavy: the share of each by
+        how far out it is, 0 to 1, `k`."""
+        arm = self.mechanism
+        assert isinstance(arm, SerialArm)
         values = arm.resolve(self.parameters)
         down = (rotation_vector_to_matrix(values[..., 3:6]).mT @ self.down.unsqueeze(-1)).squeeze(-1)
 
-        def along(joints: Tensor) -> Tensor:
+        def height(joints: Tensor) -> Tensor:
             frames = arm.link_frames(joints, values)
             rotation, flange = frames[-1]
             tool = flange + (rotation @ values[..., -6:-3, None]).squeeze(-1)
             places = torch.stack([*(place for _, place in frames[1:]), tool], -2)
-            return (places @ down.unsqueeze(-1)).squeeze(-1).mean(-1, keepdim=True)
+            share = heavy(torch.linspace(0, 1, places.shape[-2], dtype=places.dtype))
+            along: Tensor = share @ (places @ down.unsqueeze(-1)) / share.sum()
+            return along
 
-        return jacobian_of(along, self.joints)[1].squeeze(-2).detach()
+        return jacobian_of(height, self.joints)[1].squeeze(-2).detach()
 
     @cached_property
     def down(self) -> Tensor:

@@ -133,16 +133,21 @@ def test_an_arm_sags_by_the_slope_of_its_potential_energy() -> None:
     arm = rows.mechanism
     assert isinstance(arm, SerialArm)
 
-    def energy(joints: Tensor) -> Tensor:
+    # Of the weight: spread evenly over the origins of links and the tool, and the less of it the farther out.
+    even, inner = torch.ones(7, dtype=torch.float64), torch.linspace(1, 0, 7, dtype=torch.float64)
+
+    def energy(joints: Tensor, weight: Tensor) -> Tensor:
         heights = [place[..., 2] for _, place in arm.link_frames(joints, arm.nominal)[1:]]
-        return torch.stack([*heights, arm.forward_frame(joints)[0][..., 2]], -1).mean(-1)
+        return torch.stack([*heights, arm.forward_frame(joints)[0][..., 2]], -1) @ (weight / weight.sum())
 
     basis = make_effect("gravity").basis(rows, NO_SHAPE)
+    names = [c.name for c in make_effect("gravity").coefficients(rows)]
     for i in range(6):
         step = torch.zeros(6, dtype=torch.float64)
         step[i] = 1e-6
-        slope = (energy(rows.joints + step) - energy(rows.joints - step)) / 2e-6
-        assert torch.allclose(basis[:, i, 3 * i], -slope, atol=1e-8)
+        for name, weight in ((f"q{i + 1}", even), (f"q{i + 1} inner links", inner)):
+            slope = (energy(rows.joints + step, weight) - energy(rows.joints - step, weight)) / 2e-6
+            assert torch.allclose(basis[:, i, names.index(name)], -slope, atol=1e-8)
 
 
 def test_a_platform_hangs_in_its_drives_with_its_weight() -> None:

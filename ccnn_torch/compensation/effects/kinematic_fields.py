@@ -30,6 +30,7 @@ _NAMES = (
     "jacobian",
     "parameter_jacobian",
     "own_weight_torque",
+    "inner_weight_torque",
     "weight_torque",
     "holding",
     "frame_slope",

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import Atom, default_shape
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows, Shaped
-from ccnn_torch.diagnosis.candidates.single_joint import single_joint_atoms
+from ccnn_torch.diagnosis.candidates.single_joint import single_joint_atoms, without_secondary
 from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Acting, Effect, Situation
@@ -71,6 +71,7 @@ def candidates_about_nominal(
     """
     whole = [a for a in atoms if a.shape.numel() == 0]
     parts = [p for p in single_joint_atoms(situation, whole, white, [residual] * len(whole)) if p is not None]
+    parts += without_secondary(situation, whole)
     bare = white(fitted)
     beside = torch.cat([bare, *(white(a.columns) for a in whole)], -1)
     grounds = [SearchRows(white(residual), nuisance, quick=True) for nuisance in (bare, beside)]
@@ -126,12 +127,19 @@ def candidates_about_set(
     grounds: dict[tuple[str, ...], SearchRows] = {}
     rigid = [e for e in effects if not e.shapes(situation)]
     whole = [without_unused_rows(default_atom(situation, there, e), usable) for e in rigid]
+    # In which joints an effect is, is asked beside what acts, and beside that without one: what stands for it hides it.
+    fewer = {a.effect.name: beside([b for b in acting if b is not a]) for a in acting}
     all_act = beside(acting)
-    left = []
-    for effect in rigid:
-        others = [a for a in acting if a.effect is not effect]
-        left.append(all_act if len(others) == len(acting) else beside(others))
-    atoms = [*whole, *(p for p in single_joint_atoms(situation, whole, white, left) if p is not None)]
+    asked, left = [], []
+    for atom in whole:
+        here = [fewer[atom.name]] if atom.name in fewer else [all_act, *fewer.values()]
+        asked += [atom] * len(here)
+        left += here
+    parts: dict[tuple[str, tuple[int, ...] | None], Atom] = {}
+    for part in single_joint_atoms(situation, asked, white, left):
+        if part is not None:
+            parts.setdefault((part.name, part.used), part)
+    atoms = [*whole, *parts.values(), *without_secondary(situation, whole)]
     for effect in (e for e in effects if e.shapes(situation)):
         others = [a for a in acting if a.effect is not effect]
         start = next((a.shape for a in acting if a.effect is effect), None)

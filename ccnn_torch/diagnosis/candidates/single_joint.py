@@ -1,4 +1,4 @@
-"""Effects in one joint or leg, or in a few: the coefficients that explain most."""
+"""Parts of effects: in one joint or leg, or in a few, those that explain most; and without what is secondary."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from ccnn_torch.diagnosis.evidence.single_groups import GroupProducts, fit_singl
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Situation
 
-__all__ = ["single_joint_atoms"]
+__all__ = ["single_joint_atoms", "without_secondary"]
 
 # Spread of the log size of an effect that is in one joint or leg alone.
 _SIZE_SPREAD = 4.0
+# What it costs to be told with secondary coefficients or without.
+_EITHER = math.log(2.0)
 
 
 @dataclass
@@ -89,9 +91,29 @@ def single_joint_atoms(
     return [_cut(atom, choices[k]) if k in choices else None for k, atom in enumerate(atoms)]
 
 
+def without_secondary(situation: Situation, atoms: Sequence[Atom]) -> list[Atom]:
+    """Of the effects that have secondary coefficients the others alone, and all but those that only mend a form.
+
+    One scale for all would charge for the zeros of joints that count from the middle, and a term of no effect would
+    then be the cheaper name for their gains.
+    """
+    found = []
+    for atom in atoms:
+        coefficients = atom.coefficients(situation)
+        main = [k for k, c in enumerate(coefficients) if not c.secondary]
+        formed = [k for k, c in enumerate(coefficients) if not c.mends]
+        parts = [main] if main == formed else [main, formed]
+        found += [_with(atom, part, _EITHER) for part in parts if 0 < len(part) < len(coefficients)]
+    return found
+
+
 def _cut(atom: Atom, choice: _Choice) -> Atom:
-    log_prior = atom.log_prior - choice.lots * choice.charge
-    return replace(atom, columns=atom.columns[..., choice.chosen], log_prior=log_prior, used=tuple(choice.chosen))
+    return _with(atom, choice.chosen, choice.lots * choice.charge)
+
+
+def _with(atom: Atom, chosen: list[int], charge: float) -> Atom:
+    """With these coefficients of its own alone."""
+    return replace(atom, columns=atom.columns[..., chosen], log_prior=atom.log_prior - charge, used=tuple(chosen))
 
 
 def _parts(situation: Situation, atom: Atom) -> list[list[int]]:

@@ -28,7 +28,7 @@ class Blocks:
         self.floor = noise_floor(analysis)
         self.position = white.channels < 3
         atoms = analysis.dictionary.atoms
-        self.candidates = _most_probable_single(analysis)
+        self.candidates = _candidates(analysis, judgement)
         members = judgement.found.members
         alone = [[i] for i in self.candidates.values()]
         # The verdict's effects one after the other, the largest first; the last has them all.
@@ -156,10 +156,10 @@ def _part(coefficient: Coefficient, effect: str) -> str | None:
     return f"{'link' if effect == 'geometry' else 'joint'} {coefficient.joint.removeprefix('q')}"
 
 
-def _most_probable_single(analysis: Analysis) -> dict[str, int]:
+def _candidates(analysis: Analysis, judgement: Judgement) -> dict[str, int]:
     """Of each library name the atom that the verdict's set uses, or that is most probable alone."""
     atoms = analysis.dictionary.atoms
-    best: dict[str, int] = {}
+    best = {atoms[i].name: i for i in judgement.found.members if not atoms[i].is_discrepancy}
     for found in analysis.found:
         if len(found.members) == 1 and not atoms[found.members[0]].is_discrepancy:
             best.setdefault(atoms[found.members[0]].name, found.members[0])
