@@ -80,8 +80,8 @@ class _Order:
 
 
 def _linuxcnc(order: _Order) -> dict[str, str]:
-    parts = None if isinstance(order.model, IdentifiedGeometry) else order.proven()
-    return print_linuxcnc(parts, order.mechanism(), order.source())
+    form = None if isinstance(order.model, IdentifiedGeometry) else order.proven()[0]
+    return print_linuxcnc(form, order.mechanism(), order.source())
 
 
 def _onnx(order: _Order) -> dict[str, bytes]:
