@@ -29,6 +29,7 @@ __all__ = [
 ]
 
 Block = dict[str, Any]
+Error = tuple[ArrayLike, ArrayLike | None]
 
 
 def spread(values: ArrayLike) -> Block:
@@ -202,31 +203,20 @@ def ratio_to_floor(errors: Mapping[str, Any] | None, floor: Mapping[str, Any] | 
 
 
 def pose_block(
-    position_before: ArrayLike,
-    position_after: ArrayLike,
+    before: Error,
+    after: Error,
     weights: ArrayLike | None = None,
-    rotation_before: ArrayLike | None = None,
-    rotation_after: ArrayLike | None = None,
     rotation_weight: float | None = None,
-    position_remainder: ArrayLike | None = None,
-    rotation_remainder: ArrayLike | None = None,
-    position_geometry: ArrayLike | None = None,
-    rotation_geometry: ArrayLike | None = None,
-    position_effects: ArrayLike | None = None,
-    rotation_effects: ArrayLike | None = None,
+    **beside: Error | None,
 ) -> Block:
     """Root mean square and maximum of the pose error over the held-out rows, before and after.
 
     Args:
-        position_before, position_after: Euclidean position errors, `r x s` [m] (eq. 6).
+        before, after: Euclidean position errors, `r x s` [m] (eq. 6), and geodesic angles, `r x s` [rad], or None where
+            there is no orientation.
         weights: `r x s` [1], or None.
-        rotation_before, rotation_after: geodesic angles, `r x s` [rad], or None where there is no orientation.
         rotation_weight: η of eq. 5 [m/rad]; adds `energy`, E = position error + η · rotation error, row by row [m].
-        position_remainder, rotation_remainder: what no joint deviation can explain, `r x s` [m], [rad]; adds
-            `not_compensable` beside `before` and `after`.
-        position_geometry, rotation_geometry: what geometric calibration alone leaves, `r x s` [m], [rad]; adds
-            `geometry`.
-        position_effects, rotation_effects: what known effects leave by themselves, likewise; adds `effects`.
+        beside: what else is told beside `before` and `after`, under its name; None is left out.
 
     Returns:
         `{"position": {"unit": "m", "before": {"rms": S, "max": S}, "after": …}, "rotation": {…} or null}`, and `energy`
@@ -235,35 +225,20 @@ def pose_block(
     Raises:
         InputError: the shapes do not fit together, or a repeat has no row.
     """
+    errors = {"before": before, "after": after} | {name: error for name, error in beside.items() if error is not None}
 
-    def quantity(unit: str, **errors: ArrayLike | None) -> Block:
-        return {"unit": unit} | {k: _rms_and_max(_array(v), weights) for k, v in errors.items() if v is not None}
+    def quantity(unit: str, values: Mapping[str, ArrayLike | None]) -> Block:
+        return {"unit": unit} | {k: _rms_and_max(_array(v), weights) for k, v in values.items() if v is not None}
 
-    block: Block = {
-        "position": quantity(
-            "m",
-            before=position_before,
-            after=position_after,
-            geometry=position_geometry,
-            effects=position_effects,
-            not_compensable=position_remainder,
-        ),
-        "rotation": None,
-    }
-    if rotation_before is None or rotation_after is None:
+    block: Block = {"position": quantity("m", {name: error[0] for name, error in errors.items()}), "rotation": None}
+    if before[1] is None or after[1] is None:
         return block
-    block["rotation"] = quantity(
-        "rad",
-        before=rotation_before,
-        after=rotation_after,
-        geometry=rotation_geometry,
-        effects=rotation_effects,
-        not_compensable=rotation_remainder,
-    )
+    block["rotation"] = quantity("rad", {name: error[1] for name, error in errors.items()})
     if rotation_weight is not None:
-        before = _array(position_before) + rotation_weight * _array(rotation_before)
-        after = _array(position_after) + rotation_weight * _array(rotation_after)
-        block["energy"] = quantity("m", before=before, after=after) | {"rotation_weight": rotation_weight}
+        first, last = (
+            _array(p) + rotation_weight * _array(r) for p, r in ((before[0], before[1]), (after[0], after[1]))
+        )
+        block["energy"] = quantity("m", {"before": first, "after": last}) | {"rotation_weight": rotation_weight}
     return block
 
 
