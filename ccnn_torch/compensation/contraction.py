@@ -91,6 +91,17 @@ def steepest(
     return Steepness(_SAFETY * float(best.max()), min(1.0, float(sizes.max())))
 
 
+def least_step(gentle: Callable[[int], bool], last: int, first: int = 0) -> int:
+    """The first of the steps `first` … `last` that is gentle, by bisection; the last where none is."""
+    if gentle(first):
+        return first
+    low, high = first, last
+    while low + 1 < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if gentle(middle) else (middle, high)
+    return high
+
+
 def iterations_needed(found: Steepness, tolerance: float = TOLERANCE) -> int:
     """Smallest k, at least 1, with lipschitzᵏ · max|δ| ≤ tolerance, both in units of the limit."""
     if found.lipschitz == 0 or found.largest <= tolerance:

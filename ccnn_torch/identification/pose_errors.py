@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ccnn_torch.display import number_text
 from ccnn_torch.mechanisms import PoseError
 
 __all__ = ["before_and_after", "figures", "removed"]
@@ -32,6 +33,18 @@ def figures(values: Mapping[str, Tensor | None]) -> dict[str, Any]:
         if len(table) > 1:
             spread[key] = [float(known.quantile(_LOW)), float(known.quantile(_HIGH))]
     return numbers | ({"spread": spread} if spread else {})
+
+
+def figure_text(block: Mapping[str, Any] | None, key: str, scale: float = 1.0, digits: int = 3) -> str:
+    """One of the `figures` with its interval, or –."""
+    if block is None or block.get(key) is None:
+        return "–"
+    text = number_text(block[key] / scale, digits)
+    spread = block.get("spread", {}).get(key)
+    if spread is not None:
+        low, high = (number_text(v / scale, digits) for v in spread)
+        text += f" [{low}, {high}]"
+    return text
 
 
 def before_and_after(before: PoseError, after: PoseError, noise: PoseError | None = None) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.verification.promise import configurations, promise_block
 from ccnn_torch.version import __version__
 
-__all__ = ["Assembled", "Known", "assemble", "known_of", "parameter_blocks", "versions"]
+__all__ = ["Assembled", "Known", "assemble", "known_of", "method_of", "parameter_blocks", "results_of"]
 
 Z95 = 1.959963984540054
 
@@ -124,7 +124,38 @@ def assemble(
     arrays["correlation"] = known[first].correlation
     arrays["observed"] = measured.rows.observed[:1]
     arrays |= {f"observed_leg{leg}": rows.observed[:1] for leg, rows in measured.leg_rows.items()}
-    results = {
+    results = results_of(
+        config,
+        measured,
+        parameter_blocks(measured, selection, main, known[first], resampled),
+        known[first],
+        blocks,
+        _doubts(config, measured, blocks[first]["test"], known[first]),
+        [f"{m}: {o.message}" for m, o in outcomes.items() if o.message],
+    )
+    results |= {"promise": _promise(measured, before, after), "counts": counts}
+    return Assembled(results, arrays)
+
+
+def results_of(
+    config: IdentifyConfig,
+    measured: Measured,
+    parameters: dict[str, Any],
+    known: Known,
+    methods: dict[str, Any],
+    doubts: list[str],
+    notes: list[str],
+) -> dict[str, Any]:
+    """What `identified.json` has of every identification.
+
+    Args:
+        parameters: see `parameter_blocks`.
+        known: by the first method.
+        methods: their blocks; the first is the result.
+        doubts, notes: sentences, the notes beside those of the rows.
+    """
+    method, first = next(iter(methods.items()))
+    return {
         "name": config.name,
         "seed": config.seed,
         "mechanism": measured.mechanism.name,
@@ -135,23 +166,41 @@ def assemble(
             "per_leg": {str(leg): rows.joints.shape[1] for leg, rows in measured.leg_rows.items()},
             "test": measured.test.joints.shape[1],
         },
-        "method": first,
-        "parameters": parameter_blocks(measured, selection, main, known[first], resampled),
-        "combinations_not_identifiable": known[first].combinations,
-        "test": blocks[first]["test"],
-        "promise": _promise(measured, before, after),
-        "methods": blocks,
-        "compensation": blocks[first]["compensation"],
-        "singular_values": known[first].singular_values,
-        "noise_ratio": figures({"value": known[first].noise}),
-        "doubts": _doubts(config, measured, blocks[first]["test"], known[first]),
-        "counts": counts,
+        "method": method,
+        "parameters": parameters,
+        "combinations_not_identifiable": known.combinations,
+        "test": first["test"],
+        "methods": methods,
+        "compensation": first["compensation"],
+        "singular_values": known.singular_values,
+        "noise_ratio": figures({"value": known.noise}),
+        "doubts": doubts,
+        "counts": [],
         "paper": config.paper,
         "data_sha256": measured.data_hash or None,
-        "notes": [*measured.notes, *(f"{m}: {o.message}" for m, o in outcomes.items() if o.message)],
-        "versions": versions(),
+        "notes": [*measured.notes, *notes],
+        "versions": {
+            "ccnn_torch": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+        },
     }
-    return Assembled(results, arrays)
+
+
+def method_of(outcome: Outcome, test: dict[str, Any], per_leg: bool) -> dict[str, Any]:
+    """A method's block, without what only simulated machines show."""
+    return {
+        "test": test,
+        "seconds": outcome.seconds,
+        "machines": len(outcome.machines),
+        "per_leg": per_leg,
+        "converged": float(outcome.converged.double().mean()),
+        "evaluations": outcome.evaluations,
+        "deviations": None,
+        "bound": None,
+        "coverage": None,
+        "compensation": None,
+    }
 
 
 def _promise(measured: Measured, before: PoseError, after: PoseError) -> dict[str, Any] | None:
@@ -174,15 +223,6 @@ def _doubts(config: IdentifyConfig, measured: Measured, test: dict[str, Any], kn
     return doubts_of(test, float(known.noise[0]), float(known.freedom[0]), noise, given)
 
 
-def versions() -> dict[str, str]:
-    """What the results were computed with."""
-    return {
-        "ccnn_torch": __version__,
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-    }
-
-
 def _method_block(
     config: IdentifyConfig,
     measured: Measured,
@@ -197,18 +237,7 @@ def _method_block(
     after = predicted(measured, outcome.values, machines)
     noise = noise_of_test(measured)
     test = before_and_after(before, after, None if noise is None else PoseError(*(_of(n, machines) for n in noise)))
-    block: dict[str, Any] = {
-        "test": test,
-        "seconds": outcome.seconds,
-        "machines": len(machines),
-        "per_leg": is_apart(method, config),
-        "converged": float(outcome.converged.double().mean()),
-        "evaluations": outcome.evaluations,
-        "deviations": None,
-        "bound": None,
-        "coverage": None,
-        "compensation": None,
-    }
+    block = method_of(outcome, test, is_apart(method, config))
     arrays[f"values_{method}"] = outcome.values
     if measured.truth is None:
         return block

@@ -25,6 +25,7 @@ from ccnn_torch.identification import (
 from ccnn_torch.identification.config import PER_LEG, IdentifyConfig, base_method
 from ccnn_torch.identification.measured.measured import Measured, Rows
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
+from ccnn_torch.identification.problems.problem import part_of
 from ccnn_torch.identification.solvers.registry import get_solver
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
 
@@ -226,8 +227,7 @@ def run_method(method: str, measured: Measured, config: IdentifyConfig, progress
         pieces = pieces_of(measured, config, is_apart(method, config), machines, values)
         fits = []
         for i, piece in enumerate(pieces):
-            part = None if progress is None else _part(progress, i, len(pieces))
-            fits.append(solver(piece.problem, config.seed + i, part))
+            fits.append(solver(piece.problem, config.seed + i, part_of(progress, i, len(pieces))))
         values = whole_values(selection, pieces, [fit.values for fit in fits], machines)
     assert values is not None
     seconds = time.perf_counter() - begun
@@ -265,7 +265,3 @@ def knowledge_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> li
         what_is_known(piece.problem, free[:, [names.index(p.name) for p in piece.problem.parameters]])
         for piece in pieces
     ]
-
-
-def _part(progress: Progress, index: int, count: int) -> Progress:
-    return lambda done: progress((index + done) / count)

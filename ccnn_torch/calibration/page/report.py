@@ -14,7 +14,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_arrays, load_history
 from ccnn_torch.report.figures.errors import joint_error_plot, pose_error_plot
-from ccnn_torch.report.figures.style import Plot, inline_svg, save_figure
+from ccnn_torch.report.figures.style import Plot, inline_figures, save_figure
 from ccnn_torch.report.figures.workspace import overview_plot, workspace_plot
 from ccnn_torch.report.html import InlineFigure, page_text
 from ccnn_torch.report.json_files import read_json
@@ -68,11 +68,7 @@ def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -
     folder = Path(folder)
     results = read_json(folder / "results.json") if results is None else results
     write_tables(folder, results)
-    plots = run_plots(folder, results)
-    figures = []
-    for plot in plots:
-        _, svg = save_figure(plot.figure, folder / "plots" / plot.name)
-        figures.append(InlineFigure(plot.name, plot.caption, inline_svg(svg.read_text(encoding="utf-8"), plot.name)))
+    figures = inline_figures(run_plots(folder, results), folder / "plots")
     config = folder / "config.yaml"
     page = html_text(
         results,

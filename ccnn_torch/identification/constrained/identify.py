@@ -19,8 +19,8 @@ from ccnn_torch.identification.doubts import doubts_of
 from ccnn_torch.identification.measured.kinematics import Kinematics
 from ccnn_torch.identification.measured.measured import Measured, Rows
 from ccnn_torch.identification.measured.nominal import nominal_machine
-from ccnn_torch.identification.pose_errors import before_and_after, figures
-from ccnn_torch.identification.result import Known, parameter_blocks, versions
+from ccnn_torch.identification.pose_errors import before_and_after
+from ccnn_torch.identification.result import Known, method_of, parameter_blocks, results_of
 from ccnn_torch.identification.solve import Outcome
 from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
 
@@ -123,54 +123,23 @@ def _results(
     known: Known,
     test: dict[str, Any],
 ) -> dict[str, Any]:
-    method = {
-        "test": test,
-        "seconds": outcome.seconds,
-        "machines": 1,
-        "per_leg": False,
-        "converged": float(outcome.converged.double().mean()),
-        "evaluations": outcome.evaluations,
-        "deviations": None,
-        "bound": None,
-        "coverage": None,
-        "compensation": None,
-    }
     prior = [
         p.name
         for p, sd, seen in zip(found.selection.parameters, known.sd[0], found.knowledge.identifiable[0], strict=False)
         if bool(seen) and not math.isfinite(sd)
     ]
-    notes = [*measured.notes, *([f"lm: {outcome.message}"] if outcome.message else [])]
+    notes = [f"lm: {outcome.message}"] if outcome.message else []
     if prior:
         notes.append(f"No better known than by the tolerance given: {', '.join(prior)}.")
-    return {
-        "name": config.name,
-        "seed": config.seed,
-        "mechanism": measured.mechanism.name,
-        "machines": 1,
-        "simulated": False,
-        "rows": {"train": measured.rows.joints.shape[1], "per_leg": {}, "test": measured.test.joints.shape[1]},
-        "method": "lm",
-        "parameters": parameter_blocks(measured, found.selection, outcome, known),
-        "combinations_not_identifiable": known.combinations,
-        "test": test,
-        "methods": {"lm": method},
-        "compensation": None,
-        "singular_values": known.singular_values,
-        "noise_ratio": figures({"value": known.noise}),
-        "doubts": doubts_of(
-            test,
-            float(known.noise),
-            float(known.freedom),
-            None if config.noise is None else found.after.noise,
-            config.noise is not None,
-        ),
-        "counts": [],
-        "paper": None,
-        "data_sha256": measured.data_hash,
-        "notes": notes,
-        "versions": versions(),
-    }
+    doubts = doubts_of(
+        test,
+        float(known.noise),
+        float(known.freedom),
+        None if config.noise is None else found.after.noise,
+        config.noise is not None,
+    )
+    parameters = parameter_blocks(measured, found.selection, outcome, known)
+    return results_of(config, measured, parameters, known, {"lm": method_of(outcome, test, False)}, doubts, notes)
 
 
 def _constraint(config: IdentifyConfig, rows: ConstraintRows, found: ConstraintFit) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from rich.console import Console
 from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.identification.page.constraint import BEFORE_SAYS, constraint_table, holder
 from ccnn_torch.identification.page.paper import paper_tables
+from ccnn_torch.identification.pose_errors import figure_text
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
 
@@ -104,18 +105,6 @@ def unknown_sentences(results: Block) -> list[str]:
     return [*results.get("doubts", []), *said]
 
 
-def _text(block: Block | None, key: str, scale: float = 1.0, digits: int = 3) -> str:
-    """A figure with its interval, or –."""
-    if block is None or block.get(key) is None:
-        return "–"
-    text = number_text(block[key] / scale, digits)
-    spread = block.get("spread", {}).get(key)
-    if spread is not None:
-        low, high = (number_text(v / scale, digits) for v in spread)
-        text += f" [{low}, {high}]"
-    return text
-
-
 def _with_unit(block: Block, key: str) -> str:
     if block[key] is None:
         return "unknown"
@@ -146,11 +135,11 @@ def _parameter_table(results: Block) -> Table:
         if not block["free"]:
             continue
         scale, unit = units[block["unit"]]
-        sd = _text(block, "sd", scale) if block["identifiable"] else lost
+        sd = figure_text(block, "sd", scale) if block["identifiable"] else lost
         nominal = f"{number_text(block['nominal'], 6)} {block['unit']}".removesuffix(" 1")
         cells = [f"{name} [{unit}]", nominal]
         if simulated:
-            cells += [_text(block, "error_before", scale), _text(block, "deviation", scale)]
+            cells += [figure_text(block, "error_before", scale), figure_text(block, "deviation", scale)]
         else:
             cells.append(number_text((block["value"] - block["nominal"]) / scale, 4))
         cells.append(sd)
@@ -188,7 +177,7 @@ def _method_table(results: Block) -> Table:
     for method, block in results["methods"].items():
         cells = [method + (" (leg by leg)" if block["per_leg"] else "")]
         for name, keyed in scales.items():
-            cells += [_text(block["test"][name], key, scale) for key, (scale, _) in keyed.items()]
+            cells += [figure_text(block["test"][name], key, scale) for key, (scale, _) in keyed.items()]
         cells += [str(block["machines"]), f"{100 * block['converged']:.0f} %", number_text(block["seconds"], 3)]
         rows.append(tuple(cells))
     columns = ["method"]
@@ -226,7 +215,7 @@ def _transfer_table(results: Block) -> Table | None:
         if test is not None:
             scale, unit = display_unit(test["unit"], test["before"] or 1.0)
             keys = ("before", "after", "max_before", "max_after")
-            rows.append((f"{name} [{unit}]", *(_text(test, key, scale) for key in keys)))
+            rows.append((f"{name} [{unit}]", *(figure_text(test, key, scale) for key in keys)))
     columns = ("error", "nominal links", "identified links", "maximum, nominal", "maximum, identified")
     note = (
         f"RMS distance of {count_text(block['rows']['test'], 'held-out pose')} of {block['records']} from the "
@@ -248,7 +237,7 @@ def _deviation_table(results: Block) -> Table | None:
     for method, block in results["methods"].items():
         cells = [method]
         for unit, (scale, _) in scales.items():
-            cells += [_text(block["deviations"][unit], key, scale) for key in ("largest", "mean")]
+            cells += [figure_text(block["deviations"][unit], key, scale) for key in ("largest", "mean")]
         bound = block["bound"]
         cells.append(number_text(bound["median"], 3) if bound else "–")
         cells.append(f"{number_text(bound['lowest'], 3)} to {number_text(bound['highest'], 3)}" if bound else "–")
@@ -291,7 +280,7 @@ def _compensation_table(results: Block) -> Table | None:
             *(
                 cell
                 for name, (scale, _) in scales.items()
-                for cell in (_text(block[name], "after", scale), _text(block[name], "removed", 0.01, 4))
+                for cell in (figure_text(block[name], "after", scale), figure_text(block[name], "removed", 0.01, 4))
             ),
         )
         for label, block in found.items()
@@ -312,7 +301,7 @@ def _count_table(results: Block) -> Table | None:
     for entry in results["counts"]:
         cells = [str(entry["poses"])]
         for method in methods:
-            cells.append(_text(entry["methods"][method], "position", 1e-3))
+            cells.append(figure_text(entry["methods"][method], "position", 1e-3))
         rows.append(tuple(cells))
     note = "RMS position error [mm] of the machines under exact commands, by the number of poses measured."
     return Table("Measurements needed", ("poses", *methods), tuple(rows), note)

@@ -73,6 +73,11 @@ class Fit:
     message: str
 
 
+def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
+    """The progress of one of `count` parts as a share of all; numbered from 0."""
+    return None if progress is None else lambda done: progress((number + done) / count)
+
+
 class Solver(Protocol):
     """A way to minimise a problem; all its randomness comes from the seed."""
 

@@ -9,16 +9,13 @@ parameters:
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import Any
-
-from ruamel.yaml import YAML
 
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
-from ccnn_torch.files.yaml_file import parse_yaml
+from ccnn_torch.files.yaml_file import dump_yaml, parse_yaml
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.units import LARGEST
 
@@ -108,10 +105,4 @@ def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float]) -> str:
             for p in mechanism.geometry
         },
     }
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.width = 120
-    setattr(yaml, "sort_base_mapping_type_on_output", False)  # noqa: B010 - ruamel declares its type as None
-    text = io.StringIO()
-    yaml.dump(tree, text)
-    return text.getvalue()
+    return dump_yaml(tree, width=120)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import torch
-from ruamel.yaml import YAML
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import dump_yaml
 from ccnn_torch.mechanisms.machines.link_frames import compose
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
@@ -52,13 +51,7 @@ def dh_text(arm: SerialArm) -> str:
     }
     if arm.orientation == "none" and arm.recipe["keys"]["tool_offset"] is not None:
         tree["tool_offset"] = "unknown" if arm.tool_per else values[-6:-3]
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.width = 200
-    setattr(yaml, "sort_base_mapping_type_on_output", False)  # noqa: B010 - ruamel declares its type as None
-    text = io.StringIO()
-    yaml.dump(tree, text)
-    return text.getvalue()
+    return dump_yaml(tree, width=200)
 
 
 def urdf_text(arm: SerialArm) -> str:
