@@ -38,11 +38,7 @@ class Block:
 
 
 def blocks_of(config: RunConfig, folder: RunFolder) -> list[Block]:
-    """The blocks of a run, in the order of their seeds.
-
-    Raises:
-        InputError: `methods=auto` chooses once for all repeats.
-    """
+    """The blocks of a run, in the order of their seeds."""
     if config.methods == ["auto"]:
         raise InputError(
             "methods=auto chooses a method for all repeats together; name the methods, or write block=null"
@@ -75,9 +71,6 @@ def write_blocks(
 
     Args:
         again: resumes a block, to write its model files.
-
-    Raises:
-        InputError: the blocks chose different methods or geometry.
     """
     found = [read_json(block.folder.results) for block in blocks]
     for key, of in (("methods", _methods), ("geometry", _geometry)):

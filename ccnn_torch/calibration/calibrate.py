@@ -220,9 +220,6 @@ def makers(config: RunConfig, default: str = "ccnn") -> dict[str, Callable[[], L
 
     Args:
         default: the method where the config names none.
-
-    Raises:
-        InputError: a method that was named is not to be had.
     """
     found: dict[str, Callable[[], Learner] | None] = {}
     for method in method_names(config, default):

@@ -73,9 +73,6 @@ def joint_errors(
 
     Returns:
         `{"all": {"mse": S, "mae": S, "sse": S}, JOINT: {…}}` with S a spread.
-
-    Raises:
-        InputError: the shapes do not fit together, or a repeat has no row.
     """
     error, weight = _rows(_array(predicted) - _array(measured), weights, joints)
     total = weight.sum(1)
@@ -106,9 +103,6 @@ def constant_errors(
         train, test: measured deviations, `r x s x n` and `r x s' x n` [the joint's SI unit].
         train_weights, test_weights: `r x s`, `r x s'` [1], or None.
         joints: `n` coordinates.
-
-    Raises:
-        InputError: as `joint_errors`.
     """
     values, weight = _rows(_array(train), train_weights, joints)
     mean = (values * weight[..., None]).sum(1, keepdims=True) / weight.sum(1)[:, None, None]
@@ -129,9 +123,6 @@ def before_block(deviations: ArrayLike, weights: ArrayLike | None, joints: Seque
     Returns:
         `{JOINT: {"mean", "max", "max_abs", "spread": {"mean": S, "max": S, "max_abs": S}}}`; the plain numbers are the
         medians over the repeats.
-
-    Raises:
-        InputError: as `joint_errors`.
     """
     values, weight = _rows(_array(deviations), weights, joints)
     there = weight[..., None] > 0
@@ -166,9 +157,6 @@ def floor_block(
 
     Returns:
         `{"realised": {"all": {"mse": S}, JOINT: …}, "expected": …, "with_unlearnable": … or null}`.
-
-    Raises:
-        InputError: as `joint_errors`.
     """
     drawn = _array(noise)
     repeats = drawn.shape[0] if drawn.ndim == 3 else 1
@@ -221,9 +209,6 @@ def pose_block(
     Returns:
         `{"position": {"unit": "m", "before": {"rms": S, "max": S}, "after": …}, "rotation": {…} or null}`, and `energy`
         where asked for.
-
-    Raises:
-        InputError: the shapes do not fit together, or a repeat has no row.
     """
     errors = {"before": before, "after": after} | {name: error for name, error in beside.items() if error is not None}
 

@@ -88,11 +88,7 @@ class Promise:
 
 
 def as_matrix(values: ArrayLike, wanted: tuple[Coordinate, ...], what: str) -> Array:
-    """Rows of what a caller gives, `... x len(wanted)` [SI].
-
-    Raises:
-        InputError: they are no numbers, or the last dimension is wrong.
-    """
+    """Rows of what a caller gives, `... x len(wanted)` [SI]."""
     names = ", ".join(c.header for c in wanted)
     try:
         array = np.asarray(values, dtype=np.float64)

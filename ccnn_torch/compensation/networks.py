@@ -54,11 +54,7 @@ def register_network(kind: str, network: type[DescribedNetwork]) -> None:
 
 
 def describe_network(network: nn.Module) -> dict[str, Any]:
-    """The network's own description.
-
-    Raises:
-        InputError: it has none, or one of an unknown kind.
-    """
+    """The network's own description."""
     if not callable(getattr(network, "describe", None)):
         raise InputError(
             f"the network {type(network).__name__} cannot be stored: give it describe() and from_description(), "

@@ -72,11 +72,7 @@ class Identification:
         return self.measured.mechanism.with_nominal(outcome.values[machine])
 
     def save(self, folder: str | Path) -> None:
-        """Write what `ccnn identify` writes into a folder, which is made; a DataFrame's rows as `records.csv`.
-
-        Raises:
-            InputError: a class of a mechanism is not defined in a file, so it cannot be built again.
-        """
+        """Write what `ccnn identify` writes into a folder, which is made; a DataFrame's rows as `records.csv`."""
         from ccnn_torch.identification.outputs import write_outputs
 
         folder = Path(folder)
@@ -97,11 +93,7 @@ class Identification:
 
 
 def prepare(config: IdentifyConfig, given: Given | None = None) -> tuple[Mechanism, Measured]:
-    """Mechanism and rows of a config; the rows of `given` where Python has them.
-
-    Raises:
-        InputError: the mechanism or the data cannot be used.
-    """
+    """Mechanism and rows of a config; the rows of `given` where Python has them."""
     mechanism = nominal_machine(config)
     if config.frame.base or config.frame.tool:
         mechanism = Framed(mechanism, base=config.frame.base, tool=config.frame.tool)
@@ -151,11 +143,7 @@ def identify(
 
 
 def _bootstrap(config: IdentifyConfig, measured: Measured, outcomes: dict[str, Outcome]) -> Tensor | None:
-    """Standard deviations of the first machine's parameters over resampled fits, `k` [SI]; None where not asked for.
-
-    Raises:
-        InputError: of a slow method: hundreds of its fits would take hours.
-    """
+    """Standard deviations of the first machine's parameters over resampled fits, `k` [SI]; None where not asked for."""
     if config.bootstrap == 0:
         return None
     method = config.methods[0]

@@ -81,11 +81,7 @@ class Outcome:
 
 
 def choice_of(config: IdentifyConfig, mechanism: Mechanism) -> ParameterChoice:
-    """The parameters of a config; its priors in SI.
-
-    Raises:
-        InputError: a prior is no size of its parameter, or fits none.
-    """
+    """The parameters of a config; its priors in SI."""
     about = config.parameters
     prior = prior_sizes(about.prior, mechanism.geometry, "parameters.prior")
     return ParameterChoice(free=about.free, fixed=about.fixed, tied=about.tied, prior=prior)
@@ -106,9 +102,6 @@ def pieces_of(
         machines: which machines.
         near: geometry at which the noise of the pose is carried over to the residual, `r x K` [SI]; where the search
             begins when None. Near singular poses the difference matters.
-
-    Raises:
-        InputError: the rows do not fit the mechanism or are too few, or legs are not apart.
     """
     if not apart:
         return [Piece(_problem(measured, config, measured.rows.of(machines), machines, False, near))]
@@ -200,11 +193,7 @@ def machines_of(method: str, measured: Measured, config: IdentifyConfig) -> Tens
 
 
 def solver_of(method: str, config: IdentifyConfig) -> Solver:
-    """The solver of a method with its settings.
-
-    Raises:
-        InputError: a setting that it does not have.
-    """
+    """The solver of a method with its settings."""
     settings = dict(config.settings.get(base_method(method), {}))
     if base_method(method) == "lm":
         settings = {"starts": config.starts, "loss": config.robust or "squared"} | settings
@@ -212,11 +201,7 @@ def solver_of(method: str, config: IdentifyConfig) -> Solver:
 
 
 def run_method(method: str, measured: Measured, config: IdentifyConfig, progress: Progress | None = None) -> Outcome:
-    """Run a method.
-
-    Raises:
-        InputError: see `pieces_of`, `solver_of`.
-    """
+    """Run a method."""
     machines = machines_of(method, measured, config)
     solver, selection = solver_of(method, config), select(measured, config)
     begun = time.perf_counter()

@@ -31,11 +31,7 @@ def save_outcome(path: Path, outcome: Outcome, facts: Mapping[str, Any]) -> None
 
 
 def load_outcome(path: Path) -> Outcome:
-    """The outcome in a file.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """The outcome in a file."""
     tensors, about = load_checkpoint(path)
     return Outcome(
         tensors["machines"],

@@ -28,11 +28,7 @@ class Elsewhere:
 
 
 def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> Elsewhere | None:
-    """The records of `transfer`, split as the others are; None where there are none.
-
-    Raises:
-        InputError: they cannot be used, or the mechanism has no frames to be placed anew by.
-    """
+    """The records of `transfer`, split as the others are; None where there are none."""
     if config.transfer is None:
         return None
     if not isinstance(mechanism, SerialArm) or not mechanism.unknown_frames:

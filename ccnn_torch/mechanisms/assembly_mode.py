@@ -65,9 +65,6 @@ def find_jump(mechanism: Mechanism, seed: int = 0) -> Jump | None:
     Args:
         mechanism: one whose `solve_inverse` is the numeric default.
         seed: of the poses.
-
-    Raises:
-        InputError: its sampling box has hardly any reachable pose.
     """
     poses = mechanism.sample_workspace(_POSES, torch.Generator().manual_seed(seed))
     direct = mechanism.solve_inverse(poses)

@@ -52,9 +52,6 @@ def central_slope(
         step: of each coordinate, `d`.
         places: their names.
         bounds: what they cannot pass, `d` each.
-
-    Raises:
-        InputError: a row has a pose, and none on either side of it.
     """
     ahead = torch.diag(step).reshape(-1, *[1] * (point.dim() - 1), len(step))
     if bounds is not None:

@@ -30,10 +30,6 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
     Args:
         spec: `path/to/file.py:Name`, for the sentences.
         make: makes it.
-
-    Raises:
-        InputError: it is no mechanism, its code fails (the sentence names the line), or its names, shapes or values are
-            not what the protocol asks for.
     """
     try:
         mechanism = make()

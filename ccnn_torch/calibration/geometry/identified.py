@@ -88,9 +88,6 @@ def fit_machine(mechanism: Mechanism, records: Records, splits: list[Split], ide
     Args:
         splits: one a repeat; only rows that are not held out are used.
         identify: whether the geometry is to be a part of the compensator.
-
-    Raises:
-        InputError: the geometry cannot be identified from such records.
     """
     rows = pad_rows([Dataset.part(split, "fit") for split in splits])
     weights = torch.zeros(len(splits), len(records.joints), dtype=torch.float64)

@@ -129,9 +129,6 @@ def fit_effects(
 
     Returns:
         The effects; the parameters that go with them, `r x 1 x k`, or None where these are nominal; notes.
-
-    Raises:
-        InputError: the file does not fit the machine or the covariates, or frames are per group of rows.
     """
     if parameters is not None and parameters.shape[1] > 1:
         raise InputError(

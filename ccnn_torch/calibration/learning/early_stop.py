@@ -171,9 +171,6 @@ def fold_dataset(dataset: Dataset, kind: str, folds: int) -> Dataset:
     Args:
         kind: of the split, see `fold_splits`.
         folds: 1 leaves the dataset as it is.
-
-    Raises:
-        InputError: there are too few rows or groups for so many folds.
     """
     if folds == 1:
         return dataset

@@ -61,9 +61,6 @@ def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -
 
     Returns:
         The path of `report.html`.
-
-    Raises:
-        InputError: `results.json` is not there or damaged, or another file is damaged.
     """
     folder = Path(folder)
     results = read_json(folder / "results.json") if results is None else results
@@ -114,9 +111,6 @@ def make_picture(folder: str | Path, path: str | Path, joint: str | None = None)
 
     Returns:
         The caption.
-
-    Raises:
-        InputError: the arrays are not there or damaged, or there is no such joint.
     """
     arrays = load_arrays(folder)
     names = [j.name for j in arrays.joints]

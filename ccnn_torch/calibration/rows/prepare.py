@@ -107,9 +107,6 @@ def prepare(config: RunConfig, given: Given | None = None) -> Prepared:
 
     Args:
         given: records that Python has, in place of the config's file.
-
-    Raises:
-        InputError: the config names no data, or the data cannot be used; the sentence names the change needed.
     """
     seeds = [config.seed + k for k in range(config.repeats)]
     if config.case == "realistic":

@@ -51,9 +51,6 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
 
     Args:
         fields: `mechanism` (its `describe()`), `metrics`, `data_sha256`, `seed`.
-
-    Raises:
-        InputError: a field is missing, or is no JSON.
     """
     missing = [key for key in _REQUIRED if key not in fields]
     if missing:
@@ -124,11 +121,7 @@ def coordinates(entries: list[dict[str, str]]) -> tuple[Coordinate, ...]:
 
 
 def to_json(value: Mapping[str, Any], indent: int | None = None) -> str:
-    """Sorted JSON without NaN.
-
-    Raises:
-        InputError: something in it has no form in JSON.
-    """
+    """Sorted JSON without NaN."""
     try:
         return json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False, indent=indent)
     except (TypeError, ValueError) as problem:

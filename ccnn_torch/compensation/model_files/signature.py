@@ -52,11 +52,7 @@ def new_key_pair(name: str | Path) -> tuple[Path, Path]:
 
 
 def sign_content(model: bytes, card: bytes, key: str | Path) -> bytes:
-    """The text of a signature file: of a model's bytes and its card's, by the private key in a PEM file.
-
-    Raises:
-        InputError: the key cannot be read, or is no private Ed25519 key.
-    """
+    """The text of a signature file: of a model's bytes and its card's, by the private key in a PEM file."""
     _, ed25519, serialization = _cryptography()
     content = _read_key(key)
     try:

@@ -79,9 +79,6 @@ def fit_constraint(
     Priors keep the links near nominal; the tool's offset, which no maker knows, is fitted first, with nominal links.
     Where the config names no noise, it is that of the residuals, in five rounds; for the intervals it is raised by the
     equations that the fit used up.
-
-    Raises:
-        InputError: fewer equations than parameters, or a key that is no size.
     """
     build = _builder(config, mechanism, rows)
     names = [p.name for p in mechanism.geometry]

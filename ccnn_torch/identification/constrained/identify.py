@@ -38,9 +38,6 @@ def identify_by_constraint(
 
     Returns:
         Rows, the outcome of lm, content of `identified.json`, tensors behind the pictures.
-
-    Raises:
-        InputError: the mechanism or the records cannot be used, or the rows are too few.
     """
     mechanism, notes = _machine(config)
     rows = read_constraint(config, mechanism, given)

@@ -57,12 +57,7 @@ class ConstraintRows:
 
 
 def read_constraint(config: IdentifyConfig, mechanism: Mechanism, given: Given | None = None) -> ConstraintRows:
-    """Read, select and split the records of a config with a constraint.
-
-    Raises:
-        InputError: a column is missing, no row takes part, the split is not possible, or a held-out row's placement
-            or socket has no row to identify from.
-    """
+    """Read, select and split the records of a config with a constraint."""
     about = config.constraint
     assert about is not None and config.records is not None
     source = with_test_file(config.records if given is None else given, config.split)

@@ -56,11 +56,7 @@ class Kinematics:
 
 
 def make_kinematics(mechanism: Mechanism, built: bool) -> Kinematics:
-    """Check that the mechanism knows how it is built.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Check that the mechanism knows how it is built."""
     if built and not (hasattr(mechanism, "as_built") and hasattr(mechanism, "pose_near")):
         raise InputError(
             f"simulate.as_built: {mechanism.name} never leaves its nominal motion, so that there is nothing to "

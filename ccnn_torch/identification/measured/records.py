@@ -18,11 +18,7 @@ __all__ = ["from_records", "read_records", "split_records"]
 
 
 def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | None = None) -> Measured:
-    """Load and split the records of a config, or those that Python has.
-
-    Raises:
-        InputError: the records cannot be used, or the arm has frames per group of rows, which are no geometry.
-    """
+    """Load and split the records of a config, or those that Python has."""
     assert config.records is not None
     source = with_test_file(config.records if given is None else given, config.split)
     records, mechanism = read_records(config, source, mechanism)
@@ -48,11 +44,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
 
 
 def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tuple[Records, Mechanism]:
-    """Records that fit a mechanism, and the mechanism as it was measured there (with or without orientation).
-
-    Raises:
-        InputError: the records cannot be used.
-    """
+    """Records that fit a mechanism, and the mechanism as it was measured there (with or without orientation)."""
     records = load_records(source, mechanism, [], learns=False, columns=config.columns)
     if isinstance(mechanism, SerialArm):
         if mechanism.frame_per or mechanism.tool_per:

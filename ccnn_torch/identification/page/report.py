@@ -43,9 +43,6 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
 
     Args:
         folder: with arrays, and `identified.json`, which is read when `results` is None.
-
-    Raises:
-        InputError: a file is not there or damaged.
     """
     # Loads matplotlib, which only a report waits for.
     from ccnn_torch.identification.page.figures import identified_plots

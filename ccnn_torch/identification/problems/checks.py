@@ -11,11 +11,7 @@ __all__ = ["check_equations"]
 
 
 def check_equations(problem: Problem) -> None:
-    """Refuse a problem with fewer equations than parameters; a prior counts as one equation.
-
-    Raises:
-        InputError: with the numbers, and how many rows would do.
-    """
+    """Refuse a problem with fewer equations than parameters; a prior counts as one equation."""
     rows = int((problem.weights > 0).sum(-1).min())
     channels, k = len(problem.channels), len(problem.parameters)
     held = int(torch.isfinite(problem.prior_sd).sum())

@@ -35,10 +35,6 @@ def gather_rows(
         pose: `s x p` or `r x s x p` [SI].
         weights: `s` or `r x s` [1]; all 1 when None.
         start: `K` or `r x K` [SI], or None.
-
-    Raises:
-        InputError: columns that the mechanism does not have, numbers of rows or machines that do not fit together, a
-            negative weight, or a value that is not a number in a row whose weight is not 0.
     """
     for what, table, coordinates in (("joints", joints, mechanism.joints), ("pose", pose, mechanism.pose)):
         if table.dim() not in (2, 3) or table.shape[-1] != len(coordinates):
@@ -84,9 +80,6 @@ def covariance(
         noise: standard deviation, one for all or one for each coordinate [SI], or a covariance, `… x d x d`.
         coordinates: the `d` of them.
         what: what it is the noise of, for the message.
-
-    Raises:
-        InputError: another number of values, or one that is negative.
     """
     if noise is None:
         return None
@@ -103,11 +96,7 @@ def covariance(
 
 
 def inverse_root(matrix: Tensor, used: Tensor) -> Tensor:
-    """L⁻¹ of covariances L Lᵀ, `r x s x d x d`; the identity in rows that are not `used` (`r x s`, bool).
-
-    Raises:
-        InputError: a covariance is singular.
-    """
+    """L⁻¹ of covariances L Lᵀ, `r x s x d x d`; the identity in rows that are not `used` (`r x s`, bool)."""
     d = matrix.shape[-1]
     unit = torch.eye(d, dtype=matrix.dtype, device=matrix.device)
     factor, info = torch.linalg.cholesky_ex(torch.where(used[..., None, None], matrix, unit))
@@ -139,9 +128,6 @@ def check_finite(
         given: what the kinematics were solved for, `r x s x …`, with its coordinates.
         mechanism: its name.
         channels: names of the `c` columns.
-
-    Raises:
-        InputError: there is one: the pose is out of reach.
     """
     lost = torch.nonzero(~torch.isfinite(residual) & used[..., None])
     if not len(lost):

@@ -59,10 +59,6 @@ def whitened_problem(
         what: what the entries are, for messages.
         noise_known: whether the covariance is the noise itself or only its proportions.
         per_leg: divide by the diagonal alone, and leave out entries that no free parameter moves.
-
-    Raises:
-        InputError: a singular covariance, a prior without known noise, no entry that depends on a free parameter, or
-            fewer equations than parameters.
     """
     if not noise_known and bool(torch.isfinite(selection.prior_sd).any()):
         raise InputError("parameters.prior: a prior can be weighed against the rows only if their noise is given")

@@ -15,11 +15,7 @@ __all__ = ["count_study"]
 
 
 def count_study(config: IdentifyConfig, mechanism: Mechanism) -> list[dict[str, Any]]:
-    """For each number of poses and each quick method: pose error under its exact commands, and parameter deviations.
-
-    Raises:
-        InputError: as `simulate` and `run_method`; too few poses among them.
-    """
+    """For each number of poses and each quick method: pose error under its exact commands, and parameter deviations."""
     if config.simulate is None:
         return []
     answer = []

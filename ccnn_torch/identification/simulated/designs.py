@@ -44,9 +44,6 @@ def plan_places(
     """The most informative places for all parameters, `s x .`, and for each leg alone (`planned_per_leg`), by leg.
 
     Chosen at the nominal geometry, since no better one is known before measuring.
-
-    Raises:
-        InputError: too few poses, the poses cannot be dealt to the legs, or the legs are not apart.
     """
     about, mechanism = config.simulate, places.mechanism
     assert about is not None

@@ -33,9 +33,6 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
         config: with a section `simulate`.
         mechanism: with its nominal parameters.
         poses: how many to measure of each machine, in place of `simulate.poses`.
-
-    Raises:
-        InputError: an error, a noise or a box names something that the mechanism lacks, or too few poses are in reach.
     """
     about = config.simulate
     assert about is not None

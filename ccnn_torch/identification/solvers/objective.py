@@ -114,11 +114,7 @@ class Objective:
 
 
 def make_objective(problem: Problem) -> Objective:
-    """The objective of a problem.
-
-    Raises:
-        InputError: a machine has no row that counts, or its start leads to a residual that is not finite.
-    """
+    """The objective of a problem."""
     r = problem.start.shape[0]
     weights = problem.weights.expand(r, -1)
     counts = weights > 0

@@ -28,11 +28,7 @@ class MechanismFile:
     """A mechanism file; `recipe` builds the mechanism, `values` and `nominal` are its parameters by name."""
 
     def __init__(self, path: str, content: Mapping[str, Any]) -> None:
-        """Check the form; names and units are checked against the mechanism by `parameters_of`.
-
-        Raises:
-            InputError: names the file and the key.
-        """
+        """Check the form; names and units are checked against the mechanism by `parameters_of`."""
         self.path = path
         spec, keys, parameters = (content.get(k) for k in ("mechanism", "keys", "parameters"))
         if not isinstance(spec, str) or not isinstance(keys, Mapping) or not isinstance(parameters, Mapping):
@@ -41,11 +37,7 @@ class MechanismFile:
         self._entries: Mapping[str, Any] = parameters
 
     def parameters_of(self, mechanism: Mechanism, what: str) -> dict[str, float]:
-        """Values by name, `what` being "value" or "nominal" [SI].
-
-        Raises:
-            InputError: a parameter is missing, unknown, in another unit, or no number; names it.
-        """
+        """Values by name, `what` being "value" or "nominal" [SI]."""
         known = {p.name: p.unit for p in mechanism.geometry}
         wrong = sorted(set(known) ^ set(self._entries))
         if wrong:
@@ -71,9 +63,6 @@ def read_mechanism_file(path: str, content: bytes | None = None) -> MechanismFil
     Args:
         path: of the file.
         content: its bytes, where they were read already.
-
-    Raises:
-        InputError: it has the key `mechanism` and lacks another one.
     """
     try:
         text = read_text(path, CONFIG_LIMIT) if content is None else content.decode("utf-8")
@@ -92,9 +81,6 @@ def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float]) -> str:
     Args:
         mechanism: with the identified parameters as its nominal ones.
         nominal: what was there before, by name [SI].
-
-    Raises:
-        InputError: the mechanism's class is not defined in a file.
     """
     about = mechanism.describe()
     tree = {

@@ -27,9 +27,6 @@ def dh_text(arm: SerialArm) -> str:
     """The arm's nominal parameters as a DH file in m and rad; `read_dh_file` gives the same floats back.
 
     Frames that are per group of rows stay unknown, as they are no one transform.
-
-    Raises:
-        InputError: the arm came from a URDF, whose links are no DH table.
     """
     if arm.convention not in _CONVENTIONS:
         raise InputError(f"arm '{arm.name}' is described by a URDF and has no Denavit-Hartenberg table; write a URDF")

@@ -26,9 +26,6 @@ def inscribed_circle(crank: Tensor, coupler: Tensor, foot: Tensor) -> tuple[Tens
 
     Returns:
         Centre, `2` [m], and radius, `` [m].
-
-    Raises:
-        InputError: no pose is reached with the elbows outward.
     """
     edge = _couplers_in_line(crank, coupler, foot)
     size = (crank + coupler).amin()

@@ -67,9 +67,6 @@ class Calls:
 
         Parameters beyond their bounds are taken at the bound; rows that are not finite are returned as NaN without a
         call.
-
-        Raises:
-            InputError: the callable fails or gives another shape.
         """
         covariates = [
             conditions.get(c.name, torch.tensor(c.usual, dtype=torch.float64))[..., None] for c in self._conditions
@@ -109,9 +106,6 @@ class Calls:
 
     def ask(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """The callable itself: rows of commands, covariates and parameters side by side -> pose, NaN where it has none.
-
-        Raises:
-            InputError: it fails, or gives another shape or no numbers.
         """
         simulator, n = self.simulator, len(self.simulator.joints)
         names = [c.name for c in self._conditions]

@@ -27,9 +27,6 @@ def try_simulator(simulator: Simulator, calls: Calls, home: Tensor, joints: Tens
         home: a configuration with a pose, `n` [SI].
         joints: configurations, `s x n` [SI].
         nominal: parameters, `k` [SI].
-
-    Raises:
-        InputError: the answers differ, or no joint moves the pose.
     """
     some = torch.cat([joints[:_ROWS], home[None]])
     usual = [c.usual for c in simulator.covariates if isinstance(c, Condition)]
