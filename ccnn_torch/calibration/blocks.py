@@ -67,11 +67,7 @@ def blocks_of(config: RunConfig, folder: RunFolder) -> list[Block]:
 def write_blocks(
     config: RunConfig, folder: RunFolder, blocks: Sequence[Block], again: Callable[[Block], object]
 ) -> None:
-    """Put the figures of finished blocks together, and export the best repeat of all.
-
-    Args:
-        again: resumes a block, to write its model files.
-    """
+    """Put the figures of finished blocks together, and export the best repeat of all."""
     found = [read_json(block.folder.results) for block in blocks]
     for key, of in (("methods", _methods), ("geometry", _geometry)):
         if len({of(results) for results in found}) > 1:

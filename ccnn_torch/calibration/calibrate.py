@@ -110,7 +110,6 @@ class Calibration:
 
         Args:
             method: the best one when None.
-            name: of the files.
             forms: which files; each takes a few seconds to export and check.
 
         Returns:
@@ -217,9 +216,6 @@ def makers(config: RunConfig, default: str = "ccnn") -> dict[str, Callable[[], L
 
     A user's `path/to/file.py:Name` is called `Name` there. None marks a learner that `methods=all` or `auto`
     asks for and this version does not have.
-
-    Args:
-        default: the method where the config names none.
     """
     found: dict[str, Callable[[], Learner] | None] = {}
     for method in method_names(config, default):

@@ -69,7 +69,6 @@ def joint_errors(
         predicted: deviations by the model, `r x s x n` [the joint's SI unit].
         measured: deviations by measurement, the same shape; what has no leading `r` serves all repeats.
         weights: row weights, `r x s` [1]; rows of weight 0 are ignored (padding). None = every row counts once.
-        joints: `n` coordinates.
 
     Returns:
         `{"all": {"mse": S, "mae": S, "sse": S}, JOINT: {…}}` with S a spread.
@@ -102,7 +101,6 @@ def constant_errors(
     Args:
         train, test: measured deviations, `r x s x n` and `r x s' x n` [the joint's SI unit].
         train_weights, test_weights: `r x s`, `r x s'` [1], or None.
-        joints: `n` coordinates.
     """
     values, weight = _rows(_array(train), train_weights, joints)
     mean = (values * weight[..., None]).sum(1, keepdims=True) / weight.sum(1)[:, None, None]
@@ -118,7 +116,6 @@ def before_block(deviations: ArrayLike, weights: ArrayLike | None, joints: Seque
     Args:
         deviations: pseudoerrors, `r x s x n` [the joint's SI unit].
         weights: `r x s` [1] or None.
-        joints: `n` coordinates.
 
     Returns:
         `{JOINT: {"mean", "max", "max_abs", "spread": {"mean": S, "max": S, "max_abs": S}}}`; the plain numbers are the
@@ -150,7 +147,6 @@ def floor_block(
     Args:
         noise: noise in the test rows, `r x s x n` [the joint's SI unit].
         weights: `r x s` [1] or None.
-        joints: `n` coordinates.
         variance: variance of the noise, `n` [the square of it].
         unlearnable: the part of the signal that the inputs do not determine, like `noise` (the chirp of eq. 19), or
             None. It counts as signal in `realised` and as noise in `with_unlearnable`.
@@ -175,10 +171,6 @@ def floor_block(
 
 def ratio_to_floor(errors: Mapping[str, Any] | None, floor: Mapping[str, Any] | None) -> Block | None:
     """Ratio of the `all` mse to the realised floor, repeat by repeat.
-
-    Args:
-        errors: a `joint_errors` block, or None (the method failed).
-        floor: a `floor_block`, or None (unknown).
 
     Returns:
         A spread; None where one of the two is unknown or has no `all`.

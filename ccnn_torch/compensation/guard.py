@@ -109,10 +109,8 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
     that are no number count as the middle of the domain, infinite ones as its edge.
 
     Args:
-        found: outputs by name; others than these are left out.
         joints: `s x n` [SI], anything.
         covariates: `s x m` [SI], anything; None without any.
-        promise: of the card.
 
     Returns:
         `command`, `deviation`, `ideal`, and `deviation_sd` where the promise has one, `s x n` [SI], all finite;

@@ -99,7 +99,6 @@ def pieces_of(
 
     Args:
         apart: one for each leg, from that leg's rows where it has its own; else one for all.
-        machines: which machines.
         near: geometry at which the noise of the pose is carried over to the residual, `r x K` [SI]; where the search
             begins when None. Near singular poses the difference matters.
     """

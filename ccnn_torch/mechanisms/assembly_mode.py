@@ -61,10 +61,6 @@ def find_jump(mechanism: Mechanism, seed: int = 0) -> Jump | None:
 
     The walk goes along a straight line of pose coordinates, each step from the joints of the last. A line that leaves
     the workspace or comes near a singularity proves nothing and is left out.
-
-    Args:
-        mechanism: one whose `solve_inverse` is the numeric default.
-        seed: of the poses.
     """
     poses = mechanism.sample_workspace(_POSES, torch.Generator().manual_seed(seed))
     direct = mechanism.solve_inverse(poses)

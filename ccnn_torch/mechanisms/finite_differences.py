@@ -50,7 +50,6 @@ def central_slope(
         pose: `... x d` -> `... x p`, with further leading dims.
         point: `... x d`.
         step: of each coordinate, `d`.
-        places: their names.
         bounds: what they cannot pass, `d` each.
     """
     ahead = torch.diag(step).reshape(-1, *[1] * (point.dim() - 1), len(step))

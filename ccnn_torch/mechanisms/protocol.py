@@ -26,10 +26,6 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
 
     Home joints that are only near those of the home pose are settled first; numeric inverse kinematics are then held
     against a walk through the sampling box, which must not end on another branch.
-
-    Args:
-        spec: `path/to/file.py:Name`, for the sentences.
-        make: makes it.
     """
     try:
         mechanism = make()

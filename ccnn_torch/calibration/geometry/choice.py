@@ -65,7 +65,6 @@ def choose_geometry(
 
     Args:
         split, kind: of the repeat; `kind` says how folds are made.
-        settings: of `joint_deviations`.
     """
     name = mechanism.name
     if not mechanism.geometry:

@@ -71,7 +71,6 @@ class Fitted:
             joints: commanded, `s x n` [SI].
             total: deviations of the nominal machine, `[r x] s x n` [SI].
             splits: one a repeat; the rows that are not held out bound the correction.
-            margin: of the compensator's domain.
         """
         assert self.geometry is not None
         nominal = mechanism.nominal.expand_as(self.geometry) if self.parameters is None else self.parameters

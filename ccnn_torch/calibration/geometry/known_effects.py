@@ -124,7 +124,6 @@ def fit_effects(
         total: deviations of that machine, `[r x] s x n` [SI].
         usable: rows fit to learn from, `[r x] s` bool.
         identify: whether all parameters are to be identified beside the effects.
-        margin: of the compensator's domain.
         settings: rotation weight and damping of the pseudoerror.
 
     Returns:

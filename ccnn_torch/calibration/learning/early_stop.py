@@ -104,7 +104,6 @@ def choose(
     """Train with rows held out. All folds of all repeats are repeats of one training.
 
     Args:
-        make: makes a fresh learner.
         folder: folder of the checkpoint; None = none is written.
         budget: seconds inside the learner after which no further step begins.
 

@@ -95,10 +95,6 @@ def fit_method(
 ) -> Fitted:
     """Train one method in one or two phases, each with its own checkpoint.
 
-    Args:
-        make: makes a fresh learner.
-        folder: folder of the checkpoints; None = none are written.
-
     Raises:
         InputError: too few rows.
         MethodFailedError: the learner cannot go on, or gives numbers that are not finite.

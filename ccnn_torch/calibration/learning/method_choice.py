@@ -120,7 +120,6 @@ def compare(
         makers: what makes the learner of each method, in the order to try them; None = this version has none.
         budget: seconds inside the learners, for all methods together.
         folder: where checkpoints and decisions go; None = nowhere.
-        watch: gives the callbacks of a method.
 
     Raises:
         InputError: `auto.json` is damaged.

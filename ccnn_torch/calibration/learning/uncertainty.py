@@ -73,11 +73,7 @@ def _quantile(values: Tensor, there: Tensor) -> Tensor:
 
 
 def inside_domain(dataset: Dataset, margin: float) -> Tensor:
-    """Which rows lie in the domain of the compensator that the training rows of a repeat give, `r x s` bool.
-
-    Args:
-        margin: as `compensation.margin`.
-    """
+    """Which rows lie in the domain of the compensator that the training rows of a repeat give, `r x s` bool."""
     rows = dataset.usable_rows("fit")
     inside = []
     for inputs, index, weights in zip(dataset.inputs, rows.index, rows.weights, strict=True):

@@ -45,7 +45,6 @@ def network_plot(masks: Sequence[Mask], weights: Sequence[Array], method: str, j
     Args:
         masks: layer by layer, `out x in`.
         weights: layer by layer, `out x (in + 1)`, last column = bias.
-        method: the learner's name, for the file name.
         joints: names of the outputs, `n`.
     """
     alive = alive_nodes(masks)

@@ -27,14 +27,7 @@ _LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "mod
 def html_text(
     results: Mapping[str, Any], figures: Sequence[InlineFigure] = (), config: str = "", files: Sequence[str] = ()
 ) -> str:
-    """The report of a run.
-
-    Args:
-        results: as in `results.json`.
-        figures: in reading order.
-        config: the resolved configuration, as text.
-        files: names of files in the run folder to link to.
-    """
+    """The report of a run."""
     optional: dict[str, Any] = {"case": None, "best_method": None, "notes": [], "versions": {}}
     return page_text(
         "report",
@@ -56,7 +49,6 @@ def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -
     files give the same report, so it can be written again at any time.
 
     Args:
-        folder: the run folder.
         results: the content of its `results.json`, which is read when None.
 
     Returns:
@@ -105,7 +97,6 @@ def make_picture(folder: str | Path, path: str | Path, joint: str | None = None)
     """Draw the one wide picture of a run: joint error and workspace, before and after.
 
     Args:
-        folder: a run folder with `arrays.safetensors`.
         path: where to write; `.png` and `.svg` are both written.
         joint: name of the joint shown; by default the one with the largest error.
 

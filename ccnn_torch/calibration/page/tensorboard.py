@@ -86,7 +86,6 @@ class TensorBoardCallback:
         """Write the metrics of one step.
 
         Args:
-            step: number of the step, from 1.
             metrics: by name, each `r`, `r x k` or a plain number.
         """
         if self._writer is None:

@@ -73,9 +73,6 @@ def command_graph(
     """Both directions as one graph.
 
     Args:
-        compensator: in double.
-        opset: of ONNX.
-        metadata: JSON to carry in the file.
         outputs: which ones, in order: those of `Solution`, or `deviation`, `guard`, `back_deviation`, `back_guard`.
         dtype: in which the graph computes; single precision is for one row.
 

@@ -45,8 +45,6 @@ def export_onnx(compensator: Compensator, metadata: str, outputs: Sequence[str] 
     command; and `deviation_sd`.
 
     Args:
-        compensator: fitted.
-        metadata: JSON to carry in the file.
         outputs: those that are wanted; each costs its own operations in every call.
 
     Raises:

@@ -38,8 +38,6 @@ def to_onnx(
     Args:
         module: takes tensors `s x w`, returns tensors of as many rows.
         inputs: name -> a row for an example, `1 x w` or more.
-        outputs: names.
-        opset: of ONNX.
 
     Raises:
         MethodFailedError: there is an operation that no file has.

@@ -87,7 +87,6 @@ def expand(
         function: commanded joints `s x n` -> `s x o` [SI]; NaN where the mechanism has no such pose.
         joints: commanded joints of the training rows, `s x n` [SI].
         margin: as in `fit_compensator`.
-        what: is expanded, for messages.
         groups: widths of neighbouring outputs that share a unit and are judged by their own largest value; all
             together when None.
         worst: error at other points up to which an expansion is taken, as a share of the largest value.

@@ -41,7 +41,6 @@ def expand_geometry(deviation: Callable[[Tensor], Tensor], joints: Tensor, margi
     Args:
         deviation: commanded joints `s x n` -> δ `s x n` [SI]; NaN where the mechanism has no such pose.
         joints: commanded joints of the training rows, `s x n` [SI].
-        margin: as in `fit_compensator`.
 
     Raises:
         InputError, MethodFailedError: as `expand`.

@@ -58,7 +58,6 @@ class SerialGeometry(nn.Module):
         """Take the two geometries.
 
         Args:
-            arm: the arm.
             nominal: parameters whose links are the maker's and whose frames were fitted to them, `... x k` [SI].
             identified: parameters with links and frames fitted together, `... x k` [SI].
             rotation_weight: of orientation against position [m/rad].

@@ -56,7 +56,6 @@ def expand_arm(function: Callable[[Tensor], Tensor], turns: list[bool], what: st
     Args:
         function: joints `s x n` -> `s x o` [SI].
         turns: which of the `n` joints turn.
-        what: is expanded, for messages.
 
     Raises:
         InputError: the arm has more than seven joints.

@@ -97,10 +97,6 @@ def load_geometry(
 ) -> IdentifiedGeometry:
     """Read `identified.yaml`, or the `identified.yaml` beside an `identified.json`.
 
-    Args:
-        path: the file.
-        public_key, allow_code: as `load_model`.
-
     Raises:
         ModelFileError: the file is not one that `ccnn identify` wrote.
         InputError: it lacks a key or a parameter, or names code that was not allowed.

@@ -71,7 +71,6 @@ def check_signature(path: Path, model: bytes, card: bytes, key: str | Path) -> N
     """Refuse a model without a signature by this key.
 
     Args:
-        path: of the model; the signature is beside it.
         model, card: bytes of either file, as they are going to be used.
         key: PEM file with the public key.
 

@@ -55,8 +55,6 @@ def program_of(traced: GraphModule, name: str, inputs: Sequence[str], outputs: S
 
     Args:
         traced: with its operations decomposed.
-        name: of the program.
-        inputs: names of the function's inputs.
         outputs: names of its outputs; None for one that is left out.
 
     Raises:

@@ -65,9 +65,7 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     """The form of a fitted compensator.
 
     Args:
-        compensator: in double.
         dtype: `float64` or `float32`, in which the targets compute.
-        sd: with the standard deviation.
 
     Raises:
         MethodFailedError: the model has an operation that no form has.

@@ -39,8 +39,6 @@ def print_linuxcnc(form: Form | None, mechanism: Mechanism, source: str) -> dict
 
     Args:
         form: of the compensation; None where the mechanism's own parameters are corrected.
-        mechanism: whose kinematics are written.
-        source: where the numbers came from.
 
     Raises:
         MethodFailedError: the mechanism has no direction in closed form, or the form is not in double.

@@ -25,7 +25,6 @@ def combinations_in_words(parameters: Sequence[Parameter], hidden: Tensor, scale
     `A1x and l1 only as 1.00 A1x - 0.72 l1`: of errors of the two, in SI, the rows see this combination and no other.
 
     Args:
-        parameters: the `k`.
         hidden: directions that the rows do not see, orthonormal or zero, one a row, `… x k`, in units of `scale`.
         scale: `k` [SI].
     """

@@ -78,8 +78,6 @@ def covariance(
 
     Args:
         noise: standard deviation, one for all or one for each coordinate [SI], or a covariance, `… x d x d`.
-        coordinates: the `d` of them.
-        what: what it is the noise of, for the message.
     """
     if noise is None:
         return None
@@ -124,9 +122,7 @@ def check_finite(
     """Name the first row, and its channel, whose residual `r x s x c` is not finite although it is used (`r x s`).
 
     Args:
-        residual, used: see above.
         given: what the kinematics were solved for, `r x s x …`, with its coordinates.
-        mechanism: its name.
         channels: names of the `c` columns.
     """
     lost = torch.nonzero(~torch.isfinite(residual) & used[..., None])

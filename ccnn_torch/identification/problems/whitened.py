@@ -54,7 +54,6 @@ def whitened_problem(
         gap: `(values, *data)` -> `… x c` [SI].
         data: `r x s x …`.
         covariance: of a row's gap, broadcasts to `r x s x c x c`; None leaves the gap as it is.
-        rows, selection: as gathered and chosen.
         names: of the `c` entries.
         what: what the entries are, for messages.
         noise_known: whether the covariance is the noise itself or only its proportions.

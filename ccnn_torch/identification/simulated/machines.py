@@ -30,8 +30,6 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
     """Simulate the machines of a config.
 
     Args:
-        config: with a section `simulate`.
-        mechanism: with its nominal parameters.
         poses: how many to measure of each machine, in place of `simulate.poses`.
     """
     about = config.simulate

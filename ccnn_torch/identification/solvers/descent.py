@@ -26,7 +26,6 @@ def descend(
     """Search from many starts at once.
 
     Args:
-        normal: see `Normal`.
         start: `r x m x k` [SI].
         scale: plausible errors, `k` [SI].
         free: equations less parameters, at least 1, `r x 1`.

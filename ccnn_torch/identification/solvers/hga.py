@@ -123,7 +123,6 @@ def polish(objective: Objective, points: Tensor, tell: Progress) -> tuple[Tensor
     start is the identity, and rounds follow until one gains nothing that counts.
 
     Args:
-        objective: what is minimised.
         points: `r x k` [1].
         tell: called with the share of the rounds that is done.
 

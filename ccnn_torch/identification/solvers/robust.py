@@ -30,8 +30,6 @@ def loss_weights(residual: Tensor, weights: Tensor, loss: str, parameters: int) 
     Args:
         residual: `… x s x c`, decorrelated, its channels of one variance.
         weights: `… x s` [1]; rows with weight 0 do not enter the scale.
-        loss: `squared`, `huber` or `cauchy`.
-        parameters: `k`.
 
     Returns:
         `… x s` in (0, 1].

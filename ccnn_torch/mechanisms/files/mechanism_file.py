@@ -58,12 +58,7 @@ class MechanismFile:
 
 
 def read_mechanism_file(path: str, content: bytes | None = None) -> MechanismFile | None:
-    """Contents of the file, or None where it is no mechanism file: has no key `mechanism`, or cannot be read at all.
-
-    Args:
-        path: of the file.
-        content: its bytes, where they were read already.
-    """
+    """Contents of the file, or None where it is no mechanism file: has no key `mechanism`, or cannot be read at all."""
     try:
         text = read_text(path, CONFIG_LIMIT) if content is None else content.decode("utf-8")
         tree = parse_yaml(text, path)
@@ -79,7 +74,6 @@ def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float]) -> str:
     """A mechanism file's text; `load_mechanism` of it gives the same mechanism with the same parameters, bit by bit.
 
     Args:
-        mechanism: with the identified parameters as its nominal ones.
         nominal: what was there before, by name [SI].
     """
     about = mechanism.describe()

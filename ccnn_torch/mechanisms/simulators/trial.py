@@ -22,8 +22,6 @@ def try_simulator(simulator: Simulator, calls: Calls, home: Tensor, joints: Tens
     """Ask twice about the same rows, the second time in the reverse order and with another row among them.
 
     Args:
-        simulator: checked.
-        calls: of it.
         home: a configuration with a pose, `n` [SI].
         joints: configurations, `s x n` [SI].
         nominal: parameters, `k` [SI].
