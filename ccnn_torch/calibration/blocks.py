@@ -21,8 +21,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import read_json, write_json
 from ccnn_torch.run_folder.folder import RunFolder
 
-__all__ = ["Block", "blocks_of", "merged", "write_blocks"]
-
 _SPREAD = {"median", "low", "high", "values"}
 # What the exported repeat's block has, and its run. Checkpoints, curves of TensorBoard and the config stay there.
 _KEPT = ("arrays.safetensors", "history-*.safetensors", "model.*", "card.json", "models")

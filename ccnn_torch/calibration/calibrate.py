@@ -26,8 +26,6 @@ from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Callback, Scaling
 from ccnn_torch.verification.promise import configurations, promise_block
 
-__all__ = ["Calibration", "Watch", "calibrate", "makers"]
-
 Watch = Callable[[Prepared, str, str, Scaling], list[Callback]]
 """Callbacks of one training, given the rows, the method, the phase (`choose` or `fit`) and the phase's scaling."""
 

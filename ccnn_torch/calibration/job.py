@@ -25,8 +25,6 @@ from ccnn_torch.run_folder.folder import RunFolder, kept_for
 from ccnn_torch.run_folder.resume import facts_of, refuse_changes
 from ccnn_torch.training import Callback, Scaling, past_of
 
-__all__ = ["resume_run", "start_run"]
-
 
 def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> RunFolder:
     """Run a config into a fresh folder.

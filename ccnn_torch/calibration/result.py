@@ -29,8 +29,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.simulation.case_study import Simulation
 
-__all__ = ["assemble", "best_method", "by_score", "plan_of", "versions"]
-
 _NO_GEOMETRY = {"chosen": "none", "why": "A simulated case compares learners."}
 _PACKAGES = ("ccnn-torch", "torch", "numpy", "scipy", "onnx", "onnxruntime", "safetensors")
 

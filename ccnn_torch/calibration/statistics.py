@@ -17,17 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 
-__all__ = [
-    "before_block",
-    "constant_errors",
-    "floor_block",
-    "joint_errors",
-    "pose_block",
-    "ratio_to_floor",
-    "share_unit",
-    "spread",
-]
-
 Block = dict[str, Any]
 Error = tuple[ArrayLike, ArrayLike | None]
 

@@ -18,8 +18,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, OutsideDomainWarning
 from ccnn_torch.training import Scaling
 
-__all__ = ["Compensator", "Solution", "default_limit"]
-
 Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
 
 

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from ccnn_torch.compensation.domain import Domain
 
-__all__ = ["GENTLE", "STEEPEST_DEVIATION", "TOLERANCE", "Steepness", "iterations_needed", "spread_points", "steepest"]
-
 # A unique command exists below a slope of 1. At this one the fixed point takes 40 steps, and
 # a slope that sampling missed still has room.
 STEEPEST_DEVIATION = 0.5

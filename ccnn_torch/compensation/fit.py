@@ -25,8 +25,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.training import Scaling
 
-__all__ = ["fit_compensator"]
-
 # Rounds of damping, and the share of what was learned below which a compensator is not worth having.
 _DAMPINGS = 6
 _LEAST_SHARE = 0.1

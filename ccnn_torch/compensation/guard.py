@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 
-__all__ = ["Promise", "as_matrix", "kept"]
-
 Array = NDArray[Any]
 
 # From here an input counts as infinite; as in a `Domain`.

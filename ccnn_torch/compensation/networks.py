@@ -9,8 +9,6 @@ from torch import Tensor, nn
 
 from ccnn_torch.errors import InputError, ModelFileError
 
-__all__ = ["DescribedNetwork", "UncertainNetwork", "describe_network", "network_from_description", "register_network"]
-
 # Kind -> the class, or its module; imported when a file needs it.
 _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "constant": "ccnn_torch.learners.constant:ConstantNetwork",

@@ -42,8 +42,6 @@ from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.sources import read_source
 from ccnn_torch.run_folder.resume import facts_of, refuse_changes
 
-__all__ = ["Identification", "Watch", "identify"]
-
 Watch = Callable[[str], Progress]
 """Given a label, somewhere to report the share that is done."""
 

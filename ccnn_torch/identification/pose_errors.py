@@ -11,8 +11,6 @@ from torch import Tensor
 from ccnn_torch.display import number_text
 from ccnn_torch.mechanisms import PoseError
 
-__all__ = ["before_and_after", "figures", "removed"]
-
 _LOW, _HIGH = 0.05, 0.95
 
 

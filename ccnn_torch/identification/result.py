@@ -30,8 +30,6 @@ from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.verification.promise import configurations, promise_block
 from ccnn_torch.version import __version__
 
-__all__ = ["Assembled", "Known", "assemble", "known_of", "method_of", "parameter_blocks", "results_of"]
-
 Z95 = 1.959963984540054
 
 

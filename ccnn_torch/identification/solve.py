@@ -29,22 +29,6 @@ from ccnn_torch.identification.problems.problem import part_of
 from ccnn_torch.identification.solvers.registry import get_solver
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
 
-__all__ = [
-    "QUICK",
-    "Outcome",
-    "Piece",
-    "choice_of",
-    "frames_first",
-    "free_values",
-    "is_apart",
-    "knowledge_of",
-    "machines_of",
-    "pieces_of",
-    "run_method",
-    "select",
-    "solver_of",
-]
-
 QUICK = ("lm", "tikhonov")
 """The others are global searches, which take minutes where these take a blink."""
 # The noise of a row is carried over at the start, then at what was found; a third time changes nothing that counts.

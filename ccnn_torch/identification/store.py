@@ -11,8 +11,6 @@ import torch
 from ccnn_torch.identification.solve import Outcome
 from ccnn_torch.training import load_checkpoint, save_checkpoint
 
-__all__ = ["load_outcome", "save_outcome"]
-
 
 def save_outcome(path: Path, outcome: Outcome, facts: Mapping[str, Any]) -> None:
     """Write an outcome; `facts` say what config and data it is of.

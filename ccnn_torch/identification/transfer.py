@@ -15,8 +15,6 @@ from ccnn_torch.identification.measured.records import read_records, split_recor
 from ccnn_torch.identification.pose_errors import before_and_after
 from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames
 
-__all__ = ["Elsewhere", "read_elsewhere", "transferred"]
-
 
 @dataclass(frozen=True)
 class Elsewhere:

@@ -9,8 +9,6 @@ from torch import Tensor
 
 from ccnn_torch.mechanisms.mechanism import Mechanism
 
-__all__ = ["find_jump", "is_numeric", "jump_sentence", "settle_home"]
-
 _POSES, _STEPS = 256, 8
 # A walk whose joints change by more than this in a step, or that differs by less from the direct answer, is not
 # conclusive.

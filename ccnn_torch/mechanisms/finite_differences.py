@@ -12,8 +12,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.pose import Frame, frame_jacobian
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
-__all__ = ["central_slope", "differentiable_pose"]
-
 
 class Simulated(Protocol):
     """What these functions need of a black box."""

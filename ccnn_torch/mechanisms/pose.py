@@ -19,8 +19,6 @@ from ccnn_torch.numerics.rotations import (
     skew,
 )
 
-__all__ = ["Frame", "PoseError", "coordinates_jacobian", "frame_from_coordinates", "frame_jacobian", "pose_error"]
-
 Frame = tuple[Tensor, Tensor | None]
 _LENGTHS, _TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
 

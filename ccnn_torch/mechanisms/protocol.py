@@ -14,8 +14,6 @@ from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.simulators.black_box import BlackBox
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 
-__all__ = ["checked_plugin"]
-
 # A root is settled to about 1e-12; a user's own closed form may close a little worse [m, rad].
 _CLOSES = 1e-6
 _ADVICE = "ccnn_torch.testing.check_mechanism reports more"

@@ -17,8 +17,6 @@ from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
 
-__all__ = ["Fitted", "Identified", "fit_machine"]
-
 
 @dataclass(frozen=True)
 class Identified:

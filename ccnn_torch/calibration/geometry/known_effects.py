@@ -23,8 +23,6 @@ from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_ve
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
 
-__all__ = ["KnownEffects", "fit_effects", "verdict_of"]
-
 _FROM = "from:"
 # Steps of r <- δ - ε(q + r); each gains a factor of ε's slope, at most 0.1.
 _STEPS = 6

@@ -17,17 +17,6 @@ from ccnn_torch.records.splits import fold_splits
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Callback, Scaling, Training, train
 
-__all__ = [
-    "Choice",
-    "Plan",
-    "WatchPhase",
-    "choose",
-    "evaluations_until",
-    "fold_dataset",
-    "moved",
-    "predictive_variance",
-]
-
 WatchPhase = Callable[[str, Scaling], list[Callback]]
 """Callbacks of a phase (`choose` or `fit`), given that phase's scaling."""
 

@@ -23,8 +23,6 @@ from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Scaling, Training, train, weighted_mse
 
-__all__ = ["Fitted", "Plan", "fit_method", "refit"]
-
 
 @dataclass
 class Fitted:

@@ -22,8 +22,6 @@ from ccnn_torch.learners import Learner
 from ccnn_torch.report.json_files import plain, read_json, write_json
 from ccnn_torch.run_folder.folder import RunFolder
 
-__all__ = ["Comparison", "compare"]
-
 _SIMPLEST = "constant"
 
 

@@ -9,8 +9,6 @@ from torch import Tensor
 from ccnn_torch.calibration.rows.dataset import Dataset
 from ccnn_torch.compensation import Domain
 
-__all__ = ["NORMAL", "coverage", "inside_domain", "sd_scale"]
-
 # scipy.special's quantiles are those of scipy.stats, which takes half a second to load.
 NORMAL = float(ndtri(0.975))
 """An interval of 95 % reaches so many predictive standard deviations to either side."""

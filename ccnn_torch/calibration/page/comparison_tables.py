@@ -8,8 +8,6 @@ from typing import Any
 from ccnn_torch.display import count_text, display_unit, interval_text, number_text
 from ccnn_torch.report.table import Table
 
-__all__ = ["comparison_table", "method_label", "pose_by_method_table", "reach_table"]
-
 Results = Mapping[str, Any]
 
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from ccnn_torch.display import count_text
 from ccnn_torch.report.figures.style import FLOOR, SERIES, Plot, styled
 
-__all__ = ["convergence_plot", "population_plot"]
-
 Array = NDArray[np.float64]
 
 

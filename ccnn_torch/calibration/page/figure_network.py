@@ -16,8 +16,6 @@ from ccnn_torch.display import count_text
 from ccnn_torch.evolution.network import alive_nodes as path_nodes
 from ccnn_torch.report.figures.style import GREY, Plot, bare, styled
 
-__all__ = ["alive_nodes", "network_plot"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 

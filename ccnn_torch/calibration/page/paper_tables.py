@@ -16,8 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from types import MappingProxyType
 
-__all__ = ["PAPER", "PaperCase"]
-
 Row = tuple[float, ...]
 
 

@@ -19,8 +19,6 @@ from ccnn_torch.report.figures.workspace import overview_plot, workspace_plot
 from ccnn_torch.report.html import InlineFigure, page_text
 from ccnn_torch.report.json_files import read_json
 
-__all__ = ["html_text", "make_picture", "run_plots", "write_report"]
-
 _LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "model.onnx", "model.pt2", "config.yaml")
 
 

@@ -17,8 +17,6 @@ from torch import Tensor
 
 from ccnn_torch.report.event_file import EventFile
 
-__all__ = ["TensorBoardCallback", "tags_of"]
-
 _PER_SUBPOPULATION = ("density", "diversity")
 _CURVES = ("heldout_mse_", "error_")
 _CELL = 16

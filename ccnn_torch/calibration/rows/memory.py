@@ -7,8 +7,6 @@ import os
 from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.errors import InputError
 
-__all__ = ["TooManyRepeatsError", "check_memory", "free_memory", "memory_of_run"]
-
 # Bytes for a row of a repeat, measured on runs of the tripod: rows, deviations and Jacobians of all kinds; and, of the
 # one method that keeps a population, for each individual.
 _ROW, _INDIVIDUAL = 10_000, 2_500

@@ -29,8 +29,6 @@ from ccnn_torch.simulation.case_study import CaseSimulation, Simulation, simulat
 from ccnn_torch.simulation.cases import build_case
 from ccnn_torch.simulation.machines.realistic import build_machine
 
-__all__ = ["Prepared", "damping_of", "prepare"]
-
 # Of the realistic machines.
 _MOST_JOINTS = 6
 

@@ -15,8 +15,6 @@ from ccnn_torch.compensation.geometry.serial import _inverse
 from ccnn_torch.effects import Acting, Situation, make_effect
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 
-__all__ = ["Care", "PhysicalEffects", "effect_deviation", "expand_effects", "gains"]
-
 # Joints that move the platform less than this are held back [m per joint unit]: a thousandth of what is usual.
 _LEAST_DAMPING = 1e-3
 # A Jacobian from here on is none.

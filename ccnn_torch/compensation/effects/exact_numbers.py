@@ -9,8 +9,6 @@ from typing import Any
 import torch
 from torch.overrides import TorchFunctionMode
 
-__all__ = ["exact_numbers"]
-
 _OPERATIONS = {
     *("add", "__add__", "__radd__", "sub", "__sub__", "__rsub__", "rsub"),
     *("mul", "__mul__", "__rmul__", "div", "__truediv__", "__rtruediv__", "__rdiv__"),

@@ -23,8 +23,6 @@ from ccnn_torch.compensation.geometry.trigonometric import TrigonometricExpansio
 from ccnn_torch.effects import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
-__all__ = ["Fields", "looked_at", "make_fields"]
-
 _WHAT = "kinematics that the effects need"
 _NAMES = (
     "jacobian",

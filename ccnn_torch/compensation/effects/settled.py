@@ -13,8 +13,6 @@ from ccnn_torch.compensation.effects.effects import Care, PhysicalEffects, expan
 from ccnn_torch.effects import Acting, Situation
 from ccnn_torch.mechanisms import SerialArm
 
-__all__ = ["settled_effects"]
-
 # Of the rows' gains, by bisection: the shares of the rows that lie below; and above the largest by so much.
 _SHARES = (1.0, 0.99, 0.98, 0.97, 0.96, 0.94, 0.92, 0.9, 0.87, 0.84, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)
 _ABOVE = 1.1

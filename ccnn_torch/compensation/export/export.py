@@ -27,8 +27,6 @@ from ccnn_torch.compensation.model_files.onnx_session import (
 )
 from ccnn_torch.errors import MethodFailedError
 
-__all__ = ["export_float32", "export_onnx", "probe_points", "verify"]
-
 _OPSET = 20
 _OPSET_FLOAT32 = 17
 # Of the correction limit: what a network may ask for, and what single precision gives.

@@ -12,8 +12,6 @@ from ccnn_torch.compensation.contraction import spread_points
 from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.errors import InputError, MethodFailedError
 
-__all__ = ["ChebyshevExpansion", "expand"]
-
 _DEGREES = (2, 4, 6, 8, 10, 12, 16)
 _MOST_TERMS = 600
 # Error of the expansion at points it was not fitted to, as a share of the largest value: what is aimed at, and what is

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion, expand
 
-__all__ = ["ExpandedGeometry", "expand_geometry"]
-
 
 class ExpandedGeometry(ChebyshevExpansion):
     """δ(q), commanded joints `... x n` -> `... x n` [SI], as a polynomial.

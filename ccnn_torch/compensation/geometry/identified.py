@@ -14,8 +14,6 @@ from ccnn_torch.compensation.geometry.expanded import expand_geometry
 from ccnn_torch.compensation.geometry.serial import SerialGeometry
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
-__all__ = ["Geometry", "fit_geometry_module", "geometric_deviation", "settled_damping"]
-
 # Tried by bisection; without a singular pose near by the first will do.
 _DAMPINGS = tuple(0.01 * 1.3**k for k in range(16))
 # Of the steepest slope that a compensator may have.

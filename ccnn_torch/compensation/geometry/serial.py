@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
-__all__ = ["SerialGeometry"]
-
 # In a redundant arm the joints are not determined by the pose; so much damping [m per joint unit] always keeps the
 # normal equations regular, and leaves out less than 1e-4 of what a lever of 0.1 m corrects.
 _LEAST_DAMPING = 1e-3

@@ -14,8 +14,6 @@ from torch import Tensor, nn
 
 from ccnn_torch.errors import InputError, MethodFailedError
 
-__all__ = ["TrigonometricExpansion", "expand_arm"]
-
 _MOST_JOINTS = 7
 # Tolerance, as a share of the largest value, with which a function of this form is reproduced at other joints.
 _EXACT = 1e-9

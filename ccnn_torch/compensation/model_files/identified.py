@@ -19,8 +19,6 @@ from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism, mechanism_of_file
 from ccnn_torch.mechanisms.files.mechanism_file import MechanismFile, read_mechanism_file
 
-__all__ = ["IdentifiedGeometry", "load_compensation", "load_geometry", "sign_model"]
-
 Array = NDArray[Any]
 
 # How near to a pose the joints must bring a machine [m, rad].

@@ -22,8 +22,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import FallbackWarning, InputError, ModelFileError
 from ccnn_torch.plugins import code_refused
 
-__all__ = ["LoadedModel", "load_model"]
-
 
 class HasKinematics(Protocol):
     """What is asked of a mechanism here; `ccnn_torch.mechanisms.Mechanism` is one."""

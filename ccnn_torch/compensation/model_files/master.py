@@ -32,8 +32,6 @@ from ccnn_torch.compensation.networks import network_from_description
 from ccnn_torch.errors import ModelFileError
 from ccnn_torch.training import Scaling
 
-__all__ = ["Run", "open_model"]
-
 Run = Callable[[Array, Array | None], dict[str, Array]]
 
 

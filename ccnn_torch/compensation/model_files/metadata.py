@@ -19,19 +19,6 @@ from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.training import tensor_digest
 from ccnn_torch.version import __version__
 
-__all__ = [
-    "FORMAT",
-    "FORMAT_EFFECTS",
-    "FORMAT_GEOMETRY",
-    "FORMAT_SECANT",
-    "check_keys",
-    "check_tensors",
-    "coordinates",
-    "facts_of",
-    "from_json",
-    "to_json",
-]
-
 FORMAT = "ccnn_torch compensator 2"
 # A reader that does not know of geometry must refuse such a file, not leave the geometry out.
 FORMAT_GEOMETRY = "ccnn_torch compensator 3"

@@ -13,8 +13,6 @@ from ccnn_torch.errors import InputError, ModelFileError
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-__all__ = ["check_signature", "new_key_pair", "sign_content", "signature_path"]
-
 # What is signed begins with it, so that no signature made for another purpose is one of a model.
 _PURPOSE = b"ccnn_torch model signature 1\n"
 

@@ -9,8 +9,6 @@ from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
 from ccnn_torch.compensation.targets.template import filled
 
-__all__ = ["c_compensation", "c_constants", "c_dialect", "c_function", "print_c99"]
-
 _NAMES = ("sqrt", "exp", "log", "sin", "cos", "tan", "tanh", "asin", "acos", "atan", "floor")
 _FUNCTIONS = {name: f"{name}{{s}}({{{{0}}}})" for name in _NAMES}
 _FUNCTIONS |= {"abs": "fabs{s}({{0}})", "atan2": "atan2{s}({{0}}, {{1}})", "pow": "pow{s}({{0}}, {{1}})"}

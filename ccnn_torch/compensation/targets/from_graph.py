@@ -17,8 +17,6 @@ from ccnn_torch.compensation.targets.build import Builder
 from ccnn_torch.compensation.targets.form import BOOLEAN, Program
 from ccnn_torch.errors import MethodFailedError
 
-__all__ = ["program_of"]
-
 # More elements, or products, are a loop over arrays; fewer are written out, without those of zeros.
 _ELEMENTS, _PRODUCTS = 512, 1024
 # Of a thin matrix (masks) so many.

@@ -17,8 +17,6 @@ from ccnn_torch.compensation.targets.from_model import SINGLE_TOLERANCE
 from ccnn_torch.compensation.targets.run import run_form
 from ccnn_torch.errors import MethodFailedError
 
-__all__ = ["Golden", "golden_vectors", "require_equal"]
-
 _RANDOM = 1000
 # Corners of the domain are as many as 2 to the power of its inputs; of more inputs than these the middle is taken.
 _CORNERS = 6

@@ -13,8 +13,6 @@ from ccnn_torch.compensation.targets.template import filled
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
-__all__ = ["print_linuxcnc"]
-
 _ANGLES = ("a", "b", "c")
 
 

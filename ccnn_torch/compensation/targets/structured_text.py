@@ -13,8 +13,6 @@ from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print
 from ccnn_torch.compensation.targets.template import filled
 from ccnn_torch.errors import MethodFailedError
 
-__all__ = ["print_structured_text"]
-
 # An argument of EXP beyond these would stop a controller; what it gives is 0 or without effect long before.
 _EXP = {"float64": 700.0, "float32": 80.0}
 # Golden vectors in the self-test: enough to find a mistake in copying, few enough for a small controller.

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["filled"]
-
 
 def filled(template: str, **values: Any) -> str:
     """A file's text; a name in the template that no value has is an error."""

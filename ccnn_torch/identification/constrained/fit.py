@@ -32,8 +32,6 @@ from ccnn_torch.identification.problems.parameters import Selection, select_para
 from ccnn_torch.identification.solve import choice_of, solver_of
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["ConstraintFit", "State", "fit_constraint", "held_distance"]
-
 # Links and noise are estimated in turn, the noise from this size on [m].
 _ROUNDS, _FIRST_NOISE, _LEAST_NOISE = 5, 1e-3, 1e-9
 # Prior of the tool's offset around its first fit, and of a plate's extent around what its records say [m].

@@ -24,8 +24,6 @@ from ccnn_torch.identification.result import Known, method_of, parameter_blocks,
 from ccnn_torch.identification.solve import Outcome
 from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
 
-__all__ = ["identify_by_constraint"]
-
 # An interval above this share of its prior's is the prior's. Turning machine and plates together turns the residuals,
 # too, which the linearised problem takes for a little knowledge.
 _AS_PRIOR = 0.9

@@ -19,8 +19,6 @@ from ccnn_torch.records import Records, Table, stack_columns
 from ccnn_torch.records.pose_columns import check_joints
 from ccnn_torch.records.sources import read_source
 
-__all__ = ["ConstraintRows", "read_constraint"]
-
 GROUPED_BY = {"sockets": "placement", "distances": "anchor", "plane": "plane"}
 """Column that numbers the groups of each kind, unless the config names others."""
 # Joints beyond this are taken for degrees [rad], as in records of poses: 4 turns.

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 
-__all__ = ["TAKES_PART", "combinations_in_words"]
-
 # Component of a hidden direction below which a parameter does not take part. Real geometry is never exactly parallel:
 # smaller components come from the errors themselves and would tie everything to everything.
 TAKES_PART = 1e-2

@@ -10,8 +10,6 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Kinematics", "make_kinematics"]
-
 # Each round of `command` shrinks the remainder by about the relative size of the errors.
 _ROUNDS = 6
 

@@ -9,8 +9,6 @@ from torch import Tensor
 from ccnn_torch.identification.measured.kinematics import Kinematics
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Measured", "Rows"]
-
 
 @dataclass(frozen=True)
 class Rows:

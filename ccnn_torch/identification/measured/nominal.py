@@ -6,8 +6,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 
-__all__ = ["nominal_machine"]
-
 
 def nominal_machine(config: IdentifyConfig) -> Mechanism:
     """The mechanism that the config names, with as many parameters a link as it asks for."""

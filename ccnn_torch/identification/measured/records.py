@@ -14,8 +14,6 @@ from ccnn_torch.identification.measured.measured import Measured, Rows
 from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
 from ccnn_torch.records import Records, check_rows, load_records
 
-__all__ = ["from_records", "read_records", "split_records"]
-
 
 def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | None = None) -> Measured:
     """Load and split the records of a config, or those that Python has."""

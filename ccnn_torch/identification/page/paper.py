@@ -9,8 +9,6 @@ from ccnn_torch.display import number_text
 from ccnn_torch.identification.pose_errors import figure_text
 from ccnn_torch.report.table import Table
 
-__all__ = ["OVERCONSTRAINED", "paper_tables"]
-
 MM, DEG = 1e-3, 0.017453292519943295
 
 # Sun et al. 2018, Table 2: (predefined, identified) by our parameter's name, in mm and deg.

@@ -19,8 +19,6 @@ from ccnn_torch.identification.page.tables import identified_tables, identified_
 from ccnn_torch.report.html import page_text
 from ccnn_torch.report.json_files import read_json
 
-__all__ = ["ARRAYS", "save_identified_arrays", "write_identified_report"]
-
 ARRAYS = "arrays.safetensors"
 _LINKED = (
     "identified.json",

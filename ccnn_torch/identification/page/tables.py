@@ -16,16 +16,6 @@ from ccnn_torch.identification.pose_errors import figure_text
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
 
-__all__ = [
-    "identified_markdown",
-    "identified_tables",
-    "identified_verdict",
-    "not_settled",
-    "print_identified",
-    "unknown_sentences",
-    "write_identified_csv",
-]
-
 Block = Mapping[str, Any]
 
 

@@ -7,8 +7,6 @@ import torch
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.problem import Problem
 
-__all__ = ["check_equations"]
-
 
 def check_equations(problem: Problem) -> None:
     """Refuse a problem with fewer equations than parameters; a prior counts as one equation."""

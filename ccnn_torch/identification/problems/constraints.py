@@ -23,8 +23,6 @@ from ccnn_torch.identification.problems.rows import check_finite
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
-__all__ = ["distance_problem", "plane_problem", "scatter", "socket_problem", "tool_points"]
-
 # Plausible errors of what a constraint is unknown in, after a start from the nominal machine [m, rad].
 _PLACE, _TURN = 5e-3, 2e-2
 # Directions in which points spread less than this share of their largest extent do not show a rotation.

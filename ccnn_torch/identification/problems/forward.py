@@ -17,8 +17,6 @@ from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
-__all__ = ["forward_problem"]
-
 _TURN = ("rx", "ry", "rz")
 
 

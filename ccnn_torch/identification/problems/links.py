@@ -11,8 +11,6 @@ from ccnn_torch.mechanisms.pose import frame_gap
 from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
 from ccnn_torch.numerics.outliers import inlying
 
-__all__ = ["fit_links"]
-
 # The noise and the parameters are estimated in turn; the noise has settled after two rounds.
 _ROUNDS = 3
 

@@ -16,8 +16,6 @@ from torch import Tensor
 from ccnn_torch.coordinates import Parameter, plausible_error
 from ccnn_torch.errors import InputError
 
-__all__ = ["ParameterChoice", "Selection", "match_parameters", "select_parameters"]
-
 
 @dataclass(frozen=True)
 class ParameterChoice:

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 
-__all__ = ["Channel", "Fit", "Problem", "Progress", "Solver"]
-
 Progress = Callable[[float], None]
 """Told the share that is done, 0 to 1."""
 

@@ -12,8 +12,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["MeasuredRows", "check_finite", "covariance", "gather_rows", "inverse_root"]
-
 
 @dataclass(frozen=True)
 class MeasuredRows:

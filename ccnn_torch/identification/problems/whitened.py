@@ -15,8 +15,6 @@ from ccnn_torch.identification.problems.problem import Channel, Problem
 from ccnn_torch.identification.problems.rows import MeasuredRows, inverse_root
 from ccnn_torch.identification.problems.sparse import WhitenedResidual, dependence
 
-__all__ = ["Geometry", "whitened_problem"]
-
 
 class Geometry:
     """The whole geometry from the free values, as cheaply as the choice allows."""

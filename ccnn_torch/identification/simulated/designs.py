@@ -17,8 +17,6 @@ from ccnn_torch.simulation.instrument import Instrument
 from ccnn_torch.simulation.places import Places
 from ccnn_torch.simulation.random_numbers import generator_of
 
-__all__ = ["choose_places", "plan_places"]
-
 MAX_CONDITION = 50.0
 """Of the Jacobian at a planned pose."""
 # Stream of the candidates, beside the seed of the first machine.

@@ -20,8 +20,6 @@ from ccnn_torch.simulation.instrument import Instrument, make_instrument
 from ccnn_torch.simulation.places import Places
 from ccnn_torch.simulation.random_numbers import generator_of, normal_draws
 
-__all__ = ["simulate"]
-
 # Streams of random numbers of a machine, so that more poses do not change its errors.
 _ERRORS, _ROWS, _TEST, _PLACES, _LEGS = 0, 1, 2, 3, 10
 

@@ -22,8 +22,6 @@ from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
 from ccnn_torch.identification.solvers.lockstep import Array, run_side_by_side
 from ccnn_torch.identification.solvers.objective import Objective, make_objective
 
-__all__ = ["HybridGenetic", "polish"]
-
 # Streams of random numbers: the first population and the generations.
 _FIRST, _BREED = 0, 1
 # Line recombination reaches so far beyond either parent, as a share of their distance.

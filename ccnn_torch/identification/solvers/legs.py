@@ -12,8 +12,6 @@ from ccnn_torch.identification.problems.checks import check_equations
 from ccnn_torch.identification.problems.linear import WeightedRows
 from ccnn_torch.identification.problems.problem import Channel, Fit, Problem, Progress, Solver, part_of
 
-__all__ = ["solve_per_leg", "split_by_leg"]
-
 _DEPENDS = 1e-9  # Relative size of a derivative below which it is rounding.
 
 

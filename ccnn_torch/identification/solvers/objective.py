@@ -11,8 +11,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.problem import Problem
 from ccnn_torch.numerics.least_squares import jacobian_of
 
-__all__ = ["FORBIDDEN", "Objective", "make_objective"]
-
 FORBIDDEN = 1e100
 """Cost of parameters with which a measured row cannot be reached; finite, so that searches may compare with it."""
 

@@ -25,8 +25,6 @@ from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
 from ccnn_torch.identification.solvers.lockstep import Array, run_side_by_side
 from ccnn_torch.identification.solvers.objective import FORBIDDEN, Objective, make_objective
 
-__all__ = ["Annealing", "Genetic", "Swarm"]
-
 
 @dataclass(frozen=True)
 class Genetic:

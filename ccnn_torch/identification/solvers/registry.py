@@ -12,8 +12,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress, Solver
 from ccnn_torch.spelling import nearest
 
-__all__ = ["SOLVERS", "get_solver"]
-
 # Module and name of each. Imported when asked for: pymoo alone takes half a second.
 _WHERE = {
     "lm": ("lm", "solve_lm"),

@@ -13,8 +13,6 @@ from ccnn_torch.identification.problems.linear import WeightedRows
 from ccnn_torch.identification.problems.problem import Problem
 from ccnn_torch.numerics.outliers import chi_quantile, residual_scale
 
-__all__ = ["LOSSES", "loss_weights", "reweighted"]
-
 LOSSES = ("squared", "huber", "cauchy")
 
 # Where the loss bends, in standard deviations of one residual: 95 % efficient with normal noise (Holland and Welsch

@@ -19,8 +19,6 @@ from ccnn_torch.files.yaml_file import dump_yaml, parse_yaml
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.units import LARGEST
 
-__all__ = ["MechanismFile", "mechanism_text", "read_mechanism_file"]
-
 _FORM = "a mechanism file has mechanism, keys and parameters: {NAME: {value: …, nominal: …, unit: …}}"
 
 

@@ -15,8 +15,6 @@ from ccnn_torch.mechanisms.machines.link_frames import compose
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
 
-__all__ = ["dh_text", "mjcf_text", "urdf_text"]
-
 _CONVENTIONS = {
     "standard": "standard Denavit-Hartenberg; link i = Rz(q_i + theta_i) * Tz(d_i) * Tx(a_i) * Rx(alpha_i)",
     "modified": "modified Denavit-Hartenberg (Craig); link i = Rx(alpha_i) * Tx(a_i) * Rz(q_i + theta_i) * Tz(d_i)",

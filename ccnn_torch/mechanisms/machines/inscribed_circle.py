@@ -7,8 +7,6 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["inscribed_circle"]
-
 # Points on each singular curve: the radius is right to about (spacing)²/8 over it, 1e-7 of the size of the mechanism.
 _POINTS = 4000
 _GRID, _ROUNDS = 17, 20

@@ -19,8 +19,6 @@ from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
 
-__all__ = ["MOST_JOINTS", "SerialArm"]
-
 MOST_JOINTS = 100
 """Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
 

@@ -22,8 +22,6 @@ from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
-__all__ = ["BlackBox"]
-
 # Configurations all over the workspace: searches start from the nearest.
 _STARTS = 256
 # Of a machine as built: a parameter is moved by this share of its plausible error.

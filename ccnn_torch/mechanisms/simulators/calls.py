@@ -19,8 +19,6 @@ from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 from ccnn_torch.numerics.batching import leading_shape
 
-__all__ = ["Calls", "described", "simulated_rows"]
-
 # Rows in one call, so that memory suffices; of a simulator that remembers, so that its user sees it move on.
 _AT_MOST, _AT_ONCE = 50_000, 512
 # Rows that are kept.

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
 
-__all__ = ["Array", "ModelNumbers", "ModelParameter"]
-
 Array = NDArray[np.float64]
 
 # Fields that may be parameters, with their units about a turning and along a sliding joint, and whether they are >= 0.

@@ -11,8 +11,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.simulators.calls import Calls, described
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 
-__all__ = ["try_simulator"]
-
 _ROWS = 4
 # Of the change over a step: what differs by more from call to call spoils every derivative.
 _REPEATS = 0.01
