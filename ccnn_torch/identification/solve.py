@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -112,30 +113,21 @@ def _problem_at(measured: Measured, config: IdentifyConfig, rows: Rows, start: T
         config.residual == "auto"
         and (isinstance(measured.mechanism, SerialArm) or config.frame.base or config.frame.tool)
     )
-    if not forward:
-        return inverse_problem(
-            measured.view,
-            rows.joints,
-            rows.observed,
-            choice=choice_of(config, measured.mechanism),
-            pose_noise=measured.pose_noise,
-            joint_noise=measured.joint_noise,
-            start=start,
-            per_leg=per_leg,
-        )
-    if per_leg:
+    if forward and per_leg:
         raise InputError(
             "methods: a pose depends on all legs, so legs are identified apart only by their joints; write "
             "residual=inverse, or remove _per_leg"
         )
-    return forward_problem(
+    build = partial(inverse_problem, per_leg=per_leg)
+    if forward:
+        build = partial(forward_problem, rotation_weight=config.rotation_weight)
+    return build(
         measured.view,
         rows.joints,
         rows.observed,
         choice=choice_of(config, measured.mechanism),
         pose_noise=measured.pose_noise,
         joint_noise=measured.joint_noise,
-        rotation_weight=config.rotation_weight,
         start=start,
     )
 

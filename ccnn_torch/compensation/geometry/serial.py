@@ -67,8 +67,7 @@ class SerialGeometry(nn.Module):
         self._arm = (arm,)
         self._turned = arm.orientation != "none"
         self.rotation_weight, self.damping = rotation_weight, damping
-        # Buffers, since the ONNX exporter writes plain numbers in single precision; all of them follow from the
-        # description.
+        # All of them follow from the description.
         weight = torch.ones(6 if self._turned else 3, dtype=torch.float64)
         weight[3:] = rotation_weight
         unit = torch.eye(len(arm.joints), dtype=torch.float64)

@@ -16,9 +16,8 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.problems.checks import check_equations
 from ccnn_torch.identification.problems.parameters import ParameterChoice, Selection, select_parameters
-from ccnn_torch.identification.problems.problem import Channel, Problem
+from ccnn_torch.identification.problems.problem import Channel, Problem, check_equations
 from ccnn_torch.identification.problems.rows import check_finite
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix

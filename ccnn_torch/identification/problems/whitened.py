@@ -9,9 +9,8 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.problems.checks import check_equations
 from ccnn_torch.identification.problems.parameters import Selection
-from ccnn_torch.identification.problems.problem import Channel, Problem
+from ccnn_torch.identification.problems.problem import Channel, Problem, check_equations
 from ccnn_torch.identification.problems.rows import MeasuredRows, inverse_root
 from ccnn_torch.identification.problems.sparse import WhitenedResidual, dependence
 

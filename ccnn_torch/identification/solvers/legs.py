@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.problems.checks import check_equations
 from ccnn_torch.identification.problems.linear import WeightedRows
-from ccnn_torch.identification.problems.problem import Channel, Fit, Problem, Progress, Solver, part_of
+from ccnn_torch.identification.problems.problem import Channel, Fit, Problem, Progress, Solver, check_equations, part_of
 
 _DEPENDS = 1e-9  # Relative size of a derivative below which it is rounding.
 

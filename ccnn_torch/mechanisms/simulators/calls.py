@@ -103,7 +103,7 @@ class Calls:
         return np.stack([self._kept[key] for key in keys])
 
     def ask(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The callable itself: commands, covariates and parameters side by side in rows -> pose, NaN where it has none."""
+        """The callable itself: rows of commands, covariates and parameters -> pose, NaN where it has none."""
         simulator, n = self.simulator, len(self.simulator.joints)
         names = [c.name for c in self._conditions]
         # Copies: a simulator that writes into what it is given must not change what it is compared with.
