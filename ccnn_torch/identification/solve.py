@@ -118,14 +118,26 @@ def _problem_at(measured: Measured, config: IdentifyConfig, rows: Rows, start: T
             "methods: a pose depends on all legs, so legs are identified apart only by their joints; write "
             "residual=inverse, or remove _per_leg"
         )
-    build = partial(inverse_problem, per_leg=per_leg)
-    if forward:
-        build = partial(forward_problem, rotation_weight=config.rotation_weight)
+    return _built(measured, config, rows, choice_of(config, measured.mechanism), start, None if forward else per_leg)
+
+
+def _built(
+    measured: Measured,
+    config: IdentifyConfig,
+    rows: Rows,
+    choice: ParameterChoice,
+    start: Tensor,
+    per_leg: bool | None = None,
+) -> Problem:
+    """The problem of joints, `per_leg` or not, or of poses where that is None."""
+    build = partial(forward_problem, rotation_weight=config.rotation_weight)
+    if per_leg is not None:
+        build = partial(inverse_problem, per_leg=per_leg)
     return build(
         measured.view,
         rows.joints,
         rows.observed,
-        choice=choice_of(config, measured.mechanism),
+        choice=choice,
         pose_noise=measured.pose_noise,
         joint_noise=measured.joint_noise,
         start=start,
@@ -139,21 +151,12 @@ def frames_first(measured: Measured, config: IdentifyConfig) -> Measured:
     assert isinstance(measured.mechanism, Framed)
     closed = measured.mechanism.fitted_frames(measured.rows.joints, measured.view.frame(measured.rows.observed))
     prefixes = tuple(f"{part}_" for part, free in (("base", config.frame.base), ("tool", config.frame.tool)) if free)
-    names = tuple(p.name for p in measured.mechanism.geometry if p.name.startswith(prefixes))
+    names = [p.name for p in measured.mechanism.geometry if p.name.startswith(prefixes)]
     choice = ParameterChoice(free=names)
-    problem = forward_problem(
-        measured.view,
-        measured.rows.joints,
-        measured.rows.observed,
-        choice=choice,
-        pose_noise=measured.pose_noise,
-        joint_noise=measured.joint_noise,
-        rotation_weight=config.rotation_weight,
-        start=closed,
-    )
+    problem = _built(measured, config, measured.rows, choice, closed)
     found = get_solver("lm")(problem, config.seed)
     start = select_parameters(measured.mechanism.geometry, choice, closed).full(found.values)
-    return replace(measured, start=start, unknown_frame=names)
+    return replace(measured, start=start)
 
 
 def is_apart(method: str, config: IdentifyConfig) -> bool:

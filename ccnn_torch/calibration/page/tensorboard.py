@@ -43,7 +43,6 @@ class TensorBoardCallback:
     def __init__(
         self,
         folder: str | Path,
-        masks: Callable[[], Sequence[ArrayLike]] | None = None,
         *,
         every: int = 1,
         masks_every: int = 20,
@@ -54,8 +53,6 @@ class TensorBoardCallback:
 
         Args:
             folder: where the event files go.
-            masks: gives the masks of the best network of the first repeat, layer by layer, `out x in`, bool; None =
-                those of the learner, if it has a `genome`.
             every: write scalars each so many steps.
             masks_every: write the masks each so many steps.
             past: gives the history before a resumed training, metrics `t x r [x k]`, and the seconds inside the
@@ -63,7 +60,7 @@ class TensorBoardCallback:
             tell: is given the sentence when the curves cannot be written any further.
         """
         self._folder = Path(folder)
-        self._masks = masks
+        self._masks: Callable[[], Sequence[ArrayLike]] | None = None
         self._every = every
         self._masks_every = masks_every
         self._past = past
@@ -77,7 +74,7 @@ class TensorBoardCallback:
         if step == 0:
             # A fresh start has no earlier steps, whatever an older file holds.
             self._past = None
-        if self._masks is None and genome is not None:
+        if genome is not None:
             self._masks = lambda: [mask.cpu().numpy() for mask in genome(0)[0]]
 
     def on_step(self, step: int, metrics: Mapping[str, Tensor]) -> None:

@@ -21,7 +21,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
     source = with_test_file(config.records if given is None else given, config.split)
     records, mechanism = read_records(config, source, mechanism)
     train, test = split_records(config, records)
-    start, unknown = _frames(mechanism, train)
+    start = _start(mechanism, train)
     far = []
     if isinstance(mechanism, SerialArm):
         far = judge_frames(mechanism, train.joints[0], train.observed[0], start, where=records.path)
@@ -35,7 +35,6 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
         start=start,
         pose_noise=None if config.noise is None else sizes_of_pose(config.noise, mechanism.pose, "noise"),
         joint_noise=_joint_noise(config, mechanism),
-        unknown_frame=unknown,
         data_hash=records.data_hash,
         notes=[*held_out_notes(config.split, test.joints.shape[1]), *_notes(records), *far],
     )
@@ -81,14 +80,11 @@ def split_records(config: IdentifyConfig, records: Records) -> tuple[Rows, Rows]
     return train, test
 
 
-def _frames(mechanism: Mechanism, rows: Rows) -> tuple[Tensor, tuple[str, ...]]:
-    """Where the search starts, `1 x K`, and the parameters of frames that had to be fitted first."""
+def _start(mechanism: Mechanism, rows: Rows) -> Tensor:
+    """Where the search starts, `1 x K`: frames that are unknown have to be fitted first."""
     if not isinstance(mechanism, SerialArm) or not mechanism.unknown_frames:
-        return mechanism.nominal[None].clone(), ()
-    start = fit_frames(mechanism, rows.joints[0], rows.observed[0])
-    names = [p.name for p in mechanism.geometry]
-    prefixes = tuple(f"{frame}_" for frame in mechanism.unknown_frames)
-    return start[None], tuple(name for name in names if name.startswith(prefixes))
+        return mechanism.nominal[None].clone()
+    return fit_frames(mechanism, rows.joints[0], rows.observed[0])[None]
 
 
 def _joint_noise(config: IdentifyConfig, mechanism: Mechanism) -> Tensor | None:

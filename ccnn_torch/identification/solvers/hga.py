@@ -20,7 +20,7 @@ from ccnn_torch.evolution.operators import tournament
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
 from ccnn_torch.identification.solvers.lockstep import Array, run_side_by_side
-from ccnn_torch.identification.solvers.objective import Objective, make_objective
+from ccnn_torch.identification.solvers.objective import WIDTH, Objective, make_objective
 
 # Streams of random numbers: the first population and the generations.
 _FIRST, _BREED = 0, 1
@@ -78,7 +78,7 @@ class HybridGenetic:
         r, k = objective.machines, len(objective.problem.scale)
         seeds = seed + torch.arange(r)
         (draws,) = uniform_parts(seeds, _FIRST, 0, [(self.population, k)])
-        people = (2 * draws - 1) * objective.width
+        people = (2 * draws - 1) * WIDTH
         people[:, 0] = 0.0  # the start is a guess worth having
         costs = objective.cost(people)
         mark, since = costs.amin(-1), torch.zeros(r, dtype=torch.int64)
@@ -86,7 +86,7 @@ class HybridGenetic:
         generation = 0
         while len(active) and generation < self.generations:
             generation += 1
-            children = self._breed(people[active], costs[active], seeds[active], generation, objective.width)
+            children = self._breed(people[active], costs[active], seeds[active], generation, WIDTH)
             kept = costs[active].argsort(dim=-1, stable=True)[:, : self.elites]
             old = people[active].gather(1, kept[..., None].expand(-1, -1, k))
             people[active] = torch.cat([old, children], dim=1)

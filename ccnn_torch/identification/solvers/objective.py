@@ -17,8 +17,8 @@ FORBIDDEN = 1e100
 # Rows evaluated in one call: intermediate results of the kinematics then stay in the processor's cache.
 _ROWS_AT_ONCE = 1 << 15
 
-# Half the width of the box that global searches stay in, in units of `Problem.scale`.
-_WIDTH = 3.0
+WIDTH = 3.0
+"""Half the width of the box that global searches stay in, in units of `Problem.scale`."""
 
 
 _HELD = 1e-9
@@ -44,20 +44,11 @@ class Objective:
         """Number of machines, `r`."""
         return self.problem.start.shape[0]
 
-    @property
-    def width(self) -> float:
-        """Global searches stay in -width .. width."""
-        return _WIDTH
-
     def values(self, points: Tensor) -> Tensor:
         """From coordinates to parameters: `r x … x k` [1] to the same [SI]."""
         start = self.problem.start
         start = start.reshape(len(start), *(1,) * (points.dim() - 2), -1)
         return start + points * self.problem.scale
-
-    def points(self, values: Tensor) -> Tensor:
-        """From parameters to coordinates, `r x k` [SI] to `r x k` [1]."""
-        return (values - self.problem.start) / self.problem.scale
 
     @torch.no_grad()
     def cost(self, points: Tensor, machines: Tensor | None = None) -> Tensor:

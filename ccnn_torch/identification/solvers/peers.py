@@ -1,7 +1,7 @@
 """Global searches of well-kept libraries, for comparison: genetic algorithm, particle swarm, simulated annealing.
 
 The first two are pymoo's (Blank and Deb 2020), asked for their populations, which are evaluated together for all
-machines; the third is SciPy's generalised simulated annealing. All stay in the box of `Objective.width` and spend the
+machines; the third is SciPy's generalised simulated annealing. All stay in the box of `WIDTH` and spend the
 same number of evaluations by default.
 """
 
@@ -23,7 +23,7 @@ from scipy.optimize import dual_annealing
 
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
 from ccnn_torch.identification.solvers.lockstep import Array, run_side_by_side
-from ccnn_torch.identification.solvers.objective import FORBIDDEN, Objective, make_objective
+from ccnn_torch.identification.solvers.objective import FORBIDDEN, WIDTH, Objective, make_objective
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Annealing:
         """Minimise; machine i draws its numbers from seed + i alone."""
         objective = make_objective(problem)
         r, k = objective.machines, len(problem.scale)
-        bounds = [(-objective.width, objective.width)] * k
+        bounds = [(-WIDTH, WIDTH)] * k
         done = 0
 
         def evaluate(points: Array) -> list[float]:
@@ -124,7 +124,7 @@ def _ask_and_tell(
     generations = max(1, evaluations // population)
     searches = []
     for machine in range(r):
-        draw = np.random.default_rng(seed + machine).uniform(-objective.width, objective.width, (population, k))
+        draw = np.random.default_rng(seed + machine).uniform(-WIDTH, WIDTH, (population, k))
         draw[0] = 0.0  # the start is a guess worth having
         search = make(draw)
         search.setup(_box(objective), termination=("n_gen", generations), seed=seed + machine, verbose=False)
@@ -144,7 +144,7 @@ def _ask_and_tell(
 
 def _box(objective: Objective) -> Any:
     k = len(objective.problem.scale)
-    return Box(n_var=k, n_obj=1, xl=np.full(k, -objective.width), xu=np.full(k, objective.width))
+    return Box(n_var=k, n_obj=1, xl=np.full(k, -WIDTH), xu=np.full(k, WIDTH))
 
 
 def _fit(objective: Objective, points: torch.Tensor, evaluations: int) -> Fit:
