@@ -134,10 +134,10 @@ def identify(
         if path is not None:
             save_outcome(path, outcomes[method], facts)
     counts = count_study(config, mechanism)
-    done = assemble(config, measured, outcomes, counts, _bootstrap(config, measured, outcomes))
+    results, arrays = assemble(config, measured, outcomes, counts, _bootstrap(config, measured, outcomes))
     if elsewhere is not None:
-        done.results["transfer"] = transferred(config, elsewhere, next(iter(outcomes.values())).values[0])
-    return Identification(config, measured, outcomes, done.results, done.arrays, given)
+        results["transfer"] = transferred(config, elsewhere, next(iter(outcomes.values())).values[0])
+    return Identification(config, measured, outcomes, results, arrays, given)
 
 
 def _bootstrap(config: IdentifyConfig, measured: Measured, outcomes: dict[str, Outcome]) -> Tensor | None:

@@ -53,9 +53,8 @@ def before_and_after(before: PoseError, after: PoseError, noise: PoseError | Non
         noise: of the measurement, `r x t`, where it is known.
     """
     answer: dict[str, Any] = {}
-    for name, unit, first, last, floor in (
-        ("position", "m", before.position, after.position, None if noise is None else noise.position),
-        ("rotation", "rad", before.rotation, after.rotation, None if noise is None else noise.rotation),
+    for name, unit, first, last, floor in zip(
+        PoseError._fields, ("m", "rad"), before, after, noise or (None, None), strict=True
     ):
         if first is None or last is None or float(first.abs().nan_to_num().max()) == 0:
             answer[name] = None
@@ -75,10 +74,7 @@ def before_and_after(before: PoseError, after: PoseError, noise: PoseError | Non
 def removed(before: PoseError, after: PoseError) -> dict[str, Any]:
     """As `before_and_after`, with the share of the RMS that was removed."""
     answer = before_and_after(before, after)
-    for name, first, last in (
-        ("position", before.position, after.position),
-        ("rotation", before.rotation, after.rotation),
-    ):
+    for name, first, last in zip(PoseError._fields, before, after, strict=True):
         if answer[name] is None or first is None or last is None:
             continue
         share = figures({"removed": 1 - _rms(last) / _rms(first)})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -74,22 +74,14 @@ def known_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> Known:
     return Known(sd, combinations, correlation, singular, torch.stack(noise).mean(0), torch.stack(freedom).sum(0))
 
 
-@dataclass
-class Assembled:
-    """`results`: the content of identified.json; `arrays`: tensors by name, for the pictures."""
-
-    results: dict[str, Any]
-    arrays: dict[str, Tensor] = field(default_factory=dict)
-
-
 def assemble(
     config: IdentifyConfig,
     measured: Measured,
     outcomes: Mapping[str, Outcome],
     counts: list[dict[str, Any]],
     resampled: Tensor | None = None,
-) -> Assembled:
-    """Judge every outcome; the first method's values are the result.
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The content of `identified.json`, and tensors by name for the pictures; the first method's values are the result.
 
     Not the method of the best held-out error: that would choose by the rows that judge.
 
@@ -132,7 +124,7 @@ def assemble(
         [f"{m}: {o.message}" for m, o in outcomes.items() if o.message],
     )
     results |= {"promise": _promise(measured, before, after), "counts": counts}
-    return Assembled(results, arrays)
+    return results, arrays
 
 
 def results_of(
@@ -324,14 +316,13 @@ def parameter_blocks(
 
 
 def _pose_arrays(before: PoseError, after: PoseError, noise: PoseError | None) -> dict[str, Tensor]:
-    arrays = {"position_before": before.position, "position_after": after.position}
-    if before.rotation is not None and after.rotation is not None:
-        arrays |= {"rotation_before": before.rotation, "rotation_after": after.rotation}
-    if noise is not None:
-        arrays["position_noise"] = noise.position
-        if noise.rotation is not None:
-            arrays["rotation_noise"] = noise.rotation
-    return arrays
+    found = {"before": before, "after": after} | ({} if noise is None else {"noise": noise})
+    return {
+        f"{part}_{when}": values
+        for when, error in found.items()
+        for part, values in error._asdict().items()
+        if values is not None
+    }
 
 
 def _residuals(pieces: list[Piece], selection: Selection, outcome: Outcome) -> dict[str, Tensor]:

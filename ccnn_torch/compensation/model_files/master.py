@@ -16,7 +16,7 @@ from torch import Tensor
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.compensation.model_files.metadata import check_keys, check_tensors, coordinates, from_json, to_json
-from ccnn_torch.compensation.model_files.onnx_form import check_form
+from ccnn_torch.compensation.model_files.metadata_form import check_form
 from ccnn_torch.compensation.model_files.onnx_session import (
     METADATA_KEY,
     OUTPUTS,
