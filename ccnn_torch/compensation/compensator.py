@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ccnn_torch.compensation.contraction import TOLERANCE
 from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.compensation.effects.effects import PhysicalEffects
 from ccnn_torch.compensation.geometry.identified import Geometry
@@ -188,6 +189,12 @@ class Compensator(nn.Module):
         """
         _, _, last, first = self._solve(joints, covariates)
         return last.value, last.weight, first.value, first.weight
+
+    @property
+    def export_tolerance(self) -> float:
+        """Share of the limit to which exports agree: 1e-12, or what network, geometry or effects ask for."""
+        parts = (self.network, self.geometry, self.effects)
+        return max(float(getattr(part, "export_tolerance", TOLERANCE)) for part in parts)
 
     def next_correction(self, deviation: Tensor, correction: Tensor, steps: list[Step]) -> tuple[Tensor, list[Step]]:
         """What to subtract from the ideal joints next; see `secant.next_correction`."""

@@ -33,7 +33,7 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
             raise InputError(
                 f"{spec}: is no mechanism; derive the class from ccnn_torch.mechanisms.Mechanism, or make a Simulator"
             )
-        wrong = _wrong_names(mechanism) or _wrong_shape_of_closure(mechanism)
+        wrong = wrong_names(mechanism) or _wrong_shape_of_closure(mechanism)
         if not wrong:
             settle_home(mechanism)
             wrong = _wrong_kinematics(mechanism) or jump_sentence(mechanism)
@@ -47,7 +47,8 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
     return mechanism
 
 
-def _wrong_names(m: Mechanism) -> str:
+def wrong_names(m: Mechanism) -> str:
+    """What is wrong with names, units, legs and the sampling box; empty where nothing is."""
     n, wanted = len(m.joints), [f"q{i + 1}" for i in range(len(m.joints))]
     if n == 0 or [j.name for j in m.joints] != wanted:
         return f"its joints must be named {', '.join(wanted) or 'q1, q2, …'}, not {[j.name for j in m.joints]}"

@@ -85,9 +85,7 @@ def golden_vectors(compensator: Compensator, form: Form) -> Golden:
     }
     if form.spread is not None:
         outputs["sd"] = np.where(lost, form.fallback_sd, sd)
-    parts = (compensator.network, compensator.geometry, compensator.effects)
-    share = max(TOLERANCE, *(float(getattr(part, "export_tolerance", TOLERANCE)) for part in parts))
-    share = SINGLE_TOLERANCE if form.dtype == "float32" else share
+    share = SINGLE_TOLERANCE if form.dtype == "float32" else compensator.export_tolerance
     values = given.numpy()
     return Golden(values[:, :n], values[:, n:], outputs, share * form.limit, 10 * share, _hard(compensator))
 
