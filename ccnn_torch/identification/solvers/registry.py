@@ -17,9 +17,9 @@ _WHERE = {
     "lm": ("lm", "solve_lm"),
     "hga": ("hga", "HybridGenetic"),
     "tikhonov": ("tikhonov", "solve_tikhonov"),
-    "ga": ("peers", "Genetic"),
-    "sa": ("peers", "Annealing"),
-    "pso": ("peers", "Swarm"),
+    "ga": ("peers", "solve_ga"),
+    "sa": ("peers", "solve_sa"),
+    "pso": ("peers", "solve_pso"),
 }
 
 _PER_LEG = "_per_leg"
