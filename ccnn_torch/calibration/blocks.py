@@ -21,8 +21,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import read_json, write_json
 from ccnn_torch.run_folder.folder import RunFolder
 
-__all__ = ["Block", "blocks_of", "merged", "write_blocks"]
-
 _SPREAD = {"median", "low", "high", "values"}
 # What the exported repeat's block has, and its run. Checkpoints, curves of TensorBoard and the config stay there.
 _KEPT = ("arrays.safetensors", "history-*.safetensors", "model.*", "card.json", "models")
@@ -38,11 +36,7 @@ class Block:
 
 
 def blocks_of(config: RunConfig, folder: RunFolder) -> list[Block]:
-    """The blocks of a run, in the order of their seeds.
-
-    Raises:
-        InputError: `methods=auto` chooses once for all repeats.
-    """
+    """The blocks of a run, in the order of their seeds."""
     if config.methods == ["auto"]:
         raise InputError(
             "methods=auto chooses a method for all repeats together; name the methods, or write block=null"
@@ -71,14 +65,7 @@ def blocks_of(config: RunConfig, folder: RunFolder) -> list[Block]:
 def write_blocks(
     config: RunConfig, folder: RunFolder, blocks: Sequence[Block], again: Callable[[Block], object]
 ) -> None:
-    """Put the figures of finished blocks together, and export the best repeat of all.
-
-    Args:
-        again: resumes a block, to write its model files.
-
-    Raises:
-        InputError: the blocks chose different methods or geometry.
-    """
+    """Put the figures of finished blocks together, and export the best repeat of all."""
     found = [read_json(block.folder.results) for block in blocks]
     for key, of in (("methods", _methods), ("geometry", _geometry)):
         if len({of(results) for results in found}) > 1:

@@ -26,8 +26,6 @@ from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Callback, Scaling
 from ccnn_torch.verification.promise import configurations, promise_block
 
-__all__ = ["Calibration", "Watch", "calibrate", "makers"]
-
 Watch = Callable[[Prepared, str, str, Scaling], list[Callback]]
 """Callbacks of one training, given the rows, the method, the phase (`choose` or `fit`) and the phase's scaling."""
 
@@ -110,7 +108,6 @@ class Calibration:
 
         Args:
             method: the best one when None.
-            name: of the files.
             forms: which files; each takes a few seconds to export and check.
 
         Returns:
@@ -217,12 +214,6 @@ def makers(config: RunConfig, default: str = "ccnn") -> dict[str, Callable[[], L
 
     A user's `path/to/file.py:Name` is called `Name` there. None marks a learner that `methods=all` or `auto`
     asks for and this version does not have.
-
-    Args:
-        default: the method where the config names none.
-
-    Raises:
-        InputError: a method that was named is not to be had.
     """
     found: dict[str, Callable[[], Learner] | None] = {}
     for method in method_names(config, default):

@@ -32,22 +32,6 @@ from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.spelling import nearest
 
-__all__ = [
-    "METHODS",
-    "AutoConfig",
-    "CompensationConfig",
-    "RealisticConfig",
-    "RunConfig",
-    "SplitConfig",
-    "TrainingConfig",
-    "describe_keys",
-    "dump_config",
-    "key_table",
-    "load_config",
-    "make_config",
-    "method_names",
-]
-
 METHODS = ("ccnn", "bp_lm", "grnn", "enn", "constant", "gp")
 """The learner names of the framework; `ccnn_torch.learners.LEARNERS` has those that this version can make."""
 

@@ -11,8 +11,6 @@ from ccnn_torch.calibration.learning.fitting import Fitted
 from ccnn_torch.calibration.rows.prepare import Prepared
 from ccnn_torch.mechanisms import PoseError
 
-__all__ = ["Outcome", "evaluate", "pose_before", "pose_with_effects", "pose_with_geometry"]
-
 # The fixed point q = q* - δ(q) gains a factor of the Lipschitz constant of δ each time, about 1e-3 for real machines.
 _COMMAND_ITERATIONS = 8
 

@@ -25,15 +25,9 @@ from ccnn_torch.run_folder.folder import RunFolder, kept_for
 from ccnn_torch.run_folder.resume import facts_of, refuse_changes
 from ccnn_torch.training import Callback, Scaling, past_of
 
-__all__ = ["resume_run", "start_run"]
-
 
 def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> RunFolder:
     """Run a config into a fresh folder.
-
-    Args:
-        quiet: no progress and no tables.
-        tables: show the results when it is done.
 
     Raises:
         InputError: the config or its data cannot be used, or the folder is taken or in use.
@@ -49,9 +43,6 @@ def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> Ru
 
 def resume_run(path: Path, quiet: bool = False, tables: bool = True) -> RunFolder:
     """Finish the run in a folder; the result is that of a run that was never stopped. A finished one stays as it is.
-
-    Args:
-        quiet, tables: as in `start_run`.
 
     Raises:
         InputError: there is no run in the folder, it is in use, or its config, records or checkpoints were changed.

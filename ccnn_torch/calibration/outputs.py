@@ -21,8 +21,6 @@ from ccnn_torch.report.json_files import write_json
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Training
 
-__all__ = ["write_outputs"]
-
 
 def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
     """Model files, arrays, curves, plots, tables, report, and at last `results.json`."""

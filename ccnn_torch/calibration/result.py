@@ -29,8 +29,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.simulation.case_study import Simulation
 
-__all__ = ["assemble", "best_method", "by_score", "plan_of", "versions"]
-
 _NO_GEOMETRY = {"chosen": "none", "why": "A simulated case compares learners."}
 _PACKAGES = ("ccnn-torch", "torch", "numpy", "scipy", "onnx", "onnxruntime", "safetensors")
 
@@ -156,14 +154,17 @@ def _spread_or_none(values: Tensor | None) -> dict[str, Any] | None:
 
 def _pose_of(prepared: Prepared, outcome: Outcome) -> dict[str, Any]:
     """The pose error that a method leaves, over all test rows."""
-    rows = pad_rows([split.test for split in prepared.dataset.splits])
-    position, rotation = (
-        None if error is None else rows.take(error.expand(len(rows.index), -1))
-        for error in (outcome.after.position, outcome.after.rotation)
-    )
-    assert position is not None
-    block = pose_block(position, position, rows.weights, rotation, rotation)
+    left, weights = _held_out(prepared, outcome.after)
+    block = pose_block(left, left, weights)
     return {name: part and {"unit": part["unit"], **part["after"]} for name, part in block.items()}
+
+
+def _held_out(prepared: Prepared, error: PoseError) -> tuple[PoseError, Tensor]:
+    """Pose errors of all test rows, those that were not fit to be trained on as well, and the rows' weights."""
+    rows = pad_rows([split.test for split in prepared.dataset.splits])
+    position, rotation = (None if e is None else rows.take(e.expand(len(rows.index), -1)) for e in error)
+    assert position is not None
+    return PoseError(position, rotation), rows.weights
 
 
 def case_label(config: RunConfig) -> str:
@@ -199,34 +200,20 @@ def row_counts(config: RunConfig, dataset: Dataset) -> dict[str, int]:
 
 
 def _pose(config: RunConfig, prepared: Prepared, before: PoseError, after: PoseError) -> dict[str, Any]:
-    """Over all test rows, those that were not fit to be trained on as well."""
-    rows = pad_rows([split.test for split in prepared.dataset.splits])
-    remainder = prepared.pseudoerror
-    geometry, effects = pose_with_geometry(prepared), pose_with_effects(prepared)
-
-    def held_out(values: Tensor | None) -> Tensor | None:
-        return None if values is None else rows.take(values.expand(len(rows.index), -1))
-
-    position_before, position_after = held_out(before.position), held_out(after.position)
-    assert position_before is not None and position_after is not None
+    place, turn = prepared.pseudoerror.remainder_position, prepared.pseudoerror.remainder_rotation
+    errors = {
+        "before": before,
+        "after": after,
+        "geometry": pose_with_geometry(prepared),
+        "effects": pose_with_effects(prepared),
+        # What no joint deviation can explain.
+        "not_compensable": PoseError(place.nan_to_num(0.0), None if turn is None else turn.nan_to_num(0.0)),
+    }
+    found = {name: _held_out(prepared, error) for name, error in errors.items() if error is not None}
+    weights = found["before"][1]
     return pose_block(
-        position_before,
-        position_after,
-        rows.weights,
-        held_out(before.rotation),
-        held_out(after.rotation),
-        config.rotation_weight,
-        held_out(_finite(remainder.remainder_position)),
-        held_out(_finite(remainder.remainder_rotation)),
-        held_out(None if geometry is None else geometry.position),
-        held_out(None if geometry is None else geometry.rotation),
-        held_out(None if effects is None else effects.position),
-        held_out(None if effects is None else effects.rotation),
+        weights=weights, rotation_weight=config.rotation_weight, **{name: error for name, (error, _) in found.items()}
     )
-
-
-def _finite(values: Tensor | None) -> Tensor | None:
-    return None if values is None else torch.nan_to_num(values, nan=0.0)
 
 
 def _effects(prepared: Prepared, test: Rows) -> dict[str, Any]:

@@ -17,18 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 
-__all__ = [
-    "before_block",
-    "constant_errors",
-    "floor_block",
-    "joint_errors",
-    "pose_block",
-    "ratio_to_floor",
-    "share_unit",
-    "spread",
-]
-
 Block = dict[str, Any]
+Error = tuple[ArrayLike, ArrayLike | None]
 
 
 def spread(values: ArrayLike) -> Block:
@@ -68,13 +58,9 @@ def joint_errors(
         predicted: deviations by the model, `r x s x n` [the joint's SI unit].
         measured: deviations by measurement, the same shape; what has no leading `r` serves all repeats.
         weights: row weights, `r x s` [1]; rows of weight 0 are ignored (padding). None = every row counts once.
-        joints: `n` coordinates.
 
     Returns:
         `{"all": {"mse": S, "mae": S, "sse": S}, JOINT: {…}}` with S a spread.
-
-    Raises:
-        InputError: the shapes do not fit together, or a repeat has no row.
     """
     error, weight = _rows(_array(predicted) - _array(measured), weights, joints)
     total = weight.sum(1)
@@ -104,10 +90,6 @@ def constant_errors(
     Args:
         train, test: measured deviations, `r x s x n` and `r x s' x n` [the joint's SI unit].
         train_weights, test_weights: `r x s`, `r x s'` [1], or None.
-        joints: `n` coordinates.
-
-    Raises:
-        InputError: as `joint_errors`.
     """
     values, weight = _rows(_array(train), train_weights, joints)
     mean = (values * weight[..., None]).sum(1, keepdims=True) / weight.sum(1)[:, None, None]
@@ -123,14 +105,10 @@ def before_block(deviations: ArrayLike, weights: ArrayLike | None, joints: Seque
     Args:
         deviations: pseudoerrors, `r x s x n` [the joint's SI unit].
         weights: `r x s` [1] or None.
-        joints: `n` coordinates.
 
     Returns:
         `{JOINT: {"mean", "max", "max_abs", "spread": {"mean": S, "max": S, "max_abs": S}}}`; the plain numbers are the
         medians over the repeats.
-
-    Raises:
-        InputError: as `joint_errors`.
     """
     values, weight = _rows(_array(deviations), weights, joints)
     there = weight[..., None] > 0
@@ -158,16 +136,12 @@ def floor_block(
     Args:
         noise: noise in the test rows, `r x s x n` [the joint's SI unit].
         weights: `r x s` [1] or None.
-        joints: `n` coordinates.
         variance: variance of the noise, `n` [the square of it].
         unlearnable: the part of the signal that the inputs do not determine, like `noise` (the chirp of eq. 19), or
             None. It counts as signal in `realised` and as noise in `with_unlearnable`.
 
     Returns:
         `{"realised": {"all": {"mse": S}, JOINT: …}, "expected": …, "with_unlearnable": … or null}`.
-
-    Raises:
-        InputError: as `joint_errors`.
     """
     drawn = _array(noise)
     repeats = drawn.shape[0] if drawn.ndim == 3 else 1
@@ -187,10 +161,6 @@ def floor_block(
 def ratio_to_floor(errors: Mapping[str, Any] | None, floor: Mapping[str, Any] | None) -> Block | None:
     """Ratio of the `all` mse to the realised floor, repeat by repeat.
 
-    Args:
-        errors: a `joint_errors` block, or None (the method failed).
-        floor: a `floor_block`, or None (unknown).
-
     Returns:
         A spread; None where one of the two is unknown or has no `all`.
     """
@@ -202,68 +172,39 @@ def ratio_to_floor(errors: Mapping[str, Any] | None, floor: Mapping[str, Any] | 
 
 
 def pose_block(
-    position_before: ArrayLike,
-    position_after: ArrayLike,
+    before: Error,
+    after: Error,
     weights: ArrayLike | None = None,
-    rotation_before: ArrayLike | None = None,
-    rotation_after: ArrayLike | None = None,
     rotation_weight: float | None = None,
-    position_remainder: ArrayLike | None = None,
-    rotation_remainder: ArrayLike | None = None,
-    position_geometry: ArrayLike | None = None,
-    rotation_geometry: ArrayLike | None = None,
-    position_effects: ArrayLike | None = None,
-    rotation_effects: ArrayLike | None = None,
+    **beside: Error | None,
 ) -> Block:
     """Root mean square and maximum of the pose error over the held-out rows, before and after.
 
     Args:
-        position_before, position_after: Euclidean position errors, `r x s` [m] (eq. 6).
+        before, after: Euclidean position errors, `r x s` [m] (eq. 6), and geodesic angles, `r x s` [rad], or None where
+            there is no orientation.
         weights: `r x s` [1], or None.
-        rotation_before, rotation_after: geodesic angles, `r x s` [rad], or None where there is no orientation.
         rotation_weight: η of eq. 5 [m/rad]; adds `energy`, E = position error + η · rotation error, row by row [m].
-        position_remainder, rotation_remainder: what no joint deviation can explain, `r x s` [m], [rad]; adds
-            `not_compensable` beside `before` and `after`.
-        position_geometry, rotation_geometry: what geometric calibration alone leaves, `r x s` [m], [rad]; adds
-            `geometry`.
-        position_effects, rotation_effects: what known effects leave by themselves, likewise; adds `effects`.
+        beside: what else is told beside `before` and `after`, under its name; None is left out.
 
     Returns:
         `{"position": {"unit": "m", "before": {"rms": S, "max": S}, "after": …}, "rotation": {…} or null}`, and `energy`
         where asked for.
-
-    Raises:
-        InputError: the shapes do not fit together, or a repeat has no row.
     """
+    errors = {"before": before, "after": after} | {name: error for name, error in beside.items() if error is not None}
 
-    def quantity(unit: str, **errors: ArrayLike | None) -> Block:
-        return {"unit": unit} | {k: _rms_and_max(_array(v), weights) for k, v in errors.items() if v is not None}
+    def quantity(unit: str, values: Mapping[str, ArrayLike | None]) -> Block:
+        return {"unit": unit} | {k: _rms_and_max(_array(v), weights) for k, v in values.items() if v is not None}
 
-    block: Block = {
-        "position": quantity(
-            "m",
-            before=position_before,
-            after=position_after,
-            geometry=position_geometry,
-            effects=position_effects,
-            not_compensable=position_remainder,
-        ),
-        "rotation": None,
-    }
-    if rotation_before is None or rotation_after is None:
+    block: Block = {"position": quantity("m", {name: error[0] for name, error in errors.items()}), "rotation": None}
+    if before[1] is None or after[1] is None:
         return block
-    block["rotation"] = quantity(
-        "rad",
-        before=rotation_before,
-        after=rotation_after,
-        geometry=rotation_geometry,
-        effects=rotation_effects,
-        not_compensable=rotation_remainder,
-    )
+    block["rotation"] = quantity("rad", {name: error[1] for name, error in errors.items()})
     if rotation_weight is not None:
-        before = _array(position_before) + rotation_weight * _array(rotation_before)
-        after = _array(position_after) + rotation_weight * _array(rotation_after)
-        block["energy"] = quantity("m", before=before, after=after) | {"rotation_weight": rotation_weight}
+        first, last = (
+            _array(p) + rotation_weight * _array(r) for p, r in ((before[0], before[1]), (after[0], after[1]))
+        )
+        block["energy"] = quantity("m", {"before": first, "after": last}) | {"rotation_weight": rotation_weight}
     return block
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ccnn_torch.compensation.contraction import TOLERANCE
 from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.compensation.effects.effects import PhysicalEffects
 from ccnn_torch.compensation.geometry.identified import Geometry
@@ -17,8 +18,6 @@ from ccnn_torch.compensation.secant import Step, next_correction
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, OutsideDomainWarning
 from ccnn_torch.training import Scaling
-
-__all__ = ["Compensator", "Solution", "default_limit"]
 
 Hook = Callable[[nn.Module, tuple[Any, ...], dict[str, Any], Tensor], Tensor]
 
@@ -190,6 +189,12 @@ class Compensator(nn.Module):
         """
         _, _, last, first = self._solve(joints, covariates)
         return last.value, last.weight, first.value, first.weight
+
+    @property
+    def export_tolerance(self) -> float:
+        """Share of the limit to which exports agree: 1e-12, or what network, geometry or effects ask for."""
+        parts = (self.network, self.geometry, self.effects)
+        return max(float(getattr(part, "export_tolerance", TOLERANCE)) for part in parts)
 
     def next_correction(self, deviation: Tensor, correction: Tensor, steps: list[Step]) -> tuple[Tensor, list[Step]]:
         """What to subtract from the ideal joints next; see `secant.next_correction`."""

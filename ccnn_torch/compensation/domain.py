@@ -11,8 +11,6 @@ from torch import Tensor, nn
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 
-__all__ = ["Domain", "Known"]
-
 # A principal direction thinner than this share of the inputs' half range counts as so thick: the training rows say
 # nothing about finer detail, and a guard that thin would be all slope.
 _THINNEST = 0.05

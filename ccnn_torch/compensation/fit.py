@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from ccnn_torch.compensation.compensator import Compensator, default_limit
 from ccnn_torch.compensation.contraction import (
     STEEPEST_DEVIATION,
-    TOLERANCE,
     iterations_needed,
     spread_points,
     steepest,
@@ -24,8 +23,6 @@ from ccnn_torch.compensation.secant import secant_steps
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.training import Scaling
-
-__all__ = ["fit_compensator"]
 
 # Rounds of damping, and the share of what was learned below which a compensator is not worth having.
 _DAMPINGS = 6
@@ -134,11 +131,9 @@ def _accelerate(compensator: Compensator, inputs: Tensor) -> None:
         return
     points = spread_points(inputs, compensator.domain, torch.Generator().manual_seed(1), _COUNTED)
     n = len(compensator.joints)
-    parts = (compensator.network, compensator.geometry, compensator.effects)
-    near = max(TOLERANCE, *(getattr(part, "export_tolerance", TOLERANCE) for part in parts))
     steps = secant_steps(
         lambda joints: compensator.deviation(joints, points[:, n:] if compensator.covariates else None),
-        points[:, :n], compensator.limit, compensator.iterations, near,
+        points[:, :n], compensator.limit, compensator.iterations, compensator.export_tolerance,
     )  # fmt: skip
     compensator.secant = steps < compensator.iterations
     compensator.iterations = steps

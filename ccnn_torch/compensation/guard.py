@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 
-__all__ = ["Promise", "as_matrix", "kept"]
-
 Array = NDArray[Any]
 
 # From here an input counts as infinite; as in a `Domain`.
@@ -88,11 +86,7 @@ class Promise:
 
 
 def as_matrix(values: ArrayLike, wanted: tuple[Coordinate, ...], what: str) -> Array:
-    """Rows of what a caller gives, `... x len(wanted)` [SI].
-
-    Raises:
-        InputError: they are no numbers, or the last dimension is wrong.
-    """
+    """Rows of what a caller gives, `... x len(wanted)` [SI]."""
     names = ", ".join(c.header for c in wanted)
     try:
         array = np.asarray(values, dtype=np.float64)
@@ -113,10 +107,8 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
     that are no number count as the middle of the domain, infinite ones as its edge.
 
     Args:
-        found: outputs by name; others than these are left out.
         joints: `s x n` [SI], anything.
         covariates: `s x m` [SI], anything; None without any.
-        promise: of the card.
 
     Returns:
         `command`, `deviation`, `ideal`, and `deviation_sd` where the promise has one, `s x n` [SI], all finite;

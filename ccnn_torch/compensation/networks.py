@@ -9,8 +9,6 @@ from torch import Tensor, nn
 
 from ccnn_torch.errors import InputError, ModelFileError
 
-__all__ = ["DescribedNetwork", "UncertainNetwork", "describe_network", "network_from_description", "register_network"]
-
 # Kind -> the class, or its module; imported when a file needs it.
 _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "constant": "ccnn_torch.learners.constant:ConstantNetwork",
@@ -54,11 +52,7 @@ def register_network(kind: str, network: type[DescribedNetwork]) -> None:
 
 
 def describe_network(network: nn.Module) -> dict[str, Any]:
-    """The network's own description.
-
-    Raises:
-        InputError: it has none, or one of an unknown kind.
-    """
+    """The network's own description."""
     if not callable(getattr(network, "describe", None)):
         raise InputError(
             f"the network {type(network).__name__} cannot be stored: give it describe() and from_description(), "

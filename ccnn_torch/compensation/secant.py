@@ -15,8 +15,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Step", "next_correction", "secant_steps"]
-
 # Steps below it are rounding, from which nothing is learned: share of the limit.
 _ROUNDING = 1e-10
 # A slope of at most 1/2, as compensators have, keeps the denominator above this but for curvature.

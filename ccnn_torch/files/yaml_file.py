@@ -91,16 +91,22 @@ def check_values(tree: Any, where: str) -> None:
             check_values(value, where)
 
 
-def dump_yaml(tree: dict[str, Any]) -> str:
-    """YAML text in block style, keys in the order given; `parse_yaml` gives the same tree back."""
-    text = _dumped(tree, unicode=True)
+def dump_yaml(tree: dict[str, Any], width: int | None = None) -> str:
+    """YAML text, keys in the order given; `parse_yaml` gives the same tree back.
+
+    Args:
+        width: put the innermost lists and mappings in one line each, up to so many characters; block style when None.
+    """
+    text = _dumped(tree, width, unicode=True)
     # The emitter treats NEL as a line break and the parser does not; escaped, both read the same text.
-    return _dumped(tree, unicode=False) if "\x85" in text else text
+    return _dumped(tree, width, unicode=False) if "\x85" in text else text
 
 
-def _dumped(tree: dict[str, Any], unicode: bool) -> str:
+def _dumped(tree: dict[str, Any], width: int | None, unicode: bool) -> str:
     yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = False
+    yaml.default_flow_style = False if width is None else None
+    if width is not None:
+        yaml.width = width
     yaml.allow_unicode = unicode
     setattr(yaml, "sort_base_mapping_type_on_output", False)  # noqa: B010 - ruamel declares its type as None
     # A repeated list is written out twice: aliases are not read.

@@ -25,20 +25,6 @@ from ccnn_torch.config.tree import (
 )
 from ccnn_torch.spelling import nearest
 
-__all__ = [
-    "IDENTIFY_METHODS",
-    "ConstraintConfig",
-    "FrameConfig",
-    "IdentifyConfig",
-    "ParameterConfig",
-    "SimulateConfig",
-    "base_method",
-    "describe_identify_keys",
-    "dump_identify_config",
-    "load_identify_config",
-    "make_identify_config",
-]
-
 IDENTIFY_METHODS = ("lm", "hga", "tikhonov", "ga", "sa", "pso")
 """Solvers by name; `NAME_per_leg` identifies each leg from its own equations alone."""
 

@@ -10,8 +10,6 @@ from scipy.stats import chi2
 
 from ccnn_torch.display import display_unit, number_text
 
-__all__ = ["doubts_of"]
-
 # Residuals that chance makes as rarely as this do not fit the noise given; a ratio this near 1 is nothing to speak of.
 _RARE, _NEAR = 1e-3, 1.5
 # Held-out errors above so many times the noise, or this share of the error before, say that something else is wrong.

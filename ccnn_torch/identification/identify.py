@@ -42,8 +42,6 @@ from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.sources import read_source
 from ccnn_torch.run_folder.resume import facts_of, refuse_changes
 
-__all__ = ["Identification", "Watch", "identify"]
-
 Watch = Callable[[str], Progress]
 """Given a label, somewhere to report the share that is done."""
 
@@ -72,11 +70,7 @@ class Identification:
         return self.measured.mechanism.with_nominal(outcome.values[machine])
 
     def save(self, folder: str | Path) -> None:
-        """Write what `ccnn identify` writes into a folder, which is made; a DataFrame's rows as `records.csv`.
-
-        Raises:
-            InputError: a class of a mechanism is not defined in a file, so it cannot be built again.
-        """
+        """Write what `ccnn identify` writes into a folder, which is made; a DataFrame's rows as `records.csv`."""
         from ccnn_torch.identification.outputs import write_outputs
 
         folder = Path(folder)
@@ -97,11 +91,7 @@ class Identification:
 
 
 def prepare(config: IdentifyConfig, given: Given | None = None) -> tuple[Mechanism, Measured]:
-    """Mechanism and rows of a config; the rows of `given` where Python has them.
-
-    Raises:
-        InputError: the mechanism or the data cannot be used.
-    """
+    """Mechanism and rows of a config; the rows of `given` where Python has them."""
     mechanism = nominal_machine(config)
     if config.frame.base or config.frame.tool:
         mechanism = Framed(mechanism, base=config.frame.base, tool=config.frame.tool)
@@ -144,18 +134,14 @@ def identify(
         if path is not None:
             save_outcome(path, outcomes[method], facts)
     counts = count_study(config, mechanism)
-    done = assemble(config, measured, outcomes, counts, _bootstrap(config, measured, outcomes))
+    results, arrays = assemble(config, measured, outcomes, counts, _bootstrap(config, measured, outcomes))
     if elsewhere is not None:
-        done.results["transfer"] = transferred(config, elsewhere, next(iter(outcomes.values())).values[0])
-    return Identification(config, measured, outcomes, done.results, done.arrays, given)
+        results["transfer"] = transferred(config, elsewhere, next(iter(outcomes.values())).values[0])
+    return Identification(config, measured, outcomes, results, arrays, given)
 
 
 def _bootstrap(config: IdentifyConfig, measured: Measured, outcomes: dict[str, Outcome]) -> Tensor | None:
-    """Standard deviations of the first machine's parameters over resampled fits, `k` [SI]; None where not asked for.
-
-    Raises:
-        InputError: of a slow method: hundreds of its fits would take hours.
-    """
+    """Standard deviations of the first machine's parameters over resampled fits, `k` [SI]; None where not asked for."""
     if config.bootstrap == 0:
         return None
     method = config.methods[0]

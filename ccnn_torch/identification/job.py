@@ -14,8 +14,6 @@ from ccnn_torch.report.screen import note, progress_bar, say_place, stdout
 from ccnn_torch.run_folder.folder import RunFolder, kept_for
 from ccnn_torch.run_folder.resume import facts_of, refuse_changes
 
-__all__ = ["resume_identification", "start_identification"]
-
 
 def start_identification(config: IdentifyConfig, quiet: bool = False) -> Path:
     """Identify into a fresh folder.

@@ -10,8 +10,6 @@ from ccnn_torch.identification.measured.measured import Measured
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.numerics.least_squares import jacobian_of
 
-__all__ = ["Commanded", "commanded", "map_error", "noise_of_test", "predicted"]
-
 
 class Commanded(NamedTuple):
     """Pose errors of the simulated machine at wanted poses: commanded by nominal geometry, exactly, and linearly."""

@@ -13,8 +13,6 @@ from ccnn_torch.mechanisms.files.mechanism_file import mechanism_text
 from ccnn_torch.mechanisms.files.write_arm import dh_text, urdf_text
 from ccnn_torch.report.json_files import write_json
 
-__all__ = ["RESULTS", "write_machine", "write_outputs"]
-
 RESULTS = "identified.json"
 
 

@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ccnn_torch.display import number_text
 from ccnn_torch.mechanisms import PoseError
-
-__all__ = ["before_and_after", "figures", "removed"]
 
 _LOW, _HIGH = 0.05, 0.95
 
@@ -34,6 +33,18 @@ def figures(values: Mapping[str, Tensor | None]) -> dict[str, Any]:
     return numbers | ({"spread": spread} if spread else {})
 
 
+def figure_text(block: Mapping[str, Any] | None, key: str, scale: float = 1.0, digits: int = 3) -> str:
+    """One of the `figures` with its interval, or –."""
+    if block is None or block.get(key) is None:
+        return "–"
+    text = number_text(block[key] / scale, digits)
+    spread = block.get("spread", {}).get(key)
+    if spread is not None:
+        low, high = (number_text(v / scale, digits) for v in spread)
+        text += f" [{low}, {high}]"
+    return text
+
+
 def before_and_after(before: PoseError, after: PoseError, noise: PoseError | None = None) -> dict[str, Any]:
     """Position and rotation: RMS and maximum over the poses of a machine, before and after.
 
@@ -42,9 +53,8 @@ def before_and_after(before: PoseError, after: PoseError, noise: PoseError | Non
         noise: of the measurement, `r x t`, where it is known.
     """
     answer: dict[str, Any] = {}
-    for name, unit, first, last, floor in (
-        ("position", "m", before.position, after.position, None if noise is None else noise.position),
-        ("rotation", "rad", before.rotation, after.rotation, None if noise is None else noise.rotation),
+    for name, unit, first, last, floor in zip(
+        PoseError._fields, ("m", "rad"), before, after, noise or (None, None), strict=True
     ):
         if first is None or last is None or float(first.abs().nan_to_num().max()) == 0:
             answer[name] = None
@@ -64,10 +74,7 @@ def before_and_after(before: PoseError, after: PoseError, noise: PoseError | Non
 def removed(before: PoseError, after: PoseError) -> dict[str, Any]:
     """As `before_and_after`, with the share of the RMS that was removed."""
     answer = before_and_after(before, after)
-    for name, first, last in (
-        ("position", before.position, after.position),
-        ("rotation", before.rotation, after.rotation),
-    ):
+    for name, first, last in zip(PoseError._fields, before, after, strict=True):
         if answer[name] is None or first is None or last is None:
             continue
         share = figures({"removed": 1 - _rms(last) / _rms(first)})

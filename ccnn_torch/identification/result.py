@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -29,8 +29,6 @@ from ccnn_torch.identification.solve import (
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.verification.promise import configurations, promise_block
 from ccnn_torch.version import __version__
-
-__all__ = ["Assembled", "Known", "assemble", "known_of", "parameter_blocks", "versions"]
 
 Z95 = 1.959963984540054
 
@@ -76,22 +74,14 @@ def known_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> Known:
     return Known(sd, combinations, correlation, singular, torch.stack(noise).mean(0), torch.stack(freedom).sum(0))
 
 
-@dataclass
-class Assembled:
-    """`results`: the content of identified.json; `arrays`: tensors by name, for the pictures."""
-
-    results: dict[str, Any]
-    arrays: dict[str, Tensor] = field(default_factory=dict)
-
-
 def assemble(
     config: IdentifyConfig,
     measured: Measured,
     outcomes: Mapping[str, Outcome],
     counts: list[dict[str, Any]],
     resampled: Tensor | None = None,
-) -> Assembled:
-    """Judge every outcome; the first method's values are the result.
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The content of `identified.json`, and tensors by name for the pictures; the first method's values are the result.
 
     Not the method of the best held-out error: that would choose by the rows that judge.
 
@@ -124,7 +114,38 @@ def assemble(
     arrays["correlation"] = known[first].correlation
     arrays["observed"] = measured.rows.observed[:1]
     arrays |= {f"observed_leg{leg}": rows.observed[:1] for leg, rows in measured.leg_rows.items()}
-    results = {
+    results = results_of(
+        config,
+        measured,
+        parameter_blocks(measured, selection, main, known[first], resampled),
+        known[first],
+        blocks,
+        _doubts(config, measured, blocks[first]["test"], known[first]),
+        [f"{m}: {o.message}" for m, o in outcomes.items() if o.message],
+    )
+    results |= {"promise": _promise(measured, before, after), "counts": counts}
+    return results, arrays
+
+
+def results_of(
+    config: IdentifyConfig,
+    measured: Measured,
+    parameters: dict[str, Any],
+    known: Known,
+    methods: dict[str, Any],
+    doubts: list[str],
+    notes: list[str],
+) -> dict[str, Any]:
+    """What `identified.json` has of every identification.
+
+    Args:
+        parameters: see `parameter_blocks`.
+        known: by the first method.
+        methods: their blocks; the first is the result.
+        doubts, notes: sentences, the notes beside those of the rows.
+    """
+    method, first = next(iter(methods.items()))
+    return {
         "name": config.name,
         "seed": config.seed,
         "mechanism": measured.mechanism.name,
@@ -135,23 +156,41 @@ def assemble(
             "per_leg": {str(leg): rows.joints.shape[1] for leg, rows in measured.leg_rows.items()},
             "test": measured.test.joints.shape[1],
         },
-        "method": first,
-        "parameters": parameter_blocks(measured, selection, main, known[first], resampled),
-        "combinations_not_identifiable": known[first].combinations,
-        "test": blocks[first]["test"],
-        "promise": _promise(measured, before, after),
-        "methods": blocks,
-        "compensation": blocks[first]["compensation"],
-        "singular_values": known[first].singular_values,
-        "noise_ratio": figures({"value": known[first].noise}),
-        "doubts": _doubts(config, measured, blocks[first]["test"], known[first]),
-        "counts": counts,
+        "method": method,
+        "parameters": parameters,
+        "combinations_not_identifiable": known.combinations,
+        "test": first["test"],
+        "methods": methods,
+        "compensation": first["compensation"],
+        "singular_values": known.singular_values,
+        "noise_ratio": figures({"value": known.noise}),
+        "doubts": doubts,
+        "counts": [],
         "paper": config.paper,
         "data_sha256": measured.data_hash or None,
-        "notes": [*measured.notes, *(f"{m}: {o.message}" for m, o in outcomes.items() if o.message)],
-        "versions": versions(),
+        "notes": [*measured.notes, *notes],
+        "versions": {
+            "ccnn_torch": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+        },
     }
-    return Assembled(results, arrays)
+
+
+def method_of(outcome: Outcome, test: dict[str, Any], per_leg: bool) -> dict[str, Any]:
+    """A method's block, without what only simulated machines show."""
+    return {
+        "test": test,
+        "seconds": outcome.seconds,
+        "machines": len(outcome.machines),
+        "per_leg": per_leg,
+        "converged": float(outcome.converged.double().mean()),
+        "evaluations": outcome.evaluations,
+        "deviations": None,
+        "bound": None,
+        "coverage": None,
+        "compensation": None,
+    }
 
 
 def _promise(measured: Measured, before: PoseError, after: PoseError) -> dict[str, Any] | None:
@@ -174,15 +213,6 @@ def _doubts(config: IdentifyConfig, measured: Measured, test: dict[str, Any], kn
     return doubts_of(test, float(known.noise[0]), float(known.freedom[0]), noise, given)
 
 
-def versions() -> dict[str, str]:
-    """What the results were computed with."""
-    return {
-        "ccnn_torch": __version__,
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-    }
-
-
 def _method_block(
     config: IdentifyConfig,
     measured: Measured,
@@ -197,18 +227,7 @@ def _method_block(
     after = predicted(measured, outcome.values, machines)
     noise = noise_of_test(measured)
     test = before_and_after(before, after, None if noise is None else PoseError(*(_of(n, machines) for n in noise)))
-    block: dict[str, Any] = {
-        "test": test,
-        "seconds": outcome.seconds,
-        "machines": len(machines),
-        "per_leg": is_apart(method, config),
-        "converged": float(outcome.converged.double().mean()),
-        "evaluations": outcome.evaluations,
-        "deviations": None,
-        "bound": None,
-        "coverage": None,
-        "compensation": None,
-    }
+    block = method_of(outcome, test, is_apart(method, config))
     arrays[f"values_{method}"] = outcome.values
     if measured.truth is None:
         return block
@@ -297,14 +316,13 @@ def parameter_blocks(
 
 
 def _pose_arrays(before: PoseError, after: PoseError, noise: PoseError | None) -> dict[str, Tensor]:
-    arrays = {"position_before": before.position, "position_after": after.position}
-    if before.rotation is not None and after.rotation is not None:
-        arrays |= {"rotation_before": before.rotation, "rotation_after": after.rotation}
-    if noise is not None:
-        arrays["position_noise"] = noise.position
-        if noise.rotation is not None:
-            arrays["rotation_noise"] = noise.rotation
-    return arrays
+    found = {"before": before, "after": after} | ({} if noise is None else {"noise": noise})
+    return {
+        f"{part}_{when}": values
+        for when, error in found.items()
+        for part, values in error._asdict().items()
+        if values is not None
+    }
 
 
 def _residuals(pieces: list[Piece], selection: Selection, outcome: Outcome) -> dict[str, Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -25,24 +26,9 @@ from ccnn_torch.identification import (
 from ccnn_torch.identification.config import PER_LEG, IdentifyConfig, base_method
 from ccnn_torch.identification.measured.measured import Measured, Rows
 from ccnn_torch.identification.problems.parameters import Selection, select_parameters
+from ccnn_torch.identification.problems.problem import part_of
 from ccnn_torch.identification.solvers.registry import get_solver
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
-
-__all__ = [
-    "QUICK",
-    "Outcome",
-    "Piece",
-    "choice_of",
-    "frames_first",
-    "free_values",
-    "is_apart",
-    "knowledge_of",
-    "machines_of",
-    "pieces_of",
-    "run_method",
-    "select",
-    "solver_of",
-]
 
 QUICK = ("lm", "tikhonov")
 """The others are global searches, which take minutes where these take a blink."""
@@ -80,11 +66,7 @@ class Outcome:
 
 
 def choice_of(config: IdentifyConfig, mechanism: Mechanism) -> ParameterChoice:
-    """The parameters of a config; its priors in SI.
-
-    Raises:
-        InputError: a prior is no size of its parameter, or fits none.
-    """
+    """The parameters of a config; its priors in SI."""
     about = config.parameters
     prior = prior_sizes(about.prior, mechanism.geometry, "parameters.prior")
     return ParameterChoice(free=about.free, fixed=about.fixed, tied=about.tied, prior=prior)
@@ -102,12 +84,8 @@ def pieces_of(
 
     Args:
         apart: one for each leg, from that leg's rows where it has its own; else one for all.
-        machines: which machines.
         near: geometry at which the noise of the pose is carried over to the residual, `r x K` [SI]; where the search
             begins when None. Near singular poses the difference matters.
-
-    Raises:
-        InputError: the rows do not fit the mechanism or are too few, or legs are not apart.
     """
     if not apart:
         return [Piece(_problem(measured, config, measured.rows.of(machines), machines, False, near))]
@@ -135,30 +113,33 @@ def _problem_at(measured: Measured, config: IdentifyConfig, rows: Rows, start: T
         config.residual == "auto"
         and (isinstance(measured.mechanism, SerialArm) or config.frame.base or config.frame.tool)
     )
-    if not forward:
-        return inverse_problem(
-            measured.view,
-            rows.joints,
-            rows.observed,
-            choice=choice_of(config, measured.mechanism),
-            pose_noise=measured.pose_noise,
-            joint_noise=measured.joint_noise,
-            start=start,
-            per_leg=per_leg,
-        )
-    if per_leg:
+    if forward and per_leg:
         raise InputError(
             "methods: a pose depends on all legs, so legs are identified apart only by their joints; write "
             "residual=inverse, or remove _per_leg"
         )
-    return forward_problem(
+    return _built(measured, config, rows, choice_of(config, measured.mechanism), start, None if forward else per_leg)
+
+
+def _built(
+    measured: Measured,
+    config: IdentifyConfig,
+    rows: Rows,
+    choice: ParameterChoice,
+    start: Tensor,
+    per_leg: bool | None = None,
+) -> Problem:
+    """The problem of joints, `per_leg` or not, or of poses where that is None."""
+    build = partial(forward_problem, rotation_weight=config.rotation_weight)
+    if per_leg is not None:
+        build = partial(inverse_problem, per_leg=per_leg)
+    return build(
         measured.view,
         rows.joints,
         rows.observed,
-        choice=choice_of(config, measured.mechanism),
+        choice=choice,
         pose_noise=measured.pose_noise,
         joint_noise=measured.joint_noise,
-        rotation_weight=config.rotation_weight,
         start=start,
     )
 
@@ -170,21 +151,12 @@ def frames_first(measured: Measured, config: IdentifyConfig) -> Measured:
     assert isinstance(measured.mechanism, Framed)
     closed = measured.mechanism.fitted_frames(measured.rows.joints, measured.view.frame(measured.rows.observed))
     prefixes = tuple(f"{part}_" for part, free in (("base", config.frame.base), ("tool", config.frame.tool)) if free)
-    names = tuple(p.name for p in measured.mechanism.geometry if p.name.startswith(prefixes))
+    names = [p.name for p in measured.mechanism.geometry if p.name.startswith(prefixes)]
     choice = ParameterChoice(free=names)
-    problem = forward_problem(
-        measured.view,
-        measured.rows.joints,
-        measured.rows.observed,
-        choice=choice,
-        pose_noise=measured.pose_noise,
-        joint_noise=measured.joint_noise,
-        rotation_weight=config.rotation_weight,
-        start=closed,
-    )
+    problem = _built(measured, config, measured.rows, choice, closed)
     found = get_solver("lm")(problem, config.seed)
     start = select_parameters(measured.mechanism.geometry, choice, closed).full(found.values)
-    return replace(measured, start=start, unknown_frame=names)
+    return replace(measured, start=start)
 
 
 def is_apart(method: str, config: IdentifyConfig) -> bool:
@@ -199,11 +171,7 @@ def machines_of(method: str, measured: Measured, config: IdentifyConfig) -> Tens
 
 
 def solver_of(method: str, config: IdentifyConfig) -> Solver:
-    """The solver of a method with its settings.
-
-    Raises:
-        InputError: a setting that it does not have.
-    """
+    """The solver of a method with its settings."""
     settings = dict(config.settings.get(base_method(method), {}))
     if base_method(method) == "lm":
         settings = {"starts": config.starts, "loss": config.robust or "squared"} | settings
@@ -211,11 +179,7 @@ def solver_of(method: str, config: IdentifyConfig) -> Solver:
 
 
 def run_method(method: str, measured: Measured, config: IdentifyConfig, progress: Progress | None = None) -> Outcome:
-    """Run a method.
-
-    Raises:
-        InputError: see `pieces_of`, `solver_of`.
-    """
+    """Run a method."""
     machines = machines_of(method, measured, config)
     solver, selection = solver_of(method, config), select(measured, config)
     begun = time.perf_counter()
@@ -226,8 +190,7 @@ def run_method(method: str, measured: Measured, config: IdentifyConfig, progress
         pieces = pieces_of(measured, config, is_apart(method, config), machines, values)
         fits = []
         for i, piece in enumerate(pieces):
-            part = None if progress is None else _part(progress, i, len(pieces))
-            fits.append(solver(piece.problem, config.seed + i, part))
+            fits.append(solver(piece.problem, config.seed + i, part_of(progress, i, len(pieces))))
         values = whole_values(selection, pieces, [fit.values for fit in fits], machines)
     assert values is not None
     seconds = time.perf_counter() - begun
@@ -265,7 +228,3 @@ def knowledge_of(pieces: list[Piece], selection: Selection, whole: Tensor) -> li
         what_is_known(piece.problem, free[:, [names.index(p.name) for p in piece.problem.parameters]])
         for piece in pieces
     ]
-
-
-def _part(progress: Progress, index: int, count: int) -> Progress:
-    return lambda done: progress((index + done) / count)

@@ -11,8 +11,6 @@ import torch
 from ccnn_torch.identification.solve import Outcome
 from ccnn_torch.training import load_checkpoint, save_checkpoint
 
-__all__ = ["load_outcome", "save_outcome"]
-
 
 def save_outcome(path: Path, outcome: Outcome, facts: Mapping[str, Any]) -> None:
     """Write an outcome; `facts` say what config and data it is of.
@@ -31,11 +29,7 @@ def save_outcome(path: Path, outcome: Outcome, facts: Mapping[str, Any]) -> None
 
 
 def load_outcome(path: Path) -> Outcome:
-    """The outcome in a file.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """The outcome in a file."""
     tensors, about = load_checkpoint(path)
     return Outcome(
         tensors["machines"],

@@ -15,8 +15,6 @@ from ccnn_torch.identification.measured.records import read_records, split_recor
 from ccnn_torch.identification.pose_errors import before_and_after
 from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames
 
-__all__ = ["Elsewhere", "read_elsewhere", "transferred"]
-
 
 @dataclass(frozen=True)
 class Elsewhere:
@@ -28,11 +26,7 @@ class Elsewhere:
 
 
 def read_elsewhere(config: IdentifyConfig, mechanism: Mechanism) -> Elsewhere | None:
-    """The records of `transfer`, split as the others are; None where there are none.
-
-    Raises:
-        InputError: they cannot be used, or the mechanism has no frames to be placed anew by.
-    """
+    """The records of `transfer`, split as the others are; None where there are none."""
     if config.transfer is None:
         return None
     if not isinstance(mechanism, SerialArm) or not mechanism.unknown_frames:

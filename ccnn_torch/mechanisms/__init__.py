@@ -21,8 +21,8 @@ from ccnn_torch.mechanisms.registry import mechanism_from_description as mechani
 from ccnn_torch.mechanisms.registry import mechanism_of_file as mechanism_of_file
 from ccnn_torch.mechanisms.simulators.black_box import BlackBox as BlackBox
 from ccnn_torch.mechanisms.simulators.calls import simulated_rows as simulated_rows
-from ccnn_torch.mechanisms.simulators.mujoco_model import ModelParameter as ModelParameter
 from ccnn_torch.mechanisms.simulators.mujoco_model import mujoco_simulator as mujoco_simulator
+from ccnn_torch.mechanisms.simulators.mujoco_parameters import ModelParameter as ModelParameter
 from ccnn_torch.mechanisms.simulators.simulator import Joint as Joint
 from ccnn_torch.mechanisms.simulators.simulator import Simulator as Simulator
 from ccnn_torch.mechanisms.simulators.simulator import rowwise as rowwise

@@ -9,8 +9,6 @@ from torch import Tensor
 
 from ccnn_torch.mechanisms.mechanism import Mechanism
 
-__all__ = ["find_jump", "is_numeric", "jump_sentence", "settle_home"]
-
 _POSES, _STEPS = 256, 8
 # A walk whose joints change by more than this in a step, or that differs by less from the direct answer, is not
 # conclusive.
@@ -61,13 +59,6 @@ def find_jump(mechanism: Mechanism, seed: int = 0) -> Jump | None:
 
     The walk goes along a straight line of pose coordinates, each step from the joints of the last. A line that leaves
     the workspace or comes near a singularity proves nothing and is left out.
-
-    Args:
-        mechanism: one whose `solve_inverse` is the numeric default.
-        seed: of the poses.
-
-    Raises:
-        InputError: its sampling box has hardly any reachable pose.
     """
     poses = mechanism.sample_workspace(_POSES, torch.Generator().manual_seed(seed))
     direct = mechanism.solve_inverse(poses)

@@ -3,40 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.pose import Frame, frame_jacobian
+from ccnn_torch.mechanisms.pose import frame_jacobian
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
-__all__ = ["central_slope", "differentiable_pose"]
-
-
-class Simulated(Protocol):
-    """What these functions need of a black box."""
-
-    name: str
-
-    def simulated(self, joints: Tensor, values: Tensor) -> Tensor:
-        """Pose of joints and parameters."""
-
-    def frame(self, pose: Tensor) -> Frame:
-        """Frame of a pose."""
-
-    def jacobian(self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
-        """Derivative of the frame by the joints."""
-
-    def parameter_jacobian(
-        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
-    ) -> Tensor:
-        """Derivative of the frame by the parameters."""
+if TYPE_CHECKING:
+    from ccnn_torch.mechanisms.simulators.black_box import BlackBox
 
 
 def central_slope(
-    machine: Simulated,
+    machine: BlackBox,
     pose: Callable[[Tensor], Tensor],
     point: Tensor,
     step: Tensor,
@@ -50,11 +31,7 @@ def central_slope(
         pose: `... x d` -> `... x p`, with further leading dims.
         point: `... x d`.
         step: of each coordinate, `d`.
-        places: their names.
         bounds: what they cannot pass, `d` each.
-
-    Raises:
-        InputError: a row has a pose, and none on either side of it.
     """
     ahead = torch.diag(step).reshape(-1, *[1] * (point.dim() - 1), len(step))
     if bounds is not None:
@@ -78,7 +55,7 @@ def central_slope(
     return (change / torch.where(way == 0, 1.0, way)).movedim(0, -1)
 
 
-def _refuse_islands(machine: Simulated, ends: Tensor, nowhere: Tensor, places: Sequence[str]) -> None:
+def _refuse_islands(machine: BlackBox, ends: Tensor, nowhere: Tensor, places: Sequence[str]) -> None:
     if not bool(nowhere.any()):
         return
     k, *row = torch.nonzero(nowhere)[0].tolist()
@@ -89,7 +66,7 @@ def _refuse_islands(machine: Simulated, ends: Tensor, nowhere: Tensor, places: S
     )
 
 
-def differentiable_pose(machine: Simulated, joints: Tensor, values: Tensor) -> Tensor:
+def differentiable_pose(machine: BlackBox, joints: Tensor, values: Tensor) -> Tensor:
     """Pose `... x p` of joints `... x n` and parameters `... x k`, with the differences as its first derivative."""
     found: Tensor = _Pose.apply(joints, values, machine)  # type: ignore[no-untyped-call]
     return found
@@ -97,7 +74,7 @@ def differentiable_pose(machine: Simulated, joints: Tensor, values: Tensor) -> T
 
 class _Pose(torch.autograd.Function):
     @staticmethod
-    def forward(joints: Tensor, values: Tensor, machine: Simulated) -> Tensor:
+    def forward(joints: Tensor, values: Tensor, machine: BlackBox) -> Tensor:
         return machine.simulated(joints, values)
 
     @staticmethod
@@ -123,7 +100,7 @@ class _Slope(torch.autograd.Function):
     """Derivative of the pose coordinates, `... x p x d`: of the frame by differences, and back to the coordinates."""
 
     @staticmethod
-    def forward(joints: Tensor, values: Tensor, pose: Tensor, machine: Simulated, which: int) -> Tensor:
+    def forward(joints: Tensor, values: Tensor, pose: Tensor, machine: BlackBox, which: int) -> Tensor:
         slope = (machine.parameter_jacobian if which else machine.jacobian)(joints, values)
         rows = frame_jacobian(machine.frame, torch.nan_to_num(pose)).detach()
         back: Tensor = torch.linalg.pinv(rows) @ slope

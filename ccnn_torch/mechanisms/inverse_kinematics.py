@@ -6,8 +6,6 @@ from collections.abc import Callable
 
 from torch import Tensor, nn
 
-__all__ = ["InverseKinematics"]
-
 
 class InverseKinematics(nn.Module):
     """The module that torch forward hooks sit on; it only calls `solve_inverse` of its mechanism."""

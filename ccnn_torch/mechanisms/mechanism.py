@@ -24,8 +24,6 @@ from ccnn_torch.mechanisms.pose import (
 from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, wrap_angle
 
-__all__ = ["Mechanism"]
-
 
 class Mechanism(nn.Module):
     """Base class of mechanisms. A new one gives `closure` or `solve_inverse`; all else has a numerical default.

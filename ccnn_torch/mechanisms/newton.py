@@ -10,8 +10,6 @@ from torch import Tensor
 from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.numerics.least_squares import Solution, jacobian_of, levenberg_marquardt
 
-__all__ = ["carry_derivative", "least_norm", "solve"]
-
 # Residual left [SI] above which a settled search is a least-squares minimum and not a root.
 _ROOT = 1e-9
 

@@ -11,9 +11,13 @@ from torch import Tensor
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.numerics.least_squares import jacobian_of
-from ccnn_torch.numerics.rotations import geodesic_angle, rotation_vector_rate, rotation_vector_to_matrix, skew
-
-__all__ = ["Frame", "PoseError", "coordinates_jacobian", "frame_from_coordinates", "frame_jacobian", "pose_error"]
+from ccnn_torch.numerics.rotations import (
+    geodesic_angle,
+    matrix_to_rotation_vector,
+    rotation_vector_rate,
+    rotation_vector_to_matrix,
+    skew,
+)
 
 Frame = tuple[Tensor, Tensor | None]
 _LENGTHS, _TURNS = ("x", "y", "z"), ("rx", "ry", "rz")
@@ -36,6 +40,16 @@ def pose_error(measured: Frame, reference: Frame) -> PoseError:
     if measured[1] is None or reference[1] is None:
         return PoseError(position, None)
     return PoseError(position, geodesic_angle(measured[1], reference[1]))
+
+
+def frame_gap(there: Frame, here: Frame, rotation_weight: float) -> Tensor:
+    """Position difference and weighted rotation vector from `here` to `there`, `... x 6` or `... x 3`."""
+    shift = there[0] - here[0]
+    if there[1] is None or here[1] is None:
+        return shift
+    turn = matrix_to_rotation_vector(there[1] @ here[1].mT)
+    shift, turn = torch.broadcast_tensors(shift, rotation_weight * turn)  # type: ignore[no-untyped-call]
+    return torch.cat([shift, turn], dim=-1)
 
 
 def frame_from_coordinates(pose: Tensor, coordinates: tuple[Coordinate, ...], name: str) -> Frame:

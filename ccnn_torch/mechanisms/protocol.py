@@ -14,8 +14,6 @@ from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.simulators.black_box import BlackBox
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 
-__all__ = ["checked_plugin"]
-
 # A root is settled to about 1e-12; a user's own closed form may close a little worse [m, rad].
 _CLOSES = 1e-6
 _ADVICE = "ccnn_torch.testing.check_mechanism reports more"
@@ -26,14 +24,6 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
 
     Home joints that are only near those of the home pose are settled first; numeric inverse kinematics are then held
     against a walk through the sampling box, which must not end on another branch.
-
-    Args:
-        spec: `path/to/file.py:Name`, for the sentences.
-        make: makes it.
-
-    Raises:
-        InputError: it is no mechanism, its code fails (the sentence names the line), or its names, shapes or values are
-            not what the protocol asks for.
     """
     try:
         mechanism = make()
@@ -43,7 +33,7 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
             raise InputError(
                 f"{spec}: is no mechanism; derive the class from ccnn_torch.mechanisms.Mechanism, or make a Simulator"
             )
-        wrong = _wrong_names(mechanism) or _wrong_shape_of_closure(mechanism)
+        wrong = wrong_names(mechanism) or _wrong_shape_of_closure(mechanism)
         if not wrong:
             settle_home(mechanism)
             wrong = _wrong_kinematics(mechanism) or jump_sentence(mechanism)
@@ -57,7 +47,8 @@ def checked_plugin(spec: str, make: Callable[[], Any]) -> Mechanism:
     return mechanism
 
 
-def _wrong_names(m: Mechanism) -> str:
+def wrong_names(m: Mechanism) -> str:
+    """What is wrong with names, units, legs and the sampling box; empty where nothing is."""
     n, wanted = len(m.joints), [f"q{i + 1}" for i in range(len(m.joints))]
     if n == 0 or [j.name for j in m.joints] != wanted:
         return f"its joints must be named {', '.join(wanted) or 'q1, q2, …'}, not {[j.name for j in m.joints]}"

@@ -26,8 +26,6 @@ from ccnn_torch.mechanisms.protocol import checked_plugin
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 from ccnn_torch.plugins import class_hint, code_refused, file_that_names, is_plugin, load_plugin
 
-__all__ = ["REGISTRY", "load_mechanism", "mechanism_from_description", "mechanism_of_file"]
-
 
 def _framed(
     mechanism: str | Mapping[str, Any], base: bool = True, tool: bool = False, rotation_weight: float = 0.04

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from rich.cells import cell_len
@@ -12,7 +12,7 @@ from rich.text import Text
 
 from ccnn_torch.display import visible
 
-__all__ = ["Table", "fitting_columns", "markdown_table", "print_labelled", "print_table", "print_text"]
+__all__ = ["Table", "fitting_columns", "markdown_table", "print_labelled", "print_table", "print_text", "table_of"]
 
 # Characters that the first column and columns of words get where the terminal is too narrow for their longest cell.
 _LEAST_FIRST = 14
@@ -44,6 +44,11 @@ class Table:
     words: tuple[str, ...] = ()
     details: tuple[str, ...] = ()
     page_only: bool = False
+
+
+def table_of(title: str, columns: Mapping[str, Sequence[str]], note: str = "", details: Sequence[str] = ()) -> Table:
+    """A table out of its columns, header -> cells."""
+    return Table(title, tuple(columns), tuple(zip(*columns.values(), strict=True)), note, details=tuple(details))
 
 
 def markdown_table(table: Table) -> str:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 from ccnn_torch.mechanisms.assembly_mode import jump_sentence
+from ccnn_torch.mechanisms.protocol import wrong_names
 from ccnn_torch.numerics.rotations import vee
 
 __all__ = ["check_mechanism"]
@@ -58,17 +59,11 @@ def _require(fine: bool, m: Mechanism, sentence: str) -> None:
 
 def _check_names(m: Mechanism) -> None:
     _require(bool(m.name), m, "has no name")
-    for kind, things in (("joints", m.joints), ("pose", m.pose), ("geometry", m.geometry)):
-        names = [t.name for t in things]
-        _require(len(set(names)) == len(names), m, f"{kind} has a name twice: {names}")
-    wanted = [f"q{i + 1}" for i in range(len(m.joints))]
-    _require([j.name for j in m.joints] == wanted, m, f"its joints must be named {', '.join(wanted)}")
-    units = {c.unit for c in (*m.joints, *m.pose)}
-    _require(units <= {"m", "rad"}, m, f"joints and pose are in m or rad, got {sorted(units)}")
+    wrong = wrong_names(m)
+    _require(not wrong, m, wrong)
     for name, buffer, count in (("nominal", m.nominal, len(m.geometry)), ("low", m.low, len(m.pose))):
         _require(buffer.shape == (count,), m, f"{name} has shape {tuple(buffer.shape)}, expected ({count},)")
         _require(buffer.dtype == torch.float64, m, f"{name} is {buffer.dtype}, expected torch.float64")
-    _require(bool((m.low < m.high).all()), m, "its sampling box is empty: low must be below high")
 
 
 def _configurations(m: Mechanism, seed: int) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,6 @@ from torch import Tensor
 from ccnn_torch import export_model
 from ccnn_torch.compensation import load_model
 from ccnn_torch.compensation.targets.from_model import form_of
-from ccnn_torch.compensation.targets.golden import golden_vectors
 from ccnn_torch.compensation.targets.linuxcnc import print_linuxcnc
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
@@ -94,7 +93,7 @@ def turned(machine: Mechanism, position: Tensor, turns: Tensor) -> tuple[np.ndar
 def test_compensated_kinematics_of_the_tripod(tmp_path: Path) -> None:
     machine, compensator = load_mechanism("tripod"), tripod_compensator()
     form = form_of(compensator)
-    files = print_linuxcnc((form, golden_vectors(compensator, form)), machine, "a test")
+    files = print_linuxcnc(form, machine, "a test")
     kins = Compiled(files["ccnnkins.comp"], tmp_path)
     world, ideal = drawn(machine, of_tripod)
     with torch.no_grad():
@@ -149,7 +148,7 @@ def test_what_linuxcnc_cannot_have() -> None:
         print_linuxcnc(None, load_mechanism(f"{own}:Planar3RRR", allow_code=True), "a test")
     form = form_of(tripod_compensator(), "float32")
     with pytest.raises(MethodFailedError, match="leave out --dtype float32"):
-        print_linuxcnc((form, golden_vectors(tripod_compensator(), form)), load_mechanism("tripod"), "a test")
+        print_linuxcnc(form, load_mechanism("tripod"), "a test")
 
 
 DRIVE = """#!/usr/bin/python3

@@ -77,11 +77,7 @@ def tripod_run(repeats: int = 5) -> tuple[dict[str, Any], RunArrays, dict[str, n
         "constant": {"test": constant, "ratio_to_floor": ratio_to_floor(constant, floor)},
         "floor": floor,
         "pose": pose_block(
-            np.take_along_axis(before, test, 1),
-            np.take_along_axis(after, test, 1),
-            None,
-            np.take_along_axis(before, test, 1) * 0.8,
-            np.take_along_axis(after, test, 1) * 0.8,
+            *((held, held * 0.8) for held in (np.take_along_axis(error, test, 1) for error in (before, after))),
             rotation_weight=0.04,
         ),
         "notes": ["Column 'goal_x' is ignored: it is not listed under covariates."],
@@ -153,7 +149,7 @@ def arm_run(rows: int = 500) -> tuple[dict[str, Any], RunArrays]:
         "methods": {"ccnn": {"test": errors, "ratio_to_floor": None, "seconds": spread([3.4])}},
         "constant": {"test": constant_errors(measured[None, ~held], measured[None, held], None, None, joints)},
         "floor": None,
-        "pose": pose_block(before[None, held], after[None, held], None, before[None, held], after[None, held]),
+        "pose": pose_block(*((error[None, held], error[None, held]) for error in (before, after))),
     }
     arrays = RunArrays(
         joints=joints,

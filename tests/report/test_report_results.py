@@ -126,12 +126,12 @@ def test_ratio_is_paired_repeat_by_repeat(generator: np.random.Generator) -> Non
 
 def test_pose_block(generator: np.random.Generator) -> None:
     before, after, turn, turned = np.abs(generator.normal(size=(4, 3, 8)))
-    found = pose_block(before, after, None, turn, turned, rotation_weight=0.04, position_remainder=after / 2)
+    found = pose_block((before, turn), (after, turned), rotation_weight=0.04, not_compensable=(after / 2, None))
     assert found["position"]["before"]["rms"]["values"] == pytest.approx(list(np.sqrt(np.square(before).mean(1))))
     assert found["rotation"]["after"]["max"]["values"] == pytest.approx(list(turned.max(1)))
     assert found["energy"]["after"]["max"]["values"] == pytest.approx(list((after + 0.04 * turned).max(1)))
     assert found["position"]["not_compensable"]["max"]["values"] == pytest.approx(list(after.max(1) / 2))
-    assert pose_block(before, after)["rotation"] is None
+    assert pose_block((before, None), (after, None))["rotation"] is None
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import io
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -197,8 +198,8 @@ def test_tags() -> None:
 
 def test_a_resumed_run_shows_no_step_twice(tmp_path: Path) -> None:
     def steps(first: int, last: int, offset: float) -> None:
-        callback = TensorBoardCallback(tmp_path, lambda: [np.eye(3, 2, dtype=bool)], masks_every=4)
-        callback.on_start(None, None, 0)
+        callback = TensorBoardCallback(tmp_path, masks_every=4)
+        callback.on_start(SimpleNamespace(genome=lambda _: ([torch.eye(3, 2, dtype=torch.bool)], [])), None, 0)
         for step in range(first, last + 1):
             callback.on_step(step, {"fitness_best": torch.tensor([step + offset, step + offset])})
         callback.on_end()

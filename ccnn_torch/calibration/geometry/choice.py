@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.geometry.identified import fit_machine
-from ccnn_torch.calibration.learning.fitting import Plan, fit_method
+from ccnn_torch.calibration.learning.early_stop import Plan
+from ccnn_torch.calibration.learning.fitting import fit_method
 from ccnn_torch.calibration.rows.dataset import dataset_of
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import make_learner
@@ -19,8 +20,6 @@ from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split, fold_splits
-
-__all__ = ["GeometryChoice", "choose_geometry"]
 
 _FOLDS = 5
 # Rows that the comparison uses: enough to see what helps, few enough to take seconds.
@@ -65,7 +64,6 @@ def choose_geometry(
 
     Args:
         split, kind: of the repeat; `kind` says how folds are made.
-        settings: of `joint_deviations`.
     """
     name = mechanism.name
     if not mechanism.geometry:

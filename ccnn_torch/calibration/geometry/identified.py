@@ -17,8 +17,6 @@ from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
 
-__all__ = ["Fitted", "Identified", "fit_machine"]
-
 
 @dataclass(frozen=True)
 class Identified:
@@ -71,7 +69,6 @@ class Fitted:
             joints: commanded, `s x n` [SI].
             total: deviations of the nominal machine, `[r x] s x n` [SI].
             splits: one a repeat; the rows that are not held out bound the correction.
-            margin: of the compensator's domain.
         """
         assert self.geometry is not None
         nominal = mechanism.nominal.expand_as(self.geometry) if self.parameters is None else self.parameters
@@ -88,9 +85,6 @@ def fit_machine(mechanism: Mechanism, records: Records, splits: list[Split], ide
     Args:
         splits: one a repeat; only rows that are not held out are used.
         identify: whether the geometry is to be a part of the compensator.
-
-    Raises:
-        InputError: the geometry cannot be identified from such records.
     """
     rows = pad_rows([Dataset.part(split, "fit") for split in splits])
     weights = torch.zeros(len(splits), len(records.joints), dtype=torch.float64)

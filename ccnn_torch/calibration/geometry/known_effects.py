@@ -23,8 +23,6 @@ from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_ve
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
 
-__all__ = ["KnownEffects", "fit_effects", "verdict_of"]
-
 _FROM = "from:"
 # Steps of r <- δ - ε(q + r); each gains a factor of ε's slope, at most 0.1.
 _STEPS = 6
@@ -124,14 +122,10 @@ def fit_effects(
         total: deviations of that machine, `[r x] s x n` [SI].
         usable: rows fit to learn from, `[r x] s` bool.
         identify: whether all parameters are to be identified beside the effects.
-        margin: of the compensator's domain.
         settings: rotation weight and damping of the pseudoerror.
 
     Returns:
         The effects; the parameters that go with them, `r x 1 x k`, or None where these are nominal; notes.
-
-    Raises:
-        InputError: the file does not fit the machine or the covariates, or frames are per group of rows.
     """
     if parameters is not None and parameters.shape[1] > 1:
         raise InputError(

@@ -17,17 +17,6 @@ from ccnn_torch.records.splits import fold_splits
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Callback, Scaling, Training, train
 
-__all__ = [
-    "Choice",
-    "Plan",
-    "WatchPhase",
-    "choose",
-    "evaluations_until",
-    "fold_dataset",
-    "moved",
-    "predictive_variance",
-]
-
 WatchPhase = Callable[[str, Scaling], list[Callback]]
 """Callbacks of a phase (`choose` or `fit`), given that phase's scaling."""
 
@@ -104,7 +93,6 @@ def choose(
     """Train with rows held out. All folds of all repeats are repeats of one training.
 
     Args:
-        make: makes a fresh learner.
         folder: folder of the checkpoint; None = none is written.
         budget: seconds inside the learner after which no further step begins.
 
@@ -171,9 +159,6 @@ def fold_dataset(dataset: Dataset, kind: str, folds: int) -> Dataset:
     Args:
         kind: of the split, see `fold_splits`.
         folds: 1 leaves the dataset as it is.
-
-    Raises:
-        InputError: there are too few rows or groups for so many folds.
     """
     if folds == 1:
         return dataset

@@ -23,8 +23,6 @@ from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Scaling, Training, train, weighted_mse
 
-__all__ = ["Fitted", "Plan", "fit_method", "refit"]
-
 
 @dataclass
 class Fitted:
@@ -94,10 +92,6 @@ def fit_method(
     watch: WatchPhase,
 ) -> Fitted:
     """Train one method in one or two phases, each with its own checkpoint.
-
-    Args:
-        make: makes a fresh learner.
-        folder: folder of the checkpoints; None = none are written.
 
     Raises:
         InputError: too few rows.

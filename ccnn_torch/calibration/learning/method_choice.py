@@ -8,11 +8,9 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from ccnn_torch.calibration.learning.early_stop import Choice, Plan, WatchPhase, choose
 from ccnn_torch.calibration.rows.dataset import Dataset
@@ -21,8 +19,6 @@ from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner
 from ccnn_torch.report.json_files import plain, read_json, write_json
 from ccnn_torch.run_folder.folder import RunFolder
-
-__all__ = ["Comparison", "compare"]
 
 _SIMPLEST = "constant"
 
@@ -120,7 +116,6 @@ def compare(
         makers: what makes the learner of each method, in the order to try them; None = this version has none.
         budget: seconds inside the learners, for all methods together.
         folder: where checkpoints and decisions go; None = nowhere.
-        watch: gives the callbacks of a method.
 
     Raises:
         InputError: `auto.json` is damaged.
@@ -173,18 +168,20 @@ def _judge(
     return choice
 
 
+# What of a `Choice` is written, and of which type its tensors are.
+_TENSORS = {
+    "best_step": torch.int64,
+    "errors": torch.float64,
+    "sd_scale": torch.float64,
+    "converged": torch.bool,
+    "evaluations": torch.float64,
+}
+_NUMBERS = ("step", "seconds", "ended")
+
+
 def _write(folder: RunFolder, comparison: Comparison) -> None:
     compared = {
-        name: {
-            "best_step": choice.best_step,
-            "errors": choice.errors,
-            "sd_scale": choice.sd_scale,
-            "converged": choice.converged,
-            "evaluations": choice.evaluations,
-            "step": choice.step,
-            "seconds": choice.seconds,
-            "ended": choice.ended,
-        }
+        name: {key: getattr(choice, key) for key in (*_TENSORS, *_NUMBERS)}
         for name, choice in comparison.compared.items()
     }
     decided = {"compared": compared, "skipped": comparison.skipped, "spent": comparison.spent}
@@ -193,25 +190,14 @@ def _write(folder: RunFolder, comparison: Comparison) -> None:
 
 def _read(folder: RunFolder, comparison: Comparison) -> None:
     found = read_json(folder.auto)
-    real = partial(torch.tensor, dtype=torch.float64)
-
-    def optional(value: Any, make: Callable[[Any], Tensor]) -> Tensor | None:
-        return None if value is None else make(value)
-
     try:
         if found.pop("sha256") != _seal(found):
             raise ValueError("was altered")
         for name, entry in found["compared"].items():
-            comparison.compared[name] = Choice(
-                best_step=torch.tensor(entry["best_step"], dtype=torch.int64),
-                errors=real(entry["errors"]),
-                sd_scale=real(entry["sd_scale"]),
-                converged=optional(entry["converged"], partial(torch.tensor, dtype=torch.bool)),
-                evaluations=optional(entry["evaluations"], real),
-                step=int(entry["step"]),
-                seconds=float(entry["seconds"]),
-                ended=bool(entry["ended"]),
-            )
+            fields: dict[str, Any] = {key: entry[key] for key in _NUMBERS}
+            for key, kind in _TENSORS.items():
+                fields[key] = None if entry[key] is None else torch.tensor(entry[key], dtype=kind)
+            comparison.compared[name] = Choice(**fields)
         comparison.skipped |= found["skipped"]
         comparison.spent = float(found["spent"])
     except (KeyError, TypeError, ValueError, AttributeError):

@@ -12,8 +12,6 @@ from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.report.screen import progress_bar
 from ccnn_torch.training import Scaling
 
-__all__ = ["HeldOut", "ProgressBar", "genome"]
-
 
 def genome(learner: Learner, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
     """Masks `out x in` and weights `out x in [+ 1]` of one repeat's network; empty for a learner without masks."""

@@ -9,8 +9,6 @@ from torch import Tensor
 from ccnn_torch.calibration.rows.dataset import Dataset
 from ccnn_torch.compensation import Domain
 
-__all__ = ["NORMAL", "coverage", "inside_domain", "sd_scale"]
-
 # scipy.special's quantiles are those of scipy.stats, which takes half a second to load.
 NORMAL = float(ndtri(0.975))
 """An interval of 95 % reaches so many predictive standard deviations to either side."""
@@ -73,11 +71,7 @@ def _quantile(values: Tensor, there: Tensor) -> Tensor:
 
 
 def inside_domain(dataset: Dataset, margin: float) -> Tensor:
-    """Which rows lie in the domain of the compensator that the training rows of a repeat give, `r x s` bool.
-
-    Args:
-        margin: as `compensation.margin`.
-    """
+    """Which rows lie in the domain of the compensator that the training rows of a repeat give, `r x s` bool."""
     rows = dataset.usable_rows("fit")
     inside = []
     for inputs, index, weights in zip(dataset.inputs, rows.index, rows.weights, strict=True):

@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ccnn_torch.display import count_text, display_unit, interval_text, number_text
-from ccnn_torch.report.table import Table
-
-__all__ = ["comparison_table", "method_label", "pose_by_method_table", "reach_table"]
+from ccnn_torch.report.table import Table, table_of
 
 Results = Mapping[str, Any]
 
@@ -75,20 +73,14 @@ def pose_by_method_table(results: Results) -> Table | None:
     if len(found) < 2:
         return None
     kinds = [kind for kind in ("position", "rotation") if results["pose"].get(kind)]
-    scales = {
-        kind: display_unit(results["pose"][kind]["unit"], results["pose"][kind]["before"]["rms"]["median"] or 0.0)
-        for kind in kinds
-    }
-    columns = ["method"]
-    for kind in kinds:
-        columns += [f"{kind} RMS [{scales[kind][1]}]", f"{kind} max [{scales[kind][1]}]"]
-
-    def row(name: str, blocks: Mapping[str, Any]) -> tuple[str, ...]:
-        cells = [interval_text(blocks[kind][m], scales[kind][0]) for kind in kinds for m in ("rms", "max")]
-        return (name, *cells)
-
-    rows = [row("before", {kind: results["pose"][kind]["before"] for kind in kinds})]
+    shown = {"before": {kind: results["pose"][kind]["before"] for kind in kinds}}
     if all(results["pose"][kind].get("geometry") for kind in kinds):
-        rows.append(row("geometry alone", {kind: results["pose"][kind]["geometry"] for kind in kinds}))
-    rows += [row(method_label(results, name), blocks) for name, blocks in found.items()]
-    return Table("Pose error on held-out rows, method by method", tuple(columns), tuple(rows))
+        shown["geometry alone"] = {kind: results["pose"][kind]["geometry"] for kind in kinds}
+    shown |= {method_label(results, name): blocks for name, blocks in found.items()}
+    columns = {"method": [*shown]}
+    for kind in kinds:
+        block = results["pose"][kind]
+        scale, unit = display_unit(block["unit"], block["before"]["rms"]["median"] or 0.0)
+        for key, words in (("rms", "RMS"), ("max", "max")):
+            columns[f"{kind} {words} [{unit}]"] = [interval_text(rows[kind][key], scale) for rows in shown.values()]
+    return table_of("Pose error on held-out rows, method by method", columns)

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from ccnn_torch.display import count_text
 from ccnn_torch.report.figures.style import FLOOR, SERIES, Plot, styled
 
-__all__ = ["convergence_plot", "population_plot"]
-
 Array = NDArray[np.float64]
 
 
@@ -31,7 +29,6 @@ def convergence_plot(
     Args:
         history: `step`: `t`, metrics `t x r` (`fitness_best`, `fitness_mean`, `error_train`, `error_validation`,
             `heldout_mse_all` or `heldout_mse_JOINT`); those that are there are drawn.
-        method: the learner's name, for the title.
         floor, constant: mse of the noise floor and of the constant predictor over all joints [unit²], drawn as lines
             where `heldout_mse_all` is.
         unit: the joints' SI unit.
@@ -74,7 +71,6 @@ def population_plot(history: Mapping[str, Array], method: str) -> Plot | None:
 
     Args:
         history: `step`: `t`, `density` and `diversity`: `t x r x k`.
-        method: the learner's name, for the file name.
 
     Returns:
         None when the history has neither.

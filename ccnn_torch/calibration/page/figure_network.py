@@ -16,8 +16,6 @@ from ccnn_torch.display import count_text
 from ccnn_torch.evolution.network import alive_nodes as path_nodes
 from ccnn_torch.report.figures.style import GREY, Plot, bare, styled
 
-__all__ = ["alive_nodes", "network_plot"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -45,7 +43,6 @@ def network_plot(masks: Sequence[Mask], weights: Sequence[Array], method: str, j
     Args:
         masks: layer by layer, `out x in`.
         weights: layer by layer, `out x (in + 1)`, last column = bias.
-        method: the learner's name, for the file name.
         joints: names of the outputs, `n`.
     """
     alive = alive_nodes(masks)

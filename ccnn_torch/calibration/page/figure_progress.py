@@ -13,8 +13,6 @@ from ccnn_torch.calibration.page.reach import CURVE
 from ccnn_torch.display import count_text
 from ccnn_torch.report.figures.style import FLOOR, SERIES, Plot, styled
 
-__all__ = ["progress_plot"]
-
 Array = NDArray[np.float64]
 _AXES = (
     ("seconds", "time inside the learner [s]"),

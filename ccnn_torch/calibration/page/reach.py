@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["CURVE", "reach_block"]
-
 CURVE = "heldout_mse_all"
 """The metric that methods are compared by: held-out mean squared error over all joints [SI²]."""
 _BASELINE = "constant"

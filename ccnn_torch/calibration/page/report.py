@@ -14,12 +14,10 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_arrays, load_history
 from ccnn_torch.report.figures.errors import joint_error_plot, pose_error_plot
-from ccnn_torch.report.figures.style import Plot, inline_svg, save_figure
+from ccnn_torch.report.figures.style import Plot, inline_figures, save_figure
 from ccnn_torch.report.figures.workspace import overview_plot, workspace_plot
 from ccnn_torch.report.html import InlineFigure, page_text
 from ccnn_torch.report.json_files import read_json
-
-__all__ = ["html_text", "make_picture", "run_plots", "write_report"]
 
 _LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "model.onnx", "model.pt2", "config.yaml")
 
@@ -27,14 +25,7 @@ _LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "mod
 def html_text(
     results: Mapping[str, Any], figures: Sequence[InlineFigure] = (), config: str = "", files: Sequence[str] = ()
 ) -> str:
-    """The report of a run.
-
-    Args:
-        results: as in `results.json`.
-        figures: in reading order.
-        config: the resolved configuration, as text.
-        files: names of files in the run folder to link to.
-    """
+    """The report of a run."""
     optional: dict[str, Any] = {"case": None, "best_method": None, "notes": [], "versions": {}}
     return page_text(
         "report",
@@ -56,23 +47,15 @@ def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -
     files give the same report, so it can be written again at any time.
 
     Args:
-        folder: the run folder.
         results: the content of its `results.json`, which is read when None.
 
     Returns:
         The path of `report.html`.
-
-    Raises:
-        InputError: `results.json` is not there or damaged, or another file is damaged.
     """
     folder = Path(folder)
     results = read_json(folder / "results.json") if results is None else results
     write_tables(folder, results)
-    plots = run_plots(folder, results)
-    figures = []
-    for plot in plots:
-        _, svg = save_figure(plot.figure, folder / "plots" / plot.name)
-        figures.append(InlineFigure(plot.name, plot.caption, inline_svg(svg.read_text(encoding="utf-8"), plot.name)))
+    figures = inline_figures(run_plots(folder, results), folder / "plots")
     config = folder / "config.yaml"
     page = html_text(
         results,
@@ -112,15 +95,11 @@ def make_picture(folder: str | Path, path: str | Path, joint: str | None = None)
     """Draw the one wide picture of a run: joint error and workspace, before and after.
 
     Args:
-        folder: a run folder with `arrays.safetensors`.
         path: where to write; `.png` and `.svg` are both written.
         joint: name of the joint shown; by default the one with the largest error.
 
     Returns:
         The caption.
-
-    Raises:
-        InputError: the arrays are not there or damaged, or there is no such joint.
     """
     arrays = load_arrays(folder)
     names = [j.name for j in arrays.joints]

@@ -25,17 +25,6 @@ from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.csv_file import write_csv
 from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
 
-__all__ = [
-    "cautions",
-    "failures",
-    "markdown_text",
-    "print_tables",
-    "result_tables",
-    "verdict",
-    "worse_text",
-    "write_tables",
-]
-
 Results = Mapping[str, Any]
 # By less a learned part may be worse on other rows by chance.
 _WORSE = 1.01

@@ -17,8 +17,6 @@ from torch import Tensor
 
 from ccnn_torch.report.event_file import EventFile
 
-__all__ = ["TensorBoardCallback", "tags_of"]
-
 _PER_SUBPOPULATION = ("density", "diversity")
 _CURVES = ("heldout_mse_", "error_")
 _CELL = 16
@@ -45,7 +43,6 @@ class TensorBoardCallback:
     def __init__(
         self,
         folder: str | Path,
-        masks: Callable[[], Sequence[ArrayLike]] | None = None,
         *,
         every: int = 1,
         masks_every: int = 20,
@@ -56,8 +53,6 @@ class TensorBoardCallback:
 
         Args:
             folder: where the event files go.
-            masks: gives the masks of the best network of the first repeat, layer by layer, `out x in`, bool; None =
-                those of the learner, if it has a `genome`.
             every: write scalars each so many steps.
             masks_every: write the masks each so many steps.
             past: gives the history before a resumed training, metrics `t x r [x k]`, and the seconds inside the
@@ -65,7 +60,7 @@ class TensorBoardCallback:
             tell: is given the sentence when the curves cannot be written any further.
         """
         self._folder = Path(folder)
-        self._masks = masks
+        self._masks: Callable[[], Sequence[ArrayLike]] | None = None
         self._every = every
         self._masks_every = masks_every
         self._past = past
@@ -79,14 +74,13 @@ class TensorBoardCallback:
         if step == 0:
             # A fresh start has no earlier steps, whatever an older file holds.
             self._past = None
-        if self._masks is None and genome is not None:
+        if genome is not None:
             self._masks = lambda: [mask.cpu().numpy() for mask in genome(0)[0]]
 
     def on_step(self, step: int, metrics: Mapping[str, Tensor]) -> None:
         """Write the metrics of one step.
 
         Args:
-            step: number of the step, from 1.
             metrics: by name, each `r`, `r x k` or a plain number.
         """
         if self._writer is None:

@@ -14,8 +14,6 @@ from ccnn_torch.pseudoerror import Pseudoerror
 from ccnn_torch.records.splits import Split
 from ccnn_torch.training import Scaling
 
-__all__ = ["Dataset", "Rows", "by_repeat", "dataset_of", "pad_rows"]
-
 _SMALLEST_TRAINING_SET = 8
 
 

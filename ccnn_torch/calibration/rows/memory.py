@@ -7,8 +7,6 @@ import os
 from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.errors import InputError
 
-__all__ = ["TooManyRepeatsError", "check_memory", "free_memory", "memory_of_run"]
-
 # Bytes for a row of a repeat, measured on runs of the tripod: rows, deviations and Jacobians of all kinds; and, of the
 # one method that keeps a population, for each individual.
 _ROW, _INDIVIDUAL = 10_000, 2_500
@@ -17,13 +15,7 @@ _FIGURES = 10_000
 
 
 def memory_of_run(config: RunConfig, rows: int, joints: int) -> int:
-    """About what a run takes at its peak, in bytes; the methods come one after the other.
-
-    Args:
-        config: with repeats, methods and their sizes.
-        rows: of the data.
-        joints: of the mechanism.
-    """
+    """About what a run takes at its peak, in bytes; the methods come one after the other."""
     methods = method_names(config)
     of_row = _ROW + (_INDIVIDUAL * config.ccnn.population if "ccnn" in methods else 0)
     # A Gaussian process has a matrix of all rows by all rows for each joint, its factor and its gradient.

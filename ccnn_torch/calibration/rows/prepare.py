@@ -29,8 +29,6 @@ from ccnn_torch.simulation.case_study import CaseSimulation, Simulation, simulat
 from ccnn_torch.simulation.cases import build_case
 from ccnn_torch.simulation.machines.realistic import build_machine
 
-__all__ = ["Prepared", "damping_of", "prepare"]
-
 # Of the realistic machines.
 _MOST_JOINTS = 6
 
@@ -107,9 +105,6 @@ def prepare(config: RunConfig, given: Given | None = None) -> Prepared:
 
     Args:
         given: records that Python has, in place of the config's file.
-
-    Raises:
-        InputError: the config names no data, or the data cannot be used; the sentence names the change needed.
     """
     seeds = [config.seed + k for k in range(config.repeats)]
     if config.case == "realistic":

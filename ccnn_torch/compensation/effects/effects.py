@@ -9,13 +9,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ccnn_torch.compensation.effects.exact_numbers import exact_numbers
 from ccnn_torch.compensation.effects.kinematic_fields import Fields, looked_at, make_fields
 from ccnn_torch.compensation.geometry.serial import _inverse
 from ccnn_torch.effects import Acting, Situation, make_effect
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
-
-__all__ = ["Care", "PhysicalEffects", "effect_deviation", "expand_effects", "gains"]
 
 # Joints that move the platform less than this are held back [m per joint unit]: a thousandth of what is usual.
 _LEAST_DAMPING = 1e-3
@@ -138,9 +135,8 @@ class PhysicalEffects(nn.Module):
         rows = joints.reshape(-1, joints.shape[-1])
         columns = covariates.reshape(-1, covariates.shape[-1]) if self.covariates else covariates
         given = {name: columns[:, i] for i, name in enumerate(self.covariates) if name != "time"}
-        with exact_numbers():
-            here = self.fields.fill(Situation(self._mechanism[0], rows, given, self.gravity))
-            found = effect_deviation(here, self.acting, self.fields.jacobian, self.care)
+        here = self.fields.fill(Situation(self._mechanism[0], rows, given, self.gravity))
+        found = effect_deviation(here, self.acting, self.fields.jacobian, self.care)
         return found.reshape(joints.shape)
 
     def describe(self) -> dict[str, Any]:

@@ -23,8 +23,6 @@ from ccnn_torch.compensation.geometry.trigonometric import TrigonometricExpansio
 from ccnn_torch.effects import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
-__all__ = ["Fields", "looked_at", "make_fields"]
-
 _WHAT = "kinematics that the effects need"
 _NAMES = (
     "jacobian",
@@ -58,7 +56,6 @@ def looked_at(situation: Situation, use: Callable[[Situation], object]) -> set[s
 
     Args:
         situation: some rows, of which nothing has been worked out yet.
-        use: what is to be done with it.
     """
     use(situation)
     watched = _Watched(situation.mechanism, situation.joints, situation.covariates, situation.gravity)
@@ -173,9 +170,7 @@ def make_fields(mechanism: Mechanism, gravity: Tensor, names: set[str], joints: 
 
     Args:
         gravity: `3` [m/s²], base frame.
-        names: as `looked_at` returns them.
         joints: commanded joints of the training rows, `s x n` [SI].
-        margin: of the compensator's domain.
 
     Raises:
         InputError, MethodFailedError: as `expand` and `expand_arm`.

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation.contraction import GENTLE, steepest
+from ccnn_torch.compensation.contraction import GENTLE, least_step, steepest
 from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.compensation.effects.effects import Care, PhysicalEffects, expand_effects, gains
 from ccnn_torch.effects import Acting, Situation
 from ccnn_torch.mechanisms import SerialArm
-
-__all__ = ["settled_effects"]
 
 # Of the rows' gains, by bisection: the shares of the rows that lie below; and above the largest by so much.
 _SHARES = (1.0, 0.99, 0.98, 0.97, 0.96, 0.94, 0.92, 0.9, 0.87, 0.84, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)
@@ -73,24 +71,14 @@ def settled_effects(
 
     if not module.fields.layout:
         return module
-    _settle(hold_back, lambda: _steepness(module, inputs, domain, limit))
-    return module
-
-
-def _settle(hold_back: Callable[[int], None], steepness: Callable[[], float]) -> None:
-    """Hold back by as few of the 16 steps as it takes, by bisection."""
 
     def gentle(step: int) -> bool:
         hold_back(step)
-        return steepness() <= _SHARE * GENTLE
+        return _steepness(module, inputs, domain, limit) <= _SHARE * GENTLE
 
-    low, high = 0, len(_SHARES) - 1
-    if gentle(low):
-        return
-    while low + 1 < high:
-        middle = (low + high) // 2
-        low, high = (low, middle) if gentle(middle) else (middle, high)
-    hold_back(high)
+    # By as little as it takes.
+    hold_back(least_step(gentle, len(_SHARES) - 1))
+    return module
 
 
 def _steepness(module: PhysicalEffects, inputs: Tensor, domain: Domain, limit: Tensor) -> float:

@@ -15,8 +15,6 @@ from ccnn_torch.compensation.export.to_onnx import Traced, rows_apart_from
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
 from ccnn_torch.compensation.secant import Step
 
-__all__ = ["command_graph"]
-
 
 class _Step:
     """δ at `joints - value`, of finite joints: the compensator's own formula in fewer operations."""
@@ -73,9 +71,6 @@ def command_graph(
     """Both directions as one graph.
 
     Args:
-        compensator: in double.
-        opset: of ONNX.
-        metadata: JSON to carry in the file.
         outputs: which ones, in order: those of `Solution`, or `deviation`, `guard`, `back_deviation`, `back_guard`.
         dtype: in which the graph computes; single precision is for one row.
 

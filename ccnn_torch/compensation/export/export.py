@@ -16,7 +16,7 @@ from onnxruntime.capi.onnxruntime_pybind11_state import NotImplemented as NoKern
 from torch import Tensor
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.contraction import TOLERANCE, Steepness, iterations_needed
+from ccnn_torch.compensation.contraction import Steepness, iterations_needed
 from ccnn_torch.compensation.export.command import command_graph
 from ccnn_torch.compensation.geometry.serial import SerialGeometry
 from ccnn_torch.compensation.model_files.onnx_session import (
@@ -26,8 +26,6 @@ from ccnn_torch.compensation.model_files.onnx_session import (
     run_onnx,
 )
 from ccnn_torch.errors import MethodFailedError
-
-__all__ = ["export_float32", "export_onnx", "probe_points", "verify"]
 
 _OPSET = 20
 _OPSET_FLOAT32 = 17
@@ -45,8 +43,6 @@ def export_onnx(compensator: Compensator, metadata: str, outputs: Sequence[str] 
     command; and `deviation_sd`.
 
     Args:
-        compensator: fitted.
-        metadata: JSON to carry in the file.
         outputs: those that are wanted; each costs its own operations in every call.
 
     Raises:
@@ -124,8 +120,7 @@ def verify(compensator: Compensator, run: Any, form: str, outputs: Sequence[str]
         expected = {k: v.numpy() for k, v in compensator.solve(joints, covariates)._asdict().items()}
     given = joints.numpy(), None if covariates is None else covariates.numpy()
     single = joints.numpy()[:1], None if covariates is None else covariates.numpy()[:1]
-    parts = (compensator.network, compensator.geometry, compensator.effects)
-    share = min(max(TOLERANCE, *(getattr(part, "export_tolerance", TOLERANCE) for part in parts)), _LOOSEST)
+    share = min(compensator.export_tolerance, _LOOSEST)
     tolerance = share * compensator.limit.numpy()
     for found, wanted in ((run(*given), expected), (run(*single), {k: v[:1] for k, v in expected.items()})):
         for name in outputs:

@@ -18,8 +18,6 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor
 
-__all__ = ["Graph", "Value", "batch_of"]
-
 # A matrix with more elements is not multiplied with another one when the graph is written.
 _LARGEST = 200_000
 

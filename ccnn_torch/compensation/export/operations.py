@@ -15,8 +15,6 @@ from torch.utils._pytree import tree_leaves
 from ccnn_torch.compensation.export.graph import Graph, Value, batch_of
 from ccnn_torch.errors import MethodFailedError
 
-__all__ = ["write_operation"]
-
 _SAME = frozenset({"lift_fresh_copy", "lift_fresh", "detach", "detach_", "alias", "clone", "contiguous"})
 _UNARY = {
     "neg": "Neg", "abs": "Abs", "exp": "Exp", "log": "Log", "sin": "Sin", "cos": "Cos", "tan": "Tan", "tanh": "Tanh",

@@ -20,8 +20,6 @@ from ccnn_torch.compensation.export.export import verify
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY, OUTPUTS, Array
 from ccnn_torch.compensation.secant import Step, next_correction
 
-__all__ = ["export_pt2"]
-
 
 class _Step(nn.Module):
     """One evaluation at joints - start, and what both directions take from it; what is traced."""

@@ -16,8 +16,6 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from ccnn_torch.compensation.export.graph import Graph
 from ccnn_torch.compensation.export.operations import write_operation
 
-__all__ = ["Traced", "rows_apart_from", "to_onnx"]
-
 # Rows of an example, or a few more.
 _LEAST = 61
 
@@ -38,8 +36,6 @@ def to_onnx(
     Args:
         module: takes tensors `s x w`, returns tensors of as many rows.
         inputs: name -> a row for an example, `1 x w` or more.
-        outputs: names.
-        opset: of ONNX.
 
     Raises:
         MethodFailedError: there is an operation that no file has.

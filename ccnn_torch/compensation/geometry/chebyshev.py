@@ -12,8 +12,6 @@ from ccnn_torch.compensation.contraction import spread_points
 from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.errors import InputError, MethodFailedError
 
-__all__ = ["ChebyshevExpansion", "expand"]
-
 _DEGREES = (2, 4, 6, 8, 10, 12, 16)
 _MOST_TERMS = 600
 # Error of the expansion at points it was not fitted to, as a share of the largest value: what is aimed at, and what is
@@ -87,7 +85,6 @@ def expand(
         function: commanded joints `s x n` -> `s x o` [SI]; NaN where the mechanism has no such pose.
         joints: commanded joints of the training rows, `s x n` [SI].
         margin: as in `fit_compensator`.
-        what: is expanded, for messages.
         groups: widths of neighbouring outputs that share a unit and are judged by their own largest value; all
             together when None.
         worst: error at other points up to which an expansion is taken, as a share of the largest value.

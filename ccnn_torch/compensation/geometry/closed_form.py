@@ -11,8 +11,6 @@ from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
 from ccnn_torch.compensation.geometry.serial import _inverse
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["ClosedKinematics"]
-
 # Of central differences of the fourth order [SI]: machines are about 1 m, and their kinematics are curved by about 1/m.
 _STEP = 5e-4
 # From a polynomial that is off by some hundredths at most, and by 1e-4 mostly.

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion, expand
 
-__all__ = ["ExpandedGeometry", "expand_geometry"]
-
 
 class ExpandedGeometry(ChebyshevExpansion):
     """δ(q), commanded joints `... x n` -> `... x n` [SI], as a polynomial.
@@ -41,7 +39,6 @@ def expand_geometry(deviation: Callable[[Tensor], Tensor], joints: Tensor, margi
     Args:
         deviation: commanded joints `s x n` -> δ `s x n` [SI]; NaN where the mechanism has no such pose.
         joints: commanded joints of the training rows, `s x n` [SI].
-        margin: as in `fit_compensator`.
 
     Raises:
         InputError, MethodFailedError: as `expand`.

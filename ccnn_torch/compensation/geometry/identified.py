@@ -8,13 +8,11 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from ccnn_torch.compensation.contraction import GENTLE, steepest
+from ccnn_torch.compensation.contraction import GENTLE, least_step, steepest
 from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.compensation.geometry.expanded import expand_geometry
 from ccnn_torch.compensation.geometry.serial import SerialGeometry
 from ccnn_torch.mechanisms import Mechanism, SerialArm
-
-__all__ = ["Geometry", "fit_geometry_module", "geometric_deviation", "settled_damping"]
 
 # Tried by bisection; without a singular pose near by the first will do.
 _DAMPINGS = tuple(0.01 * 1.3**k for k in range(16))
@@ -128,13 +126,7 @@ def settled_damping(
             return _steepness(mechanism, pair, joints, limit, rotation_weight, margin, _DAMPINGS[step]) <= slope
 
         # A repeat that needs no more damping than those before costs one look.
-        if gentle(low):
-            continue
-        high = len(_DAMPINGS) - 1
-        while low + 1 < high:
-            middle = (low + high) // 2
-            low, high = (low, middle) if gentle(middle) else (middle, high)
-        low = high
+        low = least_step(gentle, len(_DAMPINGS) - 1, low)
     return _DAMPINGS[low]
 
 

@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
-__all__ = ["SerialGeometry"]
-
 # In a redundant arm the joints are not determined by the pose; so much damping [m per joint unit] always keeps the
 # normal equations regular, and leaves out less than 1e-4 of what a lever of 0.1 m corrects.
 _LEAST_DAMPING = 1e-3
@@ -58,7 +56,6 @@ class SerialGeometry(nn.Module):
         """Take the two geometries.
 
         Args:
-            arm: the arm.
             nominal: parameters whose links are the maker's and whose frames were fitted to them, `... x k` [SI].
             identified: parameters with links and frames fitted together, `... x k` [SI].
             rotation_weight: of orientation against position [m/rad].
@@ -70,8 +67,7 @@ class SerialGeometry(nn.Module):
         self._arm = (arm,)
         self._turned = arm.orientation != "none"
         self.rotation_weight, self.damping = rotation_weight, damping
-        # Buffers, since the ONNX exporter writes plain numbers in single precision; all of them follow from the
-        # description.
+        # All of them follow from the description.
         weight = torch.ones(6 if self._turned else 3, dtype=torch.float64)
         weight[3:] = rotation_weight
         unit = torch.eye(len(arm.joints), dtype=torch.float64)

@@ -14,8 +14,6 @@ from torch import Tensor, nn
 
 from ccnn_torch.errors import InputError, MethodFailedError
 
-__all__ = ["TrigonometricExpansion", "expand_arm"]
-
 _MOST_JOINTS = 7
 # Tolerance, as a share of the largest value, with which a function of this form is reproduced at other joints.
 _EXACT = 1e-9
@@ -56,7 +54,6 @@ def expand_arm(function: Callable[[Tensor], Tensor], turns: list[bool], what: st
     Args:
         function: joints `s x n` -> `s x o` [SI].
         turns: which of the `n` joints turn.
-        what: is expanded, for messages.
 
     Raises:
         InputError: the arm has more than seven joints.

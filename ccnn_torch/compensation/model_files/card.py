@@ -9,8 +9,6 @@ from typing import Any
 from ccnn_torch.compensation.model_files.metadata import from_json
 from ccnn_torch.errors import ModelFileError
 
-__all__ = ["MODEL_FORMS", "card_of", "read_model"]
-
 MODEL_FORMS = (".safetensors", ".onnx")
 
 

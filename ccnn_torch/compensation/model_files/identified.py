@@ -19,8 +19,6 @@ from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism, mechanism_of_file
 from ccnn_torch.mechanisms.files.mechanism_file import MechanismFile, read_mechanism_file
 
-__all__ = ["IdentifiedGeometry", "load_compensation", "load_geometry", "sign_model"]
-
 Array = NDArray[Any]
 
 # How near to a pose the joints must bring a machine [m, rad].
@@ -96,10 +94,6 @@ def load_geometry(
     path: str | Path, *, public_key: str | Path | None = None, allow_code: bool = False
 ) -> IdentifiedGeometry:
     """Read `identified.yaml`, or the `identified.yaml` beside an `identified.json`.
-
-    Args:
-        path: the file.
-        public_key, allow_code: as `load_model`.
 
     Raises:
         ModelFileError: the file is not one that `ccnn identify` wrote.

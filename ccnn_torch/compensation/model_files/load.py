@@ -6,7 +6,7 @@ import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,18 +20,8 @@ from ccnn_torch.compensation.model_files.onnx_session import RUN_ERRORS, TAKE_AG
 from ccnn_torch.compensation.model_files.signature import check_signature
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import FallbackWarning, InputError, ModelFileError
+from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.plugins import code_refused
-
-__all__ = ["LoadedModel", "load_model"]
-
-
-class HasKinematics(Protocol):
-    """What is asked of a mechanism here; `ccnn_torch.mechanisms.Mechanism` is one."""
-
-    name: str
-
-    def describe(self) -> dict[str, Any]:
-        """Its name, joints, pose coordinates and parameters as JSON."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +103,7 @@ class LoadedModel:
         """Ideal joints of commands (or of joints fed back), `... x n` [SI]; arguments and errors as a call."""
         return self(command, covariates)["ideal"]
 
-    def require_mechanism(self, mechanism: HasKinematics) -> None:
+    def require_mechanism(self, mechanism: Mechanism) -> None:
         """Refuse a mechanism that the model was not made for.
 
         Raises:
@@ -137,7 +127,7 @@ class LoadedModel:
                 "mechanism_from_description(model.facts['mechanism'])"
             )
 
-    def hook_for(self, mechanism: HasKinematics) -> Hook:
+    def hook_for(self, mechanism: Mechanism) -> Hook:
         """The compensator's hook, for this mechanism's inverse kinematics.
 
         Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import onnx
 import torch
@@ -15,10 +15,8 @@ from torch import Tensor
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.domain import Domain
-from ccnn_torch.compensation.effects.effects import PhysicalEffects
-from ccnn_torch.compensation.geometry.identified import Geometry
 from ccnn_torch.compensation.model_files.metadata import check_keys, check_tensors, coordinates, from_json, to_json
-from ccnn_torch.compensation.model_files.onnx_form import check_form
+from ccnn_torch.compensation.model_files.metadata_form import check_form
 from ccnn_torch.compensation.model_files.onnx_session import (
     METADATA_KEY,
     OUTPUTS,
@@ -33,8 +31,6 @@ from ccnn_torch.compensation.model_files.onnx_session import (
 from ccnn_torch.compensation.networks import network_from_description
 from ccnn_torch.errors import ModelFileError
 from ccnn_torch.training import Scaling
-
-__all__ = ["Run", "open_model"]
 
 Run = Callable[[Array, Array | None], dict[str, Array]]
 
@@ -112,16 +108,16 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
     for name, value in tensors.items():
         part, _, rest = name.partition(".")
         parts.setdefault(part, {})[rest] = value
-    network = network_from_description(facts["network"])
-    network.load_state_dict(parts.get("network", {}))
-    geometry = network_from_description(facts["geometry"]) if "geometry" in facts else None
-    if geometry is not None:
-        geometry.load_state_dict(parts.get("geometry", {}))
-    effects = network_from_description(facts["effects"]) if "effects" in facts else None
-    if effects is not None:
-        effects.load_state_dict(parts.get("effects", {}))
+
+    def made(key: str) -> Any:
+        if key not in facts:
+            return None
+        module = network_from_description(facts[key])
+        module.load_state_dict(parts.get(key, {}))
+        return module
+
     return Compensator(
-        network.requires_grad_(False),
+        made("network").requires_grad_(False),
         Scaling(**parts["scaling"]),
         Domain(**parts["domain"]),
         tensors["limit"],
@@ -132,8 +128,8 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
         facts["iterations"],
         tensors["sd_scale"],
         tensors["safe_sd"],
-        cast(Geometry | None, geometry),
-        cast(PhysicalEffects | None, effects),
+        made("geometry"),
+        made("effects"),
         facts.get("secant", False),
     )
 

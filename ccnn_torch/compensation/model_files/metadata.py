@@ -19,29 +19,11 @@ from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.training import tensor_digest
 from ccnn_torch.version import __version__
 
-__all__ = [
-    "FORMAT",
-    "FORMAT_EFFECTS",
-    "FORMAT_GEOMETRY",
-    "FORMAT_SECANT",
-    "check_keys",
-    "check_tensors",
-    "coordinates",
-    "facts_of",
-    "from_json",
-    "to_json",
-]
-
-FORMAT = "ccnn_torch compensator 2"
-# A reader that does not know of geometry must refuse such a file, not leave the geometry out.
-FORMAT_GEOMETRY = "ccnn_torch compensator 3"
-# The same of effects.
-FORMAT_EFFECTS = "ccnn_torch compensator 4"
-# The same of steps that are not those of the fixed point.
-FORMAT_SECANT = "ccnn_torch compensator 5"
-_KNOWN = (FORMAT, FORMAT_GEOMETRY, FORMAT_EFFECTS, FORMAT_SECANT)
+# A reader that does not know of a part must refuse such a file, not leave the part out: the newest part counts.
 _FORMATS = "ccnn_torch compensator "
-
+FORMAT = f"{_FORMATS}2"
+_PARTS = {"secant": f"{_FORMATS}5", "effects": f"{_FORMATS}4", "geometry": f"{_FORMATS}3"}
+_KNOWN = (FORMAT, *reversed(_PARTS.values()))
 _REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
 _PACKAGES = ("torch", "onnx", "onnxruntime", "safetensors", "numpy")
 
@@ -51,9 +33,6 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
 
     Args:
         fields: `mechanism` (its `describe()`), `metrics`, `data_sha256`, `seed`.
-
-    Raises:
-        InputError: a field is missing, or is no JSON.
     """
     missing = [key for key in _REQUIRED if key not in fields]
     if missing:
@@ -62,7 +41,7 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
     pose = mechanism.get("pose", []) if isinstance(mechanism, Mapping) else []
     limits = (v.tolist() for v in (compensator.limit, compensator.safe, compensator.safe_sd, compensator.sd_scale))
     facts: dict[str, Any] = {
-        "format": _format(compensator),
+        "format": next((form for part, form in _PARTS.items() if getattr(compensator, part)), FORMAT),
         **{key: fields[key] for key in _REQUIRED},
         "joints": [_plain(c) for c in compensator.joints],
         "covariates": [_plain(c) for c in compensator.covariates],
@@ -124,11 +103,7 @@ def coordinates(entries: list[dict[str, str]]) -> tuple[Coordinate, ...]:
 
 
 def to_json(value: Mapping[str, Any], indent: int | None = None) -> str:
-    """Sorted JSON without NaN.
-
-    Raises:
-        InputError: something in it has no form in JSON.
-    """
+    """Sorted JSON without NaN."""
     try:
         return json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False, indent=indent)
     except (TypeError, ValueError) as problem:
@@ -149,15 +124,6 @@ def from_json(text: str | bytes) -> Any:
         return json.loads(text, parse_constant=no_number)
     except RecursionError:
         raise ValueError("is nested too deeply") from None
-
-
-def _format(compensator: Compensator) -> str:
-    """The shortest form without loss."""
-    if compensator.secant:
-        return FORMAT_SECANT
-    if compensator.effects is not None:
-        return FORMAT_EFFECTS
-    return FORMAT if compensator.geometry is None else FORMAT_GEOMETRY
 
 
 def _digest(facts: Mapping[str, Any]) -> str:

@@ -12,18 +12,6 @@ from onnxruntime.capi import onnxruntime_pybind11_state as runtime
 
 from ccnn_torch.errors import ModelFileError
 
-__all__ = [
-    "METADATA_KEY",
-    "OUTPUTS",
-    "RUN_ERRORS",
-    "TAKE_AGAIN",
-    "Array",
-    "check_graph",
-    "open_onnx",
-    "run_onnx",
-    "said",
-]
-
 Array = NDArray[Any]
 
 # How sentences about a touched file end.

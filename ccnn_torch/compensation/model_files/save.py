@@ -18,8 +18,6 @@ from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import write_whole
 
-__all__ = ["FORMS", "card_name", "save_model"]
-
 FORMS = ("safetensors", "onnx", "pt2", "float32.onnx")
 
 # Written by this command itself; a field of these names would be lost.

@@ -13,8 +13,6 @@ from ccnn_torch.errors import InputError, ModelFileError
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-__all__ = ["check_signature", "new_key_pair", "sign_content", "signature_path"]
-
 # What is signed begins with it, so that no signature made for another purpose is one of a model.
 _PURPOSE = b"ccnn_torch model signature 1\n"
 
@@ -52,11 +50,7 @@ def new_key_pair(name: str | Path) -> tuple[Path, Path]:
 
 
 def sign_content(model: bytes, card: bytes, key: str | Path) -> bytes:
-    """The text of a signature file: of a model's bytes and its card's, by the private key in a PEM file.
-
-    Raises:
-        InputError: the key cannot be read, or is no private Ed25519 key.
-    """
+    """The text of a signature file: of a model's bytes and its card's, by the private key in a PEM file."""
     _, ed25519, serialization = _cryptography()
     content = _read_key(key)
     try:
@@ -75,7 +69,6 @@ def check_signature(path: Path, model: bytes, card: bytes, key: str | Path) -> N
     """Refuse a model without a signature by this key.
 
     Args:
-        path: of the model; the signature is beside it.
         model, card: bytes of either file, as they are going to be used.
         key: PEM file with the public key.
 

@@ -29,8 +29,6 @@ from ccnn_torch.compensation.targets.form import (
 )
 from ccnn_torch.compensation.targets.simplify import live_steps, merge_axes, put_loops_together
 
-__all__ = ["Builder"]
-
 # Operands in whatever order are the same.
 _COMMUTATIVE = frozenset({"add", "mul", "min", "max", "eq", "and", "or"})
 # Finite where what they take is: an argument is in a cage around the domain, where nothing overflows.

@@ -4,25 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ccnn_torch.compensation.targets.c99_text import (
-    COVARIATES,
-    DECLARATIONS,
-    DRIVER,
-    FIXED_POINT,
-    GIVEN,
-    MAKEFILE,
-    SD_DECLARATION,
-    SD_DRIVER,
-    SD_TEST,
-    SECANT,
-    SELFTEST,
-    SMALLER,
-)
 from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
-
-__all__ = ["c_constants", "c_dialect", "c_function", "print_c99"]
+from ccnn_torch.compensation.targets.template import filled
 
 _NAMES = ("sqrt", "exp", "log", "sin", "cos", "tan", "tanh", "asin", "acos", "atan", "floor")
 _FUNCTIONS = {name: f"{name}{{s}}({{{{0}}}})" for name in _NAMES}
@@ -47,14 +32,11 @@ _OPERATIONS = {
 
 def print_c99(form: Form, golden: Golden) -> dict[str, str]:
     """Contents of the files by name."""
-    dialect = c_dialect(form.dtype)
-    tables: dict[bytes, str] = {}
-    texts = [print_program(program, dialect, tables) for program in form.programs]
     return {
         "compensator.h": _header(form),
-        "compensator.c": _source(form, texts, dialect),
-        "selftest.c": _selftest(form, golden, dialect),
-        "Makefile": MAKEFILE,
+        "compensator.c": filled("compensator.c.jinja", compensation=c_compensation(form)),
+        "selftest.c": _selftest(form, golden),
+        "Makefile": filled("Makefile.jinja"),
     }
 
 
@@ -90,7 +72,6 @@ def _comment(lines: list[str]) -> str:
 
 
 def _header(form: Form) -> str:
-    sd = "" if form.spread is None else SD_DECLARATION
     about = [
         *form.facts,
         "",
@@ -101,18 +82,14 @@ def _header(form: Form) -> str:
         "No heap, no recursion, no global state; each array is of fixed size. An output may be the same array as an "
         "input. Do not compile with -ffast-math: the check for numbers that are none would be left out.",
     ]
-    real = "double" if form.dtype == "float64" else "float"
-    return f"""{_comment(about)}
-#ifndef CCNN_COMPENSATOR_H
-#define CCNN_COMPENSATOR_H
-
-typedef {real} ccnn_real;
-
-enum {{ CCNN_JOINTS = {len(form.joints)}, CCNN_COVARIATES = {len(form.covariates)} }};
-
-{DECLARATIONS}{sd}
-#endif
-"""
+    return filled(
+        "compensator.h.jinja",
+        about=_comment(about),
+        real="double" if form.dtype == "float64" else "float",
+        joints=len(form.joints),
+        covariates=len(form.covariates),
+        sd=form.spread is not None,
+    )
 
 
 def _arguments(program: Program) -> str:
@@ -137,34 +114,38 @@ def c_constants(name: str, values: Array, dialect: Dialect) -> str:
     return f"static const ccnn_real {name}[{len(flat)}] = {{\n    " + ",\n    ".join(rows) + "\n};"
 
 
-def _source(form: Form, texts: list[Text], dialect: Dialect) -> str:
-    parts = ['#include "compensator.h"', "", "#include <math.h>", "#include <stddef.h>", ""]
-    s = "f" if form.dtype == "float32" else ""
-    for name, values in {k: v for text in texts for k, v in text.tables.items()}.items():
-        parts += [c_constants(name, values, dialect), ""]
-    numbers = {"ccnn_limit": form.limit * (1 + 1e-9), "ccnn_slack": form.slack}
+def c_compensation(form: Form, static: str = "") -> str:
+    """The functions of the compensation; `static` comes before each, where they are a part of another file."""
+    dialect, tables = c_dialect(form.dtype), dict[bytes, str]()
+    texts = [print_program(program, dialect, tables) for program in form.programs]
+    functions = "\n\n".join(c_function(program, text) for program, text in zip(form.programs, texts, strict=True))
+    numbers = {k: v for text in texts for k, v in text.tables.items()}
+    numbers |= {"ccnn_limit": form.limit * (1 + 1e-9), "ccnn_slack": form.slack}
     numbers |= {} if form.spread is None else {"ccnn_fallback_sd": form.fallback_sd}
-    for name, values in numbers.items():
-        parts += [c_constants(name, values, dialect), ""]
-    body = "\n\n".join(c_function(program, text) for program, text in zip(form.programs, texts, strict=True))
-    for name, sign in (("min", "<"), ("max", ">")):
-        if f"ccnn_{name}(" in body:
-            parts += [SMALLER.format(name=name, sign=sign)]
-    m = len(form.covariates)
-    driver = DRIVER + (SD_DRIVER if form.spread is not None else "")
-    for key, text in (FIXED_POINT if form.secant is None else SECANT).items():
-        driver = driver.replace(key, text)
-    driver = driver.replace("@SIZE@", str(form.kept))
-    driver = driver.replace("@EPS@", dialect.literal(8 * float(np.finfo(form.dtype).eps))).replace("fabs(", f"fabs{s}(")
-    driver = driver.replace("@STEPS@", str(form.iterations)).replace("@ZERO@", dialect.literal(0.0))
-    for key, with_covariates in COVARIATES.items():
-        driver = driver.replace(key, with_covariates if m else "")
-    given = GIVEN if m else "    (void)covariates;\n"
-    return "\n".join([*parts, body, "", driver.replace("@GIVEN@", given)])
+    return filled(
+        "compensation.c.jinja",
+        static=static,
+        tables=[c_constants(name, values, dialect) for name, values in numbers.items()],
+        smaller={name: sign for name, sign in (("min", "<"), ("max", ">")) if f"ccnn_{name}(" in functions},
+        functions=functions,
+        covariates=form.covariates,
+        secant=form.secant is not None,
+        sd=form.spread is not None,
+        kept=form.kept,
+        steps=form.iterations,
+        rounding=dialect.literal(8 * float(np.finfo(form.dtype).eps)),
+        zero=dialect.literal(0.0),
+        s=_suffix(form),
+    )
 
 
-def _selftest(form: Form, golden: Golden, dialect: Dialect) -> str:
-    outputs = golden.outputs
+def _suffix(form: Form) -> str:
+    """Of C's functions: fabsf is that of single precision."""
+    return "f" if form.dtype == "float32" else ""
+
+
+def _selftest(form: Form, golden: Golden) -> str:
+    dialect, outputs = c_dialect(form.dtype), golden.outputs
     names = {"joints": golden.joints, "covariates": golden.covariates} | {
         k: v for k, v in outputs.items() if "status" not in k
     }
@@ -173,13 +154,17 @@ def _selftest(form: Form, golden: Golden, dialect: Dialect) -> str:
         rows = _whole(outputs[k])
         tables.append(f"static const char golden_{k}[{len(outputs[k])}] = {{\n    {rows}\n}};")
     tables.append(c_constants("tolerance", golden.tolerance, dialect))
-    covariates = "golden_covariates + k * CCNN_COVARIATES" if golden.covariates.size else "NULL"
-    sd = "" if form.spread is None else SD_TEST.replace("@RELATIVE@", dialect.literal(golden.relative))
-    s = "f" if form.dtype == "float32" else ""
-    text = SELFTEST.replace("@SD@", sd).replace("@COUNT@", str(len(golden.joints))).replace("fabs(", f"fabs{s}(")
-    text = text.replace("@COVARIATES@", covariates).replace("@ZERO@", dialect.literal(0.0))
-    text = text.replace("@EPS@", dialect.literal(4 * float(np.finfo(form.dtype).eps)))
-    return text.replace("@TABLES@", "\n\n".join(tables))
+    return filled(
+        "selftest.c.jinja",
+        tables=tables,
+        covariates=form.covariates,
+        sd=form.spread is not None,
+        count=len(golden.joints),
+        relative=dialect.literal(golden.relative),
+        rounding=dialect.literal(4 * float(np.finfo(form.dtype).eps)),
+        zero=dialect.literal(0.0),
+        s=_suffix(form),
+    )
 
 
 def _whole(values: Array) -> str:

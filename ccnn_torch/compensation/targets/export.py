@@ -29,8 +29,6 @@ from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 from ccnn_torch.spelling import nearest
 from ccnn_torch.version import __version__
 
-__all__ = ["COMMAND", "DTYPES", "TARGETS", "export_model"]
-
 DTYPES = ("float64", "float32")
 # What a controller needs: without the way back and the standard deviation a graph takes three quarters of the time.
 COMMAND = ("command", "deviation", "inside_domain")
@@ -80,8 +78,8 @@ class _Order:
 
 
 def _linuxcnc(order: _Order) -> dict[str, str]:
-    parts = None if isinstance(order.model, IdentifiedGeometry) else order.proven()
-    return print_linuxcnc(parts, order.mechanism(), order.source())
+    form = None if isinstance(order.model, IdentifiedGeometry) else order.proven()[0]
+    return print_linuxcnc(form, order.mechanism(), order.source())
 
 
 def _onnx(order: _Order) -> dict[str, bytes]:

@@ -15,8 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BOOLEAN", "OPERATIONS", "Form", "Leaf", "Let", "Loop", "Node", "Program", "leaves", "operations"]
-
 Array = NDArray[Any]
 
 # What an operation does, on numpy arrays. `select` takes condition, then, else.

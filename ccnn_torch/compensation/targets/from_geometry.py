@@ -14,8 +14,6 @@ from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners.constant import ConstantNetwork
 from ccnn_torch.training import Scaling
 
-__all__ = ["compensator_of_geometry"]
-
 _ROWS, _FEWEST = 2500, 100
 _WEIGHT, _MARGIN = 0.04, 0.0
 # Joints nearer to a singular pose are left out; of the others the first of these shares about their middle with which a

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any
 
@@ -16,8 +16,6 @@ from torch.fx import Node as GraphNode
 from ccnn_torch.compensation.targets.build import Builder
 from ccnn_torch.compensation.targets.form import BOOLEAN, Program
 from ccnn_torch.errors import MethodFailedError
-
-__all__ = ["program_of"]
 
 # More elements, or products, are a loop over arrays; fewer are written out, without those of zeros.
 _ELEMENTS, _PRODUCTS = 512, 1024
@@ -55,8 +53,6 @@ def program_of(traced: GraphModule, name: str, inputs: Sequence[str], outputs: S
 
     Args:
         traced: with its operations decomposed.
-        name: of the program.
-        inputs: names of the function's inputs.
         outputs: names of its outputs; None for one that is left out.
 
     Raises:
@@ -130,10 +126,10 @@ class _Lowering:
             dims = args[1] if len(args) > 1 and args[1] is not None else [*range(args[0].ids.dim())]
             keep = args[2] if len(args) > 2 else False
             return self.reduced(_REDUCTIONS[name], args[0], [dims] if isinstance(dims, int) else [*dims], keep)
-        composed = getattr(self, f"_{name.strip('_')}", None)
+        composed = _COMPOSED.get(name)
         if composed is None:
             raise MethodFailedError(f"the model needs '{name}', which no target has; leave that part of it out")
-        return composed(*args, **kwargs)
+        return composed(self, *args, **kwargs)
 
     def each(self, op: str, *operands: Any) -> Any:
         """An operation on each element of operands that broadcast; numbers and constants among them."""
@@ -207,17 +203,9 @@ class _Lowering:
 
     # What is made of others.
 
-    def _mm(self, a: Any, b: Any) -> Value:
-        return self.product(a, b)
-
-    _bmm = matmul = _mm
-
     def _mv(self, a: Any, b: Any) -> Value:
         column = Value(b.ids.unsqueeze(-1)) if isinstance(b, Value) else b.unsqueeze(-1)
         return Value(self.product(a, column).ids.squeeze(-1))
-
-    def _addmm(self, bias: Any, a: Any, b: Any) -> Any:
-        return self.each("add", self.product(a, b), bias)
 
     def _to_copy(self, value: Value, **_: Any) -> Any:
         # Truth values as numbers.
@@ -225,27 +213,10 @@ class _Lowering:
             return self.each("select", value, 1.0, 0.0)
         return value
 
-    def _relu(self, value: Value) -> Any:
-        return self.each("max", value, 0.0)
-
-    def _sigmoid(self, value: Value) -> Any:
-        return self.each("div", 1.0, self.each("add", 1.0, self.each("exp", self.each("neg", value))))
-
-    def _reciprocal(self, value: Value) -> Any:
-        return self.each("div", 1.0, value)
-
-    def _rsqrt(self, value: Value) -> Any:
-        return self.each("div", 1.0, self.each("sqrt", value))
-
     def _clamp(self, value: Value, least: Any = None, most: Any = None, **named: Any) -> Any:
         least, most = named.get("min", least), named.get("max", most)
         found = value if least is None else self.each("max", value, least)
         return found if most is None else self.each("min", found, most)
-
-    _clamp_min = _clamp
-
-    def _clamp_max(self, value: Value, most: Any) -> Any:
-        return self._clamp(value, None, most)
 
     def _pow(self, value: Value, exponent: Any) -> Any:
         if exponent == 0.5:
@@ -261,19 +232,10 @@ class _Lowering:
         count = math.prod(value.ids.shape[d] for d in dims)
         return self.each("mul", self.reduced("add", value, dims, keep), 1.0 / count)
 
-    def _rsub(self, a: Any, b: Any) -> Any:
-        return self.each("sub", b, a)
-
-    def _square(self, value: Value) -> Any:
-        return self.each("mul", value, value)
-
-    def _hypot(self, a: Any, b: Any) -> Any:
-        return self.each("sqrt", self.each("add", self.each("mul", a, a), self.each("mul", b, b)))
-
     def _linalg_vector_norm(self, value: Value, order: Any = 2, dims: Any = None, keep: bool = False) -> Any:
         assert order == 2, "lengths are Euclidean"
         dims = [*range(value.ids.dim())] if dims is None else [dims] if isinstance(dims, int) else [*dims]
-        return self.each("sqrt", self.reduced("add", self._square(value), dims, keep))
+        return self.each("sqrt", self.reduced("add", self.each("mul", value, value), dims, keep))
 
     def _linalg_cross(self, a: Any, b: Any, dim: int = -1) -> Any:
         turned = [[self._turned(v, k, dim) for k in (1, 2)] for v in (a, b)]
@@ -286,31 +248,33 @@ class _Lowering:
             return Value(torch.roll(value.ids, -places, dim))
         return torch.roll(value, -places, dim)
 
-    def _gt(self, a: Any, b: Any) -> Any:
-        return self.each("lt", b, a)
-
-    def _ge(self, a: Any, b: Any) -> Any:
-        return self.each("le", b, a)
-
-    def _ne(self, a: Any, b: Any) -> Any:
-        return self.each("not", self.each("eq", a, b))
-
     def _nan_to_num(self, value: Value, nan: Any = None, posinf: Any = None, neginf: Any = None) -> Any:
         most = torch.finfo(torch.float64).max
-        found = self.each("select", self._isnan(value), nan or 0.0, value)
+        found = self.each("select", self.each("not", self.each("eq", value, value)), nan or 0.0, value)
         for edge, to, usual in ((math.inf, posinf, most), (-math.inf, neginf, -most)):
             found = self.each("select", self.each("eq", found, edge), usual if to is None else to, found)
         return found
 
-    def _isnan(self, value: Value) -> Any:
-        return self._ne(value, value)
-
-    def _isinf(self, value: Value) -> Any:
-        return self.each("eq", self.each("abs", value), math.inf)
-
-    def _isfinite(self, value: Value) -> Any:
-        return self.each("lt", self.each("abs", value), math.inf)
-
     def _sign(self, value: Value) -> Any:
         below = self.each("select", self.each("lt", value, 0.0), -1.0, 0.0)
         return self.each("select", self.each("lt", 0.0, value), 1.0, below)
+
+
+_COMPOSED: dict[str, Callable[..., Any]] = {
+    "mm": _Lowering.product, "bmm": _Lowering.product, "matmul": _Lowering.product, "mv": _Lowering._mv,
+    "addmm": lambda own, bias, a, b: own.each("add", own.product(a, b), bias), "_to_copy": _Lowering._to_copy,
+    "relu": lambda own, v: own.each("max", v, 0.0),
+    "sigmoid": lambda own, v: own.each("div", 1.0, own.each("add", 1.0, own.each("exp", own.each("neg", v)))),
+    "reciprocal": lambda own, v: own.each("div", 1.0, v),
+    "rsqrt": lambda own, v: own.each("div", 1.0, own.each("sqrt", v)), "clamp": _Lowering._clamp,
+    "clamp_min": _Lowering._clamp, "clamp_max": lambda own, v, most: own._clamp(v, None, most),
+    "pow": _Lowering._pow, "mean": _Lowering._mean, "rsub": lambda own, a, b: own.each("sub", b, a),
+    "square": lambda own, v: own.each("mul", v, v),
+    "hypot": lambda own, a, b: own.each("sqrt", own.each("add", own.each("mul", a, a), own.each("mul", b, b))),
+    "linalg_vector_norm": _Lowering._linalg_vector_norm, "linalg_cross": _Lowering._linalg_cross,
+    "gt": lambda own, a, b: own.each("lt", b, a), "ge": lambda own, a, b: own.each("le", b, a),
+    "ne": lambda own, a, b: own.each("not", own.each("eq", a, b)), "nan_to_num": _Lowering._nan_to_num,
+    "isnan": lambda own, v: own.each("not", own.each("eq", v, v)),
+    "isinf": lambda own, v: own.each("eq", own.each("abs", v), math.inf),
+    "isfinite": lambda own, v: own.each("lt", own.each("abs", v), math.inf), "sign": _Lowering._sign,
+}  # fmt: skip

@@ -16,8 +16,6 @@ from ccnn_torch.compensation.secant import Step
 from ccnn_torch.compensation.targets.form import Form, Program
 from ccnn_torch.compensation.targets.from_graph import program_of
 
-__all__ = ["SINGLE_TOLERANCE", "form_of", "traced_program"]
-
 # Share of the limit to which single precision is right.
 SINGLE_TOLERANCE = 1e-5
 # As in the check of every other model file: what is left of command + deviation = joints, as a share of the limit.
@@ -65,9 +63,7 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     """The form of a fitted compensator.
 
     Args:
-        compensator: in double.
         dtype: `float64` or `float32`, in which the targets compute.
-        sd: with the standard deviation.
 
     Raises:
         MethodFailedError: the model has an operation that no form has.

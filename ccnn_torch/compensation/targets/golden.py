@@ -17,8 +17,6 @@ from ccnn_torch.compensation.targets.from_model import SINGLE_TOLERANCE
 from ccnn_torch.compensation.targets.run import run_form
 from ccnn_torch.errors import MethodFailedError
 
-__all__ = ["Golden", "golden_vectors", "require_equal"]
-
 _RANDOM = 1000
 # Corners of the domain are as many as 2 to the power of its inputs; of more inputs than these the middle is taken.
 _CORNERS = 6
@@ -87,9 +85,7 @@ def golden_vectors(compensator: Compensator, form: Form) -> Golden:
     }
     if form.spread is not None:
         outputs["sd"] = np.where(lost, form.fallback_sd, sd)
-    parts = (compensator.network, compensator.geometry, compensator.effects)
-    share = max(TOLERANCE, *(float(getattr(part, "export_tolerance", TOLERANCE)) for part in parts))
-    share = SINGLE_TOLERANCE if form.dtype == "float32" else share
+    share = SINGLE_TOLERANCE if form.dtype == "float32" else compensator.export_tolerance
     values = given.numpy()
     return Golden(values[:, :n], values[:, n:], outputs, share * form.limit, 10 * share, _hard(compensator))
 

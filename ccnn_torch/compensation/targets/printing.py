@@ -13,8 +13,6 @@ import numpy as np
 from ccnn_torch.compensation.targets.form import BOOLEAN, Array, Expression, Form, Leaf, Let, Loop, Program, leaves
 from ccnn_torch.errors import MethodFailedError
 
-__all__ = ["Dialect", "Text", "costs", "print_program", "within", "wrapped"]
-
 # What is used once is written where it is used, up to so many characters.
 _LONGEST = 90
 # Operations as a reader counts them.

@@ -9,8 +9,6 @@ from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.files.write_arm import dh_text, mjcf_text, urdf_text
 
-__all__ = ["print_robot"]
-
 
 def print_robot(model: LoadedModel | IdentifiedGeometry) -> dict[str, str]:
     """Contents of the files by name: `robot.urdf`, `robot.xml` (MJCF), and `robot.yaml` where the arm has a DH table.

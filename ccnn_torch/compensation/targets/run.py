@@ -8,8 +8,6 @@ import numpy as np
 
 from ccnn_torch.compensation.targets.form import OPERATIONS, Array, Expression, Form, Leaf, Let, Program
 
-__all__ = ["run_form", "run_program"]
-
 # Numbers at a time: a loop over a large table holds all its products of every row.
 _AT_ONCE = 1 << 18
 

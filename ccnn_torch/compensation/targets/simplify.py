@@ -6,8 +6,6 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from ccnn_torch.compensation.targets.form import Expression, Leaf, Let, Loop, Node, leaves
 
-__all__ = ["live_steps", "merge_axes", "put_loops_together"]
-
 
 def live_steps(steps: Iterable[Let | Loop], nodes: Mapping[int, Node], wanted: Collection[int]) -> list[Let | Loop]:
     """Those that the wanted nodes need, in order."""

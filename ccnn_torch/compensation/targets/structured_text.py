@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
-from ccnn_torch.compensation.targets.structured_text_blocks import (
-    COMPENSATE,
-    FIXED_POINT,
-    IDEAL,
-    README,
-    SD,
-    SECANT,
-    SELFTEST,
-)
+from ccnn_torch.compensation.targets.template import filled
 from ccnn_torch.errors import MethodFailedError
-
-__all__ = ["print_structured_text"]
 
 # An argument of EXP beyond these would stop a controller; what it gives is 0 or without effect long before.
 _EXP = {"float64": 700.0, "float32": 80.0}
@@ -31,22 +22,28 @@ _NAMES = ("abs", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan")
 
 def print_structured_text(form: Form, golden: Golden) -> dict[str, str]:
     """Contents of the files by name."""
-    dialect = _dialect(form.dtype)
-    tables: dict[bytes, str] = {}
-    blocks = [_block(program, print_program(program, dialect, tables), form) for program in form.programs]
+    dialect, tables = _dialect(form.dtype), dict[bytes, str]()
     about = [*form.facts, "", *_units(form), "", *costs(form)]
-    head = "\n".join(["(*", *(f"   {line}".rstrip() for line in wrapped(about)), "*)"])
-    numbers = {"limit": form.limit * (1 + 1e-9), "slack": form.slack}
-    main = [
-        _filled(COMPENSATE, form, numbers),
-        _filled(IDEAL, form, {"limit": numbers["limit"]}),
-        *([] if form.spread is None else [_filled(SD, form, {"fallback_sd": form.fallback_sd})]),
-    ]
-    return {
-        "compensator.st": "\n\n".join([head, *blocks, *main]) + "\n",
-        "selftest.st": _selftest(form, golden) + "\n",
-        "README.md": README.format(real=_real(form)),
-    }
+    text = filled(
+        "compensator.st.jinja",
+        about="\n".join(["(*", *(f"   {line}".rstrip() for line in wrapped(about)), "*)"]),
+        blocks=[_block(program, print_program(program, dialect, tables), form) for program in form.programs],
+        limit=_table("limit", form.limit * (1 + 1e-9), form),
+        slack=_table("slack", form.slack, form),
+        fallback_sd="" if form.spread is None else _table("fallback_sd", form.fallback_sd, form),
+        secant=form.secant is not None,
+        kept=form.kept,
+        steps=form.iterations,
+        rounding=_literal(8 * float(np.finfo(form.dtype).eps), form.dtype),
+        zero=_literal(0.0, form.dtype),
+        **_sizes(form),
+    )
+    readme = filled("structured_text.md.jinja", real=_real(form))
+    return {"compensator.st": text, "selftest.st": _selftest(form, golden), "README.md": readme}
+
+
+def _sizes(form: Form) -> dict[str, Any]:
+    return {"n": len(form.joints), "m": len(form.covariates), "real": _real(form)}
 
 
 def _real(form: Form) -> str:
@@ -155,22 +152,6 @@ def _block(program: Program, text: Text, form: Form) -> str:
     )
 
 
-def _filled(template: str, form: Form, constants: dict[str, Array]) -> str:
-    """A block around the programs, with its names, sizes and numbers."""
-    real, m = _real(form), len(form.covariates)
-    for key, text in (FIXED_POINT if form.secant is None else SECANT).items():
-        template = template.replace(key, text)
-    template = template.replace("@LAST@", str(form.kept - 1))
-    found = (
-        template.replace("@N@", str(len(form.joints) - 1)).replace("@M@", str(max(m, 1) - 1)).replace("@REAL@", real)
-    )
-    found = found.replace("@CONSTANTS@", "\n".join(_table(name, values, form) for name, values in constants.items()))
-    found = found.replace("@GIVEN@", ", covariates := covariates" if m else "").replace("@STEPS@", str(form.iterations))
-    found = found.replace("@X@", ", covariates := clean.covariates_out" if m else "")
-    eps = _literal(8 * float(np.finfo(form.dtype).eps), form.dtype)
-    return found.replace("@EPS@", eps).replace("@ZERO@", _literal(0.0, form.dtype))
-
-
 def _selftest(form: Form, golden: Golden) -> str:
     """Some golden vectors as a function block: finite ones, half of them at the edges of the domain."""
     finite = np.flatnonzero((np.abs(np.hstack([golden.joints, golden.covariates])) < 1e30).all(-1))
@@ -179,13 +160,11 @@ def _selftest(form: Form, golden: Golden) -> str:
     tables = {"joints": golden.joints[rows], **tables, "tolerance": golden.tolerance}
     if form.covariates:
         tables["covariates"] = golden.covariates[rows]
-    constants = "\n".join(_table(f"golden_{name}", values, form) for name, values in tables.items())
-    codes = ", ".join(map(str, golden.outputs["status"][rows].tolist()))
-    constants += f"\n    golden_status : ARRAY[0..{_TESTED - 1}] OF INT := [{codes}];"
-    n, m, eps = len(form.joints), len(form.covariates), 4 * float(np.finfo(form.dtype).eps)
-    given = f"\n    FOR j := 0 TO {m - 1} DO\n        x[j] := golden_covariates[{m} * k + j];\n    END_FOR" if m else ""
-    found = SELFTEST.replace("@LAST@", str(_TESTED - 1)).replace("@N@", str(n - 1)).replace("@COUNT@", str(n))
-    found = found.replace("@CONSTANTS@", constants).replace("@REAL@", _real(form)).replace("@SETX@", given)
-    found = found.replace("@M@", str(max(m, 1) - 1)).replace("@X@", ", covariates := x" if m else "")
-    found = found.replace("@XVAR@", f"\n    x : ARRAY[0..{max(m, 1) - 1}] OF {_real(form)};" if m else "")
-    return found.replace("@EPS@", _literal(eps, form.dtype))
+    return filled(
+        "selftest.st.jinja",
+        tables=[_table(f"golden_{name}", values, form) for name, values in tables.items()],
+        status=golden.outputs["status"][rows].tolist(),
+        count=_TESTED,
+        rounding=_literal(4 * float(np.finfo(form.dtype).eps), form.dtype),
+        **_sizes(form),
+    )

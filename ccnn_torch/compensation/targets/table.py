@@ -14,8 +14,6 @@ from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["print_tables"]
-
 Array = NDArray[Any]
 
 # Points of the whole grid at most, and along one axis (LinuxCNC takes 256).

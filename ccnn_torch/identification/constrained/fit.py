@@ -32,8 +32,6 @@ from ccnn_torch.identification.problems.parameters import Selection, select_para
 from ccnn_torch.identification.solve import choice_of, solver_of
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["ConstraintFit", "State", "fit_constraint", "held_distance"]
-
 # Links and noise are estimated in turn, the noise from this size on [m].
 _ROUNDS, _FIRST_NOISE, _LEAST_NOISE = 5, 1e-3, 1e-9
 # Prior of the tool's offset around its first fit, and of a plate's extent around what its records say [m].
@@ -79,9 +77,6 @@ def fit_constraint(
     Priors keep the links near nominal; the tool's offset, which no maker knows, is fitted first, with nominal links.
     Where the config names no noise, it is that of the residuals, in five rounds; for the intervals it is raised by the
     equations that the fit used up.
-
-    Raises:
-        InputError: fewer equations than parameters, or a key that is no size.
     """
     build = _builder(config, mechanism, rows)
     names = [p.name for p in mechanism.geometry]

@@ -19,12 +19,10 @@ from ccnn_torch.identification.doubts import doubts_of
 from ccnn_torch.identification.measured.kinematics import Kinematics
 from ccnn_torch.identification.measured.measured import Measured, Rows
 from ccnn_torch.identification.measured.nominal import nominal_machine
-from ccnn_torch.identification.pose_errors import before_and_after, figures
-from ccnn_torch.identification.result import Known, parameter_blocks, versions
+from ccnn_torch.identification.pose_errors import before_and_after
+from ccnn_torch.identification.result import Known, method_of, parameter_blocks, results_of
 from ccnn_torch.identification.solve import Outcome
 from ccnn_torch.mechanisms import Framed, Mechanism, PoseError, SerialArm
-
-__all__ = ["identify_by_constraint"]
 
 # An interval above this share of its prior's is the prior's. Turning machine and plates together turns the residuals,
 # too, which the linearised problem takes for a little knowledge.
@@ -38,9 +36,6 @@ def identify_by_constraint(
 
     Returns:
         Rows, the outcome of lm, content of `identified.json`, tensors behind the pictures.
-
-    Raises:
-        InputError: the mechanism or the records cannot be used, or the rows are too few.
     """
     mechanism, notes = _machine(config)
     rows = read_constraint(config, mechanism, given)
@@ -123,54 +118,23 @@ def _results(
     known: Known,
     test: dict[str, Any],
 ) -> dict[str, Any]:
-    method = {
-        "test": test,
-        "seconds": outcome.seconds,
-        "machines": 1,
-        "per_leg": False,
-        "converged": float(outcome.converged.double().mean()),
-        "evaluations": outcome.evaluations,
-        "deviations": None,
-        "bound": None,
-        "coverage": None,
-        "compensation": None,
-    }
     prior = [
         p.name
         for p, sd, seen in zip(found.selection.parameters, known.sd[0], found.knowledge.identifiable[0], strict=False)
         if bool(seen) and not math.isfinite(sd)
     ]
-    notes = [*measured.notes, *([f"lm: {outcome.message}"] if outcome.message else [])]
+    notes = [f"lm: {outcome.message}"] if outcome.message else []
     if prior:
         notes.append(f"No better known than by the tolerance given: {', '.join(prior)}.")
-    return {
-        "name": config.name,
-        "seed": config.seed,
-        "mechanism": measured.mechanism.name,
-        "machines": 1,
-        "simulated": False,
-        "rows": {"train": measured.rows.joints.shape[1], "per_leg": {}, "test": measured.test.joints.shape[1]},
-        "method": "lm",
-        "parameters": parameter_blocks(measured, found.selection, outcome, known),
-        "combinations_not_identifiable": known.combinations,
-        "test": test,
-        "methods": {"lm": method},
-        "compensation": None,
-        "singular_values": known.singular_values,
-        "noise_ratio": figures({"value": known.noise}),
-        "doubts": doubts_of(
-            test,
-            float(known.noise),
-            float(known.freedom),
-            None if config.noise is None else found.after.noise,
-            config.noise is not None,
-        ),
-        "counts": [],
-        "paper": None,
-        "data_sha256": measured.data_hash,
-        "notes": notes,
-        "versions": versions(),
-    }
+    doubts = doubts_of(
+        test,
+        float(known.noise),
+        float(known.freedom),
+        None if config.noise is None else found.after.noise,
+        config.noise is not None,
+    )
+    parameters = parameter_blocks(measured, found.selection, outcome, known)
+    return results_of(config, measured, parameters, known, {"lm": method_of(outcome, test, False)}, doubts, notes)
 
 
 def _constraint(config: IdentifyConfig, rows: ConstraintRows, found: ConstraintFit) -> dict[str, Any]:

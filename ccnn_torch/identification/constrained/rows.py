@@ -19,8 +19,6 @@ from ccnn_torch.records import Records, Table, stack_columns
 from ccnn_torch.records.pose_columns import check_joints
 from ccnn_torch.records.sources import read_source
 
-__all__ = ["ConstraintRows", "read_constraint"]
-
 GROUPED_BY = {"sockets": "placement", "distances": "anchor", "plane": "plane"}
 """Column that numbers the groups of each kind, unless the config names others."""
 # Joints beyond this are taken for degrees [rad], as in records of poses: 4 turns.
@@ -57,12 +55,7 @@ class ConstraintRows:
 
 
 def read_constraint(config: IdentifyConfig, mechanism: Mechanism, given: Given | None = None) -> ConstraintRows:
-    """Read, select and split the records of a config with a constraint.
-
-    Raises:
-        InputError: a column is missing, no row takes part, the split is not possible, or a held-out row's placement
-            or socket has no row to identify from.
-    """
+    """Read, select and split the records of a config with a constraint."""
     about = config.constraint
     assert about is not None and config.records is not None
     source = with_test_file(config.records if given is None else given, config.split)

@@ -12,8 +12,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.linear import WeightedRows
 from ccnn_torch.identification.problems.problem import Fit, Problem, Solver
 
-__all__ = ["Bootstrap", "bootstrap"]
-
 
 @dataclass(frozen=True)
 class Bootstrap:

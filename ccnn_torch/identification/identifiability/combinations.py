@@ -12,8 +12,6 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 
-__all__ = ["TAKES_PART", "combinations_in_words"]
-
 # Component of a hidden direction below which a parameter does not take part. Real geometry is never exactly parallel:
 # smaller components come from the errors themselves and would tie everything to everything.
 TAKES_PART = 1e-2
@@ -25,7 +23,6 @@ def combinations_in_words(parameters: Sequence[Parameter], hidden: Tensor, scale
     `A1x and l1 only as 1.00 A1x - 0.72 l1`: of errors of the two, in SI, the rows see this combination and no other.
 
     Args:
-        parameters: the `k`.
         hidden: directions that the rows do not see, orthonormal or zero, one a row, `… x k`, in units of `scale`.
         scale: `k` [SI].
     """

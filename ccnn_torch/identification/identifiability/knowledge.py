@@ -14,8 +14,6 @@ from ccnn_torch.identification.identifiability.combinations import TAKES_PART, c
 from ccnn_torch.identification.problems.linear import OPEN, WeightedRows
 from ccnn_torch.identification.problems.problem import Problem
 
-__all__ = ["Knowledge", "require_identifiable", "what_is_known"]
-
 # Singular values below this share of the largest are rounding.
 _RANK = 1e-9
 

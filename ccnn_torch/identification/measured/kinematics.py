@@ -10,8 +10,6 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Kinematics", "make_kinematics"]
-
 # Each round of `command` shrinks the remainder by about the relative size of the errors.
 _ROUNDS = 6
 
@@ -56,11 +54,7 @@ class Kinematics:
 
 
 def make_kinematics(mechanism: Mechanism, built: bool) -> Kinematics:
-    """Check that the mechanism knows how it is built.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Check that the mechanism knows how it is built."""
     if built and not (hasattr(mechanism, "as_built") and hasattr(mechanism, "pose_near")):
         raise InputError(
             f"simulate.as_built: {mechanism.name} never leaves its nominal motion, so that there is nothing to "

@@ -9,8 +9,6 @@ from torch import Tensor
 from ccnn_torch.identification.measured.kinematics import Kinematics
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Measured", "Rows"]
-
 
 @dataclass(frozen=True)
 class Rows:
@@ -49,8 +47,6 @@ class Measured:
         map: poses of the map, `m x p` [SI]; None where none is drawn.
         pose_noise: standard deviation of each observed coordinate, `o` [SI]; None where it is to be estimated.
         joint_noise: of the recorded joints, `n` [SI]; None where there is none.
-        unknown_frame: parameters that say the pose of the machine in the measuring frame, which the maker cannot know:
-            they are fitted before "before" is judged, too.
         data_hash: SHA-256 of the records; empty for simulated data.
         notes: sentences for the person who reads the results.
     """
@@ -69,7 +65,6 @@ class Measured:
     map: Tensor | None = None
     pose_noise: Tensor | None = None
     joint_noise: Tensor | None = None
-    unknown_frame: tuple[str, ...] = ()
     data_hash: str = ""
     notes: list[str] = field(default_factory=list)
 

@@ -6,15 +6,9 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 
-__all__ = ["nominal_machine"]
-
 
 def nominal_machine(config: IdentifyConfig) -> Mechanism:
-    """The mechanism that the config names, with as many parameters a link as it asks for.
-
-    Raises:
-        InputError: there is no such mechanism, or it has no links of six parameters.
-    """
+    """The mechanism that the config names, with as many parameters a link as it asks for."""
     mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
     if config.links == "given":
         return mechanism

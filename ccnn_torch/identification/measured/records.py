@@ -14,20 +14,14 @@ from ccnn_torch.identification.measured.measured import Measured, Rows
 from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
 from ccnn_torch.records import Records, check_rows, load_records
 
-__all__ = ["from_records", "read_records", "split_records"]
-
 
 def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | None = None) -> Measured:
-    """Load and split the records of a config, or those that Python has.
-
-    Raises:
-        InputError: the records cannot be used, or the arm has frames per group of rows, which are no geometry.
-    """
+    """Load and split the records of a config, or those that Python has."""
     assert config.records is not None
     source = with_test_file(config.records if given is None else given, config.split)
     records, mechanism = read_records(config, source, mechanism)
     train, test = split_records(config, records)
-    start, unknown = _frames(mechanism, train)
+    start = _start(mechanism, train)
     far = []
     if isinstance(mechanism, SerialArm):
         far = judge_frames(mechanism, train.joints[0], train.observed[0], start, where=records.path)
@@ -41,18 +35,13 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
         start=start,
         pose_noise=None if config.noise is None else sizes_of_pose(config.noise, mechanism.pose, "noise"),
         joint_noise=_joint_noise(config, mechanism),
-        unknown_frame=unknown,
         data_hash=records.data_hash,
         notes=[*held_out_notes(config.split, test.joints.shape[1]), *_notes(records), *far],
     )
 
 
 def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tuple[Records, Mechanism]:
-    """Records that fit a mechanism, and the mechanism as it was measured there (with or without orientation).
-
-    Raises:
-        InputError: the records cannot be used.
-    """
+    """Records that fit a mechanism, and the mechanism as it was measured there (with or without orientation)."""
     records = load_records(source, mechanism, [], learns=False, columns=config.columns)
     if isinstance(mechanism, SerialArm):
         if mechanism.frame_per or mechanism.tool_per:
@@ -91,14 +80,11 @@ def split_records(config: IdentifyConfig, records: Records) -> tuple[Rows, Rows]
     return train, test
 
 
-def _frames(mechanism: Mechanism, rows: Rows) -> tuple[Tensor, tuple[str, ...]]:
-    """Where the search starts, `1 x K`, and the parameters of frames that had to be fitted first."""
+def _start(mechanism: Mechanism, rows: Rows) -> Tensor:
+    """Where the search starts, `1 x K`: frames that are unknown have to be fitted first."""
     if not isinstance(mechanism, SerialArm) or not mechanism.unknown_frames:
-        return mechanism.nominal[None].clone(), ()
-    start = fit_frames(mechanism, rows.joints[0], rows.observed[0])
-    names = [p.name for p in mechanism.geometry]
-    prefixes = tuple(f"{frame}_" for frame in mechanism.unknown_frames)
-    return start[None], tuple(name for name in names if name.startswith(prefixes))
+        return mechanism.nominal[None].clone()
+    return fit_frames(mechanism, rows.joints[0], rows.observed[0])[None]
 
 
 def _joint_noise(config: IdentifyConfig, mechanism: Mechanism) -> Tensor | None:

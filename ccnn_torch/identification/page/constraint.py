@@ -8,8 +8,6 @@ from typing import Any
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.table import Table
 
-__all__ = ["BEFORE_SAYS", "constraint_table", "holder"]
-
 BEFORE_SAYS = "Before: links nominal, the tool's offset fitted."
 _HOLDERS = {
     "sockets": "the other rows of its socket put",

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from ccnn_torch.display import display_unit
 from ccnn_torch.report.figures.style import AFTER, BEFORE, SERIES, Plot, bare, styled
 
-__all__ = ["correlation_plot", "parameter_plot", "singular_value_plot"]
-
 Array = NDArray[np.float64]
 Arrays = Mapping[str, Array]
 Results = Mapping[str, Any]

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.figures.style import SERIES, Plot, styled
 
-__all__ = ["map_plot", "poses_plot"]
-
 Arrays = Mapping[str, NDArray[np.float64]]
 Results = Mapping[str, Any]
 

@@ -15,8 +15,6 @@ from ccnn_torch.identification.page.figure_knowledge import correlation_plot, pa
 from ccnn_torch.identification.page.figure_maps import map_plot, poses_plot
 from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, SERIES, Plot, styled
 
-__all__ = ["identified_plots"]
-
 Array = NDArray[np.float64]
 Arrays = Mapping[str, Array]
 Results = Mapping[str, Any]

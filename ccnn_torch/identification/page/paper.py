@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from ccnn_torch.display import number_text
+from ccnn_torch.identification.pose_errors import figure_text
 from ccnn_torch.report.table import Table
-
-__all__ = ["OVERCONSTRAINED", "paper_tables"]
 
 MM, DEG = 1e-3, 0.017453292519943295
 
@@ -107,10 +106,10 @@ def _figures_seven_eight(results: Mapping[str, Any]) -> Table:
         rows.append(
             (
                 f"ours: {method}",
-                _in(about.get("m"), "largest", MM),
-                _in(about.get("m"), "mean", MM),
-                _in(about.get("rad"), "largest", DEG),
-                _in(about["share"], "mean", 0.01),
+                figure_text(about.get("m"), "largest", MM),
+                figure_text(about.get("m"), "mean", MM),
+                figure_text(about.get("rad"), "largest", DEG),
+                figure_text(about["share"], "mean", 0.01),
             )
         )
     note = (
@@ -120,16 +119,6 @@ def _figures_seven_eight(results: Mapping[str, Any]) -> Table:
     )
     columns = ("method", "largest position [mm]", "mean position [mm]", "largest orientation [deg]", "mean share [%]")
     return Table("Largest deviations, Table 2 and Figures 7 and 8", columns, tuple(rows), note)
-
-
-def _in(block: Mapping[str, Any] | None, key: str, scale: float) -> str:
-    if block is None or block[key] is None:
-        return "–"
-    text = number_text(block[key] / scale, 3)
-    if "spread" in block and key in block["spread"]:
-        low, high = (number_text(v / scale, 3) for v in block["spread"][key])
-        text += f" [{low}, {high}]"
-    return text
 
 
 def _table_three(results: Mapping[str, Any]) -> Table:

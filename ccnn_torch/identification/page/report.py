@@ -16,10 +16,8 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification.page.tables import identified_tables, identified_verdict, unknown_sentences
-from ccnn_torch.report.html import InlineFigure, page_text
+from ccnn_torch.report.html import page_text
 from ccnn_torch.report.json_files import read_json
-
-__all__ = ["ARRAYS", "save_identified_arrays", "write_identified_report"]
 
 ARRAYS = "arrays.safetensors"
 _LINKED = (
@@ -43,13 +41,10 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
 
     Args:
         folder: with arrays, and `identified.json`, which is read when `results` is None.
-
-    Raises:
-        InputError: a file is not there or damaged.
     """
     # Loads matplotlib, which only a report waits for.
     from ccnn_torch.identification.page.figures import identified_plots
-    from ccnn_torch.report.figures.style import inline_svg, save_figure
+    from ccnn_torch.report.figures.style import inline_figures
 
     folder = Path(folder)
     results = read_json(folder / "identified.json") if results is None else results
@@ -57,10 +52,7 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
         arrays: dict[str, NDArray[np.float64]] = load_file(folder / ARRAYS)
     except (OSError, SafetensorError):
         raise InputError(f"{folder / ARRAYS}: is not there or damaged; identify again into another folder") from None
-    figures = []
-    for plot in identified_plots(results, arrays):
-        _, svg = save_figure(plot.figure, folder / "plots" / plot.name)
-        figures.append(InlineFigure(plot.name, plot.caption, inline_svg(svg.read_text(encoding="utf-8"), plot.name)))
+    figures = inline_figures(identified_plots(results, arrays), folder / "plots")
     config = folder / "config.yaml"
     page = page_text(
         "identified",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -12,18 +12,9 @@ from rich.console import Console
 from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.identification.page.constraint import BEFORE_SAYS, constraint_table, holder
 from ccnn_torch.identification.page.paper import paper_tables
+from ccnn_torch.identification.pose_errors import figure_text
 from ccnn_torch.report.csv_file import write_rows
-from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
-
-__all__ = [
-    "identified_markdown",
-    "identified_tables",
-    "identified_verdict",
-    "not_settled",
-    "print_identified",
-    "unknown_sentences",
-    "write_identified_csv",
-]
+from ccnn_torch.report.table import Table, markdown_table, print_table, print_text, table_of
 
 Block = Mapping[str, Any]
 
@@ -104,18 +95,6 @@ def unknown_sentences(results: Block) -> list[str]:
     return [*results.get("doubts", []), *said]
 
 
-def _text(block: Block | None, key: str, scale: float = 1.0, digits: int = 3) -> str:
-    """A figure with its interval, or –."""
-    if block is None or block.get(key) is None:
-        return "–"
-    text = number_text(block[key] / scale, digits)
-    spread = block.get("spread", {}).get(key)
-    if spread is not None:
-        low, high = (number_text(v / scale, digits) for v in spread)
-        text += f" [{low}, {high}]"
-    return text
-
-
 def _with_unit(block: Block, key: str) -> str:
     if block[key] is None:
         return "unknown"
@@ -138,34 +117,28 @@ def _shown_units(blocks: Sequence[Block]) -> dict[str, tuple[float, str]]:
 
 
 def _parameter_table(results: Block) -> Table:
-    simulated = results["simulated"]
+    free = {name: block for name, block in results["parameters"].items() if block["free"]}
     lost = "not identifiable" if results["methods"][results["method"]]["converged"] else "–"
-    units = _shown_units([block for block in results["parameters"].values() if block["free"]])
-    rows = []
-    for name, block in results["parameters"].items():
-        if not block["free"]:
-            continue
-        scale, unit = units[block["unit"]]
-        sd = _text(block, "sd", scale) if block["identifiable"] else lost
-        nominal = f"{number_text(block['nominal'], 6)} {block['unit']}".removesuffix(" 1")
-        cells = [f"{name} [{unit}]", nominal]
-        if simulated:
-            cells += [_text(block, "error_before", scale), _text(block, "deviation", scale)]
-        else:
-            cells.append(number_text((block["value"] - block["nominal"]) / scale, 4))
-        cells.append(sd)
-        if "sd_bootstrap" in block:
-            cells.append(number_text(block["sd_bootstrap"] / scale, 3))
-        rows.append(tuple(cells))
-    columns = ["parameter", "nominal"]
-    columns += ["|true - nominal|", "|true - identified|"] if simulated else ["identified - nominal"]
-    columns.append("standard deviation")
-    bootstrapped = any("sd_bootstrap" in p for p in results["parameters"].values())
-    columns += ["by bootstrap"] * bootstrapped
+    units = _shown_units([*free.values()])
+
+    def column(cell: Callable[[Block, float], str]) -> list[str]:
+        return [cell(block, units[block["unit"]][0]) for block in free.values()]
+
+    columns = {
+        "parameter": [f"{name} [{units[block['unit']][1]}]" for name, block in free.items()],
+        "nominal": column(lambda p, _: f"{number_text(p['nominal'], 6)} {p['unit']}".removesuffix(" 1")),
+    }
+    if results["simulated"]:
+        columns["|true - nominal|"] = column(lambda p, scale: figure_text(p, "error_before", scale))
+        columns["|true - identified|"] = column(lambda p, scale: figure_text(p, "deviation", scale))
+    else:
+        columns["identified - nominal"] = column(lambda p, scale: number_text((p["value"] - p["nominal"]) / scale, 4))
+    columns["standard deviation"] = column(lambda p, scale: figure_text(p, "sd", scale) if p["identifiable"] else lost)
+    if any("sd_bootstrap" in block for block in free.values()):
+        columns["by bootstrap"] = column(lambda p, scale: figure_text(p, "sd_bootstrap", scale))
     several = results["machines"] > 1
     note = f"By {results['method']}." + " Medians over the machines, [5 %, 95 %]." * several
-    note += f" {_interval_note(results)}"
-    return Table("Parameters", tuple(columns), tuple(rows), note, details=("nominal",))
+    return table_of("Parameters", columns, f"{note} {_interval_note(results)}", ["nominal"])
 
 
 def _interval_note(results: Block) -> str:
@@ -178,26 +151,20 @@ def _interval_note(results: Block) -> str:
 
 
 def _method_table(results: Block) -> Table:
-    tests = [block["test"] for block in results["methods"].values()]
-    scales = {
-        name: {key: _shared_unit([test[name] for test in tests], key) for key in ("before", "after", "max_after")}
-        for name in ("position", "rotation")
-        if results["test"][name] is not None
-    }
-    rows = []
-    for method, block in results["methods"].items():
-        cells = [method + (" (leg by leg)" if block["per_leg"] else "")]
-        for name, keyed in scales.items():
-            cells += [_text(block["test"][name], key, scale) for key, (scale, _) in keyed.items()]
-        cells += [str(block["machines"]), f"{100 * block['converged']:.0f} %", number_text(block["seconds"], 3)]
-        rows.append(tuple(cells))
-    columns = ["method"]
+    methods = results["methods"]
+    columns = {"method": [name + (" (leg by leg)" if block["per_leg"] else "") for name, block in methods.items()]}
     details = ["machines", "converged", "time [s]"]
-    for name, keyed in scales.items():
-        words = {"before": "before", "after": "after", "max_after": "maximum after"}
-        columns += [f"{name} {words[key]} [{unit}]" for key, (_, unit) in keyed.items()]
-        details += columns[-1:]
-    columns += ["machines", "converged", "time [s]"]
+    for name in ("position", "rotation"):
+        if results["test"][name] is None:
+            continue
+        tests = [block["test"][name] for block in methods.values()]
+        for key, words in (("before", "before"), ("after", "after"), ("max_after", "maximum after")):
+            scale, unit = _shared_unit(tests, key)
+            columns[f"{name} {words} [{unit}]"] = [figure_text(test, key, scale) for test in tests]
+        details += [*columns][-1:]
+    columns["machines"] = [str(block["machines"]) for block in methods.values()]
+    columns["converged"] = [f"{100 * block['converged']:.0f} %" for block in methods.values()]
+    columns["time [s]"] = [number_text(block["seconds"], 3) for block in methods.values()]
     noise = results["test"]["position"] or {}
     note = "RMS distance of held-out measured poses from the predicted ones."
     if "constraint" in results:
@@ -205,7 +172,7 @@ def _method_table(results: Block) -> Table:
     if noise.get("noise") is not None:
         scale, unit = display_unit("m", noise["noise"])
         note += f" The measurement noise alone is {number_text(noise['noise'] / scale, 3)} {unit} in position."
-    return Table("Held-out pose error", tuple(columns), tuple(rows), note, details=tuple(details))
+    return table_of("Held-out pose error", columns, note, details)
 
 
 def _shared_unit(blocks: Sequence[Block | None], key: str) -> tuple[float, str]:
@@ -226,7 +193,7 @@ def _transfer_table(results: Block) -> Table | None:
         if test is not None:
             scale, unit = display_unit(test["unit"], test["before"] or 1.0)
             keys = ("before", "after", "max_before", "max_after")
-            rows.append((f"{name} [{unit}]", *(_text(test, key, scale) for key in keys)))
+            rows.append((f"{name} [{unit}]", *(figure_text(test, key, scale) for key in keys)))
     columns = ("error", "nominal links", "identified links", "maximum, nominal", "maximum, identified")
     note = (
         f"RMS distance of {count_text(block['rows']['test'], 'held-out pose')} of {block['records']} from the "
@@ -238,34 +205,25 @@ def _transfer_table(results: Block) -> Table | None:
 def _deviation_table(results: Block) -> Table | None:
     if not results["simulated"]:
         return None
-    found = [block["deviations"] for block in results["methods"].values()]
-    scales = {
-        unit: _shared_unit([{"unit": unit, **block[unit]} for block in found], "largest")
-        for unit in ("m", "rad", "1")
-        if unit in found[0]
-    }
-    rows = []
-    for method, block in results["methods"].items():
-        cells = [method]
-        for unit, (scale, _) in scales.items():
-            cells += [_text(block["deviations"][unit], key, scale) for key in ("largest", "mean")]
-        bound = block["bound"]
-        cells.append(number_text(bound["median"], 3) if bound else "–")
-        cells.append(f"{number_text(bound['lowest'], 3)} to {number_text(bound['highest'], 3)}" if bound else "–")
-        cells.append("–" if block["coverage"] is None else f"{100 * block['coverage']:.1f} %")
-        rows.append(tuple(cells))
-    columns = ["method"]
-    details = ["range of σ / bound"]
-    for unit, (_, shown) in scales.items():
-        kind = {"m": "lengths", "rad": "angles"}.get(unit, "gains")
-        columns += [f"{kind}: maximum [{shown}]", f"{kind}: mean [{shown}]"]
-        details += columns[-1:]
-    columns += ["σ / bound", "range of σ / bound", "95 % intervals hold"]
+    methods = results["methods"]
+    found, bounds = ([block[key] for block in methods.values()] for key in ("deviations", "bound"))
+    columns, details = {"method": [*methods]}, ["range of σ / bound"]
+    for unit, kind in (("m", "lengths"), ("rad", "angles"), ("1", "gains")):
+        if unit in found[0]:
+            scale, shown = _shared_unit([{"unit": unit, **block[unit]} for block in found], "largest")
+            for key, words in (("largest", "maximum"), ("mean", "mean")):
+                columns[f"{kind}: {words} [{shown}]"] = [figure_text(block[unit], key, scale) for block in found]
+            details += [*columns][-1:]
+    ends = [[number_text(bound[key], 3) for key in ("lowest", "highest")] if bound else None for bound in bounds]
+    columns["σ / bound"] = [figure_text(bound, "median") for bound in bounds]
+    columns["range of σ / bound"] = ["–" if end is None else " to ".join(end) for end in ends]
+    shares = [block["coverage"] for block in methods.values()]
+    columns["95 % intervals hold"] = ["–" if share is None else f"{100 * share:.1f} %" for share in shares]
     note = (
         "Deviation of identified from true parameters, median over machines. Bound: the Cramér-Rao bound of the same "
         "rows and noise; the standard deviation over the machines divided by it, median over the parameters."
     )
-    return Table("Deviation of the parameters", tuple(columns), tuple(rows), note, details=tuple(details))
+    return table_of("Deviation of the parameters", columns, note, details)
 
 
 def _compensation_table(results: Block) -> Table | None:
@@ -277,45 +235,30 @@ def _compensation_table(results: Block) -> Table | None:
     }
     if not found:
         return None
-    scales = {
-        name: _shared_unit(blocks, "after")
-        for name in ("position", "rotation")
-        if any(blocks := [block[name] for block in found.values()])
-    }
-    columns = ["commands"]
-    for name, (_, unit) in scales.items():
-        columns += [f"{name} after [{unit}]", f"{name} removed [%]"]
-    rows = [
-        (
-            label,
-            *(
-                cell
-                for name, (scale, _) in scales.items()
-                for cell in (_text(block[name], "after", scale), _text(block[name], "removed", 0.01, 4))
-            ),
-        )
-        for label, block in found.items()
-    ]
+    columns = {"commands": [*found]}
+    for name in ("position", "rotation"):
+        blocks = [block[name] for block in found.values()]
+        if any(blocks):
+            scale, unit = _shared_unit(blocks, "after")
+            columns[f"{name} after [{unit}]"] = [figure_text(block, "after", scale) for block in blocks]
+            columns[f"{name} removed [%]"] = [figure_text(block, "removed", 0.01, 4) for block in blocks]
     note = (
         "RMS pose error of the simulated machines at held-out poses, commanded by the identified geometry: exact = "
         "real inverse kinematics; linear = nominal joints corrected by the identification Jacobian (Sun et al. 2018, "
         "eq. 15)."
     )
-    return Table("Compensation with the identified geometry", tuple(columns), tuple(rows), note)
+    return table_of("Compensation with the identified geometry", columns, note)
 
 
 def _count_table(results: Block) -> Table | None:
     if not results["counts"]:
         return None
-    methods = list(results["counts"][0]["methods"])
-    rows = []
-    for entry in results["counts"]:
-        cells = [str(entry["poses"])]
-        for method in methods:
-            cells.append(_text(entry["methods"][method], "position", 1e-3))
-        rows.append(tuple(cells))
+    counts = results["counts"]
+    columns = {"poses": [str(entry["poses"]) for entry in counts]}
+    for name in counts[0]["methods"]:
+        columns[name] = [figure_text(entry["methods"][name], "position", 1e-3) for entry in counts]
     note = "RMS position error [mm] of the machines under exact commands, by the number of poses measured."
-    return Table("Measurements needed", ("poses", *methods), tuple(rows), note)
+    return table_of("Measurements needed", columns, note)
 
 
 _HEADER = ("subject", "name", "quantity", "unit", "value", "low", "high")

@@ -16,14 +16,11 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.problems.checks import check_equations
 from ccnn_torch.identification.problems.parameters import ParameterChoice, Selection, select_parameters
-from ccnn_torch.identification.problems.problem import Channel, Problem
+from ccnn_torch.identification.problems.problem import Channel, Problem, check_equations
 from ccnn_torch.identification.problems.rows import check_finite
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
-
-__all__ = ["distance_problem", "plane_problem", "scatter", "socket_problem", "tool_points"]
 
 # Plausible errors of what a constraint is unknown in, after a start from the nominal machine [m, rad].
 _PLACE, _TURN = 5e-3, 2e-2

@@ -17,8 +17,6 @@ from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
-__all__ = ["forward_problem"]
-
 _TURN = ("rx", "ry", "rz")
 
 
@@ -43,14 +41,9 @@ def forward_problem(
     Args:
         mechanism: serial arms, and whatever has its forward kinematics exactly; iterative ones start from the
             measured pose.
-        joints: `s x n` or `r x s x n`, as commanded or read [SI].
-        pose: `s x p` or `r x s x p`, measured [SI].
-        weights: `s` or `r x s` [1]; 0 leaves a row out; all 1 when None.
-        choice: what is free, fixed, tied, held by a prior; everything free when None.
-        pose_noise: standard deviation of each pose coordinate, one for all or `p` of them [SI], or the covariance,
-            `p x p` or `r x s x p x p`; that of rx, ry, rz is about the axes of the measuring frame.
-        joint_noise: likewise of the joints; matters only beside a pose noise.
-        start: the whole geometry from which the search begins, `K` or `r x K` [SI]; nominal when None.
+        joints, pose, weights, choice, joint_noise, start: as `inverse_problem`; a joint noise matters only beside a
+            pose noise.
+        pose_noise: likewise; that of rx, ry, rz is about the axes of the measuring frame.
         rotation_weight: [m/rad].
 
     Raises:

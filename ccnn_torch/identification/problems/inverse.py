@@ -19,8 +19,6 @@ from ccnn_torch.identification.problems.whitened import Geometry, whitened_probl
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.least_squares import jacobian_of
 
-__all__ = ["Noise", "inverse_problem"]
-
 Noise = float | Sequence[float] | Tensor
 """Standard deviation, one for all coordinates or one each [SI]; or their covariance."""
 

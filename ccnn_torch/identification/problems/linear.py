@@ -10,8 +10,6 @@ from torch import Tensor
 
 from ccnn_torch.identification.problems.problem import Problem
 
-__all__ = ["OPEN", "SparseResidual", "WeightedRows", "row_jacobian"]
-
 # A direction in which the rows leave more than so many plausible errors open (0.1 m, 0.2 rad) counts as unseen: what a
 # linearised problem is not valid so far away.
 OPEN = 100.0

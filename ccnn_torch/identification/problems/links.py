@@ -7,11 +7,9 @@ from torch import Tensor
 
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, TOOL_SPREAD
 from ccnn_torch.mechanisms.machines.serial import SerialArm
+from ccnn_torch.mechanisms.pose import frame_gap
 from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
 from ccnn_torch.numerics.outliers import inlying
-from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
-
-__all__ = ["fit_links"]
 
 # The noise and the parameters are estimated in turn; the noise has settled after two rounds.
 _ROUNDS = 3
@@ -61,11 +59,7 @@ def fit_links(
 
     def gap(values: Tensor) -> Tensor:
         """Pose difference, `... x s x c` [m]. values: `... x s x k`."""
-        there, turned = arm.forward_frame(joints, values)
-        if rotation is None:
-            return there - position
-        turn = matrix_to_rotation_vector(turned @ rotation.mT)
-        return torch.cat([there - position, rotation_weight * turn], dim=-1)
+        return frame_gap(arm.forward_frame(joints, values), (position, rotation), rotation_weight)
 
     def by_row(values: Tensor) -> Tensor:
         return values[..., None, :].expand(*values.shape[:-1], len(joints), -1)

@@ -16,8 +16,6 @@ from torch import Tensor
 from ccnn_torch.coordinates import Parameter, plausible_error
 from ccnn_torch.errors import InputError
 
-__all__ = ["ParameterChoice", "Selection", "match_parameters", "select_parameters"]
-
 
 @dataclass(frozen=True)
 class ParameterChoice:
@@ -106,11 +104,7 @@ def select_parameters(
 
 
 def match_parameters(geometry: Sequence[Parameter], patterns: Sequence[str], key: str) -> set[str]:
-    """Names that any of the patterns fits.
-
-    Raises:
-        InputError: a pattern that fits nothing; names the key `parameters.{key}`.
-    """
+    """Names that any of the patterns fits."""
     found: set[str] = set()
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         of_leg = re.fullmatch(r"leg(\d+)\.(.*)", pattern)

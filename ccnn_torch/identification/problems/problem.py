@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
-
-__all__ = ["Channel", "Fit", "Problem", "Progress", "Solver"]
+from ccnn_torch.errors import InputError
 
 Progress = Callable[[float], None]
 """Told the share that is done, 0 to 1."""
@@ -54,6 +54,19 @@ class Problem:
     noise_known: bool = True
 
 
+def check_equations(problem: Problem) -> None:
+    """Refuse a problem with fewer equations than parameters; a prior counts as one equation."""
+    rows = int((problem.weights > 0).sum(-1).min())
+    channels, k = len(problem.channels), len(problem.parameters)
+    held = int(torch.isfinite(problem.prior_sd).sum())
+    if rows * channels + held < k:
+        needed = -(-(k - held) // channels)
+        raise InputError(
+            f"{rows} rows of {channels} equations{f' and {held} priors' if held else ''} cannot determine {k} free "
+            f"parameters; measure at least {needed} poses, or fix parameters"
+        )
+
+
 @dataclass(frozen=True)
 class Fit:
     """What a solver found.
@@ -71,6 +84,11 @@ class Fit:
     converged: Tensor
     evaluations: int
     message: str
+
+
+def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
+    """The progress of one of `count` parts as a share of all; numbered from 0."""
+    return None if progress is None else lambda done: progress((number + done) / count)
 
 
 class Solver(Protocol):

@@ -12,8 +12,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["MeasuredRows", "check_finite", "covariance", "gather_rows", "inverse_root"]
-
 
 @dataclass(frozen=True)
 class MeasuredRows:
@@ -35,10 +33,6 @@ def gather_rows(
         pose: `s x p` or `r x s x p` [SI].
         weights: `s` or `r x s` [1]; all 1 when None.
         start: `K` or `r x K` [SI], or None.
-
-    Raises:
-        InputError: columns that the mechanism does not have, numbers of rows or machines that do not fit together, a
-            negative weight, or a value that is not a number in a row whose weight is not 0.
     """
     for what, table, coordinates in (("joints", joints, mechanism.joints), ("pose", pose, mechanism.pose)):
         if table.dim() not in (2, 3) or table.shape[-1] != len(coordinates):
@@ -82,11 +76,6 @@ def covariance(
 
     Args:
         noise: standard deviation, one for all or one for each coordinate [SI], or a covariance, `… x d x d`.
-        coordinates: the `d` of them.
-        what: what it is the noise of, for the message.
-
-    Raises:
-        InputError: another number of values, or one that is negative.
     """
     if noise is None:
         return None
@@ -103,11 +92,7 @@ def covariance(
 
 
 def inverse_root(matrix: Tensor, used: Tensor) -> Tensor:
-    """L⁻¹ of covariances L Lᵀ, `r x s x d x d`; the identity in rows that are not `used` (`r x s`, bool).
-
-    Raises:
-        InputError: a covariance is singular.
-    """
+    """L⁻¹ of covariances L Lᵀ, `r x s x d x d`; the identity in rows that are not `used` (`r x s`, bool)."""
     d = matrix.shape[-1]
     unit = torch.eye(d, dtype=matrix.dtype, device=matrix.device)
     factor, info = torch.linalg.cholesky_ex(torch.where(used[..., None, None], matrix, unit))
@@ -135,13 +120,8 @@ def check_finite(
     """Name the first row, and its channel, whose residual `r x s x c` is not finite although it is used (`r x s`).
 
     Args:
-        residual, used: see above.
         given: what the kinematics were solved for, `r x s x …`, with its coordinates.
-        mechanism: its name.
         channels: names of the `c` columns.
-
-    Raises:
-        InputError: there is one: the pose is out of reach.
     """
     lost = torch.nonzero(~torch.isfinite(residual) & used[..., None])
     if not len(lost):

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from ccnn_torch.identification.problems.linear import row_jacobian
 
-__all__ = ["WhitenedResidual", "dependence", "entries_together"]
-
 # Structure is read at points this many plausible errors off, so that what is zero by chance at a nominal zero shows.
 _PROBES, _AWAY = 4, 0.1
 

@@ -9,13 +9,10 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.problems.checks import check_equations
 from ccnn_torch.identification.problems.parameters import Selection
-from ccnn_torch.identification.problems.problem import Channel, Problem
+from ccnn_torch.identification.problems.problem import Channel, Problem, check_equations
 from ccnn_torch.identification.problems.rows import MeasuredRows, inverse_root
 from ccnn_torch.identification.problems.sparse import WhitenedResidual, dependence
-
-__all__ = ["Geometry", "whitened_problem"]
 
 
 class Geometry:
@@ -54,15 +51,10 @@ def whitened_problem(
         gap: `(values, *data)` -> `… x c` [SI].
         data: `r x s x …`.
         covariance: of a row's gap, broadcasts to `r x s x c x c`; None leaves the gap as it is.
-        rows, selection: as gathered and chosen.
         names: of the `c` entries.
         what: what the entries are, for messages.
         noise_known: whether the covariance is the noise itself or only its proportions.
         per_leg: divide by the diagonal alone, and leave out entries that no free parameter moves.
-
-    Raises:
-        InputError: a singular covariance, a prior without known noise, no entry that depends on a free parameter, or
-            fewer equations than parameters.
     """
     if not noise_known and bool(torch.isfinite(selection.prior_sd).any()):
         raise InputError("parameters.prior: a prior can be weighed against the rows only if their noise is given")

@@ -11,15 +11,9 @@ from ccnn_torch.identification.simulated.machines import simulate
 from ccnn_torch.identification.solve import QUICK, Outcome, free_values, run_method, select
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["count_study"]
-
 
 def count_study(config: IdentifyConfig, mechanism: Mechanism) -> list[dict[str, Any]]:
-    """For each number of poses and each quick method: pose error under its exact commands, and parameter deviations.
-
-    Raises:
-        InputError: as `simulate` and `run_method`; too few poses among them.
-    """
+    """For each number of poses and each quick method: pose error under its exact commands, and parameter deviations."""
     if config.simulate is None:
         return []
     answer = []

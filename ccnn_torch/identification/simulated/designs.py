@@ -17,8 +17,6 @@ from ccnn_torch.simulation.instrument import Instrument
 from ccnn_torch.simulation.places import Places
 from ccnn_torch.simulation.random_numbers import generator_of
 
-__all__ = ["choose_places", "plan_places"]
-
 MAX_CONDITION = 50.0
 """Of the Jacobian at a planned pose."""
 # Stream of the candidates, beside the seed of the first machine.
@@ -44,9 +42,6 @@ def plan_places(
     """The most informative places for all parameters, `s x .`, and for each leg alone (`planned_per_leg`), by leg.
 
     Chosen at the nominal geometry, since no better one is known before measuring.
-
-    Raises:
-        InputError: too few poses, the poses cannot be dealt to the legs, or the legs are not apart.
     """
     about, mechanism = config.simulate, places.mechanism
     assert about is not None

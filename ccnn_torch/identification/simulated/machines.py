@@ -20,8 +20,6 @@ from ccnn_torch.simulation.instrument import Instrument, make_instrument
 from ccnn_torch.simulation.places import Places
 from ccnn_torch.simulation.random_numbers import generator_of, normal_draws
 
-__all__ = ["simulate"]
-
 # Streams of random numbers of a machine, so that more poses do not change its errors.
 _ERRORS, _ROWS, _TEST, _PLACES, _LEGS = 0, 1, 2, 3, 10
 
@@ -30,12 +28,7 @@ def simulate(config: IdentifyConfig, mechanism: Mechanism, poses: int | None = N
     """Simulate the machines of a config.
 
     Args:
-        config: with a section `simulate`.
-        mechanism: with its nominal parameters.
         poses: how many to measure of each machine, in place of `simulate.poses`.
-
-    Raises:
-        InputError: an error, a noise or a box names something that the mechanism lacks, or too few poses are in reach.
     """
     about = config.simulate
     assert about is not None

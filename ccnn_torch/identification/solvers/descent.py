@@ -9,8 +9,6 @@ from torch import Tensor
 
 from ccnn_torch.identification.problems.linear import OPEN
 
-__all__ = ["Normal", "descend"]
-
 Normal = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 """Values `r x m x k` and which machines these are -> cost `r x m`, gradient `… x k`, matrix `… x k x k`, in units of
 the plausible errors; an infinite cost where the values are out of reach."""
@@ -26,7 +24,6 @@ def descend(
     """Search from many starts at once.
 
     Args:
-        normal: see `Normal`.
         start: `r x m x k` [SI].
         scale: plausible errors, `k` [SI].
         free: equations less parameters, at least 1, `r x 1`.

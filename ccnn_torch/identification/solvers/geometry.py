@@ -13,8 +13,6 @@ from ccnn_torch.identification.problems.links import fit_links
 from ccnn_torch.identification.solvers.lm import solve_lm
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
-__all__ = ["fit_geometry"]
-
 # As for links: noise and parameters in turn.
 _ROUNDS = 3
 # Of a joint [m or rad]: exact rows leave a residual of rounding, which must not outweigh every prior by division.

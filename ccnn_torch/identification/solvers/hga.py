@@ -20,9 +20,7 @@ from ccnn_torch.evolution.operators import tournament
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
 from ccnn_torch.identification.solvers.lockstep import Array, run_side_by_side
-from ccnn_torch.identification.solvers.objective import Objective, make_objective
-
-__all__ = ["HybridGenetic", "polish"]
+from ccnn_torch.identification.solvers.objective import WIDTH, Objective, make_objective
 
 # Streams of random numbers: the first population and the generations.
 _FIRST, _BREED = 0, 1
@@ -80,7 +78,7 @@ class HybridGenetic:
         r, k = objective.machines, len(objective.problem.scale)
         seeds = seed + torch.arange(r)
         (draws,) = uniform_parts(seeds, _FIRST, 0, [(self.population, k)])
-        people = (2 * draws - 1) * objective.width
+        people = (2 * draws - 1) * WIDTH
         people[:, 0] = 0.0  # the start is a guess worth having
         costs = objective.cost(people)
         mark, since = costs.amin(-1), torch.zeros(r, dtype=torch.int64)
@@ -88,7 +86,7 @@ class HybridGenetic:
         generation = 0
         while len(active) and generation < self.generations:
             generation += 1
-            children = self._breed(people[active], costs[active], seeds[active], generation, objective.width)
+            children = self._breed(people[active], costs[active], seeds[active], generation)
             kept = costs[active].argsort(dim=-1, stable=True)[:, : self.elites]
             old = people[active].gather(1, kept[..., None].expand(-1, -1, k))
             people[active] = torch.cat([old, children], dim=1)
@@ -102,7 +100,7 @@ class HybridGenetic:
         place = costs.argmin(-1)
         return people[torch.arange(r), place], costs.amin(-1), generation, since >= self.settled
 
-    def _breed(self, people: Tensor, costs: Tensor, seeds: Tensor, generation: int, width: float) -> Tensor:
+    def _breed(self, people: Tensor, costs: Tensor, seeds: Tensor, generation: int) -> Tensor:
         """Children `m x (p - elites) x k` of people `m x p x k` with costs `m x p`."""
         k, count = people.shape[-1], self.population - self.elites
         shapes = [(2 * count, self.tournament), (count,), (count,), (count, k), (count, k), (count, k)]
@@ -111,8 +109,8 @@ class HybridGenetic:
         first, second = parents[:, :count], parents[:, count:]
         share = torch.where(mates < self.crossover, (1 + 2 * _BEYOND) * along - _BEYOND, 0.0)
         children = first + share[..., None] * (second - first)
-        step = torch.where(side < 0.5, -0.2, 0.2) * width * 2 ** (-_OCTAVES * size)
-        return (children + torch.where(chosen < self.mutation, step, 0.0)).clamp(-width, width)
+        step = torch.where(side < 0.5, -0.2, 0.2) * WIDTH * 2 ** (-_OCTAVES * size)
+        return (children + torch.where(chosen < self.mutation, step, 0.0)).clamp(-WIDTH, WIDTH)
 
 
 def polish(objective: Objective, points: Tensor, tell: Progress) -> tuple[Tensor, Tensor, Tensor, int]:
@@ -123,7 +121,6 @@ def polish(objective: Objective, points: Tensor, tell: Progress) -> tuple[Tensor
     start is the identity, and rounds follow until one gains nothing that counts.
 
     Args:
-        objective: what is minimised.
         points: `r x k` [1].
         tell: called with the share of the rounds that is done.
 

@@ -8,11 +8,8 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification.problems.checks import check_equations
 from ccnn_torch.identification.problems.linear import WeightedRows
-from ccnn_torch.identification.problems.problem import Channel, Fit, Problem, Progress, Solver
-
-__all__ = ["solve_per_leg", "split_by_leg"]
+from ccnn_torch.identification.problems.problem import Channel, Fit, Problem, Progress, Solver, check_equations, part_of
 
 _DEPENDS = 1e-9  # Relative size of a derivative below which it is rounding.
 
@@ -82,24 +79,12 @@ def solve_per_leg(solver: Solver, problem: Problem, seed: int, progress: Progres
     converged = torch.ones_like(cost, dtype=torch.bool)
     evaluations, message = 0, ""
     for number, part in enumerate(parts):
-        fit = solver(part, seed + number, None if progress is None else _Share(progress, number, len(parts)))
+        fit = solver(part, seed + number, part_of(progress, number, len(parts)))
         values[:, [names.index(p.name) for p in part.parameters]] = fit.values
         cost, converged = cost + fit.cost, converged & fit.converged
         evaluations += fit.evaluations
         message = message or (f"leg {part.parameters[0].leg}: {fit.message}" if fit.message else "")
     return Fit(values, cost, converged, evaluations, message)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Share:
-    """The progress of one part as a share of all."""
-
-    whole: Progress
-    number: int
-    count: int
-
-    def __call__(self, done: float) -> None:
-        self.whole((self.number + done) / self.count)
 
 
 def _moved(problem: Problem) -> Tensor:

@@ -11,8 +11,6 @@ from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
 from ccnn_torch.identification.solvers.descent import descend
 from ccnn_torch.identification.solvers.robust import LOSSES, loss_weights
 
-__all__ = ["solve_lm"]
-
 _BLOCK = 400_000  # Numbers in the Jacobian of the machines that are worked on at once: about what caches hold.
 _REACH = 3.0  # Starts lie within so many plausible errors.
 _ROUNDS = 30  # Of reweighting.

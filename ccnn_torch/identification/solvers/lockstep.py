@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["run_side_by_side"]
-
 Array = NDArray[np.float64]
 
 

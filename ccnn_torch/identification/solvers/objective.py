@@ -11,16 +11,14 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.problem import Problem
 from ccnn_torch.numerics.least_squares import jacobian_of
 
-__all__ = ["FORBIDDEN", "Objective", "make_objective"]
-
 FORBIDDEN = 1e100
 """Cost of parameters with which a measured row cannot be reached; finite, so that searches may compare with it."""
 
 # Rows evaluated in one call: intermediate results of the kinematics then stay in the processor's cache.
 _ROWS_AT_ONCE = 1 << 15
 
-# Half the width of the box that global searches stay in, in units of `Problem.scale`.
-_WIDTH = 3.0
+WIDTH = 3.0
+"""Half the width of the box that global searches stay in, in units of `Problem.scale`."""
 
 
 _HELD = 1e-9
@@ -46,20 +44,11 @@ class Objective:
         """Number of machines, `r`."""
         return self.problem.start.shape[0]
 
-    @property
-    def width(self) -> float:
-        """Global searches stay in -width .. width."""
-        return _WIDTH
-
     def values(self, points: Tensor) -> Tensor:
         """From coordinates to parameters: `r x … x k` [1] to the same [SI]."""
         start = self.problem.start
         start = start.reshape(len(start), *(1,) * (points.dim() - 2), -1)
         return start + points * self.problem.scale
-
-    def points(self, values: Tensor) -> Tensor:
-        """From parameters to coordinates, `r x k` [SI] to `r x k` [1]."""
-        return (values - self.problem.start) / self.problem.scale
 
     @torch.no_grad()
     def cost(self, points: Tensor, machines: Tensor | None = None) -> Tensor:
@@ -114,11 +103,7 @@ class Objective:
 
 
 def make_objective(problem: Problem) -> Objective:
-    """The objective of a problem.
-
-    Raises:
-        InputError: a machine has no row that counts, or its start leads to a residual that is not finite.
-    """
+    """The objective of a problem."""
     r = problem.start.shape[0]
     weights = problem.weights.expand(r, -1)
     counts = weights > 0

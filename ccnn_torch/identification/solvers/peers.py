@@ -1,14 +1,14 @@
 """Global searches of well-kept libraries, for comparison: genetic algorithm, particle swarm, simulated annealing.
 
 The first two are pymoo's (Blank and Deb 2020), asked for their populations, which are evaluated together for all
-machines; the third is SciPy's generalised simulated annealing. All stay in the box of `Objective.width` and spend the
+machines; the third is SciPy's generalised simulated annealing. All stay in the box of `WIDTH` and spend the
 same number of evaluations by default.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,97 +23,70 @@ from scipy.optimize import dual_annealing
 
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
 from ccnn_torch.identification.solvers.lockstep import Array, run_side_by_side
-from ccnn_torch.identification.solvers.objective import FORBIDDEN, Objective, make_objective
-
-__all__ = ["Annealing", "Genetic", "Swarm"]
+from ccnn_torch.identification.solvers.objective import FORBIDDEN, WIDTH, Objective, make_objective
 
 
-@dataclass(frozen=True)
-class Genetic:
+def solve_ga(
+    problem: Problem,
+    seed: int,
+    progress: Progress | None = None,
+    *,
+    evaluations: int = 30_000,
+    population: int = 100,
+) -> Fit:
     """Genetic algorithm of pymoo with its defaults: binary tournament, SBX crossover, polynomial mutation.
 
-    Attributes:
+    Machine i draws its numbers from seed + i alone, here and in the others.
+
+    Args:
         evaluations: bound for each machine.
         population: individuals.
     """
-
-    evaluations: int = 30_000
-    population: int = 100
-
-    def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
-        """Minimise; machine i draws its numbers from seed + i alone."""
-
-        def make(sampling: Array) -> Algorithm:
-            # Looking for equal individuals takes more time than all the rest and finds none: the coding is real.
-            return GA(pop_size=self.population, sampling=sampling, eliminate_duplicates=False)
-
-        return _ask_and_tell(make, problem, self.population, self.evaluations, seed, progress)
+    # Looking for equal individuals takes more time than all the rest and finds none: the coding is real.
+    make = partial(GA, pop_size=population, eliminate_duplicates=False)
+    return _ask_and_tell(make, problem, population, evaluations, seed, progress)
 
 
-@dataclass(frozen=True)
-class Swarm:
-    """Particle swarm of pymoo with its defaults (Zhan et al. 2009: inertia and pulls adapt to the swarm's state).
-
-    Attributes:
-        evaluations: bound for each machine.
-        particles: particles.
-    """
-
-    evaluations: int = 30_000
-    particles: int = 50
-
-    def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
-        """Minimise; machine i draws its numbers from seed + i alone."""
-
-        def make(sampling: Array) -> Algorithm:
-            return PSO(pop_size=self.particles, sampling=sampling)
-
-        return _ask_and_tell(make, problem, self.particles, self.evaluations, seed, progress)
+def solve_pso(
+    problem: Problem, seed: int, progress: Progress | None = None, *, evaluations: int = 30_000, particles: int = 50
+) -> Fit:
+    """Particle swarm of pymoo with its defaults (Zhan et al. 2009: inertia and pulls adapt to the swarm's state)."""
+    return _ask_and_tell(partial(PSO, pop_size=particles), problem, particles, evaluations, seed, progress)
 
 
-@dataclass(frozen=True)
-class Annealing:
-    """Generalised simulated annealing of SciPy (Xiang et al. 1997) without its local search.
+def solve_sa(problem: Problem, seed: int, progress: Progress | None = None, *, evaluations: int = 30_000) -> Fit:
+    """Generalised simulated annealing of SciPy (Xiang et al. 1997) without its local search."""
+    objective = make_objective(problem)
+    r, k = objective.machines, len(problem.scale)
+    bounds = [(-WIDTH, WIDTH)] * k
+    done = 0
 
-    Attributes:
-        evaluations: bound for each machine.
-    """
+    def evaluate(points: Array) -> list[float]:
+        nonlocal done
+        done += 1
+        if progress is not None and done % 100 == 0:
+            progress(min(done / evaluations, 1.0))
+        found: list[float] = objective.cost(torch.from_numpy(points)[:, None])[:, 0].tolist()
+        return found
 
-    evaluations: int = 30_000
+    def search(machine: int, ask: Callable[[Array], float]) -> Array:
+        found = dual_annealing(
+            ask,
+            bounds,
+            maxiter=evaluations,  # never reached: an iteration takes 2 k evaluations
+            maxfun=evaluations,
+            rng=np.random.default_rng(seed + machine),
+            no_local_search=True,
+            x0=np.zeros(k),
+        )
+        return np.asarray(found.x)
 
-    def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
-        """Minimise; machine i draws its numbers from seed + i alone."""
-        objective = make_objective(problem)
-        r, k = objective.machines, len(problem.scale)
-        bounds = [(-objective.width, objective.width)] * k
-        done = 0
-
-        def evaluate(points: Array) -> list[float]:
-            nonlocal done
-            done += 1
-            if progress is not None and done % 100 == 0:
-                progress(min(done / self.evaluations, 1.0))
-            found: list[float] = objective.cost(torch.from_numpy(points)[:, None])[:, 0].tolist()
-            return found
-
-        def search(machine: int, ask: Callable[[Array], float]) -> Array:
-            found = dual_annealing(
-                ask,
-                bounds,
-                maxiter=self.evaluations,  # never reached: an iteration takes 2 k evaluations
-                maxfun=self.evaluations,
-                rng=np.random.default_rng(seed + machine),
-                no_local_search=True,
-                x0=np.zeros(k),
-            )
-            return np.asarray(found.x)
-
-        best = torch.from_numpy(run_side_by_side(search, evaluate, np.zeros((r, k))))
-        return _fit(objective, best, done)
+    best = torch.from_numpy(run_side_by_side(search, evaluate, np.zeros((r, k))))
+    return _fit(objective, best, done)
 
 
 def _ask_and_tell(
-    make: Callable[[Array], Algorithm],
+    make: Callable[..., Algorithm],
     problem: Problem,
     population: int,
     evaluations: int,
@@ -126,9 +99,9 @@ def _ask_and_tell(
     generations = max(1, evaluations // population)
     searches = []
     for machine in range(r):
-        draw = np.random.default_rng(seed + machine).uniform(-objective.width, objective.width, (population, k))
+        draw = np.random.default_rng(seed + machine).uniform(-WIDTH, WIDTH, (population, k))
         draw[0] = 0.0  # the start is a guess worth having
-        search = make(draw)
+        search = make(sampling=draw)
         search.setup(_box(objective), termination=("n_gen", generations), seed=seed + machine, verbose=False)
         searches.append(search)
     for generation in range(generations):
@@ -146,7 +119,7 @@ def _ask_and_tell(
 
 def _box(objective: Objective) -> Any:
     k = len(objective.problem.scale)
-    return Box(n_var=k, n_obj=1, xl=np.full(k, -objective.width), xu=np.full(k, objective.width))
+    return Box(n_var=k, n_obj=1, xl=np.full(k, -WIDTH), xu=np.full(k, WIDTH))
 
 
 def _fit(objective: Objective, points: torch.Tensor, evaluations: int) -> Fit:

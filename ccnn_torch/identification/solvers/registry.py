@@ -12,16 +12,14 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress, Solver
 from ccnn_torch.spelling import nearest
 
-__all__ = ["SOLVERS", "get_solver"]
-
 # Module and name of each. Imported when asked for: pymoo alone takes half a second.
 _WHERE = {
     "lm": ("lm", "solve_lm"),
     "hga": ("hga", "HybridGenetic"),
     "tikhonov": ("tikhonov", "solve_tikhonov"),
-    "ga": ("peers", "Genetic"),
-    "sa": ("peers", "Annealing"),
-    "pso": ("peers", "Swarm"),
+    "ga": ("peers", "solve_ga"),
+    "sa": ("peers", "solve_sa"),
+    "pso": ("peers", "solve_pso"),
 }
 
 _PER_LEG = "_per_leg"

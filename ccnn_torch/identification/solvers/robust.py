@@ -13,8 +13,6 @@ from ccnn_torch.identification.problems.linear import WeightedRows
 from ccnn_torch.identification.problems.problem import Problem
 from ccnn_torch.numerics.outliers import chi_quantile, residual_scale
 
-__all__ = ["LOSSES", "loss_weights", "reweighted"]
-
 LOSSES = ("squared", "huber", "cauchy")
 
 # Where the loss bends, in standard deviations of one residual: 95 % efficient with normal noise (Holland and Welsch
@@ -30,8 +28,6 @@ def loss_weights(residual: Tensor, weights: Tensor, loss: str, parameters: int) 
     Args:
         residual: `… x s x c`, decorrelated, its channels of one variance.
         weights: `… x s` [1]; rows with weight 0 do not enter the scale.
-        loss: `squared`, `huber` or `cauchy`.
-        parameters: `k`.
 
     Returns:
         `… x s` in (0, 1].

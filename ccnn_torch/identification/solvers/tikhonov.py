@@ -11,8 +11,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.problems.linear import WeightedRows
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
 
-__all__ = ["LCurve", "l_curve", "solve_tikhonov"]
-
 # Weights tried, from the largest singular value down to this share of it.
 _TRIED, _LEAST = 200, 1e-10
 

@@ -13,8 +13,6 @@ from ccnn_torch.files.yaml_file import parse_yaml
 from ccnn_torch.mechanisms.machines.serial import MOST_JOINTS, SerialArm
 from ccnn_torch.units import LARGEST
 
-__all__ = ["read_dh_file"]
-
 _CONVENTIONS = {
     "standard Denavit-Hartenberg": "standard",
     "modified Denavit-Hartenberg": "modified",

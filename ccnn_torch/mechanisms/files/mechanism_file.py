@@ -9,20 +9,15 @@ parameters:
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import Any
-
-from ruamel.yaml import YAML
 
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
-from ccnn_torch.files.yaml_file import parse_yaml
+from ccnn_torch.files.yaml_file import dump_yaml, parse_yaml
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.units import LARGEST
-
-__all__ = ["MechanismFile", "mechanism_text", "read_mechanism_file"]
 
 _FORM = "a mechanism file has mechanism, keys and parameters: {NAME: {value: …, nominal: …, unit: …}}"
 
@@ -31,11 +26,7 @@ class MechanismFile:
     """A mechanism file; `recipe` builds the mechanism, `values` and `nominal` are its parameters by name."""
 
     def __init__(self, path: str, content: Mapping[str, Any]) -> None:
-        """Check the form; names and units are checked against the mechanism by `parameters_of`.
-
-        Raises:
-            InputError: names the file and the key.
-        """
+        """Check the form; names and units are checked against the mechanism by `parameters_of`."""
         self.path = path
         spec, keys, parameters = (content.get(k) for k in ("mechanism", "keys", "parameters"))
         if not isinstance(spec, str) or not isinstance(keys, Mapping) or not isinstance(parameters, Mapping):
@@ -44,11 +35,7 @@ class MechanismFile:
         self._entries: Mapping[str, Any] = parameters
 
     def parameters_of(self, mechanism: Mechanism, what: str) -> dict[str, float]:
-        """Values by name, `what` being "value" or "nominal" [SI].
-
-        Raises:
-            InputError: a parameter is missing, unknown, in another unit, or no number; names it.
-        """
+        """Values by name, `what` being "value" or "nominal" [SI]."""
         known = {p.name: p.unit for p in mechanism.geometry}
         wrong = sorted(set(known) ^ set(self._entries))
         if wrong:
@@ -69,15 +56,7 @@ class MechanismFile:
 
 
 def read_mechanism_file(path: str, content: bytes | None = None) -> MechanismFile | None:
-    """Contents of the file, or None where it is no mechanism file: has no key `mechanism`, or cannot be read at all.
-
-    Args:
-        path: of the file.
-        content: its bytes, where they were read already.
-
-    Raises:
-        InputError: it has the key `mechanism` and lacks another one.
-    """
+    """Contents of the file, or None where it is no mechanism file: has no key `mechanism`, or cannot be read at all."""
     try:
         text = read_text(path, CONFIG_LIMIT) if content is None else content.decode("utf-8")
         tree = parse_yaml(text, path)
@@ -93,11 +72,7 @@ def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float]) -> str:
     """A mechanism file's text; `load_mechanism` of it gives the same mechanism with the same parameters, bit by bit.
 
     Args:
-        mechanism: with the identified parameters as its nominal ones.
         nominal: what was there before, by name [SI].
-
-    Raises:
-        InputError: the mechanism's class is not defined in a file.
     """
     about = mechanism.describe()
     tree = {
@@ -108,10 +83,4 @@ def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float]) -> str:
             for p in mechanism.geometry
         },
     }
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.width = 120
-    setattr(yaml, "sort_base_mapping_type_on_output", False)  # noqa: B010 - ruamel declares its type as None
-    text = io.StringIO()
-    yaml.dump(tree, text)
-    return text.getvalue()
+    return dump_yaml(tree, width=120)

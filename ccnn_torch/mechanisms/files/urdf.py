@@ -19,8 +19,6 @@ from ccnn_torch.mechanisms.machines.serial import MOST_JOINTS, SerialArm
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_rotation_vector
 from ccnn_torch.units import LARGEST
 
-__all__ = ["read_urdf"]
-
 # Bytes; with inertias and meshes named, a robot has some 100 kB.
 _LARGEST = 20_000_000
 

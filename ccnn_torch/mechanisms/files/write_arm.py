@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import torch
-from ruamel.yaml import YAML
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import dump_yaml
 from ccnn_torch.mechanisms.machines.link_frames import compose
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
-
-__all__ = ["dh_text", "mjcf_text", "urdf_text"]
 
 _CONVENTIONS = {
     "standard": "standard Denavit-Hartenberg; link i = Rz(q_i + theta_i) * Tz(d_i) * Tx(a_i) * Rx(alpha_i)",
@@ -28,9 +25,6 @@ def dh_text(arm: SerialArm) -> str:
     """The arm's nominal parameters as a DH file in m and rad; `read_dh_file` gives the same floats back.
 
     Frames that are per group of rows stay unknown, as they are no one transform.
-
-    Raises:
-        InputError: the arm came from a URDF, whose links are no DH table.
     """
     if arm.convention not in _CONVENTIONS:
         raise InputError(f"arm '{arm.name}' is described by a URDF and has no Denavit-Hartenberg table; write a URDF")
@@ -52,13 +46,7 @@ def dh_text(arm: SerialArm) -> str:
     }
     if arm.orientation == "none" and arm.recipe["keys"]["tool_offset"] is not None:
         tree["tool_offset"] = "unknown" if arm.tool_per else values[-6:-3]
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.width = 200
-    setattr(yaml, "sort_base_mapping_type_on_output", False)  # noqa: B010 - ruamel declares its type as None
-    text = io.StringIO()
-    yaml.dump(tree, text)
-    return text.getvalue()
+    return dump_yaml(tree, width=200)
 
 
 def urdf_text(arm: SerialArm) -> str:

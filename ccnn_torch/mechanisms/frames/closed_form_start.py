@@ -8,8 +8,6 @@ from torch import Tensor
 from ccnn_torch.mechanisms.pose import Frame
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation, rotation_vector_to_matrix
 
-__all__ = ["best_closed_form", "closed_form_frames", "rigid_body_frame"]
-
 # Share of the largest singular value by which a rotation that the points do not show stays near none at all.
 _STILL = 1e-9
 # Of the squared lengths that rows of one metre have: what they show by less than 3 µm stays near zero.

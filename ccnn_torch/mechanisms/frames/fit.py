@@ -18,8 +18,6 @@ from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.outliers import FAR, inlying, residual_scale
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix, skew
 
-__all__ = ["ROTATION_WEIGHT", "TOOL_SPREAD", "fit_frames"]
-
 ROTATION_WEIGHT = 0.3
 """Of orientation against position [m/rad]: 1 mrad counts as 0.3 mm, about an arm's ratio of the two errors."""
 

@@ -15,12 +15,10 @@ from ccnn_torch.mechanisms.frames.closed_form_start import best_closed_form, rig
 from ccnn_torch.mechanisms.machines.link_frames import compose
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative
-from ccnn_torch.mechanisms.pose import Frame
+from ccnn_torch.mechanisms.pose import Frame, frame_gap
 from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation, rotation_vector_to_matrix, skew
-
-__all__ = ["Framed"]
 
 _FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
 
@@ -107,7 +105,7 @@ class Framed(Mechanism):
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x p`."""
-        return _gap(self.frame(self.forward_kinematics(joints, parameters, pose)), self.frame(pose), 1.0)
+        return frame_gap(self.frame(self.forward_kinematics(joints, parameters, pose)), self.frame(pose), 1.0)
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Joints of the closest pose: both frames are taken off, then the mechanism's own inverse kinematics."""
@@ -245,7 +243,7 @@ class Framed(Mechanism):
 
         def gap(point: Tensor, position: Tensor, *rotation: Tensor) -> Tensor:
             there = rotation[0].reshape(*position.shape, 3) if rotation else None
-            return _gap(self.mechanism.frame(point), (position, there), rotation_weight)
+            return frame_gap(self.mechanism.frame(point), (position, there), rotation_weight)
 
         data = (target[0],) if target[1] is None else (target[0], target[1].flatten(-2))
         plain = tuple(d.detach() for d in data)
@@ -260,11 +258,3 @@ def _transform(frame: Tensor) -> tuple[Tensor, Tensor]:
 
 def _coordinates(position: Tensor, rotation: Tensor | None) -> Tensor:
     return position if rotation is None else torch.cat([position, matrix_to_rotation_vector(rotation)], dim=-1)
-
-
-def _gap(there: Frame, here: Frame, rotation_weight: float) -> Tensor:
-    """Position difference and weighted rotation vector from `here` to `there`, `... x 6` or `... x 3`."""
-    if there[1] is None or here[1] is None:
-        return there[0] - here[0]
-    turn = matrix_to_rotation_vector(there[1] @ here[1].mT)
-    return torch.cat([there[0] - here[0], rotation_weight * turn], dim=-1)

@@ -12,8 +12,6 @@ from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.outliers import inlying
 
-__all__ = ["judge_frames"]
-
 # What the median row may be missed by, as a share of the arm's reach, and the orientation by [rad]. The worst arms that
 # we have rows of miss by 0.7 % (Panda 1 of MUKCa), a cable-driven one by 0.5 %, industrial ones by 0.1 % and 2 mrad.
 _SHARE, _ANGLE = 0.015, 0.03

@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["crank_angle", "meeting_point", "real_acos", "real_sqrt", "upward_angle"]
-
 
 def real_sqrt(square: Tensor) -> tuple[Tensor, Tensor]:
     """Square root, any shape, and where it is real (bool); elsewhere 0.

@@ -13,8 +13,6 @@ from ccnn_torch.mechanisms.machines.closed_forms import crank_angle, meeting_poi
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.numerics.batching import stack_last
 
-__all__ = ["Delta", "DeltaLinear"]
-
 _ATTACHMENTS = tuple(math.radians(a) for a in (0.0, 120.0, 240.0))
 
 

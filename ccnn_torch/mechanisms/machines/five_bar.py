@@ -11,8 +11,6 @@ from ccnn_torch.mechanisms.machines.inscribed_circle import inscribed_circle
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.numerics.batching import stack_last
 
-__all__ = ["FiveBar"]
-
 # The paper's real machine (its Table 2) is off by 4.6e-3 m, rad or 1 on average.
 _SCALE = 5e-3
 # Of the two solutions for a crank, the one that puts the elbow outward: left of leg 1, right of leg 2.

@@ -7,8 +7,6 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["inscribed_circle"]
-
 # Points on each singular curve: the radius is right to about (spacing)²/8 over it, 1e-7 of the size of the mechanism.
 _POINTS = 4000
 _GRID, _ROUNDS = 17, 20
@@ -26,9 +24,6 @@ def inscribed_circle(crank: Tensor, coupler: Tensor, foot: Tensor) -> tuple[Tens
 
     Returns:
         Centre, `2` [m], and radius, `` [m].
-
-    Raises:
-        InputError: no pose is reached with the elbows outward.
     """
     edge = _couplers_in_line(crank, coupler, foot)
     size = (crank + coupler).amin()

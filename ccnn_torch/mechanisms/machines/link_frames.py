@@ -10,8 +10,6 @@ from torch import Tensor
 from ccnn_torch.numerics.batching import stack_last
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, rotation_vector_to_matrix
 
-__all__ = ["LINKS", "LinkTransform", "compose"]
-
 LinkTransform = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 

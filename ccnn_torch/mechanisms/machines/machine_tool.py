@@ -11,8 +11,6 @@ from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.numerics.batching import stack_last
 
-__all__ = ["MachineTool"]
-
 _ATTACHMENTS = tuple(math.radians(a) for a in (90.0, 210.0, 330.0))
 
 

@@ -17,8 +17,6 @@ from ccnn_torch.numerics.batching import expand_leading, stack_last
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
-__all__ = ["Overconstrained2Dof"]
-
 _COMMON = 4
 _ERRORS = (
     *((name, "m") for name in ("dBx", "dBy", "dBz")),

@@ -14,11 +14,10 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.machines.link_frames import LINKS, compose
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative, least_norm
+from ccnn_torch.mechanisms.pose import frame_gap
 from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
-
-__all__ = ["MOST_JOINTS", "SerialArm"]
 
 MOST_JOINTS = 100
 """Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
@@ -263,26 +262,15 @@ class SerialArm(Mechanism):
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Position difference [m] and rotation vector [rad] from the pose to the arm's, `... x 6` (or `... x 3`)."""
-        position, rotation = self.frame(pose)
-        return self._gap(joints, position, rotation, self.resolve(parameters), 1.0)
-
-    def _gap(self, joints: Tensor, position: Tensor, rotation: Tensor | None, values: Tensor, weight: float) -> Tensor:
-        tool_position, tool_rotation = self.forward_frame(joints, values)
-        if rotation is None:
-            return tool_position - position
-        turn = matrix_to_rotation_vector(tool_rotation @ rotation.mT)
-        return torch.cat([tool_position - position, weight * turn], dim=-1)
+        return frame_gap(self.forward_frame(joints, parameters), self.frame(pose), 1.0)
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Joints of the closest pose, as `nearest_joints`. Never NaN: `pose_error` gives the distance that remains."""
         x = self.nearest_joints(pose, parameters, guess, self.rotation_weight)
         values = self.resolve(parameters)
-        position, rotation = self.frame(pose)
-        weights = self._weights(self.rotation_weight)
+        slope = self.jacobian(x, values.detach()) * self._weights(self.rotation_weight)
         return carry_derivative(
-            x,
-            self.jacobian(x, values.detach()) * weights,
-            self._gap(x, position, rotation, values, self.rotation_weight),
+            x, slope, frame_gap(self.forward_frame(x, values), self.frame(pose), self.rotation_weight)
         )
 
     def nearest_joints(
@@ -308,7 +296,8 @@ class SerialArm(Mechanism):
         ridge = damping * torch.eye(len(self.joints), dtype=torch.float64)
 
         def residual(q: Tensor, start: Tensor, v: Tensor, x: Tensor, *turn: Tensor) -> Tensor:
-            gap = self._gap(q, x, turn[0].reshape(*x.shape, 3) if turn else None, v, rotation_weight)
+            here = x, turn[0].reshape(*x.shape, 3) if turn else None
+            gap = frame_gap(self.forward_frame(q, v), here, rotation_weight)
             return torch.cat([gap, damping * (q - start)], dim=-1) if damping else gap
 
         def slope(q: Tensor, start: Tensor, v: Tensor, *rest: Tensor) -> Tensor:

@@ -13,8 +13,6 @@ from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import solve
 from ccnn_torch.numerics.rotations import rotation_vector_rate, rotation_vector_to_matrix
 
-__all__ = ["Stewart"]
-
 
 class Stewart(Mechanism):
     """Six legs that change their length; joints q1..q6 [m], pose x, y, z [m] and rotation vector rx, ry, rz [rad].

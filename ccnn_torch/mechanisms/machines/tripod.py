@@ -10,8 +10,6 @@ from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.numerics.batching import expand_leading, stack_last
 from ccnn_torch.numerics.least_squares import jacobian_of
 
-__all__ = ["Tripod"]
-
 
 class Tripod(Mechanism):
     """Two parallelogram legs along x, one bar along y; joints q1, q2, q3 [m] (ρ1..ρ3), pose y, z [m], phi [rad].

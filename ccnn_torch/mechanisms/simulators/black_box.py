@@ -14,15 +14,13 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.finite_differences import central_slope, differentiable_pose
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative
-from ccnn_torch.mechanisms.pose import Frame, frame_from_coordinates
+from ccnn_torch.mechanisms.pose import Frame, frame_from_coordinates, frame_gap
 from ccnn_torch.mechanisms.simulators.calls import Calls, described
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 from ccnn_torch.mechanisms.simulators.trial import try_simulator
 from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
-from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
-
-__all__ = ["BlackBox"]
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 # Configurations all over the workspace: searches start from the nearest.
 _STARTS = 256
@@ -161,15 +159,7 @@ class BlackBox(Mechanism):
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Position difference [m] and rotation vector [rad] from the pose to that of the joints, `... x 3` or `6`."""
-        return self._gap(self.forward_kinematics(joints, parameters), pose, 1.0)
-
-    def _gap(self, there: Tensor, pose: Tensor, weight: float) -> Tensor:
-        first, second = self.frame(there), self.frame(pose)
-        if first[1] is None or second[1] is None:
-            return first[0] - second[0]
-        turn = matrix_to_rotation_vector(first[1] @ second[1].mT)
-        first_shift, turn = torch.broadcast_tensors(first[0] - second[0], weight * turn)  # type: ignore[no-untyped-call]
-        return torch.cat([first_shift, turn], -1)
+        return frame_gap(self.frame(self.forward_kinematics(joints, parameters)), self.frame(pose), 1.0)
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Joints by damped Newton from the nearest of some hundred configurations, or from the guess.
@@ -198,7 +188,8 @@ class BlackBox(Mechanism):
             return self.under({n: row[..., 0] for n, row in zip(names, rows, strict=True)})
 
         def gap(joints: Tensor, pose: Tensor, values: Tensor, *rows: Tensor) -> Tensor:
-            return self._gap(machine(rows).forward_kinematics(joints, values), pose, rotation_weight)
+            there = machine(rows).forward_kinematics(joints, values)
+            return frame_gap(self.frame(there), self.frame(pose), rotation_weight)
 
         def slope(joints: Tensor, pose: Tensor, values: Tensor, *rows: Tensor) -> Tensor:
             found = machine(rows).jacobian(joints, values).clone()

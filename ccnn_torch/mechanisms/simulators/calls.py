@@ -19,8 +19,6 @@ from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 from ccnn_torch.numerics.batching import leading_shape
 
-__all__ = ["Calls", "described", "simulated_rows"]
-
 # Rows in one call, so that memory suffices; of a simulator that remembers, so that its user sees it move on.
 _AT_MOST, _AT_ONCE = 50_000, 512
 # Rows that are kept.
@@ -67,9 +65,6 @@ class Calls:
 
         Parameters beyond their bounds are taken at the bound; rows that are not finite are returned as NaN without a
         call.
-
-        Raises:
-            InputError: the callable fails or gives another shape.
         """
         covariates = [
             conditions.get(c.name, torch.tensor(c.usual, dtype=torch.float64))[..., None] for c in self._conditions
@@ -108,11 +103,7 @@ class Calls:
         return np.stack([self._kept[key] for key in keys])
 
     def ask(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The callable itself: rows of commands, covariates and parameters side by side -> pose, NaN where it has none.
-
-        Raises:
-            InputError: it fails, or gives another shape or no numbers.
-        """
+        """The callable itself: rows of commands, covariates and parameters -> pose, NaN where it has none."""
         simulator, n = self.simulator, len(self.simulator.joints)
         names = [c.name for c in self._conditions]
         # Copies: a simulator that writes into what it is given must not change what it is compared with.

@@ -14,8 +14,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.simulators.mujoco_parameters import Array, ModelNumbers, ModelParameter
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
-__all__ = ["MujocoMachine"]
-
 _AXES = "xyz"
 # A pose coordinate as an axis of the wrench that its load is: forces, then moments.
 _WRENCH = {name: k for k, name in enumerate(("x", "y", "z", "rx", "ry", "rz"))}

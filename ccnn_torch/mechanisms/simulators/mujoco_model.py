@@ -9,8 +9,6 @@ from ccnn_torch.mechanisms.simulators.mujoco_machine import MujocoMachine
 from ccnn_torch.mechanisms.simulators.mujoco_parameters import ModelParameter
 from ccnn_torch.mechanisms.simulators.simulator import Joint, Simulator
 
-__all__ = ["ModelParameter", "mujoco_simulator"]
-
 
 def mujoco_simulator(
     model: str | Path,

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.errors import InputError
 
-__all__ = ["Array", "ModelNumbers", "ModelParameter"]
-
 Array = NDArray[np.float64]
 
 # Fields that may be parameters, with their units about a turning and along a sliding joint, and whether they are >= 0.
@@ -68,22 +66,14 @@ class ModelNumbers:
     """The parameters of a compiled model."""
 
     def __init__(self, mujoco: Any, path: Path, model: Any, parameters: tuple[ModelParameter, ...]) -> None:
-        """mujoco: the package; path: of the model, for sentences.
-
-        Raises:
-            InputError: the model has no such element or field.
-        """
+        """mujoco: the package; path: of the model, for sentences."""
         self.mujoco, self.path, self.model, self.parameters = mujoco, path, model, parameters
         self._models: dict[bytes, Any] = {}
         cells = [self._cells(model, p)[0] for p in parameters]
         self.nominal = [float(array[index]) * sign for array, index, sign in cells]
 
     def element(self, kind: str, name: str) -> int:
-        """Its number.
-
-        Raises:
-            InputError: there is none of this name.
-        """
+        """Its number."""
         wanted = getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
         found = int(self.mujoco.mj_name2id(self.model, wanted, name))
         if found < 0:

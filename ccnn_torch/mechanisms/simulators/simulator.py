@@ -14,8 +14,6 @@ from torch import Tensor
 from ccnn_torch.coordinates import Condition, Coordinate, Parameter, plausible_error
 from ccnn_torch.errors import InputError
 
-__all__ = ["Joint", "Simulate", "Simulator", "rowwise"]
-
 Simulate = Callable[[Any, dict[str, Any], Any], Any]
 """`(commands N x n, {name: N}, parameters N x k) -> pose N x p`, all in SI, every row independently."""
 

@@ -11,8 +11,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.simulators.calls import Calls, described
 from ccnn_torch.mechanisms.simulators.simulator import Simulator
 
-__all__ = ["try_simulator"]
-
 _ROWS = 4
 # Of the change over a step: what differs by more from call to call spoils every derivative.
 _REPEATS = 0.01
@@ -22,14 +20,9 @@ def try_simulator(simulator: Simulator, calls: Calls, home: Tensor, joints: Tens
     """Ask twice about the same rows, the second time in the reverse order and with another row among them.
 
     Args:
-        simulator: checked.
-        calls: of it.
         home: a configuration with a pose, `n` [SI].
         joints: configurations, `s x n` [SI].
         nominal: parameters, `k` [SI].
-
-    Raises:
-        InputError: the answers differ, or no joint moves the pose.
     """
     some = torch.cat([joints[:_ROWS], home[None]])
     usual = [c.usual for c in simulator.covariates if isinstance(c, Condition)]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -20,6 +20,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from ccnn_torch.files.write import write_whole
+from ccnn_torch.report.html import InlineFigure
 
 __all__ = ["AFTER", "BEFORE", "FLOOR", "GREY", "RASTER_ABOVE", "SERIES", "Plot", "inline_svg", "save_figure", "styled"]
 
@@ -115,6 +116,16 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
         print_to(content, metadata=about)
         write_whole(path, content.getvalue())
     return [png, svg]
+
+
+def inline_figures(plots: Iterable[Plot], folder: Path) -> list[InlineFigure]:
+    """Save plots as `save_figure` does, and give them as figures of a page."""
+    found = []
+    for plot in plots:
+        _, svg = save_figure(plot.figure, folder / plot.name)
+        text = inline_svg(svg.read_text(encoding="utf-8"), plot.name)
+        found.append(InlineFigure(plot.name, plot.caption, text))
+    return found
 
 
 def inline_svg(text: str, name: str) -> str:

@@ -10,8 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ccnn_torch.compensation.model_files.onnx_session import TAKE_AGAIN
 from ccnn_torch.errors import ModelFileError
 
-__all__ = ["check_form"]
-
 # No model that can be solved for needs as many; a forged one may not compute for ever.
 _MOST_ITERATIONS = 10_000
 
