@@ -7,13 +7,17 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from ccnn_torch.diagnosis.checks.identifiable import Check
 from ccnn_torch.diagnosis.page.arrays import picture_arrays
-from ccnn_torch.diagnosis.page.data import RESULT
+from ccnn_torch.diagnosis.page.data import CORRECTED, RESULT
 from ccnn_torch.diagnosis.page.report import write_diagnosis_report
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.verdict.text import noise_text
 from ccnn_torch.effects.covariates import covariate_units
+from ccnn_torch.mechanisms import SerialArm, fit_frames
+from ccnn_torch.mechanisms.files.write_machine import write_machine
 from ccnn_torch.report.json_files import plain, write_json
 
 __all__ = ["write_check", "write_diagnosis", "write_result"]
@@ -38,7 +42,7 @@ def write_check(folder: Path, check: Check) -> Path:
 
 
 def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any] | None = None, seed: int = 0) -> Path:
-    """Write `diagnosis.json`, the arrays of its figures, and the report.
+    """Write `diagnosis.json`, the arrays of its figures, the report, and of a named geometry the corrected machine.
 
     Args:
         folder: made where it does not exist.
@@ -50,6 +54,7 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any]
         InputError: the folder cannot be written.
     """
     path = write_result(folder, diagnosis)
+    write_corrected(folder, diagnosis)
     arrays, labels = picture_arrays(diagnosis, seed)
     mechanism = diagnosis.analysis.situation.mechanism
     units = covariate_units(mechanism) | {c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)}
@@ -58,3 +63,21 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any]
     labels = labels | {"about": {"noise": noise, **(about or {}), "units": units, "lines": lines}}
     write_diagnosis_report(folder, plain(diagnosis.to_json()), arrays, labels)
     return path
+
+
+def write_corrected(folder: Path, diagnosis: Diagnosis) -> None:
+    """The machine with the geometry that was named, all of its numbers in it and its frames fitted again."""
+    analysis, mechanism = diagnosis.analysis, diagnosis.analysis.situation.mechanism
+    named = [e["parameters"] for e in diagnosis.effects if e["name"] in diagnosis.verdict["effects"]]
+    found = {n: b["value"] for parameters in named for n, b in parameters.items() if b.get("nominal") is not None}
+    frames = analysis.situation.parameters
+    # Frames by group of rows are no machine's.
+    if not found or (frames is not None and frames.dim() > 1):
+        return
+    before = mechanism.nominal if frames is None else frames
+    nominal = dict(zip([p.name for p in mechanism.geometry], before.tolist(), strict=True))
+    values = [value + found.get(name, 0.0) for name, value in nominal.items()]
+    machine = mechanism.with_nominal(torch.tensor(values, dtype=torch.float64))
+    if isinstance(machine, SerialArm) and machine.unknown_frames:
+        machine = machine.with_nominal(fit_frames(machine, analysis.situation.joints, analysis.measured))
+    write_machine(machine, nominal, folder, Path(CORRECTED[0]).stem)

@@ -30,7 +30,8 @@ _WORDS = {
     "geometry": Words(
         "an error of the geometry",
         "geometry error",
-        "The values were fitted together: enter all of diagnosis.json, not single ones.",
+        "The values were fitted together, and single ones do not correct the machine: corrected.yaml (of an arm also "
+        "corrected.urdf) has all of them.",
         "Mounting and lengths of {where}, where a value is off by more than its tolerance.",
     ),
     "joint_offset": Words(

@@ -9,6 +9,7 @@ import torch
 
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.diagnosis.from_records import situation_of
+from ccnn_torch.diagnosis.outputs import write_corrected
 from ccnn_torch.effects import Acting, make_effect, reached
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.records import load_records
@@ -17,7 +18,7 @@ DATA = Path(__file__).parents[2] / "experiments" / "data"
 NOISE = 5e-5
 
 
-def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_the_tool() -> None:
+def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_the_tool(tmp_path: Path) -> None:
     arm = load_mechanism(str(DATA / "ur10.yaml"))
     assert isinstance(arm, SerialArm)
     records = load_records(DATA / "ur10_b_500.csv", arm, learns=False)
@@ -42,3 +43,9 @@ def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_th
     proposed = [list(row["joints"].values()) for row in found.next_measurements]
     assert len(proposed) == 8
     assert all(a <= q <= b for row in proposed for a, q, b in zip(low, row, high, strict=True))
+    # All of the numbers together correct the machine.
+    write_corrected(tmp_path, found)
+    for name in ("corrected.yaml", "corrected.urdf"):
+        corrected = load_mechanism(str(tmp_path / name))
+        far = corrected.pose_error(pose, corrected.forward_kinematics(situation.joints)).position
+        assert float(far.square().mean().sqrt()) < 1.1 * NOISE * 3**0.5, name

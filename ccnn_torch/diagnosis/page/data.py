@@ -21,6 +21,7 @@ from ccnn_torch.report.json_files import read_json, write_json
 
 __all__ = [
     "ARRAYS",
+    "CORRECTED",
     "LABELS",
     "NEXT",
     "RESULT",
@@ -40,6 +41,8 @@ ARRAYS = "diagnosis.safetensors"
 LABELS = "diagnosis_pictures.json"
 RESULT = "diagnosis.json"
 NEXT = "next_measurements.csv"
+CORRECTED = tuple(f"corrected{end}" for end in (".yaml", ".urdf", "_dh.yaml"))
+"""Files of the machine with the geometry that was named."""
 _KNOWN_UNITS = {"x": "m", "y": "m", "z": "m", "rx": "rad", "ry": "rad", "rz": "rad", "time": "s", "temperature": "K"}
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich.console import Console
 
-from ccnn_torch.diagnosis.page.data import ARRAYS, LABELS, NEXT, RESULT, About
+from ccnn_torch.diagnosis.page.data import ARRAYS, CORRECTED, LABELS, NEXT, RESULT, About
 from ccnn_torch.diagnosis.page.first_screen import ON_PAGE, first_screen, first_screen_markdown, print_first_screen
 from ccnn_torch.diagnosis.page.numbers import numbers_table
 from ccnn_torch.diagnosis.verdict.text import unseen_text, verdict_text
@@ -24,6 +24,7 @@ __all__ = ["Section", "markdown_of", "notes_of", "print_page", "sections_of", "w
 Block = Mapping[str, Any]
 Planned = Sequence[tuple[str, tuple[str, ...], tuple[Table | None, ...]]]
 _MARKDOWN = "diagnosis.md"
+_FILES = (RESULT, _MARKDOWN, NEXT, *CORRECTED, ARRAYS, LABELS)
 
 
 class Section(NamedTuple):
@@ -74,7 +75,9 @@ def write_page(
         numbers=numbers_table(results, ON_PAGE),
         machine=trusted([figures[name] for name in ("machine",) if name in figures]),
         sections=sections(figures),
-        files=[f for f in (RESULT, _MARKDOWN, NEXT, ARRAYS, LABELS) if f == RESULT or (folder / f).is_file()],
+        files=[
+            f for f in (RESULT, _MARKDOWN, NEXT, *CORRECTED, ARRAYS, LABELS) if f == RESULT or (folder / f).is_file()
+        ],
         config="",
         best=None,
     )
