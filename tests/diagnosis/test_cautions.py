@@ -246,3 +246,18 @@ def test_backlash_whose_direction_was_not_recorded_is_seen_by_the_scatter_of_a_j
     assert "no effect that these records can show" in found.verdict["text"] or not found.verdict["outside_library"]
     for here, causes in ((rows, {"backlash": 6.0}), (bare, {"joint_gain": 6.0}), (bare, {})):
         assert not any("scatters as if" in t for t in diagnose_rows(here, measured(rows, causes, 12)).cautions)
+
+
+@pytest.mark.parametrize(("frequency", "doubted"), [(1.0, True), (9.0, False)])
+def test_an_error_that_is_not_seen_to_repeat_is_not_surely_periodic(frequency: float, doubted: bool) -> None:
+    rows = rows_of("five_bar", 200, 2)
+    shift = 4e-4 * torch.sin(frequency * rows.joints[:, 0] + 0.5)
+    pose = (
+        rows.pose
+        + (rows.jacobian[:, :2, 0] * shift[:, None])
+        + 1e-5 * torch.randn(rows.pose.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    )
+    found = diagnose_rows(rows, pose, None, ["transmission", "compliance"])
+    assert found.verdict["effects"] == ["transmission"]
+    assert any("of the periodic error of joint 1 these rows show" in text for text in found.cautions) == doubted
+    assert (found.verdict["probability"] <= 0.9) == doubted

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -36,6 +37,8 @@ _SEVERAL, _DRAWS, _BY_CHANCE = 5, 1000, 0.003
 _STILL = 1e-3
 # Effects that only the place of a row distinguishes.
 _OF_PLACE = EXACT | {"coupling", "gravity", "transmission"}
+# Periods from which an error is seen to repeat.
+_PERIODS = 1.5
 # Standard deviations from which a coefficient has a sign.
 _SIGNED = 3.0
 # A workshop, with something to spare [K].
@@ -71,6 +74,7 @@ def cautions(
         *_of_columns(analysis, judgement),
         *_of_inputs(analysis, missing),
         *_of_scatter(analysis, judgement),
+        *_of_periods(analysis, judgement),
     ]
 
 
@@ -221,6 +225,23 @@ def _of_scatter(analysis: Analysis, judgement: Judgement) -> list[Caution]:
         f"record direction{found.joint}; other names may stand for it"
     )
     return [Caution(text, BESIDE_UNKNOWN)]
+
+
+def _of_periods(analysis: Analysis, judgement: Judgement) -> list[Caution]:
+    """A periodic error of which the rows show no more than one period: wear or a stop at one place looks like it."""
+    travel = analysis.situation.joints.amax(0) - analysis.situation.joints.amin(0)
+    for i in judgement.found.members:
+        atom = analysis.dictionary.atoms[i]
+        if atom.name != "transmission" or atom.name not in judgement.names:
+            continue
+        acting = {c.joint for c in atom.coefficients(analysis.situation)}
+        names = [j.name for j in analysis.situation.mechanism.joints]
+        seen = {n: float(atom.shape[k] * travel[k]) / (2 * math.pi) for k, n in enumerate(names) if n in acting}
+        if seen and max(seen.values()) < _PERIODS:
+            joints = " and ".join(n.removeprefix("q") for n in seen)
+            words = f"of the periodic error of joint {joints} these rows show {max(seen.values()):.1f} periods"
+            return [Caution(f"{words}: another error of one place may look the same")]
+    return []
 
 
 def _of_columns(analysis: Analysis, judgement: Judgement) -> list[Caution]:
