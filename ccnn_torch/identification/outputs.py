@@ -33,7 +33,7 @@ def write_outputs(found: Identification, folder: Path) -> None:
 def write_machine(found: Identification, folder: Path) -> list[Path]:
     """Write the identified machine (of several the first): `identified.yaml`, of a serial arm also URDF and DH file."""
     mechanism = found.mechanism()
-    texts = {"identified.yaml": mechanism_text(mechanism, found.nominal())}
+    texts = {"identified.yaml": mechanism_text(mechanism, found.nominal(), found.config.columns)}
     if isinstance(mechanism, SerialArm):
         texts["identified.urdf"] = urdf_text(mechanism)
         if mechanism.convention != "urdf":

@@ -10,7 +10,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import si_unit_of, split_header, to_si
 
-__all__ = ["IGNORE", "Header", "read_header"]
+__all__ = ["IGNORE", "Header", "columns_there", "read_header"]
 
 # Characters of a name.
 _LONGEST = 100
@@ -77,6 +77,16 @@ def read_header(cells: Sequence[str], file: str, columns: Mapping[str, str] | No
     return Header(units, kept, len(cells))
 
 
+def columns_there(units: Mapping[str, str], columns: Mapping[str, str]) -> dict[str, str]:
+    """The entries of a map of columns whose header a table has (its names and units as written), blanks aside."""
+    return {key: target for key, target in columns.items() if any(_means(key, pair) for pair in units.items())}
+
+
+def _means(key: str, pair: tuple[str, str]) -> bool:
+    """Whether an entry's key means the column of this name and unit."""
+    return pair in (split_header(key), (key.strip(), pair[1]))
+
+
 def _check_name(name: str, number: int, file: str) -> None:
     """Refuse names that are too long, have control characters, or are formulas to a spreadsheet."""
     wrong = ""
@@ -100,7 +110,7 @@ def _targets(cells: Sequence[str], file: str, columns: Mapping[str, str]) -> dic
     found: dict[int, str] = {}
     for key, target in columns.items():
         there = [k for k, cell in enumerate(whole) if cell == key.strip()]
-        there = there or [k for k, pair in enumerate(pairs) if pair in (split_header(key), (key.strip(), pair[1]))]
+        there = there or [k for k, pair in enumerate(pairs) if _means(key, pair)]
         if len(there) != 1:
             near = nearest(key, [*whole, *names])
             hint = f"did you mean '{near}'?" if near else f"it has {', '.join(whole)}"
