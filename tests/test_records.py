@@ -201,7 +201,7 @@ def test_no_orientation(tmp_path: Path) -> None:
         ("q1[mm]", "q1[deg]", ("column 'q1'", "'deg'", "a length", "'q1[mm]'")),
         ("phi[rad]", "phi[1]", ("column 'phi'", "an angle", "'phi[deg]'")),
         ("phi[rad]", "phi[rda]", ("column 'phi'", "'rda'", "'rad'")),
-        ("temperature[degC]", "temperature[C]", ("column 'temperature'", "'temperature[degC]'")),
+        ("temperature[degC]", "temperature[V]", ("column 'temperature'", "'temperature[degC]'")),
         ("temperature[degC]", "time[degC]", ("column 'time'", "'time[s]'")),
         ("temperature[degC]", "load_y[kg]", ("column 'load_y'", "a force", "'load_y[N]'")),
         ("temperature[degC]", "load_phi[N]", ("column 'load_phi'", "a moment", "'load_phi[N*m]'")),
