@@ -19,7 +19,7 @@ from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, sim
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Effect, Situation, default_gravity
 from ccnn_torch.errors import InputError, RowsError
-from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, fit_frames, judge_frames
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES
 from ccnn_torch.records.read_table import Frame
@@ -124,6 +124,8 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
         parameters = fit_frames(mechanism, records.joints, records.pose, columns=records.columns)
         about = (records.joints, records.pose, parameters)
         judge_frames(mechanism, *about, where=records.path, name_rows=records.name_rows)
+    elif isinstance(mechanism, Framed) and mechanism.unknown_frames:
+        parameters = mechanism.inlying_frames(records.joints, records.pose)
     down = default_gravity(mechanism) if gravity is None else torch.tensor(list(gravity), dtype=torch.float64)
     if down.shape != (3,):
         raise InputError(f"gravity: needs three numbers (x, y, z in m/s²), not {len(down)}")
