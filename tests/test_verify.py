@@ -148,6 +148,17 @@ def test_a_tracker_that_was_moved(model: Path, tmp_path: Path) -> None:
     assert found["position"]["after"]["rms"] == pytest.approx(3**0.5 * NOISE, rel=0.2)
 
 
+def test_a_machine_in_a_trackers_frame(tmp_path: Path) -> None:
+    """Its base is fitted to the training rows before anything is learned, and is in the model."""
+    rows, new = (delta_rows(tmp_path / f"{seed}.csv", seed, moved=True) for seed in (0, 1))
+    keys = {"mechanism": DELTA, "keys": {"rod": 0.55}}
+    found = calibrate(records=str(rows), mechanism="framed", mechanism_keys=keys, methods=["constant"], geometry="none")
+    found.save(tmp_path, forms=())
+    told = ccnn_torch.verify(tmp_path / "model.safetensors", new)
+    # A constant is not all that the frame leaves of the offset, and the frame not all of it.
+    assert told["kept"] and told["position"]["after"]["rms"] < 1e-4
+
+
 def test_what_cannot_be_verified(model: Path, tmp_path: Path, cli: Cli) -> None:
     rows = delta_rows(tmp_path / "new.csv", seed=5, rows=20)
     code, _, err = cli("verify", model, rows, "--mechanism", "tripod", "--out", tmp_path / "v")
