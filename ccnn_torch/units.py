@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.unit_words import as_read
 
 __all__ = ["LARGEST", "from_si", "parse_header", "si_unit_of", "split_header", "to_si", "write_hint"]
 
@@ -54,11 +55,8 @@ _PARENTHESES = re.compile(r"\s*(?P<name>[^()\[\]]*?)\s*\((?P<unit>[^()\[\]]*)\)\
 _HEADER = re.compile(r"\s*(?P<name>[^\[\]]*?)\s*\[(?P<unit>[^\[\]]*)\]\s*")
 _FACTOR = r"(?:[A-Za-zµμΩÅ_]+|%|°C?)(?:(?:\^|\*\*)-?[1-9]|⁻?[²³¹])?"
 _EXPRESSION = re.compile(rf"(?:1|{_FACTOR})(?:\s*[*/·⋅.\s]\s*{_FACTOR})*")
-# pint would read these as something that no record of a robot means: textile number metre, megametre.
-_ALIASES = {"Nm": "N*m", "Nmm": "N*mm"}
 _REFUSED = {
     "Mm": "megametres; for millimetres write mm",
-    "Grad": "gigaradians; for degrees write deg",
     "grad": "a 400th of a turn to some and a degree to others; write gon or deg",
 }
 
@@ -142,8 +140,9 @@ def si_unit_of(unit: str, where: str = "") -> str:
     Raises:
         InputError: the unit is not known; `where` opens the sentence.
     """
-    if unit in _USUAL:
-        return _USUAL[unit][0]
+    usual = _USUAL.get(as_read(unit))
+    if usual is not None:
+        return usual[0]
     try:
         return _canonical(_lookup(unit).base)
     except _UnknownUnit as reason:
@@ -167,9 +166,9 @@ def to_si(
         InputError: unknown unit, or one of another dimension (an angle and a plain number differ).
     """
     array = np.asarray(values, dtype=np.float64)
-    usual, factor = _USUAL.get(unit, ("", 1.0))
+    usual, factor = _USUAL.get(as_read(unit), ("", 1.0))
     if usual and si_unit in (None, usual):
-        return array + _CELSIUS if unit == "degC" else array * factor
+        return array + _CELSIUS if as_read(unit) == "degC" else array * factor
     found = si_unit_of(unit, where)
     if si_unit is not None and _lookup(unit).base != _lookup(si_unit).base:
         kind = f", {_KINDS[found]}," if found in _KINDS else ""
@@ -214,9 +213,9 @@ def _lookup(unit: str) -> _Unit:
 
     if unit in _REFUSED:
         raise _UnknownUnit(f"means {_REFUSED[unit]}")
-    if not _EXPRESSION.fullmatch(unit):
+    name = as_read(unit)
+    if not _EXPRESSION.fullmatch(name):
         raise _UnknownUnit(_not_known(unit))
-    name = _ALIASES.get(unit, unit)
     registry = _registry()
     try:
         parsed = registry.parse_units(name)

@@ -260,8 +260,8 @@ def test_the_command_on_the_screen_puts_the_effect_in_a_compensator(
     assert "found/next_measurements.csv" in shown and "where nothing was measured (by block)" in shown
     assert "What is wrong: Backlash of joints 1 and 2: joint" in shown
     run, correct = (shlex.split(line) for line in shown.splitlines() if line.startswith("  ccnn "))
-    # The time of day is left out, so that the model holds on other days.
-    assert "covariates=[temperature,load_x,load_y,direction1,direction2]" in run
+    # Temperature and time act on nothing that was found: later targets need not have them.
+    assert "covariates=[load_x,load_y,direction1,direction2]" in run
     assert "effects=from:found/diagnosis.json" in run and "records=my data/rows 1.csv" in run
     code, _, told = cli(*run[1:], "methods=constant", "save_models=false", "--quiet")
     assert code == 0, told
@@ -324,3 +324,27 @@ print(sorted({watched} & set(sys.modules)), "matplotlib" in sys.modules)
 """
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert told.splitlines() == ["False", "[] True"]
+
+
+def test_a_length_is_the_noise_of_an_arm_measured_in_position(cli: Cli, tmp_path: Path) -> None:
+    """The arm's pose has angles, its records have none: only there a length suits all coordinates."""
+    arm = Path(__file__).parent.parent / "experiments" / "data" / "ur10.yaml"
+    made = simulate_records(str(arm), ["backlash"], 40, {"m": 1e-5, "rad": 1e-5}, seed=4)
+    write_simulated(tmp_path / "whole.csv", made)
+    lines = [line.split(",") for line in (tmp_path / "whole.csv").read_text().splitlines()]
+    kept = [k for k, header in enumerate(lines[0]) if header[:2] not in ("rx", "ry", "rz")]
+    (tmp_path / "rows.csv").write_text("\n".join(",".join(line[k] for k in kept) for line in lines) + "\n")
+    for name, expected in (("rows", 0), ("whole", 2)):
+        words = (
+            "--records",
+            tmp_path / f"{name}.csv",
+            "--mechanism",
+            arm,
+            "--noise",
+            "10um",
+            "--effects",
+            "backlash",
+            "--quiet",
+        )
+        code, _, err = cli("check", *words)
+        assert code == expected and ("lengths and angles" in err) == bool(expected), err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 import runpy
 import shlex
@@ -13,6 +14,8 @@ import pytest
 import typer
 
 from ccnn_torch.cli import app
+from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms.registry import REGISTRY
 
 ROOT = Path(__file__).parent.parent
 DIAGNOSIS = ROOT / "ccnn_torch" / "diagnosis"
@@ -49,9 +52,30 @@ def test_every_constant_of_the_diagnosis_is_in_the_table_with_its_value() -> Non
     assert len(table) > 100
 
 
+def test_the_table_of_parallel_machines_is_that_of_the_registry() -> None:
+    """Joints, pose, keys and a leg's parameters of each; and the table of conventions has the same machines."""
+    page = (ROOT / "docs" / "how_to" / "mechanisms.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (q1[^|]+) \| ([^|]+) \| ([^|]+) \| ([^|]+) \|$", page, re.M)
+    conventions = re.findall(r"^\| `(\w+)` \| [^|]+ \| [^|]+ \| [^|]+ \|$", page, re.M)
+    wanted = [name for name in REGISTRY if name not in ("serial", "framed")]
+    assert sorted(row[0] for row in rows) == sorted(conventions) == sorted(wanted)
+    for name, joints, pose, keys, parameters in rows:
+        machine = load_mechanism(name)
+        first, *_, last = (joint.name for joint in machine.joints)
+        between = ".." if len(machine.joints) > 2 else ", "
+        assert joints == f"{first}{between}{last} [{machine.joints[0].unit}]"
+        assert re.findall(r"\w+(?=[,\s])", re.sub(r"\[\w+\]", ",", pose)) == [c.name for c in machine.pose]
+        assert keys.split(", ") == [*inspect.signature(REGISTRY[name]).parameters]
+        shown = [p for p in parameters.partition(";")[0].split(", ") if p != "none"]
+        legs = {g.name for g in machine.geometry if g.leg == 1}
+        ones = [{p[:k] + "1" + p[k + 1 :] for k, mark in enumerate(p) if mark == "i"} & legs for p in shown]
+        assert all(map(len, ones)) and set().union(*ones) == legs
+
+
 def blocks(page: Path, language: str) -> list[str]:
     """The fenced blocks of a page in one language."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
+    fenced = re.findall(r"^```(\S*)\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
+    return [text for written, text in fenced if written == language]
 
 
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)

@@ -90,6 +90,26 @@ def test_a_mechanism_is_guessed_only_where_one_fits(tmp_path: Path, cli: Cli) ->
         starter_config(bare, tmp_path / "b.yaml", mechanism="five_bar", units="mm,deg")
 
 
+def test_a_german_export_runs_without_a_word(tmp_path: Path, cli: Cli) -> None:
+    headers = ["Achse 1 [Grad]", "Achse 2 [Grad]", "Achse 3 [Grad]", "X [MM]", "Y [MM]", "Z [MM]", "Zeit [Min]"]
+    headers += ["Hallentemp. [°C]", *(f"Anfahrt A{k}" for k in (1, 2, 3)), "Richtung 1"]
+    generator = np.random.default_rng(0)
+    beside = [np.arange(40), generator.normal(22, 1, 40), *generator.choice([-1, 1], (3, 40)), np.arange(40)]
+    records = write(tmp_path / "messung.csv", headers, np.column_stack([delta(), *beside]), ";")
+    assert cli("new", records, "--mechanism", "delta", "--out", tmp_path / "c.yaml")[0] == 0
+    columns = load_config(tmp_path / "c.yaml").columns
+    assert columns["Zeit[Min]"] == "time[Min]" and columns["Anfahrt A3"] == "direction3[1]"
+    assert columns["Hallentemp.[°C]"] == "temperature[°C]" and "Richtung 1" not in columns
+    code, _, err = cli("run", tmp_path / "c.yaml", "methods=[constant]", "geometry=none", "save_models=false",
+                       "save_report=false", "--out", tmp_path / "run", "--quiet")  # fmt: skip
+    assert code == 0, err
+    # A unit that is not read is as good as none: it is asked for, not copied.
+    records.write_text(records.read_text(encoding="utf-8").replace("Grad", "grad"), encoding="utf-8")
+    with pytest.raises(InputError, match="Achse 1, Achse 2, Achse 3 have no unit that is known"):
+        starter_config(records, tmp_path / "d.yaml", mechanism="delta")
+    assert '"q1[deg]"' in starter_config(records, tmp_path / "d.yaml", mechanism="delta", units="mm,deg")[0]
+
+
 def test_an_arms_controller_names_and_repeated_targets(tmp_path: Path) -> None:
     headers = [*(f"A{k}[deg]" for k in range(1, 7)), "X[mm]", "Y[mm]", "Z[mm]", "A[deg]", "B[deg]", "C[deg]"]
     records = write(tmp_path / "kuka.csv", headers, arm(60, places=15), separator=";")

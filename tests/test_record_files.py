@@ -80,7 +80,7 @@ def test_a_workbook(tmp_path: Path) -> None:
     book.active.append(["Report of", 12])
     sheet = book.create_sheet("rows")
     columns = slide_columns()
-    sheet.append([])
+    sheet.append([None, "# by hand"])
     sheet.append([*columns, "note"])
     for k, row in enumerate(zip(*columns.values(), strict=True)):
         sheet.append([*(value.item() for value in row), "seen" if k % 2 else None])

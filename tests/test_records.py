@@ -201,7 +201,7 @@ def test_no_orientation(tmp_path: Path) -> None:
         ("q1[mm]", "q1[deg]", ("column 'q1'", "'deg'", "a length", "'q1[mm]'")),
         ("phi[rad]", "phi[1]", ("column 'phi'", "an angle", "'phi[deg]'")),
         ("phi[rad]", "phi[rda]", ("column 'phi'", "'rda'", "'rad'")),
-        ("temperature[degC]", "temperature[C]", ("column 'temperature'", "'temperature[degC]'")),
+        ("temperature[degC]", "temperature[V]", ("column 'temperature'", "'temperature[degC]'")),
         ("temperature[degC]", "time[degC]", ("column 'time'", "'time[s]'")),
         ("temperature[degC]", "load_y[kg]", ("column 'load_y'", "a force", "'load_y[N]'")),
         ("temperature[degC]", "load_phi[N]", ("column 'load_phi'", "a moment", "'load_phi[N*m]'")),
@@ -330,3 +330,10 @@ def test_ten_thousand_rows_are_quick(tmp_path: Path) -> None:
     records = load_records(tmp_path / "records.csv", Arm())
     check_rows(records, Arm())
     assert time.process_time() - start < 0.5 and len(records) == 10_000
+
+
+def test_a_joint_more_than_the_machine_has_is_no_input_without_a_word(tmp_path: Path) -> None:
+    columns = slide_columns() | {"q3[rad]": np.zeros(len(slide_columns()["q1[mm]"]))}
+    assert "'q3', and the machine has 2 joints" in fails(tmp_path, columns, Slide())
+    write_table(tmp_path / "more.csv", columns)
+    assert len(load_records(tmp_path / "more.csv", Slide(), columns={"q3": "ignore"}).joint_coordinates) == 2

@@ -57,6 +57,8 @@ def test_columns_come_in_si(tmp_path: Path) -> None:
         "q1 [rad] , x [mm]\n 0.5, 1.25\n-1 ,2\n",
         "q1[rad],x[mm]\n0.5,1.25\n-1,2",
         "\n\nq1[rad],x[mm]\n\n0.5,1.25\n,\n-1,2\n\n,,\n",
+        "# tracker, by hand\n; May\n// third\n% 4\nq1[rad],x[mm]\n0.5,1.25\n-1,2\n",
+        "# as numpy writes it\n# q1[rad];x[mm]\n0,5;1,25\n-1;2\n",
     ],
 )
 def test_dialects(tmp_path: Path, text: str) -> None:
@@ -78,6 +80,11 @@ def test_dialects(tmp_path: Path, text: str) -> None:
         ("q1[rad],x[mm]\n1,2\n\n1\n", ("line 4 (row 2)", "1 cells")),
         ("q1[rad],x[mm]\n1,5,2,5\n", ("line 2 (row 1)", "4 cells", "decimal comma")),
         ("q1[rad];x[mm]\n1;2;3\n", ("line 2 (row 1)", "3 cells")),
+        ("# by hand\n; in May\nq1[rad],x[mm]\n1,2\n1\n", ("line 5 (row 2)", "1 cells")),
+        ("# by hand\n1,2\n3,4\n", ("line 2 must be the header", "numbers alone")),
+        ("Line 4, May\nq1[rad];x[mm];t[s]\n1,5;2,5;1\n", ("line 1, 'Line 4'", "a title", "line 2 has more")),
+        ("Line 4;;\n\nIn mm;and;\nq1[rad];x[mm];t[s]\n1;2;1\n", ("line 1, 'Line 4', is a title",)),
+        ("Line 4\n1;2,5\n", ("line 1, 'Line 4', is a title", "line 2 has more cells")),
     ],
 )
 def test_bad_file(tmp_path: Path, text: str, parts: tuple[str, ...]) -> None:

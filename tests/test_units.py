@@ -41,6 +41,21 @@ FACTORS = {
     "g": ("kg", 1e-3),
     "kg*m^2": ("kg*m^2", 1.0),
     "%": ("1", 1e-2),
+    # As German, French, Italian and Spanish tables write them.
+    "Grad": ("rad", constants.degree),
+    "grados": ("rad", constants.degree),
+    "º": ("rad", constants.degree),
+    "Grad/Sek.": ("rad/s", constants.degree),
+    "U/min": ("rad/s", 2 * np.pi / 60),
+    "Sek.": ("s", 1.0),
+    "Min": ("s", constants.minute),
+    "Std": ("s", constants.hour),
+    "millimètres": ("m", 1e-3),
+    "MM": ("m", 1e-3),
+    "Zoll": ("m", constants.inch),
+    "Newton": ("N", 1.0),
+    "Kelvin": ("K", 1.0),
+    "-": ("1", 1.0),
     "1": ("1", 1.0),
 }
 
@@ -63,7 +78,8 @@ def test_scale_and_si_unit(unit: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "unit, scale", [("degC", "Celsius"), ("°C", "Celsius"), ("degF", "Fahrenheit"), ("K", "Kelvin")]
+    "unit, scale",
+    [(c, "Celsius") for c in ("degC", "°C", "ºC", "C", "Grad Celsius")] + [("degF", "Fahrenheit"), ("K", "Kelvin")],
 )
 def test_temperature_has_an_offset(unit: str, scale: str) -> None:
     values = np.array([-40.0, 0.0, 21.8675])
@@ -88,7 +104,6 @@ def test_back_and_forth(value: float, unit: str) -> None:
         ("um/m", "rad"),
         ("mm", "rad"),
         ("deg", "m"),
-        ("C", "K"),
         ("kg", "N"),
         ("1/s", "rad/s"),
         ("rads", "rad"),
@@ -110,6 +125,7 @@ def test_wrong_dimension_names_column_and_remedy(unit: str, si_unit: str) -> Non
         ("RAD", "'rad'"),
         ("Deg", "'deg'"),
         ("Mm", "mm"),
+        ("grad", "deg"),
         ("dB", "linear"),
         ("dBm", "linear"),
         ("2", "not known"),

@@ -24,6 +24,8 @@ Cli = Callable[..., tuple[int, str, str]]
 DELTA = "delta"
 NOISE = 2e-5
 OFFSET = torch.tensor([2e-3, -1e-3, 1.5e-3], dtype=torch.float64)
+# Of a run whose records have other headers, one with the blank of a German export.
+COLUMNS = {"Achse 1 [rad]": "q1[rad]", "Achse 2 [rad]": "q2[rad]", "Achse 3 [rad]": "q3", "X": "x[m]"}
 
 
 def delta_rows(
@@ -44,6 +46,16 @@ def delta_rows(
     return path
 
 
+def renamed(path: Path) -> Path:
+    """The same rows under the headers of COLUMNS, where the pose has x alone renamed."""
+    header, rows = path.read_text().split("\n", 1)
+    for theirs, ours in COLUMNS.items():
+        header = header.replace(ours if "[" in ours else f"{ours}[rad]", theirs if "[" in theirs else f"{theirs}[m]")
+    out = path.with_stem(f"{path.stem}_renamed")
+    out.write_text(f"{header}\n{rows}")
+    return out
+
+
 def wanted(seed: int, rows: int) -> torch.Tensor:
     machine = load_mechanism(DELTA)
     pose = machine.sample_workspace(rows, torch.Generator().manual_seed(100 + seed))
@@ -53,8 +65,8 @@ def wanted(seed: int, rows: int) -> torch.Tensor:
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("model")
-    rows = delta_rows(folder / "rows.csv", seed=0)
-    found = calibrate(records=str(rows), mechanism=DELTA, methods=["constant"], geometry="none")
+    rows = renamed(delta_rows(folder / "rows.csv", seed=0))
+    found = calibrate(records=str(rows), mechanism=DELTA, methods=["constant"], geometry="none", columns=COLUMNS)
     found.save(folder, forms=())
     return folder / "model.safetensors"
 
@@ -96,6 +108,24 @@ def test_a_machine_that_has_changed_is_told_by_exit_code_1(model: Path, tmp_path
     assert not found["kept"] and found["position"]["after"]["rms"] > found["position"]["promised"]["high"]
 
 
+@pytest.mark.parametrize("form", ["network", "identified"])
+def test_headers_that_the_run_mapped_are_mapped_alike(model: Path, tmp_path: Path, cli: Cli, form: str) -> None:
+    """For a network and an identified machine, by verify and compensate; OUT has the headers of IN."""
+    new = delta_rows(tmp_path / "new.csv", seed=9, rows=20)
+    if form == "identified":
+        rows = renamed(delta_rows(tmp_path / "rows.csv", seed=7))
+        found = ccnn_torch.identify(
+            mechanism=DELTA, records=str(rows), methods=["lm"], save_report=False, columns=COLUMNS
+        )
+        found.save(tmp_path)
+        model = tmp_path / "identified.yaml"
+    assert ccnn_torch.verify(model, renamed(new))["position"] == ccnn_torch.verify(model, new)["position"]
+    for name, rows in (("plain.csv", new), ("mapped.csv", renamed(new))):
+        assert cli("compensate", model, rows, tmp_path / name)[0] == 0
+    plain, mapped = ((tmp_path / name).read_text().split("\n", 1) for name in ("plain.csv", "mapped.csv"))
+    assert mapped[1] == plain[1] and mapped[0].startswith("Achse 1[rad],") and ",command_q1[rad]," in mapped[0]
+
+
 def test_rows_measured_with_the_compensator_on(model: Path, tmp_path: Path) -> None:
     joints = wanted(3, 50)
     command = torch.from_numpy(ccnn_torch.load_model(model)(joints.numpy())["command"])
@@ -116,6 +146,17 @@ def test_a_tracker_that_was_moved(model: Path, tmp_path: Path) -> None:
     found = ccnn_torch.verify(model, rows, refit_frames=True)
     assert found["kept"] and found["frames"] == "fitted again" and "moved" not in " ".join(found["notes"])
     assert found["position"]["after"]["rms"] == pytest.approx(3**0.5 * NOISE, rel=0.2)
+
+
+def test_a_machine_in_a_trackers_frame(tmp_path: Path) -> None:
+    """Its base is fitted to the training rows before anything is learned, and is in the model."""
+    rows, new = (delta_rows(tmp_path / f"{seed}.csv", seed, moved=True) for seed in (0, 1))
+    keys = {"mechanism": DELTA, "keys": {"rod": 0.55}}
+    found = calibrate(records=str(rows), mechanism="framed", mechanism_keys=keys, methods=["constant"], geometry="none")
+    found.save(tmp_path, forms=())
+    told = ccnn_torch.verify(tmp_path / "model.safetensors", new)
+    # A constant is not all that the frame leaves of the offset, and the frame not all of it.
+    assert told["kept"] and told["position"]["after"]["rms"] < 1e-4
 
 
 def test_what_cannot_be_verified(model: Path, tmp_path: Path, cli: Cli) -> None:

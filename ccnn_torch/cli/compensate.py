@@ -48,6 +48,8 @@ def compensate(
 ) -> None:
     """Correct joints so that the machine reaches the intended pose; or, with --back, convert commands to ideal joints.
 
+    Headers that the model's run mapped by `columns` are mapped again.
+
     OUT.csv repeats the columns of IN.csv and adds command_q1[unit]…, deviation_q1[unit]… and inside_domain[1] (0 =
     outside the model's domain, where the correction tends to its safe value). With --back it adds ideal_q1[unit]…
     and inside_domain[1]; the commands are the columns command_q1… where IN.csv has them, else q1…. With --pose a
@@ -98,10 +100,14 @@ def compensate(
 
     from ccnn_torch.compensation import load_compensation
     from ccnn_torch.records import name_lines, read_table, stack_columns, write_table
+    from ccnn_torch.records.headers import columns_there
     from ccnn_torch.report.screen import say
 
     loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
-    table = read_table(input)
+    original = read_table(input)
+    # Headers that the model's run mapped are mapped alike; OUT repeats them as they are.
+    columns = columns_there(original.units, loaded.columns)
+    table = read_table(input, columns) if columns else original
     mechanism = _mechanism_of(loaded, allow_code) if pose else None
     if mechanism is not None:
         joints, units = _joints_of_poses(loaded, mechanism, table), {c.name: c.unit for c in loaded.joints}
@@ -125,7 +131,7 @@ def compensate(
             raise InputError(f"--sd: {model} is identified geometry, which has no standard deviation of a command")
         added |= _named("deviation_sd", loaded, found["deviation_sd"], units)
     names = {header.partition("[")[0] for header in added}
-    kept = {table.header(name): table.raw(name) for name in table.names if name not in names}
+    kept = {original.header(name): original.raw(name) for name in original.names if name not in names}
     write_table(output, kept | added)
     if not quiet:
         _report(output, inside, trained=bool(loaded.covariates) or "deviation_sd" in found)

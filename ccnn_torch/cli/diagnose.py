@@ -29,7 +29,8 @@ def diagnose(
     noise: Annotated[
         str | None,
         typer.Option(
-            help="Standard deviation of the pose: 1e-5 (m and rad alike), 10um, NAME=S,…, or m=10um,rad=30urad."
+            help="Standard deviation of the pose: 1e-5 (m and rad alike), NAME=S,…, or m=10um,rad=30urad; 10um "
+            "where the records have positions alone."
         ),
     ] = None,
     effects: Annotated[

@@ -67,7 +67,8 @@ class DiagnoseConfig(Section):
         default=None, description="candidates, by name or path/to/file.py:Name, all for the library; null = all"
     )
     gravity: tuple[float, float, float] | None = Field(
-        default=None, description="gravity in the base frame in m/s²; null = down along -z (planar machines: -y)"
+        default=None,
+        description="gravity in m/s² in the frame of the poses, of an arm whose base frame is unknown in its own base; null = along -z (planar machines: -y)",
     )
     network: bool = Field(
         default=True, description="whether to say what a network on the remainder would still gain; takes seconds"

@@ -11,6 +11,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis.checks.mistakes import what_is_wrong
 from ccnn_torch.diagnosis.discrepancy.network import with_network
 from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.residual.distance import size_of
@@ -19,7 +20,8 @@ from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, sim
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.effects import Effect, Situation, default_gravity
 from ccnn_torch.errors import InputError, RowsError
-from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, fit_frames, judge_frames
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES
 from ccnn_torch.records.read_table import Frame
@@ -122,11 +124,18 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
     parameters = None
     if isinstance(mechanism, SerialArm) and mechanism.unknown_frames:
         parameters = fit_frames(mechanism, records.joints, records.pose, columns=records.columns)
-        about = (records.joints, records.pose, parameters)
-        judge_frames(mechanism, *about, where=records.path, name_rows=records.name_rows)
+        try:
+            judge_frames(mechanism, records.joints, records.pose, parameters, None, records.path, records.name_rows)
+        except InputError as reason:
+            raise _named(reason, mechanism, records, parameters) from None
+    elif isinstance(mechanism, Framed) and mechanism.unknown_frames:
+        parameters = mechanism.inlying_frames(records.joints, records.pose)
     down = default_gravity(mechanism) if gravity is None else torch.tensor(list(gravity), dtype=torch.float64)
     if down.shape != (3,):
         raise InputError(f"gravity: needs three numbers (x, y, z in m/s²), not {len(down)}")
+    if isinstance(mechanism, SerialArm) and "base" in mechanism.unknown_frames and parameters is not None:
+        # Where the measuring device stands says nothing about gravity; frames by group of rows share the first one's.
+        down = rotation_vector_to_matrix(parameters.reshape(-1, parameters.shape[-1])[0, 3:6]) @ down
     covariates = {c.name: records.covariates[:, i] for i, c in enumerate(records.covariate_coordinates)}
     _refuse_no_sign(records, covariates)
     mechanism, more = simulator_inputs(records, mechanism, covariates)
@@ -135,6 +144,13 @@ def situation_of(records: Records, mechanism: Mechanism, gravity: Sequence[float
     situation = Situation(mechanism, records.joints, covariates, down, parameters, guess)
     refuse_lost_rows(records, situation)
     return situation
+
+
+def _named(reason: InputError, arm: SerialArm, records: Records, parameters: Tensor) -> InputError:
+    """The refusal of fitted frames, with the mistake that explains it in place of what to check, where there is one."""
+    rows = Situation(arm, records.joints, {}, default_gravity(arm), parameters, records.pose)
+    said = what_is_wrong(rows, records.pose, size_of(rows))
+    return InputError(f"{str(reason).partition('; check')[0]}: {said}") if said else reason
 
 
 def _refuse_no_sign(records: Records, covariates: Mapping[str, Tensor]) -> None:

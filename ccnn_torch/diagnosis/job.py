@@ -65,13 +65,13 @@ def run_check(config: DiagnoseConfig) -> Check:
     records, mechanism, effects = _loaded(config)
     situation = situation_of(records, mechanism, config.gravity)
     with naming(records):
-        found = check_rows(situation, records.pose, noise_of(_noise(config, mechanism), situation), effects)
+        found = check_rows(situation, records.pose, noise_of(_noise(config, records), situation), effects)
     return replace(found, lines_aside=[int(records.lines[row]) for row in found.aside])
 
 
 def _verdict(config: DiagnoseConfig, tell: Callable[..., None]) -> Diagnosis:
     records, mechanism, effects = _loaded(config)
-    noise = _noise(config, mechanism)
+    noise = _noise(config, records)
     with simulated_rows(lambda n: tell(note=f"{n:,} rows simulated")):
         return diagnose(records, mechanism, noise=noise, effects=effects, gravity=config.gravity, seed=config.seed)
 
@@ -96,8 +96,9 @@ def _complete(config: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: boo
         say_place(f"Written: {path} and report.html beside it")
 
 
-def _noise(config: DiagnoseConfig, mechanism: Mechanism) -> dict[str, float] | None:
-    return None if config.noise is None else noise_of_pose(config.noise, mechanism.pose)
+def _noise(config: DiagnoseConfig, records: Records) -> dict[str, float] | None:
+    """Of the pose as it was measured: an arm's records may have positions alone."""
+    return None if config.noise is None else noise_of_pose(config.noise, records.pose_coordinates)
 
 
 def _loaded(config: DiagnoseConfig) -> tuple[Records, Mechanism, Sequence[str] | None]:

@@ -16,7 +16,7 @@ from ccnn_torch.diagnosis.page.report import write_diagnosis_report
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.verdict.text import noise_text
 from ccnn_torch.effects.covariates import covariate_units
-from ccnn_torch.mechanisms import SerialArm, fit_frames
+from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames
 from ccnn_torch.mechanisms.files.write_machine import write_machine
 from ccnn_torch.report.json_files import plain, write_json
 
@@ -75,9 +75,13 @@ def write_corrected(folder: Path, diagnosis: Diagnosis) -> None:
     if not found or (frames is not None and frames.dim() > 1):
         return
     before = mechanism.nominal if frames is None else frames
-    nominal = dict(zip([p.name for p in mechanism.geometry], before.tolist(), strict=True))
-    values = [value + found.get(name, 0.0) for name, value in nominal.items()]
-    machine = mechanism.with_nominal(torch.tensor(values, dtype=torch.float64))
+    names = [p.name for p in mechanism.geometry]
+    change = torch.tensor([found.get(name, 0.0) for name in names], dtype=torch.float64)
+    machine = mechanism.with_nominal(mechanism.nominal + change)
+    rows = analysis.situation.joints, analysis.measured
     if isinstance(machine, SerialArm) and machine.unknown_frames:
-        machine = machine.with_nominal(fit_frames(machine, analysis.situation.joints, analysis.measured))
+        machine = machine.with_nominal(fit_frames(machine, *rows))
+    elif isinstance(machine, Framed) and machine.unknown_frames:
+        machine = machine.with_nominal(machine.inlying_frames(*rows))
+    nominal = dict(zip(names, before.tolist(), strict=True))
     write_machine(machine, nominal, folder, Path(CORRECTED[0]).stem)

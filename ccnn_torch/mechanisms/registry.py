@@ -28,12 +28,22 @@ from ccnn_torch.plugins import class_hint, code_refused, file_that_names, is_plu
 
 
 def _framed(
-    mechanism: str | Mapping[str, Any], base: bool = True, tool: bool = False, rotation_weight: float = 0.04
+    mechanism: str | Mapping[str, Any],
+    base: bool = True,
+    tool: bool = False,
+    rotation_weight: float = 0.04,
+    keys: Mapping[str, Any] | None = None,
 ) -> Framed:
-    """A mechanism by name, file or description, seen from a measuring frame."""
+    """A mechanism by name or file with its keys, or by description, seen from a measuring frame."""
+    for name, value in (("base", base), ("tool", tool)):
+        if not isinstance(value, bool):
+            raise InputError(
+                f"mechanism 'framed': {name} is true or false, whether that frame is fitted, not {value!r}; keys of "
+                "the mechanism inside go under keys: {mechanism: delta, keys: {base: 0.2}}"
+            )
     # The reader of the file that contains this decides whether code may run.
     if isinstance(mechanism, str):
-        inner = load_mechanism(mechanism)
+        inner = load_mechanism(mechanism, **(keys or {}))
     else:
         inner = mechanism_from_description(mechanism, allow_code=True)
     return Framed(inner, base, tool, rotation_weight)
@@ -68,7 +78,7 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
             class, a `Simulator`, or a function that makes one.
         allow_code: run the Python file that an identified machine's mechanism file names.
         keys: keys of its constructor (tripod: L, r, per_leg; DH file: orientation; URDF: base, tip, orientation;
-            framed: mechanism, base, tool; …).
+            framed: mechanism, its keys, base, tool; …).
 
     Raises:
         InputError: unknown name (with the nearest), missing or faulty file, a key that the mechanism does not take, a

@@ -10,7 +10,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import si_unit_of, split_header, to_si
 
-__all__ = ["IGNORE", "Header", "read_header"]
+__all__ = ["IGNORE", "Header", "columns_there", "is_number", "read_header"]
 
 # Characters of a name.
 _LONGEST = 100
@@ -33,12 +33,13 @@ class Header:
     width: int
 
 
-def read_header(cells: Sequence[str], file: str, columns: Mapping[str, str] | None = None) -> Header:
+def read_header(cells: Sequence[str], file: str, columns: Mapping[str, str] | None = None, line: int = 1) -> Header:
     """Read a header.
 
     Args:
         cells: as in the file; a cell without text gets the name ``column 3`` or the like.
         file: the file, for the error.
+        line: of the file, for the error.
         columns: header as in the file (or its name alone) -> ``name[unit]``, or ``ignore``. The unit may be left out
             where the file has it.
 
@@ -46,9 +47,10 @@ def read_header(cells: Sequence[str], file: str, columns: Mapping[str, str] | No
         InputError: there is no header, a name is repeated, or the map names no column of the file, lacks a unit or
             contradicts the file's.
     """
-    if all(_is_number(cell) for cell in cells):
+    if all(is_number(cell) for cell in cells):
         raise InputError(
-            f"{file}: line 1 must be the header, e.g. q1[rad],x[mm], but it holds numbers alone; write one above them"
+            f"{file}: line {line} must be the header, e.g. q1[rad],x[mm], but it holds numbers alone; "
+            "write one above them"
         )
     targets = _targets(cells, file, columns or {})
     units: dict[str, str] = {}
@@ -77,6 +79,16 @@ def read_header(cells: Sequence[str], file: str, columns: Mapping[str, str] | No
     return Header(units, kept, len(cells))
 
 
+def columns_there(units: Mapping[str, str], columns: Mapping[str, str]) -> dict[str, str]:
+    """The entries of a map of columns whose header a table has (its names and units as written), blanks aside."""
+    return {key: target for key, target in columns.items() if any(_means(key, pair) for pair in units.items())}
+
+
+def _means(key: str, pair: tuple[str, str]) -> bool:
+    """Whether an entry's key means the column of this name and unit."""
+    return pair in (split_header(key), (key.strip(), pair[1]))
+
+
 def _check_name(name: str, number: int, file: str) -> None:
     """Refuse names that are too long, have control characters, or are formulas to a spreadsheet."""
     wrong = ""
@@ -100,7 +112,7 @@ def _targets(cells: Sequence[str], file: str, columns: Mapping[str, str]) -> dic
     found: dict[int, str] = {}
     for key, target in columns.items():
         there = [k for k, cell in enumerate(whole) if cell == key.strip()]
-        there = there or [k for k, pair in enumerate(pairs) if pair in (split_header(key), (key.strip(), pair[1]))]
+        there = there or [k for k, pair in enumerate(pairs) if _means(key, pair)]
         if len(there) != 1:
             near = nearest(key, [*whole, *names])
             hint = f"did you mean '{near}'?" if near else f"it has {', '.join(whole)}"
@@ -135,7 +147,8 @@ def _same(unit: str, written: str, where: str) -> bool:
     return kinds[0] == kinds[1] and bool((to_si([0.0, 1.0], unit) == to_si([0.0, 1.0], written)).all())
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number, with a point or a decimal comma."""
     try:
         float(cell.replace(",", "."))
     except ValueError:

@@ -122,11 +122,17 @@ def read_pose(
 
 
 def check_joints(table: Table, joints: Sequence[Coordinate]) -> None:
-    """Refuse a table without a joint's column, and show the map of columns that look like joints.
+    """Refuse a table without a joint's column, with the map of columns that look like joints, or with a joint more.
 
     Raises:
         InputError: names the joint, and the map to write.
     """
+    more = f"q{len(joints) + 1}"
+    if more in table and all(joint.name == f"q{k + 1}" and joint.name in table for k, joint in enumerate(joints)):
+        raise InputError(
+            f"{table.path}: there is a column '{more}', and the machine has {len(joints)} joints: its model lacks one, "
+            f"or is another machine's; where the column is no joint of it write columns: {{{more}: ignore}}"
+        )
     missing = [joint for joint in joints if joint.name not in table]
     alike = {number: name for name, number in _numbered(table, joints).items()}
     if missing and all(k + 1 in alike for k, joint in enumerate(joints) if joint in missing):

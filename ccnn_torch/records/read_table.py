@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import read_bytes
 from ccnn_torch.records.headers import Header, read_header
+from ccnn_torch.records.preamble import SEPARATORS, bare_header, header_row, is_comment, refuse_title
 from ccnn_torch.records.table import Table, name_lines
 
 __all__ = ["Frame", "read_frame", "read_table"]
@@ -50,15 +51,16 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Ta
 
     CSV: the separator is a comma, a semicolon or a tab, as the header has it; with the latter two a decimal comma is
     understood. The text is UTF-8, UTF-16 with a byte-order mark, or else Windows code page 1252, which is then
-    noted. Blank lines and lines of separators alone (left by spreadsheets) are skipped.
+    noted. Blank lines and lines of separators alone (left by spreadsheets) are skipped, and so are comments above the
+    header: lines that begin with ``#``, ``;``, ``//`` or ``%``.
 
     Args:
         path: the file.
         columns: header in the file -> ``name[unit]`` or ``ignore``.
 
     Raises:
-        InputError: the file cannot be read or is empty, a header is repeated, `columns` does not fit it, or a row has
-            another number of cells than the header.
+        InputError: the file cannot be read or is empty, a header is repeated, `columns` does not fit it, a title
+            stands above it, or a row has another number of cells than the header.
     """
     file = str(path)
     if Path(file).suffix.lower() in _WORKBOOKS:
@@ -71,9 +73,12 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Ta
         filled = filled[1:]
     if not filled:
         raise InputError(f"{file}: the file is empty; line 1 must be the header, e.g. q1[rad],x[mm]")
-    first = text_lines[filled[0]]
-    separator = max(",;\t", key=first.count)
-    header = read_header(next(_split([first], separator, file, [filled[0] + 1])), file, columns)
+    filled = filled[header_row([text_lines[number] for number in filled]) :]
+    first = bare_header(text_lines[filled[0]])
+    separator = max(SEPARATORS, key=first.count)
+    near = [first, *(text_lines[number] for number in filled[1:20])]
+    refuse_title(file, [row.split(max(SEPARATORS, key=row.count)) for row in near], [n + 1 for n in filled])
+    header = read_header(next(_split([first], separator, file, [filled[0] + 1])), file, columns, filled[0] + 1)
     rows = [text_lines[number] for number in filled[1:]]
     if not rows:
         raise InputError(f"{file}: there is a header but no row below it")
@@ -122,6 +127,7 @@ def _read_workbook(file: str, columns: Mapping[str, str] | None) -> Table:
     if found is None:
         raise InputError(f"{file}: no sheet begins with a header, a row of texts such as q1[rad] and x[mm]")
     title, filled = found
+    refuse_title(file, [["" if c is None else str(c) for c in row] for _, row in filled], [n for n, _ in filled])
     width = max(k + 1 for _, row in filled for k, cell in enumerate(row) if _filled(cell))
     where = f"{file} (sheet {title})"
     header = read_header([str(cell or "") for cell in _fit(filled[0][1], width)], where, columns)
@@ -153,6 +159,9 @@ def _sheet_with_header(file: str) -> tuple[str, list[tuple[int, _Cells]]] | None
                 sheet.reset_dimensions()
                 rows = ((k + 1, row) for k, row in enumerate(sheet.iter_rows(values_only=True)))
                 filled = [(number, row) for number, row in rows if any(map(_filled, row))]
+                # A comment has a row for itself.
+                while filled and [is_comment(str(c)) for c in filled[0][1] if _filled(c)] == [True]:
+                    filled.pop(0)
                 if filled and all(isinstance(cell, str) for cell in filled[0][1] if _filled(cell)):
                     return sheet.title, filled
         return None

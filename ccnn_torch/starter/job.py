@@ -17,6 +17,7 @@ from ccnn_torch.starter.recognise import (
     Recognised,
     choose_split,
     is_covariate,
+    is_unit,
     recognise,
     suitable_mechanisms,
     unit_pair,
@@ -96,17 +97,17 @@ def _columns(
     found: Recognised, table: Table, machine: Mechanism | None, units: str | None, ask: Ask | None
 ) -> dict[str, str]:
     """Header in the file -> `name[unit]`, of every column that has a meaning."""
-    bare = [name for name in found.meaning if not table.units[name]]
+    bare = [name for name in found.meaning if not is_unit(table.units[name])]
     if bare and units is None and ask is not None:
         units = ask(f"Units of lengths and angles (columns {', '.join(bare)} have none), e.g. mm,deg")
     if bare and units is None:
         raise InputError(
-            f"{table.path}: {', '.join(bare)} {'has' if len(bare) == 1 else 'have'} no unit; add the units of lengths "
-            "and of angles: --units mm,deg"
+            f"{table.path}: {', '.join(bare)} {'has' if len(bare) == 1 else 'have'} no unit that is known; add the "
+            "units of lengths and of angles: --units mm,deg"
         )
     pair = unit_pair(units) if units is not None else {}
     return {
-        name: f"{ours}[{table.units[name] or pair[found.unit_kind(ours, machine)]}]"
+        name: f"{ours}[{pair[found.unit_kind(ours, machine)] if name in bare else table.units[name]}]"
         for name, ours in found.meaning.items()
     }
 
@@ -137,7 +138,8 @@ def _mechanism_lines(name: str | None, why: str, out: Path) -> list[str]:
 
 def _column_lines(columns: dict[str, str], found: Recognised, table: Table) -> list[str]:
     """The map of columns, without those that need no entry; a covariate without unit is left out."""
-    needed = {table.header(name): target for name, target in columns.items() if table.header(name) != target}
+    targets = {**columns, **found.inputs}
+    needed = {table.header(name): target for name, target in targets.items() if table.header(name) != target}
     bare = [name for name in found.unknown if is_covariate(name) and not table.units[name]]
     lines = [f"# Orientation: {text}." for name, text in _ORIENTATION.items() if name in found.pose]
     if not needed and not bare:
@@ -149,6 +151,7 @@ def _column_lines(columns: dict[str, str], found: Recognised, table: Table) -> l
 
 def _other_lines(found: Recognised, table: Table) -> list[str]:
     inputs = [name for name in found.unknown if is_covariate(name) and table.units[name]]
+    inputs += [target.partition("[")[0] for target in found.inputs.values()]
     ignored = [name for name in found.unknown if not is_covariate(name)]
     lines = [f"# Inputs beside the joints, by their names: {', '.join(inputs)}."] if inputs else []
     if ignored:

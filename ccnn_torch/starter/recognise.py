@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +20,10 @@ __all__ = ["Recognised", "recognise", "suitable_mechanisms", "unit_pair"]
 
 _JOINT = re.compile(r"(q|j|a|joint|axis|achse|theta)0*(\d+)")
 _POSITION = {"x", "y", "z"}
+# Names of conditions in German, French, Italian and Spanish; taken only where unit and values fit, too.
+_TIME = re.compile(r"(mess)?(zeit|time|temps|tempo|tiempo)")
+_TEMPERATURE = re.compile(r".*(temp|temperatura?|temperature|température)")
+_DIRECTION = re.compile(r"(?:anfahrt|(?:anfahr|dreh|fahr)?richtung|sens|direzione|dirección|sentido)[a-z]?0*(\d+)")
 # Usual names -> names of this package; only as a complete set, because a single letter is ambiguous.
 _TURNS = (
     (("rx", "ry", "rz"), ("rx", "ry", "rz")),
@@ -40,11 +44,13 @@ class Recognised:
         meaning: name in the file -> our name, joints first.
         joints: how many joints.
         unknown: names in the file that mean nothing here.
+        inputs: name in the file -> our header of a time, a temperature and directions under another name.
     """
 
     meaning: dict[str, str]
     joints: int
     unknown: list[str] = field(default_factory=list)
+    inputs: dict[str, str] = field(default_factory=dict)
 
     @property
     def pose(self) -> set[str]:
@@ -79,7 +85,29 @@ def recognise(table: Table) -> Recognised:
         if all(plain in by_plain for plain in plains):
             meaning |= dict(zip((by_plain[plain] for plain in plains), ours, strict=True))
             break
-    return Recognised(meaning, len(family), [name for name in table.names if name not in meaning])
+    inputs = _inputs(table, {name: plain for name, plain in folded.items() if name not in meaning}, len(family))
+    known = meaning.keys() | inputs.keys()
+    return Recognised(meaning, len(family), [name for name in table.names if name not in known], inputs)
+
+
+def _inputs(table: Table, folded: Mapping[str, str], joints: int) -> dict[str, str]:
+    """The one time, the one temperature, and a direction (-1, 0 or 1) of every joint; folded: name -> plain name."""
+    found = {}
+    for ours, pattern, kind in (("time", _TIME, "s"), ("temperature", _TEMPERATURE, "K")):
+        there = [
+            name for name, plain in folded.items() if pattern.fullmatch(plain) and _kind(table.units[name]) == kind
+        ]
+        if len(there) == 1 and ours not in table:
+            found[there[0]] = f"{ours}[{table.units[there[0]]}]"
+    matches = {name: _DIRECTION.fullmatch(plain) for name, plain in folded.items()}
+    signs = sorted((int(match[1]), name) for name, match in matches.items() if match and _is_sign(table, name))
+    if [k for k, _ in signs] == [*range(1, joints + 1)] and not any(f"direction{k}" in table for k, _ in signs):
+        found |= {name: f"direction{k}[1]" for k, name in signs}
+    return found
+
+
+def _is_sign(table: Table, name: str) -> bool:
+    return table.units[name] in ("", "1", "-") and bool(np.isin(table.raw(name), (-1.0, 0.0, 1.0)).all())
 
 
 def suitable_mechanisms(found: Recognised, table: Table) -> list[str]:
@@ -106,6 +134,11 @@ def unit_pair(text: str) -> dict[str, str]:
     if len(parts) != 2 or [_kind(part) for part in parts] != ["m", "rad"]:
         raise InputError(f"--units {text}: write the unit of lengths and that of angles, e.g. mm,deg or m,rad")
     return {"m": parts[0], "rad": parts[1], "1": "1"}
+
+
+def is_unit(text: str) -> bool:
+    """Whether a unit is there and known."""
+    return bool(text) and _kind(text) is not None
 
 
 def is_covariate(name: str, patterns: Sequence[str] = DEFAULT_COVARIATES) -> bool:

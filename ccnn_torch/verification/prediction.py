@@ -17,6 +17,7 @@ from ccnn_torch.mechanisms import Mechanism, PoseError, SerialArm, load_mechanis
 from ccnn_torch.plugins import code_refused
 from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.records import Records
+from ccnn_torch.records.headers import columns_there
 from ccnn_torch.records.sources import read_source
 from ccnn_torch.verification.moved_frame import Motion
 
@@ -62,12 +63,9 @@ def nominal_mechanism(model: LoadedModel | IdentifiedGeometry, spec: str | None,
 
 def mapped_columns(model: LoadedModel | IdentifiedGeometry, records: Any) -> dict[str, str]:
     """The map of columns that the model's run had, as far as the new rows have these headers."""
-    known = {} if isinstance(model, IdentifiedGeometry) else model.card.get("columns") or {}
-    if not known or isinstance(records, Records):
+    if not model.columns or isinstance(records, Records):
         return {}
-    table = read_source(records)
-    there = {*table.names, *(table.header(name) for name in table.names)}
-    return {header: meaning for header, meaning in known.items() if header in there}
+    return columns_there(read_source(records).units, model.columns)
 
 
 def predict(model: LoadedModel | IdentifiedGeometry, machine: Mechanism, records: Records, compensated: bool) -> Rows:

@@ -19,6 +19,7 @@ from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge
 from ccnn_torch.effects import Situation, default_gravity
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
 Mistake = Callable[[Situation, Tensor], tuple[Situation, Tensor]]
 
@@ -43,6 +44,11 @@ def _shuffled(pose: Tensor) -> Tensor:
     return pose[torch.randperm(len(pose), generator=torch.Generator().manual_seed(0))]
 
 
+def _from_a_tracker(pose: Tensor) -> Tensor:
+    turn = rotation_vector_to_matrix(torch.tensor([0.1, -0.2, 1.3], dtype=torch.float64))
+    return pose @ turn.mT + torch.tensor([2.0, 1.0, -0.5], dtype=torch.float64)
+
+
 @pytest.mark.parametrize(
     ("machine", "mistake", "said"),
     [
@@ -64,6 +70,11 @@ def _shuffled(pose: Tensor) -> Tensor:
         ("five_bar", _poses(_shuffled), "joints and pose of a row belong together"),
         ("tripod", _poses(lambda pose: pose * torch.tensor([1.0, 1.0, 180 / math.pi])), "angles .* in degrees"),
         ("delta_linear", _joints(lambda joints: joints * 1000), "the joints seem to be in millimetres under m"),
+        (
+            "delta",
+            _poses(_from_a_tracker),
+            "seen from a frame .*=framed 'mechanism_keys={mechanism: delta}'",
+        ),
     ],
 )
 def test_rows_of_another_model_are_refused_and_the_mistake_named(machine: str, mistake: Mistake, said: str) -> None:

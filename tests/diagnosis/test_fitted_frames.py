@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
+from torch import Tensor
 
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.diagnosis.from_records import situation_of
 from ccnn_torch.diagnosis.outputs import write_corrected
 from ccnn_torch.effects import Acting, make_effect, reached
-from ccnn_torch.mechanisms import SerialArm, load_mechanism
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import Framed, SerialArm, load_mechanism
+from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import load_records
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"
 NOISE = 5e-5
+Change = Callable[[Tensor], Tensor]
+
+
+def _same(values: Tensor) -> Tensor:
+    return values
 
 
 def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_the_tool(tmp_path: Path) -> None:
@@ -23,6 +33,12 @@ def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_th
     assert isinstance(arm, SerialArm)
     records = load_records(DATA / "ur10_b_500.csv", arm, learns=False)
     measured_about = situation_of(records, arm)
+    # Down is along the arm's own base, wherever the measuring device stands.
+    assert measured_about.parameters is not None
+    base = rotation_vector_to_matrix(measured_about.parameters[3:6])
+    torch.testing.assert_close(
+        base.mT @ measured_about.gravity, torch.tensor([0.0, 0.0, -9.80665], dtype=torch.float64)
+    )
     effect = make_effect("geometry")
     coefficients = effect.coefficients(measured_about)
     g = torch.Generator().manual_seed(3)
@@ -49,3 +65,44 @@ def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_th
         corrected = load_mechanism(str(tmp_path / name))
         far = corrected.pose_error(pose, corrected.forward_kinematics(situation.joints)).position
         assert float(far.square().mean().sqrt()) < 1.1 * NOISE * 3**0.5, name
+
+
+def _reversed_second(joints: Tensor) -> Tensor:
+    return joints * torch.tensor([1.0, -1, 1, 1, 1, 1], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("joints", "pose", "said"),
+    [
+        (_same, lambda pose: 1000 * pose, "the pose's lengths seem to be in millimetres under m"),
+        (_same, lambda pose: pose.roll(1, 0), "the poses seem to be one row late"),
+        (_reversed_second, _same, "joint q2 seems to count in the other direction"),
+        (_same, lambda pose: pose.flip(0), "check the units, the order"),
+    ],
+)
+def test_a_mistake_is_named_beside_frames_that_nobody_knows(joints: Change, pose: Change, said: str) -> None:
+    """Measured in position: frames fitted to the mistaken rows hide how each is off, so that they are fitted anew."""
+    arm = load_mechanism(str(DATA / "ur10.yaml"))
+    records = load_records(DATA / "ur10_b_500.csv", arm, learns=False)
+    here = replace(records, orientation="none", pose_coordinates=records.pose_coordinates[:3])
+    wrong = replace(here, joints=joints(records.joints[:60]), pose=pose(records.pose[:60, :3]))
+    with pytest.raises(InputError, match=said):
+        situation_of(wrong, arm)
+
+
+def test_the_base_of_a_framed_machine_is_fitted_first_without_outliers() -> None:
+    """The machine inside has its own keys, and its parameters as they were; simulated with a frame of its own."""
+    machine = load_mechanism("framed", mechanism="delta", keys={"base": 0.18, "crank": 0.26})
+    assert machine.describe()["keys"]["mechanism"]["keys"] == {"base": 0.18, "crank": 0.26}
+    assert isinstance(machine, Framed) and machine.unknown_frames == ("base",)
+    base = torch.tensor([2.0, 1.0, -0.5, 0.1, -0.2, 1.3], dtype=torch.float64)
+    truth = torch.cat([base, machine.nominal[6:]])
+    at = machine.mechanism.sample_workspace(60, torch.Generator().manual_seed(0))
+    joints = machine.mechanism.solve_inverse(at)
+    pose = machine.forward_kinematics(joints, truth)
+    pose[::9] += 0.2
+    found = machine.inlying_frames(joints, pose, torch.ones(2, 60, dtype=torch.float64))
+    torch.testing.assert_close(found, truth.expand(2, -1), rtol=0, atol=1e-8)
+    assert machine.with_nominal(found[0]).unknown_frames == ()
+    with pytest.raises(InputError, match="base is true or false"):
+        load_mechanism("framed", mechanism="delta", base=0.18)

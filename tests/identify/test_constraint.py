@@ -234,5 +234,8 @@ def test_given_noise_and_a_fixed_tool_are_kept() -> None:
 def test_rows_of_another_machine_are_one_sentence() -> None:
     """The singular value decomposition behind a plate's start met NaN: joints of an arm have no pose of a five-bar."""
     config = load_identify_config(SOCKETS, ["mechanism=five_bar"])
+    with pytest.raises(InputError, match="a column 'q3', and the machine has 2 joints"):
+        identify(config)
+    config = load_identify_config(SOCKETS, ["mechanism=five_bar", "columns={q3: ignore}"])
     with pytest.raises(InputError, match=r"row \d+: mechanism 'five_bar' .* is out of reach at q1 = "):
         identify(config)

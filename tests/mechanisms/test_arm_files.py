@@ -1,5 +1,7 @@
 """Geometry files with a mistake: one sentence that names the file, the key or joint, and what would be right."""
 
+import re
+
 import pytest
 import torch
 from catalogue import PANDA, UR10, URDF
@@ -93,6 +95,14 @@ def test_urdf_mistakes(tmp_path, old, new, said):
     with pytest.raises(InputError, match=said) as caught:
         load_mechanism(str(path))
     assert "arm.urdf" in str(caught.value)
+
+
+@pytest.mark.parametrize("tip", [None, "gripper"])
+def test_a_joint_that_a_urdf_lacks_is_missed(tmp_path, tip):
+    path = tmp_path / "arm.urdf"
+    path.write_text(re.sub(r'<joint name="lift".*?</joint>', "", URDF, flags=re.DOTALL))
+    with pytest.raises(InputError, match=r"no joint leads to link '.+', so that the chain is in 2 pieces: a joint is"):
+        read_urdf(str(path), tip=tip)
 
 
 def test_urdf_branches_ask_for_the_tip(tmp_path):

@@ -12,7 +12,7 @@ from ccnn_torch.calibration.rows.dataset import Dataset, pad_rows
 from ccnn_torch.compensation import Geometry, default_limit, fit_geometry_module, geometric_deviation, settled_damping
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry
-from ccnn_torch.mechanisms import Mechanism, SerialArm, fit_frames, judge_frames
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, fit_frames, judge_frames
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
@@ -106,7 +106,11 @@ def fit_machine(mechanism: Mechanism, records: Records, splits: list[Split], ide
         notes += judge_frames(arm, *about)
         frames = " and ".join(arm.unknown_frames)
         notes.append(f"Frames fitted first, on the training rows of each repeat: {frames}.")
-    if identify or (parameters is not None and not grouped):
+    elif isinstance(mechanism, Framed) and mechanism.unknown_frames:
+        parameters = mechanism.inlying_frames(records.joints, records.pose, weights).unsqueeze(-2)
+        frames = " and ".join(mechanism.unknown_frames)
+        notes.append(f"Frames fitted first, on the training rows of each repeat: {frames}.")
+    if identify or (arm is not None and parameters is not None and not grouped):
         start = mechanism.nominal.expand(len(splits), -1) if parameters is None else parameters.squeeze(-2)
         geometry = fit_geometry(mechanism, records.joints, records.pose, start, weights).unsqueeze(-2)
     if identify:

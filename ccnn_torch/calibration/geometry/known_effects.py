@@ -17,7 +17,7 @@ from ccnn_torch.display import short_path
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, measured_pose, reached
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry
-from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
 from ccnn_torch.mechanisms.frames.fit import fit_frames
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.records import Records
@@ -203,6 +203,8 @@ def _fitted(
         without = _without(here, records.pose, acting)
         if identify:
             values = fit_geometry(mechanism, records.joints, without, mechanism.nominal, weights)
+        elif isinstance(mechanism, Framed):
+            values = mechanism.inlying_frames(records.joints, without, weights)
         else:
             assert isinstance(mechanism, SerialArm)
             values = fit_frames(mechanism, records.joints, without, weights, columns=records.columns)

@@ -40,13 +40,17 @@ class IdentifiedGeometry:
         nominal, identified: the mechanism with either geometry.
         joints, covariates, pose: coordinates in order; geometry has no covariates.
         facts: `mechanism`: the nominal one's description.
+        columns: the map of columns that its records had: header in a file -> ``name[unit]`` or ``ignore``.
     """
 
-    def __init__(self, path: Path, nominal: Mechanism, identified: Mechanism) -> None:
+    def __init__(
+        self, path: Path, nominal: Mechanism, identified: Mechanism, columns: dict[str, str] | None = None
+    ) -> None:
         """Take both geometries of one mechanism."""
         self.path, self.nominal, self.identified = path, nominal, identified
         self.joints: tuple[Coordinate, ...] = nominal.joints
         self.pose: tuple[Coordinate, ...] = nominal.pose
+        self.columns = columns or {}
         self.covariates: tuple[Coordinate, ...] = ()
         self.facts: dict[str, Any] = {"mechanism": nominal.describe()}
 
@@ -105,7 +109,7 @@ def load_geometry(
         check_signature(source, content, b"", public_key)
     file = _parsed(path, source, content)
     nominal, identified = (mechanism_of_file(file, what, allow_code) for what in ("nominal", "value"))
-    return IdentifiedGeometry(path, nominal, identified)
+    return IdentifiedGeometry(path, nominal, identified, file.columns)
 
 
 def load_compensation(

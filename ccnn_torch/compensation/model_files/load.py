@@ -94,6 +94,11 @@ class LoadedModel:
         return {name: value.reshape((*lead, *value.shape[1:])) for name, value in checked.items()}
 
     @property
+    def columns(self) -> dict[str, str]:
+        """The map of columns that its run had: header in a file -> ``name[unit]`` or ``ignore``."""
+        return dict(self.card.get("columns") or {})
+
+    @property
     def middle(self) -> Array:
         """Middle of the domain's joints, `n` [SI]; where a search for joints begins."""
         edges = [self.facts["domain"]["inputs"][c.name] for c in self.joints]

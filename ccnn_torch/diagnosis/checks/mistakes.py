@@ -9,12 +9,13 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
+from ccnn_torch.diagnosis.checks.misplaced import frame_remedy, placed
 from ccnn_torch.diagnosis.residual.distance import USUAL, Size, distance
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.effects import Situation
 from ccnn_torch.mechanisms import BlackBox, Framed
 
-__all__ = ["late_rows", "mistake"]
+__all__ = ["late_rows", "mistake", "what_is_wrong"]
 
 # A mistake is named where without it so small a share of the distance is left.
 _MENDED = 0.1
@@ -28,17 +29,27 @@ _UNREACHED = 10.0
 _TURN = 180 / torch.pi
 
 
-def mistake(situation: Situation, measured: Tensor, size: Size) -> str:
-    """The mistake, of those often made, without which model and rows would agree, in words; empty for none."""
+def what_is_wrong(situation: Situation, measured: Tensor, size: Size) -> str:
+    """What would make model and rows agree if it were put right, with unknown frames fitted anew; empty for nothing."""
+    return (
+        late_rows(situation, measured, size, anew=True)
+        or mistake(situation, measured, size, anew=True)
+        or frame_remedy(situation, measured, size)
+    )
+
+
+def mistake(situation: Situation, measured: Tensor, size: Size, anew: bool = False) -> str:
+    """The mistake, of those often made, without which model and rows would agree, in words; empty for none.
+
+    With `anew` unknown frames are fitted to the rows without each of them.
+    """
     rows = torch.linspace(0, len(measured) - 1, min(_FEW, len(measured))).round().long()
     here, poses = picked(situation, rows), measured[rows]
     # A row that the machine does not reach is off by its whole workspace, and more.
-    before = float(distance(here, poses, size).nan_to_num(nan=_UNREACHED).median())
+    before = float(_far(here, poses, size).median())
     found = []
     for words, other, there in _mistakes(here, poses):
-        left = float(
-            distance(replace(other, guess=_guess(other, there)), there, size).nan_to_num(nan=_UNREACHED).median()
-        )
+        left = float(_far(other, there, size, anew).median())
         if left < min(_MENDED * before, USUAL):
             found.append((left, words))
     # On a machine that is its own mirror image two mistakes may come to the same.
@@ -46,16 +57,15 @@ def mistake(situation: Situation, measured: Tensor, size: Size) -> str:
     return ", or ".join(words for left, words in found if left <= _ALIKE * least)
 
 
-def late_rows(situation: Situation, measured: Tensor, size: Size) -> str:
-    """Poses that belong to the row before or after, in words; empty where there are none."""
-    before = distance(situation, measured, size).nan_to_num(nan=_UNREACHED)
+def late_rows(situation: Situation, measured: Tensor, size: Size, anew: bool = False) -> str:
+    """Poses that belong to the row before or after, in words; empty where there are none; anew: as for `mistake`."""
+    before = _far(situation, measured, size)
     far = before > _MENDED * USUAL
     if int(far.sum()) < _FEWEST_LATE:
         return ""
     for step, word in ((-1, "late"), (1, "early")):
         shifted = measured.roll(step, 0)
-        other = replace(situation, guess=_guess(situation, shifted))
-        left = distance(other, shifted, size).nan_to_num(nan=_UNREACHED)
+        left = _far(situation, shifted, size, anew)
         if float(left[far].median()) < _MENDED * min(float(before[far].median()), USUAL):
             first = int(torch.nonzero(far)[0])
             return (
@@ -102,7 +112,7 @@ def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Sit
     if inner is mechanism and bool(turns.any()):
         corrected = torch.where(turns, inner.nominal / _TURN, inner.nominal)
         words = "the angles of the model seem to be in degrees under rad: look at the units in its file"
-        yield words, replace(situation, parameters=corrected), measured
+        yield words, replace(situation, mechanism=mechanism.with_nominal(corrected), parameters=None), measured
     at = situation.joints
     for i, k in combinations(range(len(joints)), 2):
         if joints[i].unit == joints[k].unit:
@@ -120,8 +130,11 @@ def _mistakes(situation: Situation, measured: Tensor) -> Iterator[tuple[str, Sit
         yield f"the joints seem to be in {words}", replace(situation, joints=scaled), measured
 
 
-def _guess(situation: Situation, measured: Tensor) -> Tensor | None:
-    return None if situation.guess is None else measured
+def _far(situation: Situation, measured: Tensor, size: Size, anew: bool = False) -> Tensor:
+    """Distance of each row, `s` [1]; one that is not reached counts as some sizes of the machine."""
+    other = placed(situation, measured) if anew else situation
+    other = replace(other, guess=None if situation.guess is None else measured)
+    return distance(other, measured, size).nan_to_num(nan=_UNREACHED)
 
 
 def _reversed(values: Tensor, i: int) -> Tensor:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.checks.mistakes import late_rows, mistake
+from ccnn_torch.diagnosis.checks.mistakes import late_rows, mistake, what_is_wrong
 from ccnn_torch.diagnosis.residual.distance import USUAL, distance, size_of
 from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.effects import Situation
@@ -56,7 +56,7 @@ def plausible_rows(situation: Situation, measured: Tensor) -> PlausibleRows:
         raise RowsError(
             f"{int((~reached).sum())} of {len(far)} rows are outside the reach of {situation.mechanism.name}; "
             + (
-                mistake(situation, measured, size)
+                what_is_wrong(situation, measured, size)
                 or "check the units, the order of the joints, and that this is the machine"
             )
         )
@@ -66,7 +66,7 @@ def plausible_rows(situation: Situation, measured: Tensor) -> PlausibleRows:
             f"the usual pose lies {usual:.3g} times as far from where {situation.mechanism.name} puts it as its poses "
             "are spread over the workspace, so that these rows are not of this model; "
             + (
-                mistake(situation, measured, size)
+                what_is_wrong(situation, measured, size)
                 or "check the units, the order and signs of joints and pose, the frame that the pose is given in, and "
                 "that joints and pose of a row belong together"
             )

@@ -5,13 +5,18 @@ from __future__ import annotations
 import json
 import os
 import shlex
+from dataclasses import replace
 from pathlib import Path
+
+import torch
+from torch import Tensor
 
 from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.diagnosis.from_file import Verdict, one_row_at_a_time, read_verdict
 from ccnn_torch.diagnosis.result import Diagnosis
-from ccnn_torch.effects import OUTLIER, Situation
+from ccnn_torch.effects import OUTLIER, Acting, Situation, reached
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import BlackBox
 
 __all__ = ["compensate_lines", "typed_path"]
 
@@ -39,7 +44,8 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
         named.on(situation)
         keys["effects"] = f"from:{typed_path(str(path))}"
         sentence = "These lines put the effects and a network on what they leave in a compensator and correct targets."
-        covariates = _outlasting(named, situation) or covariates
+        needed = _outlasting(named, situation)
+        covariates = covariates if needed is None else needed
     except InputError as reason:
         # What is wrong without the file and the remedy, which the lines are themselves.
         why = str(reason).removeprefix(f"{path}: ").partition(";")[0]
@@ -53,15 +59,28 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
 
 
 def _outlasting(named: Verdict, situation: Situation) -> list[str] | None:
-    """The inputs of a model that holds on other days: without the time, where the effects do not need it."""
+    """The inputs without which the effects change; all but the time where something is beside them, for a network."""
     alone = one_row_at_a_time(situation)
-    if "time" not in situation.covariates:
-        return None
     try:
-        named.on(alone)
+        before = _acted(named, alone)
     except InputError:
         return None
-    return [*alone.covariates]
+    if named.outside or isinstance(situation.machine, BlackBox):
+        return [*alone.covariates] if "time" in situation.covariates else None
+    kept = dict(alone.covariates)
+    for name in alone.covariates:
+        fewer = {n: v for n, v in kept.items() if n != name}
+        try:
+            same = torch.equal(_acted(named, replace(alone, covariates=fewer)).nan_to_num(), before.nan_to_num())
+        except InputError:
+            continue
+        kept = fewer if same else kept
+    return [*kept]
+
+
+def _acted(named: Verdict, situation: Situation) -> Tensor:
+    """Poses of the rows under the effects, `s x c`."""
+    return reached(situation, [Acting(one.effect, one.shape, one.coefficients) for one in named.on(situation)[0]])
 
 
 def _records(config: DiagnoseConfig) -> str:

@@ -5,6 +5,7 @@ keys: {}
 parameters:
   A1x: {value: -0.5057, nominal: -0.5, unit: m}
   …
+columns: {A1: "q1[deg]"}   # where the records had other headers
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _FORM = "a mechanism file has mechanism, keys and parameters: {NAME: {value: …
 
 
 class MechanismFile:
-    """A mechanism file; `recipe` builds the mechanism, `values` and `nominal` are its parameters by name."""
+    """A mechanism file: `spec` and `keys` build the mechanism, `columns` are the headers that its records mapped."""
 
     def __init__(self, path: str, content: Mapping[str, Any]) -> None:
         """Check the form; names and units are checked against the mechanism by `parameters_of`."""
@@ -31,7 +32,10 @@ class MechanismFile:
         spec, keys, parameters = (content.get(k) for k in ("mechanism", "keys", "parameters"))
         if not isinstance(spec, str) or not isinstance(keys, Mapping) or not isinstance(parameters, Mapping):
             raise InputError(f"{path}: {_FORM}")
-        self.spec, self.keys = spec, dict(keys)
+        columns = content.get("columns") or {}
+        if not isinstance(columns, Mapping) or not all(isinstance(v, str) for pair in columns.items() for v in pair):
+            raise InputError(f"{path}: columns: must map headers to name[unit], e.g. {{A1: 'q1[deg]'}}")
+        self.spec, self.keys, self.columns = spec, dict(keys), dict(columns)
         self._entries: Mapping[str, Any] = parameters
 
     def parameters_of(self, mechanism: Mechanism, what: str) -> dict[str, float]:
@@ -68,11 +72,12 @@ def read_mechanism_file(path: str, content: bytes | None = None) -> MechanismFil
     return MechanismFile(path, tree)
 
 
-def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float]) -> str:
+def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float], columns: Mapping[str, str] | None = None) -> str:
     """A mechanism file's text; `load_mechanism` of it gives the same mechanism with the same parameters, bit by bit.
 
     Args:
         nominal: what was there before, by name [SI].
+        columns: the headers that its records mapped.
     """
     about = mechanism.describe()
     tree = {
@@ -82,5 +87,6 @@ def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float]) -> str:
             p.name: {"value": about["parameters"][p.name], "nominal": nominal[p.name], "unit": p.unit}
             for p in mechanism.geometry
         },
+        **({"columns": dict(columns)} if columns else {}),
     }
     return dump_yaml(tree, width=120)

@@ -119,6 +119,8 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
     for link in (base, tip):
         if link is not None and link not in known:
             raise InputError(f"{path}: has no link '{link}'; it has {', '.join(known)}")
+    if base is None:
+        _refuse_pieces(path, known, joints)
     if tip is None:
         tips = [link for link in known if link in parent_joint and link not in parents]
         if len(tips) != 1:
@@ -136,6 +138,20 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
     if base is not None and link != base:
         raise InputError(f"{path}: link '{tip}' does not hang on link '{base}'; give another base= or tip=")
     return chain[::-1]
+
+
+def _refuse_pieces(path: str, known: list[str], joints: list[Element]) -> None:
+    """Refuse links that hang in several trees with joints that move: the joint between them is missing."""
+    above = {_link(path, j, "child"): _link(path, j, "parent") for j in joints}
+    roots = {_link(path, j, "parent") for j in joints if j.get("type") in _MOVING}
+    for _ in joints:
+        roots = {above.get(link, link) for link in roots}
+    pieces = [link for link in known if link in roots]
+    if len(pieces) > 1:
+        raise InputError(
+            f"{path}: no joint leads to link '{pieces[1]}', so that the chain is in {len(pieces)} pieces: a joint is "
+            f"missing; add it, or give base={pieces[1]} where the piece from there is meant"
+        )
 
 
 def _link(path: str, joint: Element, role: str) -> str:

@@ -12,7 +12,13 @@ from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.mechanism import Mechanism
 
 
-def write_machine(mechanism: Mechanism, nominal: Mapping[str, float], folder: Path, stem: str) -> list[Path]:
+def write_machine(
+    mechanism: Mechanism,
+    nominal: Mapping[str, float],
+    folder: Path,
+    stem: str,
+    columns: Mapping[str, str] | None = None,
+) -> list[Path]:
     """Write `STEM.yaml`, of a serial arm also `STEM.urdf` and, where it is one of DH parameters, `STEM_dh.yaml`.
 
     Args:
@@ -20,8 +26,9 @@ def write_machine(mechanism: Mechanism, nominal: Mapping[str, float], folder: Pa
         nominal: what was there before, by name [SI].
         folder: where to.
         stem: of the files' names.
+        columns: the headers that its records mapped.
     """
-    texts = {f"{stem}.yaml": mechanism_text(mechanism, nominal)}
+    texts = {f"{stem}.yaml": mechanism_text(mechanism, nominal, columns)}
     if isinstance(mechanism, SerialArm):
         texts[f"{stem}.urdf"] = urdf_text(mechanism)
         if mechanism.convention != "urdf":

@@ -18,6 +18,7 @@ from ccnn_torch.mechanisms.newton import carry_derivative
 from ccnn_torch.mechanisms.pose import Frame, frame_gap
 from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
+from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation, rotation_vector_to_matrix, skew
 
 _FRAME = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))
@@ -38,6 +39,12 @@ class Framed(Mechanism):
         mechanism: a copy of the mechanism, without hooks.
         rotation_weight: [m/rad].
     """
+
+    @property
+    def unknown_frames(self) -> tuple[str, ...]:
+        """The frames that are to be fitted to rows first: all, as long as they are nominally the identity."""
+        base, _, tool = self._split(self.nominal)
+        return () if bool(base.any() or tool.any()) else ("base",) * self.base + ("tool",) * self.tool
 
     def __init__(
         self, mechanism: Mechanism, base: bool = True, tool: bool = False, rotation_weight: float = 0.04
@@ -157,12 +164,25 @@ class Framed(Mechanism):
         """As of the mechanism inside."""
         return self.mechanism.lacking(conditions)
 
-    def fitted_frames(self, joints: Tensor, measured: Frame) -> Tensor:
+    def inlying_frames(self, joints: Tensor, pose: Tensor, weights: Tensor | None = None) -> Tensor:
+        """As `fitted_frames` to the rows that are no gross outliers; weights: `... x s`, 0 leaves a row out."""
+        weights = torch.ones(joints.shape[:-1], dtype=joints.dtype) if weights is None else weights
+        fine = weights
+        for _ in range(3):
+            values = self.fitted_frames(joints, self.frame(pose), fine)
+            error = self.pose_error(self.forward_kinematics(joints, values[..., None, :], pose), pose)
+            turned = 0.0 if error.rotation is None else self.rotation_weight * error.rotation
+            length = torch.hypot(error.position, torch.as_tensor(turned, dtype=joints.dtype)).nan_to_num(nan=torch.inf)
+            fine = weights * inlying(length, weights > 0, len(self.pose), 6 * (self.base + self.tool))
+        return values
+
+    def fitted_frames(self, joints: Tensor, measured: Frame, weights: Tensor | None = None) -> Tensor:
         """Closed-form frames between the nominal mechanism's poses of the joints and measured ones.
 
         Args:
             joints: `... x s x n` [SI].
             measured: position `... x s x 3` [m] and rotation `... x s x 3 x 3` (or None).
+            weights: `... x s` [1]; all 1 when None.
 
         Returns:
             All parameters, `... x k` [SI], the mechanism's own nominal. Where fewer than three joints have a pose all
@@ -175,11 +195,12 @@ class Framed(Mechanism):
         for _ in range(2):
             position, rotation = self.mechanism.frame(self.mechanism.forward_kinematics(joints, inner, guess))
             known = torch.isfinite(position).all(-1)
+            weighed = known.to(position.dtype) if weights is None else known * weights
             here = torch.where(known[..., None], position, 0.0), rotation
             if rotation is not None:
                 here = here[0], torch.where(known[..., None, None], rotation, torch.eye(3, dtype=rotation.dtype))
-            enough = (known.sum(-1) >= 3)[..., None]
-            found = self._frames_between(here, measured, torch.where(enough, known, True).to(position.dtype))
+            enough = ((weighed > 0).sum(-1) >= 3)[..., None]
+            found = self._frames_between(here, measured, torch.where(enough, weighed, 1.0))
             values = torch.where(enough, found, self.nominal)
             guess = self.mechanism.pose_near(*self._unframed(measured, values[..., None, :]))
         return values.detach()
