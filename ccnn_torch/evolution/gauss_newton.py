@@ -21,7 +21,7 @@ from ccnn_torch.numerics.blocks import blocks
 __all__ = ["Linearised", "Network", "dense_jacobian", "linearise", "network_of", "residual"]
 
 # Bytes of rows that are worked on at a time: what the caches of one core hold, measured with 6 and 24 networks.
-_CACHED = 1 << 26
+_CACHED = 1 << 25
 
 
 @dataclass(frozen=True)
@@ -247,7 +247,9 @@ def _numbers_a_row(network: Network, channels: int) -> int:
     """About how many numbers `_summed` holds for a row of one network."""
     flowing = sum(mask.shape[-2] * (channels + 1) + mask.shape[-1] + 1 for mask in network.masks)
     outputs, ins = network.masks[-1].shape[-2], network.masks[-1].shape[-1] + 1
-    inner = sum(part.shape[-1] for part in (*network.kept[: len(network.masks) - 1], *network.kept[len(network.masks) :]))
+    inner = sum(
+        part.shape[-1] for part in (*network.kept[: len(network.masks) - 1], *network.kept[len(network.masks) :])
+    )
     return flowing + (3 * channels + outputs) * inner + outputs * (outputs + 1) // 2 * ins
 
 

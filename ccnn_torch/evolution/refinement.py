@@ -226,8 +226,9 @@ def step_refinement(
     weights, damping, kept = state.weights, state.damping, problem.network.kept_flat
     reached = before
     todo = torch.arange(len(before), device=before.device)
-    for _ in range(problem.settings.trials):
-        damped = matrix[todo] + torch.diag_embed(diagonal[todo] * damping[todo].unsqueeze(-1))
+    for trial in range(problem.settings.trials):
+        damped = matrix[todo]
+        damped.diagonal(dim1=-2, dim2=-1).add_(diagonal[todo] * damping[todo].unsqueeze(-1))
         root, failed = torch.linalg.cholesky_ex(damped)
         step = torch.cholesky_solve(gradient[todo].unsqueeze(-1), root).squeeze(-1)
         candidate = state.weights[todo].scatter_add(1, kept[todo], -step)
@@ -235,7 +236,10 @@ def step_refinement(
         good = (failed == 0) & (after < before[todo])
         weights = weights.index_copy(0, todo, torch.where(good.unsqueeze(-1), candidate, weights[todo]))
         reached = reached.index_copy(0, todo, torch.where(good, after, reached[todo]))
-        damping = damping.index_copy(0, todo, torch.where(good, damping[todo] / 10, damping[todo] * 10))
+        # A damping found by trial stays; only one that was right at once may be more than is needed.
+        damping = damping.index_copy(
+            0, todo, torch.where(good, damping[todo] / (1 if trial else 10), damping[todo] * 10)
+        )
         # The host waits for the device here, once a trial: most iterations need one, and none takes up the others.
         todo = todo[~good]
         if len(todo) == 0:
@@ -298,7 +302,8 @@ def second_order(problem: RefinementProblem, state: RefinementState) -> SecondOr
     active = problem.network.active.gather(1, kept)
     prior = state.prior[:, problem.groups].gather(1, kept)
     gradient = local.gradient + torch.where(active, prior * state.weights.gather(1, kept), 0)
-    matrix = local.matrix + torch.diag_embed(torch.where(active, prior, 1))
+    matrix = local.matrix
+    matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(active, prior, 1))
     return SecondOrder(gradient, matrix, *torch.linalg.cholesky_ex(matrix))
 
 

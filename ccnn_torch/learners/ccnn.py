@@ -19,12 +19,16 @@ from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
 from ccnn_torch.evolution.waves import Waves
 from ccnn_torch.learners.protocol import TrainingData
+from ccnn_torch.learners.rows import thinned
 from ccnn_torch.learners.structure import MemberRows, Structure
 
 __all__ = ["CCNN", "CCNNSettings"]
 
-# A training with rows held out chooses the number of steps, and a longer one on all rows goes on from its networks.
-_CHOOSING = 3
+# A training with rows held out chooses the number of steps, and one on all rows goes on from its networks: both have a
+# third of the iterations of one that does it all.
+_SHORTER = 3
+# Rows enough to choose, evolve and search for periodic nodes by; the training that goes on sees them all.
+_ENOUGH = 1000
 
 
 class CCNN:
@@ -56,6 +60,8 @@ class CCNN:
         """Take the data and judge the random first generation."""
         settings = self.settings
         members = settings.members
+        if data.validation is not None:
+            data = thinned(data, _ENOUGH)
         self._gears = _gears(data, settings)
         if self._gears is not None:
             there = (data.weights > 0).unsqueeze(-1)
@@ -82,7 +88,7 @@ class CCNN:
         self._layers = settings.structures(targets.shape[-1])
         iterations = settings.refinement_iterations
         if data.validation is not None:
-            iterations = math.ceil(iterations / _CHOOSING)
+            iterations = math.ceil(iterations / _SHORTER)
         self._structures = [Structure(hidden, settings, rows, iterations) for hidden in self._layers]
 
     def step(self) -> dict[str, Tensor]:
@@ -189,8 +195,15 @@ class CCNN:
 
     def begin_from(self, state: dict[str, Tensor]) -> None:
         """Refine the networks of this state, found on fewer of the same rows in the same scaling; after `start`."""
-        for number, structure in enumerate(self._structures):
-            structure.begin_from(_of_structure(state, number))
+        parts = [_of_structure(state, number) for number in range(len(self._structures))]
+        # The structure that each repeat took; the other one's evidence is too far behind for some more rows to matter.
+        best = torch.stack(
+            [part["evidence"].sort(1, descending=True).values[:, : self.settings.kept].mean(1) for part in parts]
+        )
+        for number, (structure, part) in enumerate(zip(self._structures, parts, strict=True)):
+            structure.begin_from(
+                part, best.argmax(0) == number, math.ceil(self.settings.refinement_iterations / _SHORTER)
+            )
 
     @property
     def _evolved(self) -> bool:
