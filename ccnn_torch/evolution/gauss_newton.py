@@ -304,7 +304,7 @@ def _picked(network: Network, sums: _Sums, apart: bool) -> Linearised:
         count = outputs * (outputs + 1) // 2
         place = _pairs(outputs, readout.device)[-1].flatten()[(node * outputs).unsqueeze(-1) + node.unsqueeze(-2)]
     place = (signal * (count * ins)).unsqueeze(-1) + place * ins + signal.unsqueeze(-2)
-    across = sums.across.unflatten(1, (outputs, inner)).transpose(1, 2).flatten(2)
+    across = sums.across.unflatten(1, (outputs, inner)).transpose(1, 2).flatten(2)  # type: ignore[no-untyped-call]
     linear = network.linear
     active = network.active.gather(1, network.kept_flat).to(across.dtype)
     matrix = across.new_empty(len(active), linear + inner, linear + inner)
