@@ -226,7 +226,7 @@ def step_refinement(
     weights, damping, kept = state.weights, state.damping, problem.network.kept_flat
     reached = before
     todo = torch.arange(len(before), device=before.device)
-    for trial in range(problem.settings.trials):
+    for _ in range(problem.settings.trials):
         damped = matrix[todo]
         damped.diagonal(dim1=-2, dim2=-1).add_(diagonal[todo] * damping[todo].unsqueeze(-1))
         root, failed = torch.linalg.cholesky_ex(damped)
@@ -236,10 +236,7 @@ def step_refinement(
         good = (failed == 0) & (after < before[todo])
         weights = weights.index_copy(0, todo, torch.where(good.unsqueeze(-1), candidate, weights[todo]))
         reached = reached.index_copy(0, todo, torch.where(good, after, reached[todo]))
-        # A damping found by trial stays; only one that was right at once may be more than is needed.
-        damping = damping.index_copy(
-            0, todo, torch.where(good, damping[todo] / (1 if trial else 10), damping[todo] * 10)
-        )
+        damping = damping.index_copy(0, todo, torch.where(good, damping[todo] / 10, damping[todo] * 10))
         # The host waits for the device here, once a trial: most iterations need one, and none takes up the others.
         todo = todo[~good]
         if len(todo) == 0:

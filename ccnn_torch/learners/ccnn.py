@@ -24,9 +24,9 @@ from ccnn_torch.learners.structure import MemberRows, Structure
 
 __all__ = ["CCNN", "CCNNSettings"]
 
-# A training with rows held out chooses the number of steps, and one on all rows goes on from its networks: both have a
-# third of the iterations of one that does it all.
-_SHORTER = 3
+# A training with rows held out, which chooses the number of steps, has one in so many of a refinement's iterations; the
+# one on all rows goes on from its networks with the others.
+_CHOOSING = 3
 # Rows enough to choose, evolve and search for periodic nodes by; the training that goes on sees them all.
 _ENOUGH = 1000
 
@@ -88,7 +88,7 @@ class CCNN:
         self._layers = settings.structures(targets.shape[-1])
         iterations = settings.refinement_iterations
         if data.validation is not None:
-            iterations = math.ceil(iterations / _SHORTER)
+            iterations = math.ceil(iterations / _CHOOSING)
         self._structures = [Structure(hidden, settings, rows, iterations) for hidden in self._layers]
 
     def step(self) -> dict[str, Tensor]:
@@ -195,15 +195,13 @@ class CCNN:
 
     def begin_from(self, state: dict[str, Tensor]) -> None:
         """Refine the networks of this state, found on fewer of the same rows in the same scaling; after `start`."""
+        most, kept = self.settings.refinement_iterations, self.settings.kept
         parts = [_of_structure(state, number) for number in range(len(self._structures))]
-        # The structure that each repeat took; the other one's evidence is too far behind for some more rows to matter.
-        best = torch.stack(
-            [part["evidence"].sort(1, descending=True).values[:, : self.settings.kept].mean(1) for part in parts]
-        )
+        evidence = [part["evidence"].sort(1, descending=True).values[:, :kept].mean(1) for part in parts]
+        # Only the structure that each repeat took: a few rows more do not turn the evidence.
+        taken = torch.stack(evidence).argmax(0)
         for number, (structure, part) in enumerate(zip(self._structures, parts, strict=True)):
-            structure.begin_from(
-                part, best.argmax(0) == number, math.ceil(self.settings.refinement_iterations / _SHORTER)
-            )
+            structure.begin_from(part, taken == number, most - math.ceil(most / _CHOOSING))
 
     @property
     def _evolved(self) -> bool:
