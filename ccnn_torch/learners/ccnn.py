@@ -27,8 +27,9 @@ __all__ = ["CCNN", "CCNNSettings"]
 # A training with rows held out, which chooses the number of steps, has one in so many of a refinement's iterations; the
 # one on all rows goes on from its networks with the others.
 _CHOOSING = 3
-# Rows enough to choose, evolve and search for periodic nodes by; the training that goes on sees them all.
-_ENOUGH = 1000
+# Rows enough to choose, evolve and search for periodic nodes by; the training that goes on sees them all. With 1,000 of
+# 2,100 rows a tripod had 7 % more error.
+_ENOUGH = 3000
 
 
 class CCNN:
