@@ -149,7 +149,7 @@ def pose_refinement(
     there = rows > 0
     bias = weights[0].shape[-1] == masks[0].shape[-1] + 1
     slots = 0 if waves is None else waves.frequency.shape[-1]
-    groups = prior_groups([m.shape[-2:] for m in masks], bias, settings.groups, slots)
+    groups = prior_groups([m.shape[-2:] for m in masks], bias, slots)
     flat_metric = None
     if row_metric is not None:
         flat_metric = _flatten(row_metric, leading, 3).masked_fill(~there[..., None, None], 0)
@@ -333,8 +333,6 @@ def _noise(problem: RefinementProblem, state: RefinementState) -> Tensor:
     count = _row_count(problem)
     # More weights than rows may look determined at first; a channel keeps at least a tenth of its rows' freedom.
     free = torch.maximum(count - state.effective.sum(-1) / channels, count / 10).unsqueeze(-1)
-    if problem.settings.noise == "shared":
-        squares = squares.mean(-1, keepdim=True).expand_as(squares)
     return (free / squares.clamp_min(1e-300)).clamp(*_PRECISION_RANGE)
 
 

@@ -77,9 +77,7 @@ class Structure:
         self.evidence = torch.full_like(self.state.best_fitness, -torch.inf)
         self.passes = torch.zeros_like(self.evidence)
         self.refined = self._evolved()
-        groups = prior_groups(
-            [mask.shape[-2:] for mask in self.refined.masks], settings.bias, RefinementSettings().groups, self.slots
-        )
+        groups = prior_groups([mask.shape[-2:] for mask in self.refined.masks], settings.bias, self.slots)
         channels = outputs if rows.metric is None else rows.metric.shape[-2]
         batch, zeros = len(self.evidence), self.evidence.new_zeros
         self.precisions = Precisions(zeros(batch, int(groups.max()) + 1), zeros(batch, channels), zeros(batch))
