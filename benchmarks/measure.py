@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
-__all__ = ["Row", "compare", "seconds_of"]
+__all__ = ["Row", "compare", "operations", "seconds_of"]
 
 Call = Callable[[], Any]
 
@@ -61,6 +62,25 @@ def seconds_of(call: Call) -> float:
     return own + after.children_user - children.children_user + after.children_system - children.children_system
 
 
+def operations(call: Call) -> int:
+    """Floating point operations of one call: matrix products, factors and solutions of equations."""
+
+    def factor(shape: torch.Size, *_: Any, **__: Any) -> int:
+        return shape.numel() * shape[-1] // 3
+
+    def triangular(shape: torch.Size, right: torch.Size, *_: Any, **__: Any) -> int:
+        return right.numel() * shape[-1]
+
+    def both(right: torch.Size, *_: Any, **__: Any) -> int:
+        return 2 * right.numel() * right[-2]
+
+    aten = torch.ops.aten
+    known = {aten.linalg_cholesky_ex: factor, aten.linalg_solve_triangular: triangular, aten.cholesky_solve: both}
+    with FlopCounterMode(display=False, custom_mapping=known) as counted:
+        call()
+    return int(counted.get_total_flops())
+
+
 def compare(
     task: str,
     size: int,
@@ -77,7 +97,7 @@ def compare(
     Args:
         peers: by name what they do; (call, share) where they do a share of the task only.
         rounds: in each, ours and every peer are measured once, one after the other.
-        flops: floating point operations of the task in matrix products; 0 = not counted.
+        flops: floating point operations of the task, those in matrix products or all of `operations`; 0 = not counted.
     """
     calls: dict[str, tuple[Call, float]] = {"": (ours, 1.0)}
     for name, peer in (peers or {}).items():

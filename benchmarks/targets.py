@@ -3,16 +3,17 @@
 For a tripod with a CCNN 3-6-6-3 (all connections, then 40 % of them) and the model of a folder: eager, ONNX Runtime,
 our C in double and single precision, and for the dense tripod C written by hand with the same network, guard and fixed
 point. Every way follows one trajectory, as a controller of 1 kHz would send it: a million commands (a hundredth with
-`--quick`, and again in Python) along sines in the domain, one after the other, each between two readings of the clock:
-p50, with p99 and largest in the note. The C program counts calls of malloc, calloc and realloc in its loop. Then
-100,000 vectors, in and out of the domain, by all ways: largest difference of the deviation from the eager model's, as a
-share of the limit.
+`--quick`, and again in Python) along sines in the domain, in five rounds of all ways, each command between two
+readings of the clock: p50, with p99 and largest in the note; a ratio is the median over the rounds. The C program
+counts calls of malloc, calloc and realloc in its loop. Then 100,000 vectors, in and out of the domain, by all ways:
+largest difference of the deviation from the eager model's, as a share of the limit.
 """
 
 from __future__ import annotations
 
 import ctypes
 import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -39,6 +40,9 @@ from ccnn_torch.compensation.targets.export import COMMAND  # noqa: E402
 from ccnn_torch.compensation.targets.from_model import form_of  # noqa: E402
 from ccnn_torch.compensation.targets.golden import golden_vectors, require_equal  # noqa: E402
 from ccnn_torch.errors import MethodFailedError  # noqa: E402
+
+# In each round every way follows the trajectory once.
+ROUNDS = 5
 
 _TIMER = """
 #include "compensator.h"
@@ -173,8 +177,10 @@ def _filled(text: str, names: dict[str, object]) -> str:
     return text
 
 
-def timed(folder: Path, compensator: Compensator, calls: int, compiler: str, given: np.ndarray) -> list[object]:
-    """p50, p99, largest [µs]; allocations in the loop; bytes of code and tables; deviations of the rows given."""
+def built(
+    folder: Path, compensator: Compensator, calls: int, compiler: str, given: np.ndarray
+) -> tuple[Callable[[], list[float]], int, np.ndarray]:
+    """What times so many commands, giving p50, p99, largest [µs], allocations; bytes of code and tables; deviations."""
     n = len(compensator.joints)
     low, high = reach(compensator)
     names = {"@LOW@": ", ".join(map(repr, low)), "@HIGH@": ", ".join(map(repr, high)), "@N@": str(n)}
@@ -184,18 +190,22 @@ def timed(folder: Path, compensator: Compensator, calls: int, compiler: str, giv
     (folder / "timer.c").write_text(text)
     flags = [compiler, "-O2", "-std=gnu99", "-ffp-contract=off", "-fno-builtin-malloc", "-fPIC"]
     subprocess.run([*flags, "-c", "compensator.c"], cwd=folder, check=True)
-    for words in (["-o", "timer"], ["-shared", "-o", "many.so"]):
+    # Under names of their own: a library of a known name is not loaded again.
+    number = len([*folder.glob("many*")])
+    program, library = folder / f"timer{number}", folder / f"many{number}.so"
+    for words in (["-o", program.name], ["-shared", "-o", library.name]):
         subprocess.run([*flags, "timer.c", "compensator.o", *words, "-lm"], cwd=folder, check=True)
-    told = subprocess.run([str(folder / "timer")], check=True, capture_output=True, text=True).stdout.split()
     size = subprocess.run(["size", "compensator.o"], cwd=folder, check=True, capture_output=True, text=True).stdout
-    # Under a name of its own: a library of a known name is not loaded again.
-    library = folder / f"many{len([*folder.glob('many*')])}.so"
-    shutil.move(folder / "many.so", library)
     found = np.zeros_like(given)
     pointers = [v.ctypes.data_as(ctypes.c_void_p) for v in (given, found)]
     ctypes.CDLL(str(library)).ccnn_many(*pointers, ctypes.c_long(len(given)))
-    assert int(told[4]) == 1, "the hook counts"
-    return [*map(float, told[:3]), int(told[3]), sum(map(int, size.splitlines()[1].split()[:3])), found]
+
+    def timed() -> list[float]:
+        told = subprocess.run([str(program)], check=True, capture_output=True, text=True).stdout.split()
+        assert int(told[4]) == 1, "the hook counts"
+        return [float(word) for word in told[:4]]
+
+    return timed, sum(map(int, size.splitlines()[1].split()[:3])), found
 
 
 def reach(compensator: Compensator) -> tuple[list[float], list[float]]:
@@ -234,16 +244,24 @@ def bound(run: onnxruntime.InferenceSession, row: np.ndarray) -> Callable[[np.nd
 
 
 def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> Iterator[Row]:
-    """Measure one model."""
+    """Measure one model: every way once a round, one after the other."""
     n, domain, limit = len(compensator.joints), compensator.domain, compensator.limit.numpy()
     draw = torch.rand(100_000, n, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     given = (domain.centre + domain.half_range * (4 * draw - 2)).numpy()
-    with torch.inference_mode():
+    calls //= ROUNDS
+    with torch.inference_mode(), tempfile.TemporaryDirectory() as made:
         wanted = compensator(torch.from_numpy(given))[1].numpy()
-        rows = {
-            "eager": [*streamed(compensator, lambda q: compensator(torch.from_numpy(q)), calls // 100), "", "", 0.0]
-        }
-    with tempfile.TemporaryDirectory() as made:
+        # Of each way what times it, bytes, and how far its deviations are off, as a share of the limit.
+        ways: dict[str, tuple[Callable[[], list[float]], int, float]] = {}
+
+        def python(way: str, call: Callable[[np.ndarray], object], size: int, off: float) -> None:
+            ways[way] = (lambda: streamed(compensator, call, calls // 100), size, off)
+
+        def compiled(way: str, compiler: str) -> None:
+            timed, size, found = built(folder, compensator, calls, compiler, given)
+            ways[way] = (timed, size, float((np.abs(found - wanted) / limit).max()))
+
+        python("eager", lambda q: compensator(torch.from_numpy(q)), 0, 0.0)
         folder = Path(made)
         for file, outputs in (("model.onnx", OUTPUTS), ("controller.onnx", COMMAND)):
             content = export_onnx(compensator, "{}", outputs)
@@ -253,7 +271,7 @@ def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> Iter
             off = np.abs((np.concatenate(parts) - wanted) / limit).max()
             plain = file == "model.onnx"
             call = (lambda q, run=run: run.run(None, {"joints": q})) if plain else bound(run, given[:1].copy())
-            rows[f"onnxruntime, {file}"] = [*streamed(compensator, call, calls // 100), "", len(content), off]
+            python(f"onnxruntime, {file}", call, len(content), off)
         for dtype in ("float64", "float32"):
             try:
                 form = form_of(compensator, dtype)
@@ -264,20 +282,21 @@ def measure(name: str, compensator: Compensator, calls: int, hand: bool) -> Iter
                 continue
             for file, text in print_c99(form, golden).items():
                 (folder / file).write_text(text)
-            for compiler in ("gcc", "clang"):
-                if shutil.which(compiler):
-                    *figures, found = timed(folder, compensator, calls, compiler, given)
-                    share = float((np.abs(found - wanted) / limit).max())
-                    rows[f"ccnn export, {dtype}, {compiler}"] = [*figures, share]
+            for compiler in filter(shutil.which, ("gcc", "clang")):
+                compiled(f"ccnn export, {dtype}, {compiler}", compiler)
             if hand and dtype == "float64":
                 (folder / "compensator.c").write_text(by_hand(compensator))
-                *figures, found = timed(folder, compensator, calls, "gcc", given)
-                rows["written by hand, float64, gcc"] = [*figures, float((np.abs(found - wanted) / limit).max())]
-    base = rows.get("ccnn export, float64, gcc", rows["eager"])[0]
-    for way, (p50, p99, most, allocations, size, share) in rows.items():
-        counted = f", {allocations} allocations, {size} bytes" if allocations != "" else ""
-        note = f"p99 {p99:.2f} µs, largest {most:.0f} µs{counted}, off by {share:.0e} of the limit"
-        yield Row(f"one command of {name}", 1, "command", base * 1e-6, way, p50 / base, None, note)
+                compiled("written by hand, float64, gcc", "gcc")
+        rounds = [{way: timed() for way, (timed, _, _) in ways.items()} for _ in range(ROUNDS)]
+    ours = "ccnn export, float64, gcc" if "ccnn export, float64, gcc" in ways else "eager"
+    base = statistics.median(one[ours][0] for one in rounds)
+    for way, (_, size, off) in ways.items():
+        ratio = statistics.median(one[way][0] / one[ours][0] for one in rounds)
+        p99, most = statistics.median(one[way][1] for one in rounds), max(one[way][2] for one in rounds)
+        counted = f", {rounds[0][way][3]:.0f} allocations" if len(rounds[0][way]) > 3 else ""
+        counted += f", {size} bytes" if size else ""
+        note = f"p99 {p99:.2f} µs, largest {most:.0f} µs{counted}, off by {off:.0e} of the limit"
+        yield Row(f"one command of {name}", 1, "command", base * 1e-6, way, ratio, None, note)
 
 
 def run(quick: bool, model: Path | None = None) -> Iterator[Row]:

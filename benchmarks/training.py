@@ -9,7 +9,7 @@ import torch
 from sklearn.neural_network import MLPRegressor
 
 from benchmarks.generation import toy_rows
-from benchmarks.measure import Row, compare
+from benchmarks.measure import Row, compare, operations
 from ccnn_torch.learners import TrainingData, make_learner
 from ccnn_torch.training import train
 
@@ -27,13 +27,17 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
             keys = {"activation": "logistic", "solver": "lbfgs", "max_iter": 2000}
             return [MLPRegressor(hidden_layer_sizes=(24,), random_state=k, **keys).fit(x, y) for k in range(MEMBERS)]
 
+        def ours(data: TrainingData = data) -> object:
+            return train(make_learner("ccnn"), data)
+
         yield from compare(
             "train the default network, 3 outputs",
             rows,
             "rows",
-            lambda data=data: train(make_learner("ccnn"), data),
+            ours,
             {"scikit-learn MLPRegressor (lbfgs), 6 members": perceptrons},
             rounds=1,
+            flops=operations(ours),
         )
 
 

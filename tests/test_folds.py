@@ -14,7 +14,9 @@ from toy import Descent
 from ccnn_torch.calibration.learning.early_stop import Plan, choose, fold_dataset
 from ccnn_torch.calibration.learning.fitting import fit_method
 from ccnn_torch.errors import InputError
+from ccnn_torch.learners import TrainingData
 from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.learners.rows import thinned
 from ccnn_torch.records.splits import Split, fold_splits, split_rows
 from ccnn_torch.training import train, weighted_mse
 
@@ -89,7 +91,7 @@ def test_folds_side_by_side_are_those_run_one_by_one() -> None:
 def test_a_refit_goes_on_from_the_networks_of_the_first_training_on_all_rows() -> None:
     dataset = linear_dataset(repeats=2, train=40, held=11, test=20)
     settings = CCNNSettings(
-        hidden=(3,), rival_hidden=(), population=8, generations=2, members=2, refinement_iterations=4, waves=2
+        hidden=(3,), rival_hidden=(2,), population=8, generations=2, members=2, refinement_iterations=4, wave_searches=0
     )
     fitted = fit_method("ccnn", lambda: CCNN(settings), dataset, Plan(True, None, 20), None, lambda *_: [])
     choice = fitted.choice
@@ -97,9 +99,14 @@ def test_a_refit_goes_on_from_the_networks_of_the_first_training_on_all_rows() -
     assert fitted.data.inputs.shape[1] == 51 and bool((choice.best_step > 2).all())
     torch.testing.assert_close(fitted.scaling.centre, choice.scaling.centre)
     found = fitted.learner.state_dict()
-    for layer in range(2):
-        name = f"structure_0_refined_mask_{layer}"
-        assert torch.equal(found[name], choice.state[name])
+    both = [torch.stack([part[f"structure_{n}_evidence"].mean(1) for n in (0, 1)]) for part in (choice.state, found)]
+    # Of each repeat only the structure that it took is refined again; the steps in which it is done are the same.
+    taken = both[0].argmax(0)
+    assert torch.equal(taken, both[1].argmax(0)) and bool((both[1].amin(0) == -torch.inf).all())
+    for repeat, structure in enumerate(taken.tolist()):
+        for layer in range(2):
+            name = f"structure_{structure}_refined_mask_{layer}"
+            assert torch.equal(found[name][repeat], choice.state[name][repeat])
     first = CCNN(settings)
     first.start(fitted.data)
     first.load_state_dict(choice.state)
@@ -108,7 +115,17 @@ def test_a_refit_goes_on_from_the_networks_of_the_first_training_on_all_rows() -
         for learner in (first, fitted.learner)
     )
     assert float(after.mean()) < float(before.mean())
-    assert not torch.equal(found["structure_0_evidence"], choice.state["structure_0_evidence"])
+    assert bool((both[0].amax(0) != both[1].amax(0)).all())
+
+
+def test_many_rows_are_thinned_evenly_and_padding_stays_behind() -> None:
+    place = torch.arange(10.0).double().expand(2, -1)
+    weights = torch.stack([torch.ones(10).double(), (torch.arange(10) % 3 != 0).double()])
+    data = TrainingData(place.unsqueeze(-1), 2 * place.unsqueeze(-1), weights, torch.tensor([0, 1]))
+    found = thinned(data, 7)
+    assert found.inputs[..., 0].tolist() == [[0, 1, 2, 4, 5, 7, 8], [1, 2, 4, 5, 7, 8, 0]]
+    assert torch.equal(found.targets, 2 * found.inputs) and found.weights[1].tolist() == [1] * 6 + [0]
+    assert thinned(data, 10) is data
 
 
 def test_without_early_stopping_folds_judge_the_learners_end() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import pytest
 import torch
 from torch import Tensor
@@ -193,12 +191,11 @@ def test_padded_rows_do_not_matter() -> None:
     torch.testing.assert_close(flat(twice.weights), flat(alone.weights), rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("groups", ["network", "layer", "unit"])
-def test_a_batch_equals_separate_runs(groups: Literal["network", "layer", "unit"]) -> None:
+def test_a_batch_equals_separate_runs() -> None:
     generator = torch.Generator().manual_seed(6)
     x, _, targets = toy(2, 60, generator)
     masks, weights = random_network((2, 3), (3, 4, 3), generator, density=0.8)
-    settings = RefinementSettings(iterations=8, groups=groups)
+    settings = RefinementSettings(iterations=8)
     rows = torch.ones(60, dtype=torch.float64)
     together = refine(masks, weights, x.unsqueeze(1), targets.unsqueeze(1), rows, settings)
     assert together.error.shape == (2, 3)

@@ -68,7 +68,8 @@ class DiagnoseConfig(Section):
     )
     gravity: tuple[float, float, float] | None = Field(
         default=None,
-        description="gravity in m/s² in the frame of the poses, of an arm whose base frame is unknown in its own base; null = along -z (planar machines: -y)",
+        description="gravity in m/s² in the frame of the poses, of an arm with an unknown base frame in its own base; "
+        "null = down along -z (planar machines: -y)",
     )
     network: bool = Field(
         default=True, description="whether to say what a network on the remainder would still gain; takes seconds"

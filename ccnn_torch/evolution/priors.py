@@ -8,25 +8,25 @@ from torch import Tensor, nn
 __all__ = ["prior_groups", "resized_prior", "wave_groups"]
 
 
-def prior_groups(shapes: list[torch.Size], bias: bool, kind: str, slots: int = 0) -> Tensor:
+def prior_groups(shapes: list[torch.Size], bias: bool, slots: int = 0) -> Tensor:
     """Group of every weight in the flat order, `k`, int64; the last group holds the output's biases and frequencies.
 
-    A periodic node has a group of its own for each output, of its two weights.
+    Weights of a layer share a precision, its biases apart; but there is one for each input of the network, one for each
+    of its outputs, and for each output one of the two weights of a periodic node.
     """
     last = len(shapes) - 1
     labels: list[tuple[int, int, int]] = []
     for layer, (outputs, inputs) in enumerate(shapes):
         waves = 2 * slots if layer == last else 0
         for row in range(outputs):
-            by_output = row if kind == "unit" and layer == last else 0
+            by_output = row if layer == last else 0
             for column in range(inputs):
                 if column >= inputs - waves:
                     labels.append((_wave_layer(last), row, (column - inputs + waves) % slots))
-                    continue
-                by_input = column if kind == "unit" and layer == 0 else 0
-                labels.append((0 if kind == "network" else 2 * layer, by_output, by_input))
+                else:
+                    labels.append((2 * layer, by_output, column if layer == 0 else 0))
             if bias:
-                labels.append((-1, 0, 0) if layer == last else (0 if kind == "network" else 2 * layer + 1, 0, 0))
+                labels.append((-1, 0, 0) if layer == last else (2 * layer + 1, 0, 0))
     labels += [(-1, 0, 0)] * slots
     order = {label: index for index, label in enumerate(sorted(set(labels) - {(-1, 0, 0)}))}
     return torch.tensor([order.get(label, len(order)) for label in labels])

@@ -149,7 +149,7 @@ def pose_refinement(
     there = rows > 0
     bias = weights[0].shape[-1] == masks[0].shape[-1] + 1
     slots = 0 if waves is None else waves.frequency.shape[-1]
-    groups = prior_groups([m.shape[-2:] for m in masks], bias, settings.groups, slots)
+    groups = prior_groups([m.shape[-2:] for m in masks], bias, slots)
     flat_metric = None
     if row_metric is not None:
         flat_metric = _flatten(row_metric, leading, 3).masked_fill(~there[..., None, None], 0)
@@ -227,7 +227,8 @@ def step_refinement(
     reached = before
     todo = torch.arange(len(before), device=before.device)
     for _ in range(problem.settings.trials):
-        damped = matrix[todo] + torch.diag_embed(diagonal[todo] * damping[todo].unsqueeze(-1))
+        damped = matrix[todo]
+        damped.diagonal(dim1=-2, dim2=-1).add_(diagonal[todo] * damping[todo].unsqueeze(-1))
         root, failed = torch.linalg.cholesky_ex(damped)
         step = torch.cholesky_solve(gradient[todo].unsqueeze(-1), root).squeeze(-1)
         candidate = state.weights[todo].scatter_add(1, kept[todo], -step)
@@ -298,7 +299,8 @@ def second_order(problem: RefinementProblem, state: RefinementState) -> SecondOr
     active = problem.network.active.gather(1, kept)
     prior = state.prior[:, problem.groups].gather(1, kept)
     gradient = local.gradient + torch.where(active, prior * state.weights.gather(1, kept), 0)
-    matrix = local.matrix + torch.diag_embed(torch.where(active, prior, 1))
+    matrix = local.matrix
+    matrix.diagonal(dim1=-2, dim2=-1).add_(torch.where(active, prior, 1))
     return SecondOrder(gradient, matrix, *torch.linalg.cholesky_ex(matrix))
 
 
@@ -331,8 +333,6 @@ def _noise(problem: RefinementProblem, state: RefinementState) -> Tensor:
     count = _row_count(problem)
     # More weights than rows may look determined at first; a channel keeps at least a tenth of its rows' freedom.
     free = torch.maximum(count - state.effective.sum(-1) / channels, count / 10).unsqueeze(-1)
-    if problem.settings.noise == "shared":
-        squares = squares.mean(-1, keepdim=True).expand_as(squares)
     return (free / squares.clamp_min(1e-300)).clamp(*_PRECISION_RANGE)
 
 

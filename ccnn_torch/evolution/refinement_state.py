@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -36,10 +36,6 @@ class RefinementSettings:
         iterations: Levenberg-Marquardt iterations.
         bayesian: estimate the precisions of prior and noise; else `ridge` is the prior's and 1 the noise's.
         ridge: precision of the prior where `bayesian` is off.
-        groups: which weights share a prior precision: all of the `network`; those of a `layer`, its biases apart; or
-            those of a `unit`: as `layer`, but one for each input of the network and one for each of its outputs. The
-            biases of the output are never held back: they are the mean.
-        noise: one noise precision for all channels (`shared`) or one for each (`channel`).
         first_prior: prior precision before its first estimate.
         warm_up: iterations before the first estimate of the precisions.
         prior_shape, prior_rate: Gamma distribution that the prior precisions themselves are drawn from; they then are
@@ -56,8 +52,6 @@ class RefinementSettings:
     iterations: int = 50
     bayesian: bool = True
     ridge: float = 1e-6
-    groups: Literal["network", "layer", "unit"] = "unit"
-    noise: Literal["shared", "channel"] = "channel"
     first_prior: float = 1e-3
     warm_up: int = 3
     prior_shape: float = 1.0

@@ -59,7 +59,7 @@ class CCNNSettings:
             0 = none (paper: none). They need refinement. Inside a UR10's training rows 75 or 100 did better than 30
             or 50.
         refinement_iterations: Levenberg-Marquardt iterations of one refinement at most; in a training with rows held
-            out a third of them, as the training on all rows begins from its networks; 0 = none, as in the paper. On ten
+            out a third of them, and the others on all rows, from its networks; 0 = none, as in the paper. On ten
             simulated machines 36 (12 with rows held out) did as well as 50.
 
     Raises:

@@ -19,12 +19,17 @@ from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
 from ccnn_torch.evolution.waves import Waves
 from ccnn_torch.learners.protocol import TrainingData
+from ccnn_torch.learners.rows import thinned
 from ccnn_torch.learners.structure import MemberRows, Structure
 
 __all__ = ["CCNN", "CCNNSettings"]
 
-# A training with rows held out chooses the number of steps, and a longer one on all rows goes on from its networks.
+# A training with rows held out, which chooses the number of steps, has one in so many of a refinement's iterations; the
+# one on all rows goes on from its networks with the others.
 _CHOOSING = 3
+# Rows enough to choose, evolve and search for periodic nodes by; the training that goes on sees them all. With 1,000 of
+# 2,100 rows a tripod had 7 % more error.
+_ENOUGH = 3000
 
 
 class CCNN:
@@ -56,6 +61,8 @@ class CCNN:
         """Take the data and judge the random first generation."""
         settings = self.settings
         members = settings.members
+        if data.validation is not None:
+            data = thinned(data, _ENOUGH)
         self._gears = _gears(data, settings)
         if self._gears is not None:
             there = (data.weights > 0).unsqueeze(-1)
@@ -189,8 +196,13 @@ class CCNN:
 
     def begin_from(self, state: dict[str, Tensor]) -> None:
         """Refine the networks of this state, found on fewer of the same rows in the same scaling; after `start`."""
-        for number, structure in enumerate(self._structures):
-            structure.begin_from(_of_structure(state, number))
+        most, kept = self.settings.refinement_iterations, self.settings.kept
+        parts = [_of_structure(state, number) for number in range(len(self._structures))]
+        evidence = [part["evidence"].sort(1, descending=True).values[:, :kept].mean(1) for part in parts]
+        # Only the structure that each repeat took: a few rows more do not turn the evidence.
+        taken = torch.stack(evidence).argmax(0)
+        for number, (structure, part) in enumerate(zip(self._structures, parts, strict=True)):
+            structure.begin_from(part, taken == number, most)
 
     @property
     def _evolved(self) -> bool:

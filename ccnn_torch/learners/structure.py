@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -76,23 +77,34 @@ class Structure:
         self.evidence = torch.full_like(self.state.best_fitness, -torch.inf)
         self.passes = torch.zeros_like(self.evidence)
         self.refined = self._evolved()
-        groups = prior_groups(
-            [mask.shape[-2:] for mask in self.refined.masks], settings.bias, RefinementSettings().groups, self.slots
-        )
+        groups = prior_groups([mask.shape[-2:] for mask in self.refined.masks], settings.bias, self.slots)
         channels = outputs if rows.metric is None else rows.metric.shape[-2]
         batch, zeros = len(self.evidence), self.evidence.new_zeros
         self.precisions = Precisions(zeros(batch, int(groups.max()) + 1), zeros(batch, channels), zeros(batch))
         # Whether a search found nothing in what these networks leave: the next one would not either.
         self._searched = False
-        self._first: dict[str, Tensor] | None = None
+        self._first: tuple[Bundle, Precisions, Tensor] | None = None
+        self._going = torch.ones_like(self.evidence, dtype=torch.bool)
 
-    def begin_from(self, tensors: dict[str, Tensor]) -> None:
-        """Refine the networks of an earlier training on fewer rows instead of those evolved; nothing more is sought."""
-        self._first = tensors
+    def begin_from(self, tensors: dict[str, Tensor], wanted: Tensor, iterations: int) -> None:
+        """Refine the networks of an earlier training on fewer rows instead of those evolved; nothing more is sought.
+
+        Args:
+            tensors: as of `tensors`.
+            wanted: repeats that take this structure, `r` bool; nothing is done for the others.
+            iterations: of the refinement.
+        """
+        self._first, self.iterations = _refined(tensors), iterations
+        self._going = wanted.repeat_interleave(self.settings.members)
+        self._searched = True
 
     def evolve(self) -> None:
         """One generation, and a refinement that is written back into the elite where one is due."""
         settings = self.settings
+        if self._first is not None and bool((self._first[-1] > -torch.inf)[self._going].all()):
+            # Nobody asks for what would evolve.
+            self.state = replace(self.state, generation=self.state.generation + 1)
+            return
         self.state = advance(self.state, self.rows.task, settings, self.rows.seeds)
         every = settings.refine_every
         if settings.refinement_iterations and every and self.state.generation % every == 0:
@@ -100,17 +112,18 @@ class Structure:
 
     def refine(self) -> None:
         """Refine the best joined network of every member, keep it by evidence, and write it back where it is fitter."""
-        everyone = torch.arange(len(self.passes), device=self.passes.device)
-        self._searched = self._first is not None
+        index = torch.nonzero(self._going).flatten()
+        if len(index) == 0:
+            return
         model, known = self._evolved(), None
         if self._first is not None:
-            earlier, known, evidence = _refined(self._first)
+            earlier, precisions, evidence = self._first
             model = choose(evidence > -torch.inf, earlier, model)
-        candidate, evidence, precisions = self._descend(model, everyone, known)
-        better = evidence > self.evidence
-        self.refined = choose(better, candidate, self.refined)
-        self.precisions = _put(self.precisions, torch.nonzero(better).flatten(), precisions, better)
-        self.evidence = torch.maximum(self.evidence, evidence)
+            known = Precisions(*(part[index] for part in precisions))
+        candidate, evidence, precisions = self._descend(mapped(model, itemgetter(index)), index, known)
+        self._take(index, candidate, evidence, precisions, evidence > self.evidence[index])
+        if self._first is not None:
+            return
         plain = without_waves(candidate)
         genomes = tuple(
             Genome(mask.unsqueeze(1), weight.unsqueeze(1))
@@ -156,13 +169,19 @@ class Structure:
         precisions = Precisions(*(part[taken_from] for part in precisions))
         # Taken by all members of a repeat or by none, so that they go on sharing their slots.
         gain = (evidence - self.evidence[index[going]]).reshape(-1, each).sum(1).repeat_interleave(each)
-        taken = gain > 0
-        target = index[going][taken]
-        chosen = mapped(candidate, lambda value: value[taken])
-        old, new = self.refined.tensors, chosen.tensors
-        self.refined = Bundle.from_tensors({name: old[name].index_copy(0, target, new[name]) for name in old})
-        self.evidence = self.evidence.index_copy(0, target, evidence[taken])
-        self.precisions = _put(self.precisions, target, precisions, taken)
+        self._take(index[going], candidate, evidence, precisions, gain > 0)
+
+    def _take(self, index: Tensor, candidate: Bundle, evidence: Tensor, precisions: Precisions, taken: Tensor) -> None:
+        """Keep the refined networks that are `taken`, bool; index: which of the `b` they are."""
+        target = index[taken]
+
+        def put(old: Tensor, new: Tensor) -> Tensor:
+            return old.index_copy(0, target, new[taken])
+
+        old, new = self.refined.tensors, candidate.tensors
+        self.refined = Bundle.from_tensors({name: put(old[name], new[name]) for name in old})
+        self.evidence = put(self.evidence, evidence)
+        self.precisions = Precisions(*(put(*pair) for pair in zip(self.precisions, precisions, strict=True)))
 
     def members(self) -> Bundle:
         """The kept members of each repeat, refined where they are: `r x kept x ...`."""
@@ -287,8 +306,3 @@ def _refined(tensors: dict[str, Tensor]) -> tuple[Bundle, Precisions, Tensor]:
         {name.removeprefix(prefix): tensor for name, tensor in flat.items() if name.startswith(prefix)}
     )
     return bundle, Precisions(*(flat[f"precision_{name}"] for name in Precisions._fields)), flat["evidence"]
-
-
-def _put(precisions: Precisions, index: Tensor, new: Precisions, chosen: Tensor) -> Precisions:
-    """Those of some networks (`index`) renewed by the chosen ones of `new`."""
-    return Precisions(*(old.index_copy(0, index, part[chosen]) for old, part in zip(precisions, new, strict=True)))

@@ -32,8 +32,8 @@ def block_size(bytes_each: int, default: int = _DEFAULT) -> int:
     return max(1, (default if budget is None else min(default, budget)) // max(1, bytes_each))
 
 
-def blocks(count: int, bytes_each: int) -> Iterator[slice]:
+def blocks(count: int, bytes_each: int, default: int = _DEFAULT) -> Iterator[slice]:
     """Slices that cover `count` rows or networks, as few and as even as the budget allows; one where there are none."""
-    number = max(1, -(-count // block_size(bytes_each)))
+    number = max(1, -(-count // block_size(bytes_each, default)))
     ends = [count * k // number for k in range(number + 1)]
     return (slice(first, end) for first, end in pairwise(ends))
