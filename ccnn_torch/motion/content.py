@@ -14,7 +14,7 @@ from ccnn_torch.diagnosis.shrink.held_out import INTERVAL
 from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
 from ccnn_torch.display import number_text
 from ccnn_torch.motion.fit import Fit
-from ccnn_torch.motion.held_out import Spread, folds_of, resampled, shrink_of
+from ccnn_torch.motion.held_out import Spread, resampled, shrink_of
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.numbers import parameters_of
@@ -117,7 +117,7 @@ def notes_of(
             f"{listed(dropped)} fit these runs as well, and take nothing away on runs that were not fitted: not named"
         )
     runs = len(set(data.run.tolist()))
-    folds = int(folds_of(problem).max()) + 1
+    folds = int(problem.fold.max()) + 1
     if runs > 1:
         notes.append(f"held out were whole runs, {runs} of them in {folds} folds")
     else:

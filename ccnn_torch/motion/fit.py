@@ -13,7 +13,7 @@ from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, g
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening
 
-__all__ = ["Fit", "Spec", "evidence_of", "fit_many", "sensitivities", "started"]
+__all__ = ["Fit", "Spec", "fit_many", "sensitivities", "squares_unseen", "started"]
 
 # Of a difference quotient, in plausible sizes.
 _STEP = 1e-3
@@ -71,9 +71,8 @@ class Fit(NamedTuple):
         log_evidence: of the linearised model.
         noise: variance of the whitened residual.
         mean, covariance: of the active numbers in plausible sizes, `m`, `m x m`.
-        squares: of the whitened residual by stretch, `b`.
-        rss: their sum.
-        effective: number of coefficients that the data determine.
+        rss: squares of the whitened residual.
+        unseen: the same on runs that its numbers were not fitted to.
         left: mean square of the residual itself [rad^2 or m^2].
         grams: of the linearised model's whitened columns, in plausible sizes.
     """
@@ -83,9 +82,8 @@ class Fit(NamedTuple):
     noise: float
     mean: Tensor
     covariance: Tensor
-    squares: Tensor
     rss: float
-    effective: float
+    unseen: float
     left: float
     grams: Grams
 
@@ -199,40 +197,54 @@ def _fit_lot(
     # Here, since the whitened residual does not tell it.
     plain = problem.pooled(problem.residual(theta, chosen))
     left = (plain.square() * judged).sum((-1, -2)) / values
-    squares = residual.square().reshape(n, h, *judged.shape).sum(-1)
+    fold = problem.fold if chosen is None else problem.fold[chosen]
+    fold = fold[:, None].expand(judged.shape).flatten()
     found = []
     for a, row in enumerate(specs):
         fits = []
         for b, spec in enumerate(row):
             mine = spec._replace(theta=theta[a, b])
             x = columns[b, a, : len(spec.flat)]
-            fits.append(evidence_of(mine, residual[b, a], x, squares[b, a], values, float(left[a, b])))
+            fits.append(_fit_of(mine, residual[b, a], x, values, float(left[a, b]), fold))
         found.append(fits)
     return found
 
 
-def evidence_of(
-    spec: Spec, residual: Tensor, columns: Tensor, squares: Tensor, values: float, left: float = 0.0
-) -> Fit:
-    """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`, the rest as of `Fit`."""
-    own = spec.theta[list(spec.flat)]
-    y = residual + own @ columns
-    grams = grams_of(columns.mT[:, None, :], y[:, None])._replace(values=values)
+def _fit_of(spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, fold: Tensor) -> Fit:
+    """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`, fold of each value `v`."""
+    y = residual + spec.theta[list(spec.flat)] @ x
+    grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
     fit = fit_sets(grams, [spec.groups], 0.0)
-    m = len(own)
-    evidence = float(fit.log_evidence[0])
+    m, evidence = len(x), float(fit.log_evidence[0])
     return Fit(
         spec,
         evidence if math.isfinite(evidence) else -math.inf,
         float(fit.noise[0]),
         fit.mean[0, :m],
         fit.covariance[0, :m, :m],
-        squares,
         float(residual.square().sum()),
-        float(fit.effective[0]),
+        squares_unseen(x, y, spec.groups, fold, values),
         left,
         grams,
     )
+
+
+def squares_unseen(x: Tensor, y: Tensor, groups: Sequence[Tensor], fold: Tensor, values: float) -> float:
+    """Squares that a linear model leaves of runs that it was not fitted to; its scales are those of all runs.
+
+    Args:
+        x, y: whitened columns, `m x v`, and what they explain, `v`.
+        groups: of columns.
+        fold: of each value, `v`.
+        values: how many count.
+    """
+    fit = fit_sets(grams_of(x.mT[:, None, :], y[:, None])._replace(values=values), [groups], 0.0)
+    size = torch.cat([x.new_zeros(0), *(fit.log_scale[0, g].expand(len(c)) for g, c in enumerate(groups))])
+    ridge = torch.diag(torch.exp(-size) * fit.noise[0])
+    parts = [(x[:, fold == f], y[fold == f]) for f in range(int(fold.max()) + 1)]
+    whole, along = x @ x.mT + ridge, x @ y
+    means = [torch.linalg.solve(whole - a @ a.mT, along - a @ b) for a, b in parts] if len(parts) > 1 else [fit.mean[0]]
+    return sum(float((b - mean @ a).square().sum()) for mean, (a, b) in zip(means, parts, strict=True))
 
 
 def _cost(residual: Tensor, theta: Tensor, values: float) -> Tensor:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from ccnn_torch.diagnosis.evidence.dictionary import CERTAIN
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, scaled
-from ccnn_torch.diagnosis.search.form_error import OF_EXACT, OF_FORM, form_variance
+from ccnn_torch.diagnosis.search.form_error import DIRECTIONS, OF_EXACT, OF_FORM, form_variance
 from ccnn_torch.motion.effects import EXACT
 from ccnn_torch.motion.fit import Fit
 from ccnn_torch.motion.problem import Problem, Whitening
@@ -42,3 +44,8 @@ def form_errors(problem: Problem, whitening: Whitening, best: list[Fit]) -> list
 def weighed(grams: Grams, groups: list[torch.Tensor], variance: float) -> Fits:
     """A set under a noise that is known."""
     return fit_sets(scaled(grams, variance), [groups], CERTAIN * grams.values)
+
+
+def unseen_errors(found: Sequence[Sequence[Fit]]) -> list[float]:
+    """Variance in every direction by which the best of each axis' sets is worse on runs that it was not fitted to."""
+    return [max(min(f.unseen for f in own) - min(f.rss for f in own), 0.0) / DIRECTIONS for own in found]

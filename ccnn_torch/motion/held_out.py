@@ -12,22 +12,11 @@ from ccnn_torch.diagnosis.shrink.held_out import INTERVAL
 from ccnn_torch.motion.fit import Spec, fit_many
 from ccnn_torch.motion.problem import Problem, Whitening
 
-__all__ = ["Spread", "folds_of", "held_out", "resampled", "shrink_of"]
+__all__ = ["Spread", "held_out", "resampled", "shrink_of"]
 
-_FOLDS, _REPEATS, _STEPS = 5, 400, 3
+_REPEATS, _STEPS = 400, 3
 # Reducible residual of a bootstrap sample, at least, as a share of that of all stretches.
 _LEAST_GAP = 1e-3
-
-
-def folds_of(problem: Problem) -> Tensor:
-    """Fold of each stretch: whole runs, dealt out in order; parts of the run where there is one alone."""
-    run = problem.data.run
-    runs = torch.tensor(sorted(set(run.tolist())))
-    count = len(run)
-    if len(runs) < 2:
-        return torch.arange(count) * min(_FOLDS, count) // count
-    fold = torch.arange(len(runs)) % min(_FOLDS, len(runs))
-    return fold[torch.searchsorted(runs, run)]
 
 
 def held_out(problem: Problem, whitening: Whitening, sets: Sequence[Sequence[Spec]]) -> Tensor:
@@ -38,7 +27,7 @@ def held_out(problem: Problem, whitening: Whitening, sets: Sequence[Sequence[Spe
         whitening: of the residual.
         sets: `h` sets of each of `n` axes; what they hold and its shapes are those of all runs, the numbers are not.
     """
-    fold = folds_of(problem)
+    fold = problem.fold
     nominal = problem.residual(torch.stack([torch.stack([s.theta for s in row]) for row in sets]))
     left = nominal.clone()
     if int(fold.max()) == 0:

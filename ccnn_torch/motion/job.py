@@ -9,6 +9,7 @@ from typing import Any
 from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.diagnosis.page.compensate import typed_path
 from ccnn_torch.diagnosis.page.data import NEXT, RESULT, about_of, load_labels
+from ccnn_torch.diagnosis.page.report import print_diagnosis, write_diagnosis_report
 from ccnn_torch.diagnosis.progress import watched
 from ccnn_torch.display import short_path
 from ccnn_torch.errors import InputError
@@ -16,8 +17,8 @@ from ccnn_torch.files.write import sweep
 from ccnn_torch.motion.engine import MotionDiagnosis, diagnose_motion
 from ccnn_torch.motion.identified import IDENTIFIED, write_identified
 from ccnn_torch.motion.log import load_logs
+from ccnn_torch.motion.next_motion import write_next_motion
 from ccnn_torch.motion.nominal import Nominal, nominal_of
-from ccnn_torch.motion.page import print_motion, write_motion_report, write_next_motion
 from ccnn_torch.motion.phases import phases_of
 from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.screen import say_place, stdout, step_bar
@@ -59,12 +60,12 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
         with if_stopped(kept):
             if not quiet:
                 print_text(results["verdict"]["text"], stdout, "bold")
-            write_next_motion(folder / NEXT, list(found.proposed), results["next_measurements"], results["gap"]["unit"])
+            write_next_motion(folder / NEXT, found.proposed, results)
             written = write_identified(folder, found, nominal, config.mechanism_keys)
             labels = {"about": _about(config, folder, found)}
-            write_motion_report(folder, results, motion_arrays(found), labels)
+            write_diagnosis_report(folder, results, motion_arrays(found), labels, tensorboard=False)
             if not quiet:
-                print_motion(results, stdout, about_of(load_labels(folder)), verdict=False, details=details)
+                print_diagnosis(results, stdout, about_of(load_labels(folder)), verdict=False, details=details)
                 say_place(f"Written: {folder / RESULT}, and beside it report.html, {', '.join(written)}")
     return folder
 

@@ -11,7 +11,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from ccnn_torch.diagnosis.search.form_error import LEVELS
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets
+from ccnn_torch.diagnosis.search.form_error import LEVELS, OF_SMOOTH
 from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN
 from ccnn_torch.motion.drivers import Driver, driver_columns
 from ccnn_torch.motion.fit import Fit
@@ -61,12 +62,15 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     by_members = {f.members: f for f in fits}
     slight = _slight(problem, axis)
     left = {f.members: f.left for f in fits}
-    sets = [Candidate((essential(f.members, left, slight), None), f.grams, f.spec.groups, prior_of(f)) for f in fits]
+    unseen = {f.members: f.unseen for f in fits}
+    sets = [
+        Candidate((essential(f.members, left, slight, unseen), None), f.grams, f.spec.groups, prior_of(f)) for f in fits
+    ]
     sets += with_drivers(found, axis, drivers, by_members, slight)
     share: dict[tuple[Members, str | None], float] = {}
     usual: list[float] = []
-    for variance in (fits[0].noise + level * found.form[axis] for level in LEVELS):
-        weights = [float(weighed(one.grams, one.groups, variance).log_evidence[0]) + one.log_prior for one in sets]
+    for level in LEVELS:
+        weights = _weights(sets, fits[0].noise, level * found.form[axis], level * OF_SMOOTH)
         usual = usual or weights
         top = max(weights)
         total = math.fsum(math.exp(w - top) for w in weights)
@@ -90,6 +94,27 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
         members, classes = sure, _classes(sure, inside)
     same = sum(p for own, p in inside.items() if _equals(own, members, classes))
     return AxisVerdict(by_members[members], same, marginal, classes, None)
+
+
+def _weights(sets: Sequence[Candidate], noise: float, form: float, smooth: float) -> list[float]:
+    """Log posterior of each set under noise and form errors, not normalised.
+
+    Where the best one follows a driver, what it does is smooth and the cause need not be: that share of it is noise as
+    well, and if it is not the best one then no driver is.
+    """
+
+    def under(variance: float) -> list[float]:
+        return [float(weighed(one.grams, one.groups, variance).log_evidence[0]) + one.log_prior for one in sets]
+
+    weights = under(noise + form)
+    best = sets[weights.index(max(weights))]
+    if best.rows is None:
+        return weights
+    does = float(fit_sets(best.grams, [best.groups], 0.0).energy[0, len(best.groups) - 1])
+    smeared = under(noise + form + smooth * does)
+    if sets[smeared.index(max(smeared))].rows is not None:
+        return smeared
+    return [w if one.rows is None else -math.inf for w, one in zip(weights, sets, strict=True)]
 
 
 def _slight(problem: Problem, axis: int) -> float:

@@ -15,7 +15,7 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion.axis import ABSENT
 from ccnn_torch.motion.effects import MotionEffect
-from ccnn_torch.motion.effects.own_parameter import OwnParameter
+from ccnn_torch.motion.effects.own_parameter import own_parameter
 from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
 from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.simulators import Simulator, simulator_of
@@ -110,7 +110,7 @@ class Nominal:
     def own_effects(self) -> list[MotionEffect]:
         """Wrong values of a simulator's own parameters."""
         own = self.simulator.parameters if self.simulator is not None and self.simulator.loaded is None else {}
-        return [OwnParameter(name, value) for name, value in own.items()]
+        return [own_parameter(name, value) for name, value in own.items()]
 
     def driven(self, logs: Sequence[Log], data: Stretches, about: Mapping[str, float] | None = None) -> Driven:
         """What drives the axes: the commands, or where a simulator tells no more than positions these.

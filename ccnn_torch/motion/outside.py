@@ -11,8 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, grams_of
 from ccnn_torch.motion.drivers import Driver
-from ccnn_torch.motion.fit import Fit, sensitivities
-from ccnn_torch.motion.held_out import folds_of
+from ccnn_torch.motion.fit import Fit, sensitivities, squares_unseen
 from ccnn_torch.motion.problem import Problem, Whitening
 from ccnn_torch.motion.search import CROWD, Search, log_posterior
 
@@ -22,6 +21,8 @@ __all__ = ["Candidate", "Members", "essential", "holds", "prior_of", "with_drive
 _OUTSIDE = math.log(0.001)
 # Sets beside which drivers are tried, besides those that lead from the best one to none.
 _BASES = 6
+# Share of what is left of runs that were not fitted up to which a set without a member is as good.
+_NEARLY = 1.02
 
 Members = tuple[int, ...]
 
@@ -47,14 +48,25 @@ def prior_of(fit: Fit) -> float:
     return log_posterior(fit) - fit.log_evidence
 
 
-def essential(members: Members, left: Mapping[Members, float], slight: float) -> Members:
-    """The set without members that do next to nothing, the least first; left: mean square that each set leaves."""
+def essential(
+    members: Members, left: Mapping[Members, float], slight: float, unseen: Mapping[Members, float] | None = None
+) -> Members:
+    """The set without members that do next to nothing, the least first.
+
+    Args:
+        members: of the set.
+        left: mean square that each set leaves.
+        slight: of what is next to nothing.
+        unseen: squares that each set leaves of runs that it was not fitted to, where a member has to take something
+            away as well.
+    """
+    most = None if unseen is None else _NEARLY**2 * unseen[members]
     while members:
-        rest = [tuple(m for m in members if m != e) for e in members]
-        least = min((r for r in rest if r in left), key=lambda r: left[r], default=None)
-        if least is None or left[least] - left[members] >= slight:
+        rest = [r for e in members if (r := tuple(m for m in members if m != e)) in left]
+        rest = [r for r in rest if left[r] - left[members] < slight or (unseen and most and unseen[r] <= most)]
+        if not rest:
             break
-        members = least
+        members = min(rest, key=lambda r: left[r])
     return members
 
 
@@ -102,20 +114,9 @@ def holds(problem: Problem, candidate: Candidate) -> bool:
     """Whether a driver takes something away on runs that no fit saw; the scales are those of all runs."""
     assert candidate.rows is not None
     own, columns, y = candidate.rows
-    fold = folds_of(problem)[:, None].expand(problem.judged.shape).flatten()
-    left = [0.0, 0.0]
-    for k, (x, groups) in enumerate(((own, candidate.groups[:-1]), (torch.cat([own, columns]), candidate.groups))):
-        grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=candidate.grams.values)
-        fit = fit_sets(grams, [groups], 0.0)
-        size = torch.cat(
-            [torch.zeros(0, dtype=x.dtype), *(fit.log_scale[0, g].expand(len(c)) for g, c in enumerate(groups))]
-        )
-        ridge = torch.diag(torch.exp(-size) * fit.noise[0])
-        for f in range(int(fold.max()) + 1):
-            here, rest = fold == f, fold != f
-            mean = torch.linalg.solve(x[:, rest] @ x[:, rest].mT + ridge, x[:, rest] @ y[rest])
-            left[k] += float((y[here] - mean @ x[:, here]).square().sum())
-    return left[1] < left[0]
+    fold, values = problem.fold[:, None].expand(problem.judged.shape).flatten(), candidate.grams.values
+    without = squares_unseen(own, y, candidate.groups[:-1], fold, values)
+    return squares_unseen(torch.cat([own, columns]), y, candidate.groups, fold, values) < without
 
 
 def _one(found: Search, axis: int) -> Whitening:

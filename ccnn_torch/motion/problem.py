@@ -19,6 +19,7 @@ __all__ = ["Problem", "Whitening", "white_noise"]
 
 # Of an axis that ran away: no residual is larger, in units of the motion.
 _FARTHEST = 10.0
+_FOLDS = 5
 
 
 class Whitening(NamedTuple):
@@ -152,6 +153,15 @@ class Problem:
         m = self.pool
         kept = residual[..., : residual.shape[-1] // m * m]
         return kept.reshape(*kept.shape[:-1], -1, m).mean(-1)
+
+    @cached_property
+    def fold(self) -> Tensor:
+        """Fold of each stretch, `b`: whole runs, dealt out in order; parts of the run where there is one alone."""
+        run, count = self.data.run, len(self.data.run)
+        runs = torch.tensor(sorted(set(run.tolist())))
+        if len(runs) < 2:
+            return torch.arange(count) * min(_FOLDS, count) // count
+        return (torch.arange(len(runs)) % min(_FOLDS, len(runs)))[torch.searchsorted(runs, run)]
 
     @property
     def judged(self) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.evidence.dictionary import CERTAIN
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of, scaled
 from ccnn_torch.motion.fit import Fit, Spec, fit_many, sensitivities, started
-from ccnn_torch.motion.form import form_errors, weighed
+from ccnn_torch.motion.form import form_errors, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening, white_noise
 from ccnn_torch.motion.whiten import fitted_whitening
@@ -80,12 +80,13 @@ def search(problem: Problem) -> Search:
     ranked = tuple(tuple(p) for p in final.ranked())
     # Sets that are probable although forms are wrong are smaller than those above.
     noise = [fits[0].noise for fits in ranked]
+    unseen = unseen_errors([fits[:_KEPT] for fits in ranked])
     for _ in range(2):
-        form = form_errors(problem, final.whitening, final.best())
+        form = [max(a, b) for a, b in zip(form_errors(problem, final.whitening, final.best()), unseen, strict=True)]
         final.variance = [a + b for a, b in zip(noise, form, strict=True)]
     final.forward()
     final.neighbours()
-    form = form_errors(problem, final.whitening, final.best())
+    form = [max(a, b) for a, b in zip(form_errors(problem, final.whitening, final.best()), unseen, strict=True)]
     final.variance = None
     final.reduced()
     return Search(problem, final.whitening, tuple(tuple(p) for p in final.ranked()), rich, tuple(form))

@@ -71,7 +71,7 @@ def write_diagnosis_report(
         arrays: what is drawn in the figures (`s` rows in the order of the file, `c` pose channels, float64, SI):
             `place` `s x 3`, `joints` `s x n`, `residual` and `remainder` `s x c`, `held_out` and `set_aside` `s`, the
             machine's legs or links `machine.NAME` `k x 3`, and `signature.EFFECT.x`, `.y` and `.fit` `s`; written to
-            the folder first, or read from it when None.
+            the folder first, or read from it when None. Of a motion what `course_plot` takes.
         labels: names and units of the signatures' axes, `{EFFECT: {"x": {"name", "unit"}, "y": …}}`, and under `about`
             what `About` holds; written or read like the arrays.
         tensorboard: whether to write event files, which cost a second.
@@ -88,7 +88,8 @@ def write_diagnosis_report(
         save_diagnosis_arrays(folder, arrays, labels or {})
     numbers, labels = load_diagnosis_arrays(folder), load_labels(folder)
     about = about_of(labels)
-    write_next_csv(folder / NEXT, results, about)
+    if not results.get("motion"):
+        write_next_csv(folder / NEXT, results, about)
     pictures = write_page(
         folder,
         results,
@@ -155,9 +156,11 @@ def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[
     from ccnn_torch.diagnosis.page.figure_machine import machine_plot
     from ccnn_torch.diagnosis.page.figure_signature import signature_plot
     from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
+    from ccnn_torch.motion.figure import course_plot
 
     effects = list(results["verdict"]["effects"])
     plots = (
+        course_plot(results, arrays),
         machine_plot(arrays, effects),
         gap_plot(results),
         probability_plot(results),
@@ -176,7 +179,7 @@ def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str
         ("What gives it away?", ("signatures",), ()),
         (
             "Where is the gap?",
-            ("map", "where"),
+            ("map", "where", "course"),
             (where_table(results, about), region_table(results, about)),
         ),
         ("Which effects do these rows not distinguish?", (), (confusable_table(results),)),
