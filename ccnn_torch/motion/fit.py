@@ -74,7 +74,7 @@ class Fit(NamedTuple):
         rss: squares of the whitened residual.
         unseen: the same on runs that its numbers were not fitted to.
         left: mean square of the residual itself [rad^2 or m^2].
-        grams: of the linearised model's whitened columns, in plausible sizes.
+        grams: of the linearised model's whitened columns, in plausible sizes, and of `loose` after them.
     """
 
     spec: Spec
@@ -114,6 +114,7 @@ def fit_many(
     specs: Sequence[Sequence[Spec]],
     steps: int = _STEPS,
     chosen: Tensor | None = None,
+    loose: Tensor | None = None,
 ) -> list[list[Fit]]:
     """Fit sets side by side.
 
@@ -123,6 +124,7 @@ def fit_many(
         specs: for each of `h` sets, one a joint, `n`.
         steps: Gauss-Newton steps.
         chosen: stretches that count; all when None.
+        loose: whitened, what the nominal values of each axis may be off by, `n x k x v`; nothing when None.
     """
     wide = max((len(s.moved) for row in specs for s in row), default=0)
     judged = problem.data.judged if chosen is None else problem.data.judged[chosen]
@@ -130,7 +132,7 @@ def fit_many(
     lot = max(int(_VALUES / per), 1)
     found: list[list[Fit]] = []
     for k in range(0, len(specs), lot):
-        found += _fit_lot(problem, whitening, specs[k : k + lot], steps, chosen)
+        found += _fit_lot(problem, whitening, specs[k : k + lot], steps, chosen, loose)
     return found
 
 
@@ -157,7 +159,12 @@ def sensitivities(
 
 
 def _fit_lot(
-    problem: Problem, whitening: Whitening, specs: Sequence[Sequence[Spec]], steps: int, chosen: Tensor | None
+    problem: Problem,
+    whitening: Whitening,
+    specs: Sequence[Sequence[Spec]],
+    steps: int,
+    chosen: Tensor | None,
+    loose: Tensor | None,
 ) -> list[list[Fit]]:
     h, n = len(specs), len(specs[0])
     theta = torch.stack([torch.stack([s.theta for s in row]) for row in specs])
@@ -205,15 +212,16 @@ def _fit_lot(
         for b, spec in enumerate(row):
             mine = spec._replace(theta=theta[a, b])
             x = columns[b, a, : len(spec.flat)]
-            fits.append(_fit_of(mine, residual[b, a], x, values, float(left[a, b]), fold))
+            beside = x[:0] if loose is None else loose[b]
+            fits.append(_fit_of(mine, residual[b, a], x, values, float(left[a, b]), fold, beside))
         found.append(fits)
     return found
 
 
-def _fit_of(spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, fold: Tensor) -> Fit:
+def _fit_of(spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, fold: Tensor, loose: Tensor) -> Fit:
     """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`, fold of each value `v`."""
     y = residual + spec.theta[list(spec.flat)] @ x
-    grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
+    grams = grams_of(torch.cat([x, loose]).mT[:, None, :], y[:, None])._replace(values=values)
     fit = fit_sets(grams, [spec.groups], 0.0)
     m, evidence = len(x), float(fit.log_evidence[0])
     return Fit(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.dictionary import CERTAIN
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, scaled
@@ -41,9 +42,24 @@ def form_errors(problem: Problem, whitening: Whitening, best: list[Fit]) -> list
     return found
 
 
-def weighed(grams: Grams, groups: list[torch.Tensor], variance: float) -> Fits:
-    """A set under a noise that is known."""
-    return fit_sets(scaled(grams, variance), [groups], CERTAIN * grams.values)
+def weighed(grams: Grams, sets: Sequence[Sequence[Tensor]], columns: int, variance: float) -> Fits:
+    """Sets under a noise that is known.
+
+    Args:
+        grams: of the columns, and after them of those by which the nominal values may be off, coefficients of standard
+            deviation 1: they add to the noise.
+        sets: of groups of columns.
+        columns: how many are fitted.
+        variance: of the noise.
+    """
+    g = scaled(grams, variance)
+    across = torch.cat([g.xx[columns:, :columns], g.xy[columns:, None]], -1)
+    inner = g.xx[columns:, columns:] + torch.eye(len(across), dtype=across.dtype)
+    taken = across.mT @ torch.linalg.solve(inner, across)
+    left = Grams(
+        g.xx[:columns, :columns] - taken[:-1, :-1], g.xy[:columns] - taken[:-1, -1], g.yy - taken[-1, -1], g.values
+    )
+    return fit_sets(left, sets, CERTAIN * grams.values)
 
 
 def unseen_errors(found: Sequence[Sequence[Fit]]) -> list[float]:

@@ -104,7 +104,10 @@ def _weights(sets: Sequence[Candidate], noise: float, form: float, smooth: float
     """
 
     def under(variance: float) -> list[float]:
-        return [float(weighed(one.grams, one.groups, variance).log_evidence[0]) + one.log_prior for one in sets]
+        return [
+            float(weighed(one.grams, [one.groups], sum(map(len, one.groups)), variance).log_evidence[0]) + one.log_prior
+            for one in sets
+        ]
 
     weights = under(noise + form)
     best = sets[weights.index(max(weights))]

@@ -95,7 +95,7 @@ def with_drivers(
         prior = prior_of(base) + _OUTSIDE + (CROWD if len(base.members) >= 2 else 0.0)
         for k, (driver, columns) in enumerate(zip(drivers, white, strict=True)):
             x = torch.cat([own[axis, 0], columns])
-            grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
+            grams = grams_of(torch.cat([x, found.loose[axis]]).mT[:, None, :], y[:, None])._replace(values=values)
             groups = [*base.spec.groups, torch.arange(len(flat), len(x))]
             # What it takes away of the position itself, not of its whitened form.
             mean = fit_sets(grams, [groups], 0.0).mean[0, len(flat) :]

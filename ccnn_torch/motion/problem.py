@@ -20,6 +20,10 @@ __all__ = ["Problem", "Whitening", "white_noise"]
 # Of an axis that ran away: no residual is larger, in units of the motion.
 _FARTHEST = 10.0
 _FOLDS = 5
+# Share to which the values of a nominal model are known (standard deviation), and those that are.
+_KNOWN = 0.03
+_WEIGHT = ("gravity_sin", "gravity_cos")
+_LOOSE = (*_WEIGHT, "gain", "inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "delay")
 
 
 class Whitening(NamedTuple):
@@ -118,6 +122,22 @@ class Problem:
         moved = wide.positions(theta[None])[0].reshape(n, m, b, s)
         return moved if self.simulated is None else moved + self._beyond[:, None]
 
+    def loose(self) -> Tensor:
+        """What the positions change by when a nominal parameter is off by what it is known to, `k x n x b x s`."""
+        n, rows, nominal = len(self.followed), torch.arange(len(self.data.time)), self.library.nominal
+        zero = torch.zeros(1, n, self.library.size, dtype=torch.float64)
+        start = torch.stack([self.data.position[:, :, 0], self.data.speed[:, :, 0]], -1)
+        plain, columns = self._moved(zero, rows, start), [zero.new_zeros(0, *self.followed.shape)]
+        absent = torch.zeros(n, dtype=torch.float64)
+        weight = torch.hypot(*(nominal.get(name, absent) for name in _WEIGHT))
+        sizes = {"gain": torch.ones_like(absent), **nominal, **dict.fromkeys(_WEIGHT, weight)}
+        for name, size in sizes.items() if nominal else ():
+            if name in _LOOSE and bool((size != 0).any()):
+                before = nominal.get(name, sizes["gain"] if name == "gain" else absent)
+                other = self.library._replace(nominal={**nominal, name: before + _KNOWN * size})
+                columns.append(replace(self, library=other)._moved(zero, rows, start) - plain)
+        return torch.cat(columns)
+
     def _moved(self, theta: Tensor, rows: Tensor, start: Tensor) -> Tensor:
         data, n, b = self.data, len(self.followed), len(rows)
         time = data.time[rows].expand(n, -1, -1).reshape(n * b, -1)
@@ -152,7 +172,7 @@ class Problem:
         """Means over `pool` samples each, `... x s` -> `... x t`."""
         m = self.pool
         kept = residual[..., : residual.shape[-1] // m * m]
-        return kept.reshape(*kept.shape[:-1], -1, m).mean(-1)
+        return kept.reshape(*kept.shape[:-1], kept.shape[-1] // m, m).mean(-1)
 
     @cached_property
     def fold(self) -> Tensor:
