@@ -10,11 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.shrink.held_out import INTERVAL
-from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
+from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, Draws, Gap
+from ccnn_torch.diagnosis.verdict.text import unseen_text
 from ccnn_torch.display import number_text
 from ccnn_torch.motion.fit import Fit
-from ccnn_torch.motion.held_out import Spread, resampled, shrink_of
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.numbers import parameters_of
@@ -35,50 +34,39 @@ def floor_of(problem: Problem, found: Search, verdicts: Sequence[AxisVerdict]) -
     return float(each.amin(0).sum())
 
 
-def where_is(problem: Problem, before: Tensor, spread: Spread) -> dict[str, Any]:
+def where_is(problem: Problem, before: Tensor, draws: Draws) -> dict[str, Any]:
     """`where` and `where_ci95`: shares of the gap by joint and by phase of the motion."""
     data = problem.data
-    squares = before.square() * data.judged
-    joints = {f"q{i + 1}": squares[i].sum(-1) for i in range(len(squares))}
-    phase = phases_of(data)
+    squares, phase = before.square() * data.judged, phases_of(data)
+    joints = {f"q{i + 1}": own.sum(-1) for i, own in enumerate(squares)}
     phases = {name: (squares * (phase == k)).sum((0, -1)) for k, name in enumerate(PHASES)}
-    whole = squares.sum((0, -1))
+    whole, q = squares.sum((0, -1)), torch.tensor(INTERVAL, dtype=torch.float64)
+    drawn = (draws.counts @ whole).clamp_min(1e-300)
 
     def shares(parts: Mapping[str, Tensor]) -> dict[str, float]:
         return {name: float(v.sum() / whole.sum().clamp_min(1e-300)) for name, v in parts.items()}
 
     def ends(parts: Mapping[str, Tensor]) -> dict[str, list[float]]:
-        drawn = resampled(spread, whole).clamp_min(1e-300)
-        q = torch.tensor(INTERVAL, dtype=torch.float64)
-        return {name: torch.quantile(resampled(spread, v) / drawn, q).clamp(0, 1).tolist() for name, v in parts.items()}
+        return {n: torch.quantile(draws.counts @ v / drawn, q).clamp(0, 1).tolist() for n, v in parts.items()}
 
-    samples = {name: float(((phase == k) & data.judged).double().mean()) for k, name in enumerate(PHASES)}
-    all_ = sum(samples.values()) or 1.0
+    samples = torch.stack([((phase == k) & data.judged).double().sum() for k in range(len(PHASES))])
+    time = dict(zip(PHASES, (samples / samples.sum().clamp_min(1)).tolist(), strict=True))
     empty: dict[str, Any] = {"outputs": {}, "legs": {}, "regions": [], "covariates": {}}
+    by_phase = {n: {"share": s, "samples": time[n]} for n, s in shares(phases).items()}
     return {
-        "where": empty
-        | {
-            "joints": shares(joints),
-            "phases": {n: {"share": s, "samples": samples[n] / all_} for n, s in shares(phases).items()},
-        },
+        "where": empty | {"joints": shares(joints), "phases": by_phase},
         "where_ci95": empty | {"joints": ends(joints), "phases": ends(phases)},
     }
 
 
 def effects_of(
-    problem: Problem,
-    found: Search,
-    verdicts: Sequence[AxisVerdict],
-    spread: Spread,
-    before: Tensor,
-    alone: Mapping[str, Tensor],
-    floor: float,
+    problem: Problem, found: Search, verdicts: Sequence[AxisVerdict], alone: Mapping[str, Gap]
 ) -> list[dict[str, Any]]:
+    """`effects`; alone: the gap with each effect alone in the model."""
     library = problem.library
     rows = []
-    for name, squares in alone.items():
+    for name, own in alone.items():
         e = library.names.index(name)
-        own = shrink_of(spread, before, squares, floor)
         like = dict.fromkeys(library.names[o] for v in verdicts for o in v.classes.get(e, ()))
         parameters: dict[str, Any] = {}
         for i, v in enumerate(verdicts):
@@ -90,10 +78,10 @@ def effects_of(
                 "name": name,
                 "probability": 1 - math.prod(1 - v.marginal.get(e, 0.0) for v in verdicts),
                 "parameters": parameters,
-                "gap_before": own[0],
-                "gap_after": own[1],
-                "shrink": own[2],
-                "shrink_ci95": own[3],
+                "gap_before": own.before,
+                "gap_after": own.after,
+                "shrink": own.shrink,
+                "shrink_ci95": own.interval,
                 "indistinguishable_from": list(like),
                 "signatures": {},
             }
@@ -105,17 +93,11 @@ def _alone(fits: Sequence[Fit], effect: int) -> Fit | None:
     return next((f for f in fits if f.members == (effect,)), None)
 
 
-def notes_of(
-    problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None, dropped: Sequence[str]
-) -> list[str]:
+def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None) -> list[str]:
     data = problem.data
     notes = [*data.notes, *nominal.notes]
     library = problem.library
     notes += [unseen_text(n, why) for n, why in zip(library.names, library.lacking, strict=True) if why]
-    if dropped:
-        notes.append(
-            f"{listed(dropped)} fit these runs as well, and take nothing away on runs that were not fitted: not named"
-        )
     runs = len(set(data.run.tolist()))
     folds = int(problem.fold.max()) + 1
     if runs > 1:

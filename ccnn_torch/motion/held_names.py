@@ -1,23 +1,18 @@
-"""Which names of the verdicts hold on runs that no fit saw."""
+"""Sets that are tried on runs that no fit saw: each effect alone, and the names of the verdict one after the other."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
-from ccnn_torch.motion.fit import Fit, Spec
+from ccnn_torch.motion.fit import Spec
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, without
 
-__all__ = ["how_many_hold", "in_order", "none_of", "only", "reduced", "singles"]
-
-# Names are added as long as they take the held-out gap to less than this share of itself; a verdict that loses one is
-# no surer than the second number.
-_NEARLY_LEAST, _DOUBTED = 1.02, 0.9
+__all__ = ["in_order", "none_of", "only", "singles"]
 
 
 def none_of(library: Library) -> Spec:
@@ -52,24 +47,3 @@ def in_order(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
     left = problem.residual(torch.stack([torch.stack([s.theta for s in row]) for row in specs]))
     size = (left.square() * problem.data.judged).sum((1, 2, 3))
     return [names[there[k]] for k in torch.argsort(size, descending=True).tolist()]
-
-
-def how_many_hold(squares: Sequence[Tensor]) -> int:
-    """How many of the names, added one after the other, still take something away where nothing was fitted."""
-    left = [float(s.sum()) for s in squares]
-    return next(k for k, value in enumerate(left) if value <= _NEARLY_LEAST**2 * min(left))
-
-
-def reduced(library: Library, fits: Sequence[Fit], verdict: AxisVerdict, names: Sequence[str]) -> AxisVerdict:
-    """The verdict with these names alone, as probable as what is left of it."""
-    members = tuple(m for m in verdict.best.members if library.names[m] in names)
-    best = next((f for f in fits if f.members == members), None)
-    if best is None:
-        old, spec = verdict.best, only(library, verdict.best.spec, members)
-        place = [old.spec.flat.index(j) for j in spec.flat]
-        best = old._replace(spec=spec, mean=old.mean[place], covariance=old.covariance[place][:, place])
-    like = {m: verdict.classes[m] for m in members}
-    each = [verdict.marginal.get(m, 1.0) for m in members] or [1 - max(verdict.marginal.values(), default=0.0)]
-    # Of a cause outside the library it is the probability of that.
-    doubted = verdict.probability if verdict.driver else min([verdict.probability, _DOUBTED, *each])
-    return AxisVerdict(best, doubted, verdict.marginal, like, verdict.driver)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,10 @@ from ccnn_torch.files.write import sweep
 from ccnn_torch.motion.engine import MotionDiagnosis, diagnose_motion
 from ccnn_torch.motion.identified import IDENTIFIED, write_identified
 from ccnn_torch.motion.log import load_logs
-from ccnn_torch.motion.next_motion import write_next_motion
+from ccnn_torch.motion.next_motion import Motion
 from ccnn_torch.motion.nominal import Nominal, nominal_of
 from ccnn_torch.motion.phases import phases_of
+from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.screen import say_place, stdout, step_bar
 from ccnn_torch.report.table import print_text
@@ -60,7 +61,7 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
         with if_stopped(kept):
             if not quiet:
                 print_text(results["verdict"]["text"], stdout, "bold")
-            write_next_motion(folder / NEXT, found.proposed, results)
+            _write_next(folder / NEXT, found.proposed, results)
             written = write_identified(folder, found, nominal, config.mechanism_keys)
             labels = {"about": _about(config, folder, found)}
             write_diagnosis_report(folder, results, motion_arrays(found), labels, tensorboard=False)
@@ -110,6 +111,14 @@ def motion_arrays(found: MotionDiagnosis) -> dict[str, Any]:
         "judged": data.judged.double(),
         "run": data.run.double(),
     }
+
+
+def _write_next(path: Path, motions: Sequence[Motion], results: Mapping[str, Any]) -> None:
+    """Write the commands of the first proposed motion: `time[s]` and its joint's command, to be played."""
+    if motions:
+        number = str(results["next_measurements"][0]["motion"]["joint"]).removeprefix("q")
+        rows = zip(motions[0].time.tolist(), motions[0].command.tolist(), strict=True)
+        write_rows(path, ["time[s]", f"command{number}[{results['gap']['unit']}]"], map(list, rows))
 
 
 def _about(config: DiagnoseConfig, folder: Path, found: MotionDiagnosis) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -17,9 +16,8 @@ from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem, Whitening
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.stretches import Stretches
-from ccnn_torch.report.csv_file import write_rows
 
-__all__ = ["Motion", "motions", "next_motions", "write_next_motion"]
+__all__ = ["Motion", "motions", "next_motions"]
 
 # Seconds of a proposed motion, its sampling, and the lead that is not judged.
 _SECONDS, _STEP, _LEAD = 8.0, 0.01, 0.3
@@ -131,14 +129,6 @@ def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[d
             if len(chosen) < _PROPOSED and e not in chosen and (e[0]["separates"] not in seen) == fresh:
                 chosen.append(e)
     return [c[0] for c in chosen], [c[1] for c in chosen]
-
-
-def write_next_motion(path: Path, motions: Sequence[Motion], results: Mapping[str, Any]) -> None:
-    """Write the commands of the first proposed motion: `time[s]` and its joint's command, to be played."""
-    if motions:
-        number = str(results["next_measurements"][0]["motion"]["joint"]).removeprefix("q")
-        rows = zip(motions[0].time.tolist(), motions[0].command.tolist(), strict=True)
-        write_rows(path, ["time[s]", f"command{number}[{results['gap']['unit']}]"], map(list, rows))
 
 
 def _rivals(fits: Sequence[Fit], verdict: AxisVerdict) -> list[Fit]:

@@ -152,11 +152,11 @@ def _print_tables(results: Block, console: Console, about: About) -> None:
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
     # Here, so that `ccnn check` and the verdict on the terminal do not wait for matplotlib.
+    from ccnn_torch.diagnosis.page.figure_course import course_plot
     from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
     from ccnn_torch.diagnosis.page.figure_machine import machine_plot
     from ccnn_torch.diagnosis.page.figure_signature import signature_plot
     from ccnn_torch.diagnosis.page.figures import gap_plot, probability_plot
-    from ccnn_torch.motion.figure import course_plot
 
     effects = list(results["verdict"]["effects"])
     plots = (
