@@ -13,16 +13,21 @@ from torch import Tensor
 from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, Draws, Gap
 from ccnn_torch.diagnosis.verdict.text import unseen_text
 from ccnn_torch.display import number_text
+from ccnn_torch.motion.effects import Facts, Number
 from ccnn_torch.motion.fit import Fit
 from ccnn_torch.motion.judge import AxisVerdict
+from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.nominal import Nominal
-from ccnn_torch.motion.numbers import parameters_of
 from ccnn_torch.motion.phases import PHASES, phases_of
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.stretches import Stretches
 
 __all__ = ["effects_of", "floor_of", "notes_of", "where_is"]
+
+_SHAPE_UNITS = {"cogging_order": "1", "flexible_damping": "1", "play_loaded": "1"}
+# A limit that is so far away is none.
+_TINY = 1e-9
 
 
 def floor_of(problem: Problem, found: Search, verdicts: Sequence[AxisVerdict]) -> float:
@@ -72,7 +77,7 @@ def effects_of(
         for i, v in enumerate(verdicts):
             fit = v.best if e in v.best.members else _alone(found.found[i], e)
             if fit is not None and (e in v.best.members or not any(e in w.best.members for w in verdicts)):
-                parameters |= parameters_of(library, i, fit, e)
+                parameters |= _parameters(library, i, fit, e)
         rows.append(
             {
                 "name": name,
@@ -126,3 +131,46 @@ def _resolution(data: Stretches) -> float:
     if len(values) > 0.5 * int(data.judged.sum()) or not len(steps):
         return 0.0
     return float(np.quantile(steps, 0.1))
+
+
+def _unit(unit: str, axis: Facts) -> tuple[str, float]:
+    """The unit of a number in words of the axis, and the factor to it: torques by the gain, where it is known."""
+    gain = axis.gain or 1.0
+    force = "N*m" if axis.unit == "rad" else "N"
+    known = {
+        "joint": (axis.unit, 1.0),
+        "speed": (f"{axis.unit}/s", 1.0),
+        "torque": (force if axis.gain else axis.unit, gain),
+        "inertia": ("kg*m^2" if axis.unit == "rad" else "kg", gain) if axis.gain else ("s^2", 1.0),
+        "viscous": (f"{force}*s/{axis.unit}", gain) if axis.gain else ("s", 1.0),
+    }
+    return known.get(unit, (unit, 1.0))
+
+
+def _parameters(library: Library, axis: int, fit: Fit, effect: int) -> dict[str, dict[str, Any]]:
+    """The numbers of one effect of a fit, as `parameters` of diagnosis.json; value: the difference to the model."""
+    facts = library.facts[axis]
+    found: dict[str, dict[str, Any]] = {}
+    flat = fit.spec.flat
+    deviation = fit.covariance.diagonal().clamp_min(0).sqrt()
+    for j in library.places[effect]:
+        number: Number = library.numbers[axis][j]
+        unit, factor = _unit(number.unit, facts)
+        value = float(fit.spec.theta[j]) * number.scale
+        sd = float(deviation[flat.index(j)]) * number.scale
+        if number.inverse:
+            value += facts.nominal.get(number.acts[0][0], 0.0)
+            value, sd = 1 / max(value, _TINY), sd / max(value, _TINY) ** 2
+        found[f"q{axis + 1} {number.name}"] = {
+            "value": value * factor,
+            "sd": sd * factor,
+            "unit": unit,
+            "part": f"joint {axis + 1}",
+        }
+    own = {place for variant in library.variants[effect] for place in variant.held}
+    for name, place in library.held.items():
+        value = float(fit.spec.theta[place])
+        if place in own and value:
+            unit = _SHAPE_UNITS.get(name, f"{facts.unit}/s")
+            found[f"q{axis + 1} {name}"] = {"value": value, "sd": None, "unit": unit, "part": f"joint {axis + 1}"}
+    return found

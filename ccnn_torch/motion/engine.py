@@ -17,8 +17,7 @@ from ccnn_torch.motion.content import effects_of, floor_of, notes_of, where_is
 from ccnn_torch.motion.effects import motion_effects
 from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
-from ccnn_torch.motion.held_names import in_order, only, singles
-from ccnn_torch.motion.held_out import gap_of, held_out
+from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
 from ccnn_torch.motion.judge import AxisVerdict, judge_axes
 from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.next_motion import Motion, next_motions

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -15,7 +15,6 @@ from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem, Whitening
 from ccnn_torch.motion.search import Search
-from ccnn_torch.motion.stretches import Stretches
 
 __all__ = ["Motion", "motions", "next_motions"]
 
@@ -158,33 +157,25 @@ def _apart(names: Sequence[str], best: Fit, rival: Fit) -> list[str]:
 
 def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
     """One axis that is commanded by a motion."""
-    s = len(motion.time)
-    row = motion.command[None]
-    judged = (motion.time > _LEAD)[None]
-    facts = problem.library.facts[axis]
-    nominal = dict(facts.nominal)
-    nominal["gain"] = nominal.get("gain", 1.0) * motion.gain
-    nominal["gravity_sin"] = nominal.get("gravity_sin", 0.0) + motion.load
-    library = _only(problem, axis, nominal)
-    data = Stretches(
-        motion.time[None],
-        row[None],
-        row[None],
-        torch.zeros(1, 1, s, dtype=torch.float64),
-        judged,
-        torch.zeros(1, dtype=torch.int64),
-        {},
-        torch.zeros(1, s, dtype=torch.int64),
-        ("next",),
-        (facts.unit,),
-        (),
+    library, row = problem.library, motion.command[None]
+    still = torch.zeros_like(row)
+    nominal = {n: v[axis : axis + 1] for n, v in library.nominal.items()}
+    nominal["gain"] = nominal.get("gain", torch.ones(1, dtype=row.dtype)) * motion.gain
+    nominal["gravity_sin"] = nominal.get("gravity_sin", torch.zeros(1, dtype=row.dtype)) + motion.load
+    data = problem.data._replace(
+        time=motion.time[None],
+        command=row[None],
+        position=row[None],
+        speed=still[None],
+        judged=(motion.time > _LEAD)[None],
+        run=torch.zeros(1, dtype=torch.int64),
+        beside={},
     )
-    still = torch.zeros(1, s, dtype=torch.float64)
     step = float(problem.data.time.diff(dim=-1).median()) * problem.pool
     return replace(
         problem,
         data=data,
-        library=library,
+        library=library._replace(facts=(), numbers=(library.numbers[axis],), nominal=nominal),
         followed=row[None],
         supply=still,
         warm=still,
@@ -192,16 +183,6 @@ def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
         simulated=None,
         own={},
         pool=max(round(step / _STEP), 1),
-    )
-
-
-def _only(problem: Problem, axis: int, nominal: Mapping[str, float]) -> Any:
-    """The library of one axis."""
-    library = problem.library
-    return library._replace(
-        facts=(replace(library.facts[axis], nominal=nominal),),
-        numbers=(library.numbers[axis],),
-        nominal={n: torch.tensor([v], dtype=torch.float64) for n, v in nominal.items()},
     )
 
 

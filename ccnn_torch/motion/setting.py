@@ -23,15 +23,13 @@ _POOLED = 0.02
 _NEARLY = 0.98
 
 
-def problem_of(
-    logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEffect], most: int | None = None
-) -> Problem:
+def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEffect]) -> Problem:
     """Logs and a nominal model as what is fitted.
 
     Raises:
         InputError: the logs cannot show any of the effects, or cannot be used.
     """
-    data = cut_stretches(logs) if most is None else cut_stretches(logs, most=most)
+    data = cut_stretches(logs)
     driven = nominal.driven(logs, data)
     supply = torch.zeros_like(data.time)
     if "supply" in data.beside:
