@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
+from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.simulators import Simulator
 
-__all__ = ["is_mjcf", "mujoco_simulator"]
+__all__ = ["is_mjcf", "mujoco_nominal"]
 
 Array = NDArray[np.float64]
 # Seconds at the first command before a log begins: the machine rests there.
@@ -27,8 +28,8 @@ def is_mjcf(path: Path) -> bool:
     return "<mujoco" in read_text(str(path), CONFIG_LIMIT, "write an MJCF")
 
 
-def mujoco_simulator(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> Simulator:
-    """The simulator of an MJCF whose actuators hold the positions of joints, one for each command in their order.
+def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> Nominal:
+    """The model of an MJCF whose actuators hold the positions of joints, one for each command in their order.
 
     Raises:
         InputError: MuJoCo is not installed, the model cannot be read, or it has other actuators.
@@ -60,21 +61,27 @@ def mujoco_simulator(path: str, keys: Mapping[str, Any], units: Sequence[str]) -
     gain, limit = model.actuator_gainprm[position, 0], model.actuator_forcerange[position, 1]
     values = {
         "inertia": model.dof_M0[dofs] / gain,
+        "load": (model.dof_M0[dofs] - model.dof_armature[dofs]) / gain,
         "viscous": (model.dof_damping[dofs] - model.actuator_biasprm[position, 2]) / gain,
         "coulomb": model.dof_frictionloss[dofs] / gain,
         "weakness": model.actuator_forcelimited[position] * gain / np.maximum(limit, _TINY),
     }
     levers = [_lever(model, j) for j in joints]
-    return Simulator(
+    simulator = Simulator(
         path,
         lambda time, commands, parameters: _moved(model, joints, values, time, commands)[0],
         {},
-        (f"{Path(path).name}: simulated from rest at each log's first command",),
+        lambda time, commands: _moved(model, joints, values, time, commands),
+    )
+    return Nominal(
+        path,
         tuple({name: float(v[i]) for name, v in values.items() if v[i]} for i in range(len(joints))),
         tuple(gain.tolist()),
         tuple(lever and lever[0] for lever in levers),
+        None,
+        simulator,
+        (f"{Path(path).name}: simulated from rest at each log's first command",),
         tuple(lever and lever[1] for lever in levers),
-        lambda time, commands: _moved(model, joints, values, time, commands),
     )
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,13 +14,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.motion.axis import ABSENT
 from ccnn_torch.motion.effects import MotionEffect
 from ccnn_torch.motion.effects.own_parameter import own_parameter
 from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
 from ccnn_torch.motion.log import Log
-from ccnn_torch.motion.simulators import Simulator, simulator_of
+from ccnn_torch.motion.simulators import Simulator, own_simulator
 from ccnn_torch.motion.stretches import Stretches
+from ccnn_torch.plugins import is_plugin
 from ccnn_torch.spelling import nearest
 
 __all__ = ["KEYS", "TORQUES", "Driven", "Nominal", "axis_keys", "nominal_of"]
@@ -103,7 +106,7 @@ class Nominal:
     lengths: tuple[float | None, ...]
     supply: float | None = None
     simulator: Simulator | None = None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
     weights: tuple[tuple[float, float] | None, ...] = ()
 
     @property
@@ -169,12 +172,21 @@ def nominal_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) ->
     n = len(units)
     if mechanism == "servo":
         return _servo(keys, n)
-    simulator = simulator_of(mechanism, keys, units)
-    if simulator is None:
-        return Nominal(mechanism, ({},) * n, (None,) * n, (None,) * n)
-    axes, gains = simulator.axes or ({},) * n, simulator.gains or (None,) * n
-    lengths = simulator.lengths or (None,) * n
-    return Nominal(mechanism, axes, gains, lengths, None, simulator, simulator.notes, simulator.weights)
+    nothing = Nominal(mechanism, ({},) * n, (None,) * n, (None,) * n)
+    if is_plugin(mechanism):
+        return replace(nothing, simulator=own_simulator(mechanism, keys))
+    if Path(mechanism).suffix.lower() in (".xml", ".mjcf") and Path(mechanism).is_file():
+        from ccnn_torch.motion.mujoco_model import is_mjcf, mujoco_nominal
+
+        if is_mjcf(Path(mechanism)):
+            return mujoco_nominal(mechanism, keys, units)
+    own = [joint.unit for joint in load_mechanism(mechanism, **keys).joints]
+    if own != list(units):
+        raise InputError(
+            f"{mechanism}: has {len(own)} joints ({', '.join(own)}), and the logs {len(units)} ({', '.join(units)}); "
+            "name the commands command1… and the positions q1… in the mechanism's order"
+        )
+    return nothing
 
 
 def _servo(keys: Mapping[str, Any], n: int) -> Nominal:
