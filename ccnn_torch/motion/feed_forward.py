@@ -82,12 +82,8 @@ def moved(nominal: Nominal, axes: Sequence[Mapping[str, float]], time: Array, co
     )
 
     def simulate(own: Sequence[Mapping[str, float]]) -> torch.Tensor:
-        names = {name for axis in own for name in axis}
-        values = {
-            name: torch.tensor([[axis.get(name, ABSENT[name]) for _ in range(p) for axis in own]], dtype=torch.float64)
-            for name in names
-        }
-        return simulate_axes(drive, values)[0]
+        values = {name: [[axis.get(name, ABSENT[name]) for axis in own] * p] for axis in own for name in axis}
+        return simulate_axes(drive, {name: torch.tensor(v, dtype=torch.float64) for name, v in values.items()})[0]
 
     found = simulate(axes)
     if simulated is not None:

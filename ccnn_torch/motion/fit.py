@@ -13,7 +13,7 @@ from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, g
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening
 
-__all__ = ["Fit", "Spec", "fit_many", "sensitivities", "squares_unseen", "started"]
+__all__ = ["Fit", "Spec", "fit_many", "places_of", "sensitivities", "squares_unseen", "started"]
 
 # Of a difference quotient, in plausible sizes.
 _STEP = 1e-3
@@ -136,6 +136,12 @@ def fit_many(
     return found
 
 
+def places_of(places: Sequence[Sequence[Sequence[int]]]) -> Tensor:
+    """Places of the numbers of each axis of each set, `h x n x m`, padded with -1."""
+    wide = max((len(own) for row in places for own in row), default=0)
+    return torch.tensor([[[*own, *[-1] * (wide - len(own))] for own in row] for row in places], dtype=torch.int64)
+
+
 def sensitivities(
     problem: Problem, whitening: Whitening, theta: Tensor, active: Tensor, chosen: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -169,10 +175,7 @@ def _fit_lot(
     h, n = len(specs), len(specs[0])
     theta = torch.stack([torch.stack([s.theta for s in row]) for row in specs])
     wide = max(len(s.moved) for row in specs for s in row)
-    active = torch.full((h, n, wide), -1)
-    for a, row in enumerate(specs):
-        for b, spec in enumerate(row):
-            active[a, b, : len(spec.moved)] = torch.tensor(spec.moved, dtype=torch.int64)
+    active = places_of([[s.moved for s in row] for row in specs])
     safe, real = active.clamp_min(0), (active >= 0).to(theta.dtype)
     low, high = problem.library.bounds
     damping = torch.full((h, n), _DAMPING, dtype=theta.dtype)

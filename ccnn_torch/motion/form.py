@@ -20,13 +20,14 @@ __all__ = ["form_errors", "weighed"]
 _OF_NOMINAL = 1e-5
 
 
-def form_errors(problem: Problem, whitening: Whitening, best: list[Fit]) -> list[float]:
+def form_errors(problem: Problem, whitening: Whitening, best: list[Fit], least: Sequence[float]) -> list[float]:
     """Variance in every direction by which the forms of each axis' set and of the nominal model may be wrong.
 
     Args:
         problem: the data.
         whitening: of the residual.
         best: a set of each axis.
+        least: the variance of each axis is at least that.
     """
     theta = torch.zeros(1, len(best), problem.library.size, dtype=torch.float64)
     command, names = problem.data.command, problem.library.names
@@ -38,7 +39,8 @@ def form_errors(problem: Problem, whitening: Whitening, best: list[Fit]) -> list
     for i, fit in enumerate(best):
         shares = [OF_EXACT if names[m] in EXACT else OF_FORM for m in fit.members]
         energy = fit_sets(fit.grams, [fit.spec.groups], 0.0).energy[0].tolist()[: len(shares)]
-        found.append(form_variance([*shares, _OF_NOMINAL], [*energy, does[i]], max(most[i], does[i])))
+        form = form_variance([*shares, _OF_NOMINAL], [*energy, does[i]], max(most[i], does[i]))
+        found.append(max(form, least[i]))
     return found
 
 

@@ -24,7 +24,7 @@ __all__ = ["IDENTIFIED", "Identified", "is_identified", "load_identified", "writ
 
 IDENTIFIED, _MODEL = "identified_motion.json", "identified.xml"
 # What an MJCF can hold of an axis.
-_IN_MJCF = ("gain", "inertia", "viscous", "coulomb", "weakness")
+_IN_MJCF = ("gain", "inertia", "load", "viscous", "coulomb", "weakness")
 
 # Of what is left of a weight that the MJCF holds.
 _ROUNDING = 1e-12
@@ -60,11 +60,10 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
         keys: of the mechanism, as given.
     """
     library = found.problem.library
-    axes: list[dict[str, float]] = []
     values = library.parameters(torch.stack([v.best.spec.theta for v in found.verdicts]))
     own = {name.removeprefix(OWN): values.pop(name) for name in [*values] if name.startswith(OWN)}
-    for i in range(len(found.verdicts)):
-        axes.append({name: float(v[i]) for name, v in values.items() if float(v[i]) != ABSENT[name]})
+    count = len(found.verdicts)
+    axes = [{name: float(v[i]) for name, v in values.items() if float(v[i]) != ABSENT[name]} for i in range(count)]
     content: dict[str, Any] = {
         "mechanism": nominal.name,
         "mechanism_keys": dict(keys),

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets
 from ccnn_torch.diagnosis.search.form_error import LEVELS, OF_SMOOTH
-from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN
+from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN, is_same
 from ccnn_torch.motion.drivers import Driver, driver_columns
 from ccnn_torch.motion.fit import Fit
 from ccnn_torch.motion.form import weighed
@@ -92,7 +92,7 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     sure = tuple(m for m in members if sum(p for (own, _), p in ranked if like[m] & {*own}) >= _NAMED)
     if inside.get(sure, 0.0) * _LIKE > inside[members]:
         members, classes = sure, _classes(sure, inside)
-    same = sum(p for own, p in inside.items() if _equals(own, members, classes))
+    same = sum(p for own, p in inside.items() if is_same(frozenset(own), frozenset(members), classes))
     return AxisVerdict(by_members[members], same, marginal, classes, None)
 
 
@@ -134,11 +134,3 @@ def _classes(members: Members, inside: Mapping[Members, float]) -> dict[int, tup
         others = [(own, {*own} - rest) for own, p in inside.items() if rest <= {*own} and p * _LIKE > inside[members]]
         found[m] = tuple(new.pop() for own, new in others if len(new) == 1 and m not in own)
     return found
-
-
-def _equals(own: Members, named: Members, classes: Mapping[int, tuple[int, ...]]) -> bool:
-    """Whether a set has every named effect, or one of its class in its place, and nothing else."""
-    left = {*own}
-    for m in named:
-        left.discard(next((e for e in (m, *classes[m]) if e in left), m))
-    return not left and len(own) == len(named)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.motion.fit import Fit, sensitivities
+from ccnn_torch.motion.fit import Fit, places_of, sensitivities
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem, Whitening
@@ -189,7 +189,7 @@ def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
 def _gain(problem: Problem, whitening: Whitening, axis: int, best: Fit, rival: Fit | None) -> float:
     """In nats."""
     other = best if rival is None else rival
-    active = torch.tensor([[list(other.spec.flat)]], dtype=torch.int64).reshape(1, 1, -1)
+    active = places_of([[other.spec.flat]])
     mine = problem.positions(torch.stack([best.spec.theta])[None])[0]
     there = replace(problem, data=problem.data._replace(position=mine))
     difference, columns = sensitivities(there, whitening, other.spec.theta[None, None], active)

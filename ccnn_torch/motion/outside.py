@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, grams_of
 from ccnn_torch.motion.drivers import Driver
-from ccnn_torch.motion.fit import Fit, sensitivities, squares_unseen
+from ccnn_torch.motion.fit import Fit, places_of, sensitivities, squares_unseen
 from ccnn_torch.motion.problem import Problem, Whitening
 from ccnn_torch.motion.search import CROWD, Search, log_posterior
 
@@ -87,8 +87,7 @@ def with_drivers(
     for base in {f.members: f for f in [*found.found[axis][:_BASES], *chain]}.values():
         theta = torch.stack([base.spec.theta if i == axis else own[0].spec.theta for i, own in enumerate(found.found)])
         flat = list(base.spec.flat)
-        active = torch.full((1, len(theta), len(flat)), -1)
-        active[0, axis] = torch.tensor(flat, dtype=torch.int64)
+        active = places_of([[flat if i == axis else () for i in range(len(theta))]])
         residual, own = sensitivities(problem, found.whitening, theta[None], active)
         plain = problem.residual(theta[None])[0, axis]
         y = residual[axis, 0] + base.spec.theta[flat] @ own[axis, 0]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
-from ccnn_torch.motion.fit import Fit, Spec, fit_many, sensitivities, started
+from ccnn_torch.motion.fit import Fit, Spec, fit_many, places_of, sensitivities, started
 from ccnn_torch.motion.form import form_errors, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening, white_noise
@@ -80,14 +80,14 @@ def search(problem: Problem) -> Search:
     final.reduced()
     ranked = tuple(tuple(p) for p in final.ranked())
     # Sets that are probable although forms are wrong are smaller than those above.
-    noise = [fits[0].noise for fits in ranked]
+    noise = [own[0].noise for own in ranked]
     unseen = unseen_errors([fits[:_KEPT] for fits in ranked])
     for _ in range(2):
-        form = [max(a, b) for a, b in zip(form_errors(problem, final.whitening, final.best()), unseen, strict=True)]
+        form = form_errors(problem, final.whitening, final.best(), unseen)
         final.variance = [a + b for a, b in zip(noise, form, strict=True)]
     final.forward()
     final.neighbours()
-    form = [max(a, b) for a, b in zip(form_errors(problem, final.whitening, final.best()), unseen, strict=True)]
+    form = form_errors(problem, final.whitening, final.best(), unseen)
     final.variance = None
     final.reduced()
     return Search(problem, final.whitening, tuple(tuple(p) for p in final.ranked()), rich, tuple(form), final.loose)
@@ -163,7 +163,7 @@ class _Pool:
                 d |= {f.members for f in own}
             # Alone every effect is fitted: its own share of the gap is told.
             alone = all(not f.members for own in bases for f in own)
-            self.fit(self.screened(bases, len(self.library.effects) if alone else _FITTED), _SHORT)
+            self.fit(self.screened(bases, len(self.library.names) if alone else _FITTED), _SHORT)
             self.fit([[f.spec for f in ranked[:_BEAM] if f.members] for ranked in self.ranked()], _SHORT)
             after = [self.score(i, f) for i, f in enumerate(self.best())]
             if all(a < b + _GAINED for a, b in zip(after, before, strict=True)):
@@ -246,10 +246,7 @@ class _Pool:
                     changed[:, place] = v.shapes[:, b]
                 moved.append(changed)
                 steps.append(step)
-        wide = max(len(f.spec.flat) for f in bases)
-        active = torch.full((1, len(bases), wide), -1)
-        for i, f in enumerate(bases):
-            active[0, i, : len(f.spec.flat)] = torch.tensor(f.spec.flat, dtype=torch.int64)
+        active = places_of([[f.spec.flat for f in bases]])
         residual, own = sensitivities(problem, self.whitening, theta[None], active)
         parts = []
         for k in range(0, len(moved), 16):
