@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, grams_of
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening
 
@@ -234,27 +234,30 @@ def _fit_of(spec: Spec, residual: Tensor, x: Tensor, values: float, left: float,
         fit.mean[0, :m],
         fit.covariance[0, :m, :m],
         float(residual.square().sum()),
-        squares_unseen(x, y, spec.groups, fold, values),
+        squares_unseen(x, y, fit, spec.groups, fold),
         left,
         grams,
     )
 
 
-def squares_unseen(x: Tensor, y: Tensor, groups: Sequence[Tensor], fold: Tensor, values: float) -> float:
+def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Tensor], fold: Tensor) -> float:
     """Squares that a linear model leaves of runs that it was not fitted to; its scales are those of all runs.
 
     Args:
         x, y: whitened columns, `m x v`, and what they explain, `v`.
+        fit: to all runs.
         groups: of columns.
         fold: of each value, `v`.
-        values: how many count.
     """
-    fit = fit_sets(grams_of(x.mT[:, None, :], y[:, None])._replace(values=values), [groups], 0.0)
     size = torch.cat([x.new_zeros(0), *(fit.log_scale[0, g].expand(len(c)) for g, c in enumerate(groups))])
     ridge = torch.diag(torch.exp(-size) * fit.noise[0])
     parts = [(x[:, fold == f], y[fold == f]) for f in range(int(fold.max()) + 1)]
     whole, along = x @ x.mT + ridge, x @ y
-    means = [torch.linalg.solve(whole - a @ a.mT, along - a @ b) for a, b in parts] if len(parts) > 1 else [fit.mean[0]]
+    means = (
+        [torch.linalg.solve(whole - a @ a.mT, along - a @ b) for a, b in parts]
+        if len(parts) > 1
+        else [fit.mean[0, : len(x)]]
+    )
     return sum(float((b - mean @ a).square().sum()) for mean, (a, b) in zip(means, parts, strict=True))
 
 

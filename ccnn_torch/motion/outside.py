@@ -113,9 +113,12 @@ def holds(problem: Problem, candidate: Candidate) -> bool:
     """Whether a driver takes something away on runs that no fit saw; the scales are those of all runs."""
     assert candidate.rows is not None
     own, columns, y = candidate.rows
-    fold, values = problem.fold[:, None].expand(problem.judged.shape).flatten(), candidate.grams.values
-    without = squares_unseen(own, y, candidate.groups[:-1], fold, values)
-    return squares_unseen(torch.cat([own, columns]), y, candidate.groups, fold, values) < without
+    fold = problem.fold[:, None].expand(problem.judged.shape).flatten()
+    less, more = (
+        squares_unseen(x, y, fit_sets(candidate.grams, [groups], 0.0), groups, fold)
+        for x, groups in ((own, candidate.groups[:-1]), (torch.cat([own, columns]), candidate.groups))
+    )
+    return more < less
 
 
 def _one(found: Search, axis: int) -> Whitening:

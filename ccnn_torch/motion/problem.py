@@ -122,12 +122,14 @@ class Problem:
         moved = wide.positions(theta[None])[0].reshape(n, m, b, s)
         return moved if self.simulated is None else moved + self._beyond[:, None]
 
-    def loose(self) -> Tensor:
-        """What the positions change by when a nominal parameter is off by what it is known to, `k x n x b x s`."""
+    def loose(self, theta: Tensor) -> Tensor:
+        """What the positions change by when a nominal parameter is off by what it is known to, `k x n x b x s`.
+
+        About `theta`, `n x k`, the machine as it seems to be: a model that is wrong may be near to its stability.
+        """
         n, rows, nominal = len(self.followed), torch.arange(len(self.data.time)), self.library.nominal
-        zero = torch.zeros(1, n, self.library.size, dtype=torch.float64)
         start = torch.stack([self.data.position[:, :, 0], self.data.speed[:, :, 0]], -1)
-        plain, columns = self._moved(zero, rows, start), [zero.new_zeros(0, *self.followed.shape)]
+        plain, columns = self._moved(theta[None], rows, start), [theta.new_zeros(0, *self.followed.shape)]
         absent = torch.zeros(n, dtype=torch.float64)
         weight = torch.hypot(*(nominal.get(name, absent) for name in _WEIGHT))
         sizes = {"gain": torch.ones_like(absent), **nominal, **dict.fromkeys(_WEIGHT, weight)}
@@ -135,7 +137,7 @@ class Problem:
             if name in _LOOSE and bool((size != 0).any()):
                 before = nominal.get(name, sizes["gain"] if name == "gain" else absent)
                 other = self.library._replace(nominal={**nominal, name: before + _KNOWN * size})
-                columns.append(replace(self, library=other)._moved(zero, rows, start) - plain)
+                columns.append(replace(self, library=other)._moved(theta[None], rows, start) - plain)
         return torch.cat(columns)
 
     def _moved(self, theta: Tensor, rows: Tensor, start: Tensor) -> Tensor:

@@ -74,7 +74,7 @@ def search(problem: Problem) -> Search:
     # The noise of what is left by what is most probable now.
     theta = torch.stack([f.spec.theta for f in pool.best()])[None]
     left = problem.residual(theta)[0]
-    final = _Pool(problem, fitted_whitening(problem.pooled(left), problem.judged))
+    final = _Pool(problem, fitted_whitening(problem.pooled(left), problem.judged), theta[0])
     final.again(pool)
     final.neighbours()
     final.reduced()
@@ -96,9 +96,11 @@ def search(problem: Problem) -> Search:
 class _Pool:
     """Fits of each axis by their members, under one noise."""
 
-    def __init__(self, problem: Problem, whitening: Whitening) -> None:
+    def __init__(self, problem: Problem, whitening: Whitening, about: Tensor | None = None) -> None:
         self.problem, self.whitening = problem, whitening
-        self.loose = problem.whitened(problem.loose(), whitening)
+        # Nothing, as long as each set has the noise that it leaves.
+        loose = problem.followed.new_zeros(0, *problem.followed.shape) if about is None else problem.loose(about)
+        self.loose = problem.whitened(loose, whitening)
         self.library: Library = problem.library
         self.axes = len(problem.followed)
         zero = torch.zeros(self.library.size, dtype=torch.float64)
