@@ -75,7 +75,7 @@ def effects_of(
         like = dict.fromkeys(library.names[o] for v in verdicts for o in v.classes.get(e, ()))
         parameters: dict[str, Any] = {}
         for i, v in enumerate(verdicts):
-            fit = v.best if e in v.best.members else _alone(found.found[i], e)
+            fit = v.best if e in v.best.members else next((f for f in found.found[i] if f.members == (e,)), None)
             if fit is not None and (e in v.best.members or not any(e in w.best.members for w in verdicts)):
                 parameters |= _parameters(library, i, fit, e)
         rows.append(
@@ -92,10 +92,6 @@ def effects_of(
             }
         )
     return sorted(rows, key=lambda e: (-e["probability"], e["gap_after"], e["name"]))
-
-
-def _alone(fits: Sequence[Fit], effect: int) -> Fit | None:
-    return next((f for f in fits if f.members == (effect,)), None)
 
 
 def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None) -> list[str]:

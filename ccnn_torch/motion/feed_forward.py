@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from ccnn_torch.motion.axis import ABSENT, Drive, simulate_axes
+from ccnn_torch.motion.mistakes import lag_of
 from ccnn_torch.motion.nominal import Nominal
 
 __all__ = ["Corrected", "corrected_command", "moved"]
@@ -113,7 +114,7 @@ def corrected_command(
     plain = moved(nominal, axes, time, wanted[None])[0]
     error = wanted - plain
     limit = _BOUND * np.abs(error).max(0) if bound is None else np.asarray(bound, dtype=np.float64)
-    late = [_lateness(time, wanted[:, i], plain[:, i]) for i in range(wanted.shape[1])]
+    late = [lag_of(time, wanted[:, i], plain[:, i]) for i in range(wanted.shape[1])]
     command, position, left = wanted, plain, _rms(error)
     for _ in range(_STEPS):
         ahead = np.stack([np.interp(time + t, time, e) for t, e in zip(late, error.T, strict=True)], -1)
@@ -136,11 +137,3 @@ def corrected_command(
 
 def _rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.square(values).mean(0)))
-
-
-def _lateness(time: Array, wanted: Array, position: Array) -> float:
-    """By how much a position is behind what is wanted [s], of shifts of up to 0.3 s the best."""
-    step = float(np.median(np.diff(time)))
-    shifts = np.arange(0, min(0.3, 0.25 * (time[-1] - time[0])), step)
-    left = [float(np.square(np.interp(time - s, time, wanted) - position).mean()) for s in shifts]
-    return float(shifts[int(np.argmin(left))]) if len(left) else 0.0

@@ -70,7 +70,7 @@ class Fit(NamedTuple):
         spec: the set, with `theta` where the fit ended.
         log_evidence: of the linearised model.
         noise: variance of the whitened residual.
-        mean, covariance: of the active numbers in plausible sizes, `m`, `m x m`.
+        covariance: of the active numbers in plausible sizes, `m x m`.
         rss: squares of the whitened residual.
         unseen: the same on runs that its numbers were not fitted to.
         left: mean square of the residual itself [rad^2 or m^2].
@@ -80,7 +80,6 @@ class Fit(NamedTuple):
     spec: Spec
     log_evidence: float
     noise: float
-    mean: Tensor
     covariance: Tensor
     rss: float
     unseen: float
@@ -231,7 +230,6 @@ def _fit_of(spec: Spec, residual: Tensor, x: Tensor, values: float, left: float,
         spec,
         evidence if math.isfinite(evidence) else -math.inf,
         float(fit.noise[0]),
-        fit.mean[0, :m],
         fit.covariance[0, :m, :m],
         float(residual.square().sum()),
         squares_unseen(x, y, fit, spec.groups, fold),

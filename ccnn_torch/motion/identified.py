@@ -6,7 +6,7 @@ What a model cannot hold (a delay, a play, ...) stands beside it, as parameters 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -125,14 +125,9 @@ def load_identified(path: Path, allow_code: bool = False) -> Identified:
     name = str(beside) if mechanism == _MODEL else str(mechanism)
     with code_refused(f"{path}: its simulator", allow_code):
         nominal = nominal_of(name, keys, units)
-    return Identified(nominal, _axes_of(nominal, axes), left, effects, tuple(units))
-
-
-def _axes_of(nominal: Nominal, axes: Sequence[Axis]) -> tuple[Axis, ...]:
-    """Parameters of the axes of a model with the new values in it."""
-    if nominal.name == "servo":
-        return nominal.axes
-    return tuple({**axis, **own} for axis, own in zip(axes, nominal.axes, strict=True))
+    if nominal.name != "servo":
+        axes = tuple({**axis, **own} for axis, own in zip(axes, nominal.axes, strict=True))
+    return Identified(nominal, nominal.axes if nominal.name == "servo" else axes, left, effects, tuple(units))
 
 
 def _beside(nominal: Nominal, i: int, axis: Axis, mass: float) -> dict[str, float]:

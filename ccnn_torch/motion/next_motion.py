@@ -96,8 +96,7 @@ def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[d
         middle, amplitude = float(position.mean()), 0.5 * float(position.max() - position.min())
         if not amplitude:
             continue
-        # Two effects that do the same to this model are distinguished by no motion.
-        rivals = [f for f in _rivals(found.found[i], verdict) if not _alike(library, i, verdict.best, f)]
+        rivals, best = _rivals(library, i, found.found[i], verdict), {*verdict.best.members}
         for motion in motions(middle, amplitude, library.facts[i].speed, library.facts[i].unit):
             problem = _problem_of(found.problem, i, motion)
             whitening = Whitening(found.whitening.coefficients[i : i + 1])
@@ -116,7 +115,8 @@ def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[d
             others: list[Fit | None] = [*rivals] or [None]
             for rival in others:
                 gain = _gain(problem, whitening, i, verdict.best, rival)
-                names = [] if rival is None else _apart(library.names, verdict.best, rival)
+                other = best if rival is None else {*rival.members}
+                names = [library.names[e] for e in (*sorted(best - other), *sorted(other - best))]
                 entries.append((entry | {"separates": names, "gain": gain}, motion))
     entries = [e for e in entries if math.isfinite(e[0]["gain"])]
     entries.sort(key=lambda e: -e[0]["gain"])
@@ -130,29 +130,17 @@ def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[d
     return [c[0] for c in chosen], [c[1] for c in chosen]
 
 
-def _rivals(fits: Sequence[Fit], verdict: AxisVerdict) -> list[Fit]:
-    """The most probable sets in which a member of the verdict is replaced by one of its class."""
-    found = []
-    for member, like in verdict.classes.items():
-        for other in like:
-            wanted = tuple(sorted({*verdict.best.members} - {member} | {other}))
-            found += [f for f in fits if f.members == wanted]
-    return found[:_RIVALS]
+def _rivals(library: Library, axis: int, fits: Sequence[Fit], verdict: AxisVerdict) -> list[Fit]:
+    """The most probable sets in which a member of the verdict is replaced by one of its class, and acts otherwise."""
 
+    def acts(f: Fit) -> list[Any]:
+        return sorted(a for member in f.members for j in library.places[member] for a in library.numbers[axis][j].acts)
 
-def _alike(library: Library, axis: int, best: Fit, rival: Fit) -> bool:
-    """Whether two sets act on the same parameters of the axis."""
-    acts = [
-        sorted(act for member in f.members for j in library.places[member] for act in library.numbers[axis][j].acts)
-        for f in (best, rival)
-    ]
-    return acts[0] == acts[1]
-
-
-def _apart(names: Sequence[str], best: Fit, rival: Fit) -> list[str]:
-    return [
-        names[e] for e in (*sorted({*best.members} - {*rival.members}), *sorted({*rival.members} - {*best.members}))
-    ]
+    own = {*verdict.best.members}
+    sets = [tuple(sorted(own - {m} | {other})) for m, like in verdict.classes.items() for other in like]
+    found = [f for wanted in sets for f in fits if f.members == wanted][:_RIVALS]
+    # Two effects that do the same to this model are distinguished by no motion.
+    return [f for f in found if acts(f) != acts(verdict.best)]
 
 
 def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:

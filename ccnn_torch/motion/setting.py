@@ -50,16 +50,14 @@ def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEf
 
 def _facts(data: Stretches, i: int, nominal: Nominal, followed: Tensor, supply: Tensor, warm: Tensor) -> Facts:
     judged = data.judged
-    step = data.time.diff(dim=-1)
-    speed = data.speed[i]
-    rise = speed.diff(dim=-1) / step
 
     def nearly(values: Tensor) -> float:
         kept = values.abs().flatten()
         return float(torch.quantile(kept[:: max(len(kept) // 100_000, 1)], _NEARLY))
 
-    most = nearly(speed[judged]) or 1.0
     span = float(data.command[i][judged].max() - data.command[i][judged].min())
+    # Between runs other things than the temperature change as well.
+    runs = [warm[data.run == run][judged[data.run == run]] for run in set(data.run.tolist())]
     return Facts(
         unit=data.units[i],
         nominal=nominal.axes[i],
@@ -67,15 +65,8 @@ def _facts(data: Stretches, i: int, nominal: Nominal, followed: Tensor, supply: 
         length=nominal.lengths[i],
         weight=nominal.weights[i] if nominal.weights else None,
         span=span or 1.0,
-        speed=most,
-        acceleration=nearly(rise[judged[:, 1:]]) or 1.0,
+        speed=nearly(data.speed[i][judged]) or 1.0,
         error=nearly((followed[i] - data.position[i])[judged]) or 1e-6,
         supply=float(supply[judged].abs().max()) if "supply" in data.beside else 0.0,
-        temperature=_within_runs(data, warm),
+        temperature=max(float(v.max() - v.min()) for v in runs),
     )
-
-
-def _within_runs(data: Stretches, warm: Tensor) -> float:
-    """The largest change of the temperature in one run: between runs other things change as well."""
-    own = [warm[data.run == run][data.judged[data.run == run]] for run in set(data.run.tolist())]
-    return max(float(v.max() - v.min()) for v in own)

@@ -66,6 +66,19 @@ def test_each_law_does_what_its_name_says() -> None:
     assert np.sum(np.diff(np.sign(rings)) != 0) in range(26, 32)
 
 
+def test_limits_and_loads_go_on_where_a_stretch_begins() -> None:
+    time = torch.from_numpy(TIME)[None]
+    still, begin = torch.zeros_like(time), torch.zeros(1, 2, dtype=torch.float64)
+    given = {"slowness": torch.tensor([[2.0]], dtype=torch.float64)}
+    late = simulate_axes(Drive(time, still + 1, begin, still, still), given)[0, 0].numpy()
+    # The command may be far ahead of a limited axis already.
+    assert np.abs(late - np.minimum(0.5 * (TIME - TIME[0]), 1)).max() < 1e-3
+    # What a simulator loads an axis with presses its play to one side.
+    given = {n: torch.tensor([[v]], dtype=torch.float64) for n, v in {"play": 0.1, "play_loaded": 1.0, **OWN}.items()}
+    hung = simulate_axes(Drive(time, still, begin, still, still, still + 0.2), given)[0, 0]
+    assert float(hung[-1]) == pytest.approx(-0.25, abs=1e-3)
+
+
 def test_parameters_are_batched_and_never_run_away() -> None:
     asked = torch.from_numpy(command(0, TIME))[None]
     time = torch.from_numpy(TIME)[None]

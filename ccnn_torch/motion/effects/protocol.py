@@ -22,7 +22,7 @@ class Facts:
         weight: torque of the weight of 1 kg there, times the sine and the cosine of the position [N m]; None: that of a
             lever that hangs down at 0.
         span: of the command [rad or m].
-        speed, acceleration: nearly the largest ones of the command [per s, per s^2].
+        speed: nearly the largest one [per s].
         error: nearly the largest difference of command and position [rad or m].
         supply, temperature: largest relative change of the supply voltage, and of the temperature [K], in the logs.
     """
@@ -34,7 +34,6 @@ class Facts:
     weight: tuple[float, float] | None = None
     span: float = 1.0
     speed: float = 1.0
-    acceleration: float = 1.0
     error: float = 0.1
     supply: float = 0.0
     temperature: float = 0.0
