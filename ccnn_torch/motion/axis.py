@@ -66,16 +66,16 @@ class Drive(NamedTuple):
         time: `b x s` [s], increasing, also in the padding.
         command: `b x s` [rad or m].
         start: position and speed of the first sample, `b x 2`.
-        supply: supply voltage over the nominal one, less 1, `b x s`.
-        warm: temperature less that of the first sample, `b x s` [K].
+        supply: supply voltage over the nominal one, less 1, `b x s`; None = 0.
+        warm: temperature less that of the first sample, `b x s` [K]; None = 0.
         torque: what else resists the motor, over the nominal gain, `b x s` [rad or m]; it comes as late as the command.
     """
 
     time: Tensor
     command: Tensor
     start: Tensor
-    supply: Tensor
-    warm: Tensor
+    supply: Tensor | None = None
+    warm: Tensor | None = None
     torque: Tensor | None = None
 
 
@@ -147,9 +147,9 @@ def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[
     start = drive.start.numpy()
     q, v = (np.broadcast_to(start[:, k], u.shape[1:]) for k in range(2))
     share = None
-    if np.any(a["supply"]) and bool((drive.supply != 0).any()):
+    if np.any(a["supply"]) and drive.supply is not None and bool((drive.supply != 0).any()):
         share = np.maximum(1 + a["supply"] * drive.supply.numpy().T[:, None], 0)
-    warm = drive.warm.numpy().T if np.any(a["thermal"]) else None
+    warm = drive.warm.numpy().T if np.any(a["thermal"]) and drive.warm is not None else None
     rule = _Rule(a)
     found = np.empty_like(u)
     found[0] = q

@@ -62,8 +62,8 @@ def moved(nominal: Nominal, axes: Sequence[Mapping[str, float]], time: Array, co
     asked = np.concatenate([np.repeat(commands[:, :1], len(before), 1), commands], 1)
     torque = simulated = None
     followed = asked
-    if nominal.simulator is not None and nominal.simulator.loaded is not None:
-        made = [nominal.simulator.loaded(clock.numpy(), one) for one in asked]
+    if nominal.loaded is not None:
+        made = [nominal.loaded(clock.numpy(), one) for one in asked]
         simulated, torque = (np.stack([m[k] for m in made]) for k in range(2))
     elif nominal.simulator is not None:
         followed = np.stack([nominal.simulator.positions(clock.numpy(), one) for one in asked])
@@ -71,15 +71,12 @@ def moved(nominal: Nominal, axes: Sequence[Mapping[str, float]], time: Array, co
     def rows(values: Array) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values.transpose(0, 2, 1).reshape(p * n, -1)))
 
-    still = torch.zeros(p * n, len(clock), dtype=torch.float64)
     begin = rows(followed if simulated is None else simulated)[:, 0]
     drive = Drive(
         clock.expand(p * n, -1),
         rows(followed),
         torch.stack([begin, torch.zeros_like(begin)], -1),
-        still,
-        still,
-        None if torque is None else rows(torque),
+        torque=None if torque is None else rows(torque),
     )
 
     def simulate(own: Sequence[Mapping[str, float]]) -> torch.Tensor:

@@ -75,12 +75,12 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
     files = [IDENTIFIED]
     if nominal.name == "servo":
         content["mechanism_keys"] = axis_keys(nominal, axes, _mass(found))
-    elif nominal.simulator is not None and nominal.simulator.loaded is None:
+    elif nominal.simulator is not None:
         parameters = dict(nominal.simulator.parameters)
         for name, v in own.items():
             parameters[name] += float(v.sum() / (v != 0).sum().clamp_min(1))
         content["mechanism_keys"] = parameters
-    elif nominal.simulator is not None:
+    elif nominal.loaded is not None:
         from ccnn_torch.motion.mujoco_write import write_mjcf
 
         added = _mass(found)

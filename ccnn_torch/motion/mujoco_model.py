@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 from ccnn_torch.motion.nominal import Nominal
-from ccnn_torch.motion.simulators import Simulator
 
 __all__ = ["is_mjcf", "mujoco_nominal"]
 
@@ -67,21 +66,14 @@ def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> 
         "weakness": model.actuator_forcelimited[position] * gain / np.maximum(limit, _TINY),
     }
     levers = [_lever(model, j) for j in joints]
-    simulator = Simulator(
-        path,
-        lambda time, commands, parameters: _moved(model, joints, values, time, commands)[0],
-        {},
-        lambda time, commands: _moved(model, joints, values, time, commands),
-    )
     return Nominal(
         path,
         tuple({name: float(v[i]) for name, v in values.items() if v[i]} for i in range(len(joints))),
         tuple(gain.tolist()),
         tuple(lever and lever[0] for lever in levers),
-        None,
-        simulator,
-        (f"{Path(path).name}: simulated from rest at each log's first command",),
-        tuple(lever and lever[1] for lever in levers),
+        weights=tuple(lever and lever[1] for lever in levers),
+        loaded=lambda time, commands: _moved(model, joints, values, time, commands),
+        notes=(f"{Path(path).name}: simulated from rest at each log's first command",),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,6 +69,9 @@ _SAME = {
 }
 
 
+Array = NDArray[np.float64]
+
+
 class Driven(NamedTuple):
     """What drives the axes, `n x b x s` each.
 
@@ -97,6 +100,8 @@ class Nominal:
         weights: of 1 kg there, as of `Facts`.
         supply: nominal supply voltage; None where the motor's strength is not known to follow it.
         simulator: makes the positions that the axes follow; None where they follow the commands.
+        loaded: `time, commands` -> positions, and what resists the motors beside those of `axes`, over the gains,
+            `s x n` each; None where the axes tell the positions.
         notes: sentences without a full stop.
     """
 
@@ -108,11 +113,12 @@ class Nominal:
     simulator: Simulator | None = None
     notes: tuple[str, ...] = ()
     weights: tuple[tuple[float, float] | None, ...] = ()
+    loaded: Callable[[Array, Array], tuple[Array, Array]] | None = None
 
     @property
     def own_effects(self) -> list[MotionEffect]:
         """Wrong values of a simulator's own parameters."""
-        own = self.simulator.parameters if self.simulator is not None and self.simulator.loaded is None else {}
+        own = self.simulator.parameters if self.simulator is not None else {}
         return [own_parameter(name, value) for name, value in own.items()]
 
     def driven(self, logs: Sequence[Log], data: Stretches, about: Mapping[str, float] | None = None) -> Driven:
@@ -127,9 +133,11 @@ class Nominal:
             InputError: the simulator fails.
         """
         simulator = self.simulator
-        if simulator is None:
-            return Driven(data.command)
-        if simulator.loaded is None:
+        if self.loaded is not None:
+            pairs = [self.loaded(log.time, log.command) for log in logs]
+            simulated, torque = (_along([pair[k] for pair in pairs], data) for k in range(2))
+            return Driven(data.command, torque, simulated)
+        if simulator is not None:
             centre = {name: value + (about or {}).get(name, 0.0) for name, value in simulator.parameters.items()}
 
             def made_with(**other: float) -> Tensor:
@@ -142,12 +150,10 @@ class Nominal:
                 own[name] = (made_with(**{name: value + step}) - made_with(**{name: value - step})) / (2 * step)
                 made = made - (value - simulator.parameters[name]) * own[name]
             return Driven(made, own=own)
-        pairs = [simulator.loaded(log.time, log.command) for log in logs]
-        simulated, torque = (_along([pair[k] for pair in pairs], data) for k in range(2))
-        return Driven(data.command, torque, simulated)
+        return Driven(data.command)
 
 
-def _along(made: Sequence[NDArray[np.float64]], data: Stretches) -> Tensor:
+def _along(made: Sequence[Array], data: Stretches) -> Tensor:
     """What was made for each log, at the samples of the stretches, `n x b x s`."""
     found = data.command.clone()
     for k, number in enumerate(data.run.tolist()):

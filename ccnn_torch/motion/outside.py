@@ -49,7 +49,7 @@ def prior_of(fit: Fit) -> float:
 
 
 def essential(
-    members: Members, left: Mapping[Members, float], slight: float, unseen: Mapping[Members, float] | None = None
+    members: Members, left: Mapping[Members, float], slight: float, unseen: Mapping[Members, float]
 ) -> Members:
     """The set without members that do next to nothing, the least first.
 
@@ -57,13 +57,13 @@ def essential(
         members: of the set.
         left: mean square that each set leaves.
         slight: of what is next to nothing.
-        unseen: squares that each set leaves of runs that it was not fitted to, where a member has to take something
-            away as well.
+        unseen: squares that each set leaves of runs that it was not fitted to, of which a member has to take something
+            away as well; where it is not told it has not.
     """
-    most = None if unseen is None else _NEARLY**2 * unseen[members]
+    most = _NEARLY**2 * unseen.get(members, 0.0)
     while members:
         rest = [r for e in members if (r := tuple(m for m in members if m != e)) in left]
-        rest = [r for r in rest if left[r] - left[members] < slight or (unseen and most and unseen[r] <= most)]
+        rest = [r for r in rest if left[r] - left[members] < slight or unseen.get(r, math.inf) <= most]
         if not rest:
             break
         members = min(rest, key=lambda r: left[r])
@@ -74,7 +74,8 @@ def with_drivers(
     found: Search, axis: int, drivers: Sequence[Driver], fits: Mapping[Members, Fit], slight: float
 ) -> list[Candidate]:
     """Drivers beside the most probable sets, and those that lead from the best one to none."""
-    problem, judged, one = found.problem, found.problem.data.judged, _one(found, axis)
+    problem, judged = found.problem, found.problem.data.judged
+    one = Whitening(found.whitening.coefficients[axis : axis + 1])
     values = float(problem.judged.sum())
     white = [problem.whitened(driver.columns[axis][:, None], one)[0] for driver in drivers]
     chain = [found.found[axis][0]]
@@ -104,7 +105,7 @@ def with_drivers(
             sets.append((k, Candidate((base.members, there), grams, groups, prior, (own[axis, 0], columns, y))))
     # Beside a driver a name has to do what the driver does not do as well.
     return [
-        one._replace(key=(essential(one.key[0], taken[k] if one.key[1] else left, slight), one.key[1]))
+        one._replace(key=(essential(one.key[0], taken[k] if one.key[1] else left, slight, {}), one.key[1]))
         for k, one in sets
     ]
 
@@ -119,8 +120,3 @@ def holds(problem: Problem, candidate: Candidate) -> bool:
         for x, groups in ((own, candidate.groups[:-1]), (torch.cat([own, columns]), candidate.groups))
     )
     return more < less
-
-
-def _one(found: Search, axis: int) -> Whitening:
-    """The whitening of one axis."""
-    return Whitening(found.whitening.coefficients[axis : axis + 1])

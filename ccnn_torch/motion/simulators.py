@@ -26,13 +26,11 @@ class Simulator:
         name: as given.
         simulate: `simulate(time, commands, parameters)`: `s`, `s x n`, a dict, and `s x n` back.
         parameters: what it is given.
-        loaded: where it does, positions and what resists the motors beside those, over the gains, `s x n` each.
     """
 
     name: str
     simulate: Callable[[Array, Array, dict[str, float]], Array]
     parameters: Mapping[str, float]
-    loaded: Callable[[Array, Array], tuple[Array, Array]] | None = None
 
     def positions(self, time: Array, command: Array) -> Array:
         """Positions of one run, `s x n`; time `s`, command `s x n`.

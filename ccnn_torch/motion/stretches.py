@@ -44,7 +44,6 @@ class Stretches(NamedTuple):
         run: the number of the log of each, `b`.
         beside: recorded columns by name, `b x s`.
         log: every sample's place in its log, `b x s`, int64.
-        names: of the runs.
         units: of the joints.
         notes: what was left out, one sentence each without a full stop.
     """
@@ -57,7 +56,6 @@ class Stretches(NamedTuple):
     run: Tensor
     beside: dict[str, Tensor]
     log: Tensor
-    names: tuple[str, ...]
     units: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -154,7 +152,6 @@ def _padded(logs: Sequence[Log], pieces: Sequence[tuple[int, NDArray[np.int64], 
         run=torch.tensor([number for number, _, _ in pieces]),
         beside={name: torch.from_numpy(v) for name, v in beside.items()},
         log=torch.from_numpy(place),
-        names=tuple(log.name for log in logs),
         units=logs[0].units,
         notes=tuple(notes),
     )

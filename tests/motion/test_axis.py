@@ -15,7 +15,7 @@ from ccnn_torch.motion.library import library_of
 def axis(time: np.ndarray, asked: np.ndarray, **parameters: float) -> np.ndarray:
     t, u = torch.from_numpy(time)[None], torch.from_numpy(asked)[None]
     start = torch.tensor([[asked[0], 0.0]], dtype=torch.float64)
-    drive = Drive(t, u, start, torch.zeros_like(t), torch.zeros_like(t))
+    drive = Drive(t, u, start)
     given = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in parameters.items()}
     return simulate_axes(drive, given)[0, 0].numpy()
 
@@ -70,12 +70,12 @@ def test_limits_and_loads_go_on_where_a_stretch_begins() -> None:
     time = torch.from_numpy(TIME)[None]
     still, begin = torch.zeros_like(time), torch.zeros(1, 2, dtype=torch.float64)
     given = {"slowness": torch.tensor([[2.0]], dtype=torch.float64)}
-    late = simulate_axes(Drive(time, still + 1, begin, still, still), given)[0, 0].numpy()
+    late = simulate_axes(Drive(time, still + 1, begin), given)[0, 0].numpy()
     # The command may be far ahead of a limited axis already.
     assert np.abs(late - np.minimum(0.5 * (TIME - TIME[0]), 1)).max() < 1e-3
     # What a simulator loads an axis with presses its play to one side.
     given = {n: torch.tensor([[v]], dtype=torch.float64) for n, v in {"play": 0.1, "play_loaded": 1.0, **OWN}.items()}
-    hung = simulate_axes(Drive(time, still, begin, still, still, still + 0.2), given)[0, 0]
+    hung = simulate_axes(Drive(time, still, begin, torque=still + 0.2), given)[0, 0]
     assert float(hung[-1]) == pytest.approx(-0.25, abs=1e-3)
 
 
@@ -83,7 +83,7 @@ def test_parameters_are_batched_and_never_run_away() -> None:
     asked = torch.from_numpy(command(0, TIME))[None]
     time = torch.from_numpy(TIME)[None]
     start = torch.zeros(1, 2, dtype=torch.float64)
-    drive = Drive(time, asked, start, torch.zeros_like(time), torch.zeros_like(time))
+    drive = Drive(time, asked, start)
     inertia = torch.tensor([[1e-3], [5e-3], [2e-2]], dtype=torch.float64)
     together = simulate_axes(drive, {"inertia": inertia})
     for k in range(3):
