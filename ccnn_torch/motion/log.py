@@ -204,6 +204,8 @@ def _drive_on(
     name: str, time: Array, command: Array, position: Array, beside: Mapping[str, Array], notes: list[str]
 ) -> NDArray[np.bool_]:
     """Where the drive was on: as recorded; else where it gives no output at all although the position is off."""
+    from scipy.ndimage import binary_opening
+
     on = np.ones(len(time), dtype=np.bool_)
     if "torque_on" in beside:
         on = beside["torque_on"] > 0.5
@@ -216,7 +218,7 @@ def _drive_on(
                 error = np.abs(command[:, i] - position[:, i])
                 if output is None or not np.any(output):
                     continue
-                off = _runs_of((output == 0) & (error > _OFF_ERROR * np.ptp(command[:, i])), _OFF)
+                off = binary_opening((output == 0) & (error > _OFF_ERROR * np.ptp(command[:, i])), np.ones(_OFF))
                 if off.any():
                     on &= ~off
                     source = f"{kind}{i + 1}, which is 0 although the position is off"
@@ -224,12 +226,3 @@ def _drive_on(
         lost = float(np.diff(time, append=time[-1])[~on].sum())
         notes.append(f"{name}: the drive was off for {lost:.3g} s ({source}), left out")
     return on
-
-
-def _runs_of(flags: NDArray[np.bool_], least: int) -> NDArray[np.bool_]:
-    """The flags without runs of fewer than `least`."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    kept = np.zeros_like(flags)
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
-        kept[a:b] = b - a >= least
-    return kept
