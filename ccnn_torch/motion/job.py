@@ -27,7 +27,7 @@ from ccnn_torch.report.table import print_text
 from ccnn_torch.run_folder.interrupt import if_stopped
 from ccnn_torch.run_folder.lock import locked
 
-__all__ = ["run_motion", "verdict_of"]
+__all__ = ["diagnosed", "run_motion"]
 
 _STEPS = {
     "reading the records": 1.0,
@@ -53,7 +53,7 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
         raise InputError("name the folder to write with --out DIR")
     stopped = if_stopped("interrupted before there was a verdict; nothing was written")
     with stopped, step_bar(_STEPS, quiet) as tell, watched(tell):
-        found, nominal = _diagnosed(config)
+        found, nominal = diagnosed(config)
     folder, results = Path(config.out), dict(plain(found.to_json()))
     with locked(folder):
         sweep(folder)
@@ -70,12 +70,8 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
     return folder
 
 
-def verdict_of(config: DiagnoseConfig) -> MotionDiagnosis:
-    """Diagnose what a config names; nothing is written."""
-    return _diagnosed(config)[0]
-
-
-def _diagnosed(config: DiagnoseConfig) -> tuple[MotionDiagnosis, Nominal]:
+def diagnosed(config: DiagnoseConfig) -> tuple[MotionDiagnosis, Nominal]:
+    """Diagnose what a config names, and the model that was; nothing is written."""
     if not config.motion:
         raise InputError("motion: is missing; give --motion LOG.csv")
     if config.mechanism is None:

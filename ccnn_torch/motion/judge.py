@@ -18,7 +18,6 @@ from ccnn_torch.motion.drivers import Driver, driver_columns
 from ccnn_torch.motion.fit import Fit
 from ccnn_torch.motion.form import weighed
 from ccnn_torch.motion.outside import Candidate, Members, essential, holds, prior_of, with_drivers
-from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 
 __all__ = ["AxisVerdict", "judge_axes"]
@@ -60,7 +59,9 @@ def judge_axes(found: Search) -> list[AxisVerdict]:
 def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     problem, fits = found.problem, found.found[axis]
     by_members = {f.members: f for f in fits}
-    slight = _slight(problem, axis)
+    # Mean square of what a shift of the time stamps moves the axis by [rad^2 or m^2]: less is no effect.
+    step, speed = float(problem.data.time.diff(dim=-1).median()), problem.data.speed[axis][problem.data.judged]
+    slight = (_STAMP * step) ** 2 * float(speed.square().mean())
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
     sets = [
@@ -118,12 +119,6 @@ def _weights(sets: Sequence[Candidate], noise: float, form: float, smooth: float
     if sets[smeared.index(max(smeared))].rows is not None:
         return smeared
     return [w if one.rows is None else -math.inf for w, one in zip(weights, sets, strict=True)]
-
-
-def _slight(problem: Problem, axis: int) -> float:
-    """Mean square of what a shift of the time stamps moves the axis by [rad^2 or m^2]: less is no effect."""
-    step = float(problem.data.time.diff(dim=-1).median())
-    return (_STAMP * step) ** 2 * float(problem.data.speed[axis][problem.data.judged].square().mean())
 
 
 def _classes(members: Members, inside: Mapping[Members, float]) -> dict[int, tuple[int, ...]]:
