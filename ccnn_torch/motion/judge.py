@@ -11,6 +11,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import torch
+
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets
 from ccnn_torch.diagnosis.search.form_error import LEVELS, OF_SMOOTH
 from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN, is_same
@@ -100,8 +102,8 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
 def _weights(sets: Sequence[Candidate], noise: float, form: float, smooth: float) -> list[float]:
     """Log posterior of each set under noise and form errors, not normalised.
 
-    Where the best one follows a driver, what it does is smooth and the cause need not be: that share of it is noise as
-    well, and if it is not the best one then no driver is.
+    What follows a driver is smooth where its cause need not be: beside one, where that is the best, a name has to do
+    more than that share of what the driver does.
     """
 
     def under(variance: float) -> list[float]:
@@ -116,9 +118,10 @@ def _weights(sets: Sequence[Candidate], noise: float, form: float, smooth: float
         return weights
     does = float(fit_sets(best.grams, [best.groups], 0.0).energy[0, len(best.groups) - 1])
     smeared = under(noise + form + smooth * does)
-    if sets[smeared.index(max(smeared))].rows is not None:
-        return smeared
-    return [w if one.rows is None else -math.inf for w, one in zip(weights, sets, strict=True)]
+    least = torch.tensor([0.0 if one.rows is not None else -math.inf for one in sets], dtype=torch.float64)
+    whole, beside = (torch.logsumexp(torch.tensor(w, dtype=torch.float64) + least, 0) for w in (weights, smeared))
+    pairs = zip(sets, weights, smeared, strict=True)
+    return [w if one.rows is None else v + float(whole - beside) for one, w, v in pairs]
 
 
 def _classes(members: Members, inside: Mapping[Members, float]) -> dict[int, tuple[int, ...]]:
