@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -93,6 +95,13 @@ def test_parameters_are_batched_and_never_run_away() -> None:
         theta = torch.zeros(2, 1, library.size, dtype=torch.float64)
         theta[0, 0, j], theta[1, 0, j] = 200.0, -200.0
         assert torch.isfinite(simulate_axes(drive, library.parameters(theta))).all()
+
+
+def test_an_effect_of_ones_own_is_a_value_or_a_class(tmp_path: Path) -> None:
+    own = "from ccnn_torch.motion.effects import MotionEffect\nONE = MotionEffect('one', lambda axis: ())\n"
+    (tmp_path / "mine.py").write_text(f"{own}class Two:\n    name = 'two'\n")
+    names = [f"{tmp_path}/mine.py:{name}" for name in ("ONE", "Two")]
+    assert [effect.name for effect in motion_effects(names)] == ["one", "two"]
 
 
 def test_every_effect_acts_on_parameters_that_the_axis_has() -> None:

@@ -50,7 +50,7 @@ def motion_effects(names: Sequence[str] | None = None) -> list[MotionEffect]:
         if name == "all":
             found |= EFFECTS
         elif is_plugin(name):
-            own = load_plugin(name)
+            own = load_plugin(name, (MotionEffect,))
             effect: MotionEffect = own() if isinstance(own, type) else own
             found[effect.name] = effect
         elif name in EFFECTS:
