@@ -249,13 +249,11 @@ def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Tensor], fo
     """
     size = torch.cat([x.new_zeros(0), *(fit.log_scale[0, g].expand(len(c)) for g, c in enumerate(groups))])
     ridge = torch.diag(torch.exp(-size) * fit.noise[0])
+    if int(fold.max()) == 0:
+        return float((y - fit.mean[0, : len(x)] @ x).square().sum())
     parts = [(x[:, fold == f], y[fold == f]) for f in range(int(fold.max()) + 1)]
     whole, along = x @ x.mT + ridge, x @ y
-    means = (
-        [torch.linalg.solve(whole - a @ a.mT, along - a @ b) for a, b in parts]
-        if len(parts) > 1
-        else [fit.mean[0, : len(x)]]
-    )
+    means = [torch.linalg.solve(whole - a @ a.mT, along - a @ b) for a, b in parts]
     return sum(float((b - mean @ a).square().sum()) for mean, (a, b) in zip(means, parts, strict=True))
 
 

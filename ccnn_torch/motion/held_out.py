@@ -55,10 +55,6 @@ def gap_of(problem: Problem, before: Tensor, after: Tensor, floor: float, known:
     return shrink_of(rows[0], held, torch.tensor([floor], dtype=per.dtype), torch.tensor([True]), dof, draws)
 
 
-def _none_of(library: Library) -> Spec:
-    return Spec((), torch.zeros(library.size, dtype=torch.float64), (), 0.0)
-
-
 def only(library: Library, spec: Spec, members: Sequence[int]) -> Spec:
     """The set with these members alone."""
     while extra := [k for k, m in enumerate(spec.members) if m not in members]:
@@ -69,9 +65,10 @@ def only(library: Library, spec: Spec, members: Sequence[int]) -> Spec:
 def singles(found: Search) -> dict[str, list[Spec]]:
     """Of each effect alone its fit on every axis; an axis that cannot show it has none."""
     library = found.problem.library
+    none = Spec((), torch.zeros(library.size, dtype=torch.float64), (), 0.0)
     alone = [{f.members[0]: f.spec for f in fits if len(f.members) == 1} for fits in found.found]
     return {
-        name: [own.get(e, _none_of(library)) for own in alone]
+        name: [own.get(e, none) for own in alone]
         for e, name in enumerate(library.names)
         if any(e in own for own in alone)
     }

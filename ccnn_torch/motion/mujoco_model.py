@@ -10,21 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 from ccnn_torch.motion.nominal import Nominal
 
-__all__ = ["is_mjcf", "mujoco_nominal"]
+__all__ = ["mujoco_nominal"]
 
 Array = NDArray[np.float64]
 # Seconds at the first command before a log begins: the machine rests there.
 _SETTLING = 1.0
 # A limit of 1/this or more is none.
 _TINY = 1e-9
-
-
-def is_mjcf(path: Path) -> bool:
-    """Whether an XML file is a MuJoCo model."""
-    return "<mujoco" in read_text(str(path), CONFIG_LIMIT, "write an MJCF")
 
 
 def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> Nominal:

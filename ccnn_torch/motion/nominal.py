@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.motion.axis import ABSENT
 from ccnn_torch.motion.effects import MotionEffect
@@ -182,9 +183,9 @@ def nominal_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) ->
     if is_plugin(mechanism):
         return replace(nothing, simulator=own_simulator(mechanism, keys))
     if Path(mechanism).suffix.lower() in (".xml", ".mjcf") and Path(mechanism).is_file():
-        from ccnn_torch.motion.mujoco_model import is_mjcf, mujoco_nominal
+        from ccnn_torch.motion.mujoco_model import mujoco_nominal
 
-        if is_mjcf(Path(mechanism)):
+        if "<mujoco" in read_text(mechanism, CONFIG_LIMIT, "write an MJCF"):
             return mujoco_nominal(mechanism, keys, units)
     own = [joint.unit for joint in load_mechanism(mechanism, **keys).joints]
     if own != list(units):

@@ -74,9 +74,10 @@ def cut_stretches(logs: Sequence[Log]) -> Stretches:
         # Half a step more, so that 3.9 ms are not thinned to 7.8.
         stride = max(int((_STEP + 0.5 * step) / step), 1)
         strides.append(stride)
-        for part in _uninterrupted(log):
+        ends = np.flatnonzero(log.cut | np.diff(log.on, prepend=log.on[:1]))
+        for part in np.split(np.arange(len(log.time)), ends):
             rows = part[::stride]
-            pieces += [(number, *piece) for piece in _pieces(log.time[rows], rows)]
+            pieces += [(number, *piece) for piece in _pieces(log.time[rows], rows) if log.on[part].all()]
     if not pieces:
         raise InputError(
             f"{', '.join(log.name for log in logs)}: no part with the drive on and without gaps lasts "
@@ -102,12 +103,6 @@ def smooth_speed(time: NDArray[np.float64], position: NDArray[np.float64]) -> ND
     slope: NDArray[np.float64] = savgol_filter(position, width, 2, deriv=1, axis=0)
     steps: NDArray[np.float64] = savgol_filter(time, width, 2, deriv=1)
     return np.asarray(slope / steps[:, None])
-
-
-def _uninterrupted(log: Log) -> list[NDArray[np.int64]]:
-    rows = np.arange(len(log.time))
-    ends = np.flatnonzero(log.cut | (np.diff(log.on, prepend=log.on[:1])))
-    return [part for part in np.split(rows, ends) if len(part) and log.on[part].all()]
 
 
 def _pieces(time: NDArray[np.float64], rows: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], int]]:
