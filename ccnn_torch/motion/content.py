@@ -99,8 +99,7 @@ def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, no
     notes = [*data.notes, *nominal.notes]
     library = problem.library
     notes += [unseen_text(n, why) for n, why in zip(library.names, library.lacking, strict=True) if why]
-    runs = len(set(data.run.tolist()))
-    folds = int(problem.fold.max()) + 1
+    runs, folds = len(set(data.run.tolist())), int(problem.fold.max()) + 1
     if runs > 1:
         notes.append(f"held out were whole runs, {runs} of them in {folds} folds")
     else:

@@ -117,9 +117,8 @@ def load_identified(path: Path, allow_code: bool = False) -> Identified:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: is no {IDENTIFIED}, which ccnn diagnose --motion writes ({error})") from None
     if unknown is not None or not len(axes) == len(units) == len(left) or not {*map(str, units)} <= {"rad", "m"}:
-        what = (
-            f"an axis has no number '{unknown}'" if unknown else f"{len(axes)} axes for {len(units)} joints in rad or m"
-        )
+        what = f"an axis has no number '{unknown}'"
+        what = what if unknown else f"{len(axes)} axes for {len(units)} joints in rad or m"
         raise InputError(f"{path}: {what}; write it anew with ccnn diagnose --motion")
     beside = path.parent / str(mechanism)
     name = str(beside) if mechanism == _MODEL else str(mechanism)

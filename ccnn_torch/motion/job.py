@@ -77,9 +77,7 @@ def diagnosed(config: DiagnoseConfig) -> tuple[MotionDiagnosis, Nominal]:
     if config.mechanism is None:
         raise InputError("mechanism: is missing; give --mechanism servo, a machine, or path/to/file.py:NAME")
     if config.records is not None:
-        raise InputError(
-            "records and motion: a diagnosis is of poses or of a motion; give one of --records and --motion"
-        )
+        raise InputError("records and motion: a diagnosis is of poses or of a motion; give --records or --motion")
     logs = load_logs([config.motion] if isinstance(config.motion, str) else config.motion, config.columns)
     nominal = nominal_of(config.mechanism, config.mechanism_keys, logs[0].units)
     if isinstance(config.noise, dict):

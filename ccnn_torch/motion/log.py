@@ -20,8 +20,7 @@ from ccnn_torch.units import si_unit_of
 __all__ = ["Log", "load_logs", "refuse_time", "runs_of"]
 
 Array = NDArray[np.float64]
-_RUN, _POSITION = "run", re.compile(r"q(\d+)")
-_COMMAND = re.compile(r"command(\d+)")
+_RUN, _POSITION, _COMMAND = "run", re.compile(r"q(\d+)"), re.compile(r"command(\d+)")
 _SHARED = {"supply": "V", "temperature": "K", "torque_on": "1"}
 _EACH = {"speed": None, "torque": "N*m", "current": "A", "pwm": "1"}
 # Steps longer than this many usual ones are gaps; longer than so many, late samples that the simulation can bridge.

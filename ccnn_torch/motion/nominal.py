@@ -261,15 +261,13 @@ def axis_keys(nominal: Nominal, axes: Sequence[Mapping[str, float]], added: Sequ
 
 def _numbers(key: str, value: Any, n: int) -> list[float]:
     values = value if isinstance(value, list | tuple) else [value] * n
-    signed = key in _SIGNED
+    signed, above = key in _SIGNED, key in ("gain", "supply", "length")
     fine = len(values) == n and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and (signed or v >= 0)
         for v in values
     )
-    if not fine or (key in ("gain", "supply", "length") and not all(v > 0 for v in values)):
-        what = (
-            "a number" if signed else "a number not below 0" if key not in ("gain", "supply", "length") else "above 0"
-        )
+    if not fine or (above and not all(v > 0 for v in values)):
+        what = "a number" if signed else "above 0" if above else "a number not below 0"
         raise InputError(
             f"mechanism_keys: {key} must be {what}, or a list with one for each of the {n} joints, not {value}"
         )

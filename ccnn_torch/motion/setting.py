@@ -43,8 +43,7 @@ def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEf
     if all(library.lacking):
         need = "; ".join(f"{name} needs {why}" for name, why in zip(library.names, library.lacking, strict=True))
         raise InputError(f"effects: these logs can show none of the candidates: {need}")
-    step = float(data.time.diff(dim=-1).median())
-    pool = max(round(_POOLED / step), 1)
+    pool = max(round(_POOLED / float(data.time.diff(dim=-1).median())), 1)
     return Problem(data, library, driven.followed, supply, warm, pool, driven.torque, driven.simulated, driven.own)
 
 
