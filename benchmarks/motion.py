@@ -29,7 +29,7 @@ def write_log(path: Path, samples: int) -> None:
     rates, phases = (torch.from_numpy(generator.uniform(low, high, (runs, 3, 1))) for low, high in ((1, 9), (0, 6)))
     command = 0.3 * torch.sin(rates * time_[:, None] + phases).sum(1)
     start = torch.stack([command[:, 0], torch.zeros(runs, dtype=torch.float64)], -1)
-    drive = Drive(time_, command, start, torch.zeros_like(time_), torch.zeros_like(time_))
+    drive = Drive(time_, command, start)
     position = simulate_axes(drive, {n: torch.tensor([[v]], dtype=torch.float64) for n, v in REAL.items()})[0]
     noise = 1e-4 * torch.from_numpy(generator.standard_normal(position.shape))
     run = torch.arange(runs, dtype=torch.float64)[:, None].expand(-1, 2000)

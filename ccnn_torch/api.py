@@ -17,7 +17,7 @@ from ccnn_torch.identification.config import make_identify_config
 from ccnn_torch.identification.identify import Identification
 from ccnn_torch.identification.identify import identify as _identify
 from ccnn_torch.motion import MotionDiagnosis
-from ccnn_torch.motion.job import verdict_of
+from ccnn_torch.motion.job import diagnosed
 from ccnn_torch.sweep.config import load_sweep
 from ccnn_torch.sweep.job import Row, run_sweep
 from ccnn_torch.verification.job import verify_model
@@ -60,7 +60,7 @@ def diagnose_motion(**keys: Any) -> MotionDiagnosis:
     Raises:
         InputError: a key, the logs or the model cannot be used; the sentence says what to change.
     """
-    return verdict_of(config_from_keys(DiagnoseConfig, keys))
+    return diagnosed(config_from_keys(DiagnoseConfig, keys))[0]
 
 
 def identify(**keys: Any) -> Identification:

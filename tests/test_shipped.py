@@ -35,7 +35,7 @@ FLOORS = [
     ["engine", "run_folder", "report", "config", "testing"],
     ["simulation", "planning", "verification/promise", "identification"],
     ["diagnosis/config", "diagnosis/page", "diagnosis/outputs", "diagnosis/job"],
-    ["motion/figure", "motion/page", "motion/identified", "motion/compensate", "motion/job", "motion/__init__"],
+    ["motion/identified", "motion/compensate", "motion/job", "motion/__init__"],
     ["calibration", "sklearn", "suite", "sweep", "comparison", "verification", "starter"],
     ["api", "cli", "__init__", "__main__"],
 ]

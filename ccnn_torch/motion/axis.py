@@ -66,16 +66,16 @@ class Drive(NamedTuple):
         time: `b x s` [s], increasing, also in the padding.
         command: `b x s` [rad or m].
         start: position and speed of the first sample, `b x 2`.
-        supply: supply voltage over the nominal one, less 1, `b x s`.
-        warm: temperature less that of the first sample, `b x s` [K].
+        supply: supply voltage over the nominal one, less 1, `b x s`; None = 0.
+        warm: temperature less that of the first sample, `b x s` [K]; None = 0.
         torque: what else resists the motor, over the nominal gain, `b x s` [rad or m]; it comes as late as the command.
     """
 
     time: Tensor
     command: Tensor
     start: Tensor
-    supply: Tensor
-    warm: Tensor
+    supply: Tensor | None = None
+    warm: Tensor | None = None
     torque: Tensor | None = None
 
 
@@ -123,9 +123,9 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     steps = drive.time.diff(dim=-1).numpy().T
     # Samples first: one sample of all runs lies together in memory.
     commands = np.ascontiguousarray(u.permute(2, 0, 1).numpy())
-    if np.any(a["slowness"] > 0):
-        commands = _limited(steps, commands, 1 / np.maximum(a["slowness"], _TINY))
     push = None if torque is None else np.ascontiguousarray(torque.expand(*shape, -1).permute(2, 0, 1).numpy())
+    if np.any(a["slowness"] > 0):
+        commands = _limited(steps, commands, 1 / np.maximum(a["slowness"], _TINY), _held_at(drive, push, a))
     moved = _moved(drive, steps, commands, push, a)
     if np.any(a["flexibility"] > 0):
         moved = _flexed(steps, moved, a)
@@ -133,7 +133,7 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
         loaded = a["play_loaded"] > 0
         driven = _played(moved, a["play"] / 2)
         if np.any(loaded):
-            driven = np.where(loaded, _hung(steps, moved, a), driven)
+            driven = np.where(loaded, _hung(steps, moved, push, a), driven)
         moved = driven
     return torch.from_numpy(moved).permute(1, 2, 0)
 
@@ -147,9 +147,9 @@ def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[
     start = drive.start.numpy()
     q, v = (np.broadcast_to(start[:, k], u.shape[1:]) for k in range(2))
     share = None
-    if np.any(a["supply"]) and bool((drive.supply != 0).any()):
+    if np.any(a["supply"]) and drive.supply is not None and bool((drive.supply != 0).any()):
         share = np.maximum(1 + a["supply"] * drive.supply.numpy().T[:, None], 0)
-    warm = drive.warm.numpy().T if np.any(a["thermal"]) else None
+    warm = drive.warm.numpy().T if np.any(a["thermal"]) and drive.warm is not None else None
     rule = _Rule(a)
     found = np.empty_like(u)
     found[0] = q
@@ -236,9 +236,18 @@ def _wave(sine: Array, cosine: Array) -> tuple[Array, Array]:
     return np.hypot(sine, cosine), np.arctan2(cosine, sine)
 
 
-def _limited(steps: Array, u: Array, fastest: Array) -> Array:
-    """Commands that change no faster than [rad/s], `p x b`."""
+def _held_at(drive: Drive, push: Array | None, a: Mapping[str, Array]) -> Array:
+    """The command, `p x b`, at which an axis moves as it does at its start, but for its friction and inertia."""
+    q, v = drive.start[:, 0].numpy(), drive.start[:, 1].numpy()
+    weight, hang = _wave(a["gravity_sin"], a["gravity_cos"])
+    load = weight * np.sin(q + hang) + a["viscous"] * v + (0.0 if push is None else push[0])
+    return np.asarray(q + load / np.maximum(a["gain"], _TINY))
+
+
+def _limited(steps: Array, u: Array, fastest: Array, begin: Array) -> Array:
+    """Commands that change no faster than [rad/s], and may be behind already where they begin, `p x b`."""
     found = u.copy()
+    found[0] = begin
     for k in range(len(steps)):
         reach = fastest * steps[k]
         found[k + 1] = found[k] + np.minimum(np.maximum(u[k + 1] - found[k], -reach), reach)
@@ -253,26 +262,33 @@ def _played(q: Array, half: Array) -> Array:
     return found
 
 
-def _falling(a: Mapping[str, Array]) -> tuple[Array, Array]:
-    """Size and phase of the acceleration by which the weight turns the far side of a joint back [rad/s^2].
+def _load(a: Mapping[str, Array]) -> Array:
+    """Inertia behind a joint: that of the load, or where it is not known all of the axis'."""
+    return np.where(a["load"] > 0, a["load"], a["inertia"])
 
-    The inertia there is that of the load, or where it is not known all of the axis'.
-    """
+
+def _falling(a: Mapping[str, Array]) -> tuple[Array, Array]:
+    """Size and phase of the acceleration by which the weight turns the far side of a joint back [rad/s^2]."""
     weight, hang = _wave(a["gravity_sin"], a["gravity_cos"])
-    inertia = np.where(a["load"] > 0, a["load"], a["inertia"])
+    inertia = _load(a)
     return np.where(inertia > 0, weight / np.maximum(inertia, _TINY), 0.0), hang
 
 
-def _hung(steps: Array, q: Array, a: Mapping[str, Array]) -> Array:
+def _hung(steps: Array, q: Array, push: Array | None, a: Mapping[str, Array]) -> Array:
     """The driven side of a play that falls freely between its ends, and does not bounce there."""
     fall, hang = _falling(a)
-    half = a["play"] / 2
+    inertia, half = _load(a), a["play"] / 2
+    light = np.where(inertia > 0, 1 / np.maximum(inertia, _TINY), 0.0)
     found = q.copy()
-    x, v = q[0] - half * np.sign(np.sin(q[0] + hang)), np.zeros_like(q[0])
+
+    def pulled(x: Array, k: int) -> Array:
+        return np.asarray(fall * np.sin(x + hang) + (0.0 if push is None else push[k] * light))
+
+    x, v = q[0] - half * np.sign(pulled(q[0], 0)), np.zeros_like(q[0])
     found[0] = x
     for k in range(len(steps)):
         h = steps[k]
-        v = v - h * fall * np.sin(x + hang)
+        v = v - h * pulled(x, k)
         free = x + h * v
         low, high = q[k + 1] - half, q[k + 1] + half
         held = np.minimum(np.maximum(free, low), high)

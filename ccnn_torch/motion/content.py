@@ -10,20 +10,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.shrink.held_out import INTERVAL
-from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
+from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, Draws, Gap
+from ccnn_torch.diagnosis.verdict.text import unseen_text
 from ccnn_torch.display import number_text
+from ccnn_torch.motion.effects import Facts, Number
 from ccnn_torch.motion.fit import Fit
-from ccnn_torch.motion.held_out import Spread, folds_of, resampled, shrink_of
 from ccnn_torch.motion.judge import AxisVerdict
+from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.nominal import Nominal
-from ccnn_torch.motion.numbers import parameters_of
 from ccnn_torch.motion.phases import PHASES, phases_of
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.stretches import Stretches
 
 __all__ = ["effects_of", "floor_of", "notes_of", "where_is"]
+
+_SHAPE_UNITS = {"cogging_order": "1", "flexible_damping": "1", "play_loaded": "1"}
+# A limit that is so far away is none.
+_TINY = 1e-9
 
 
 def floor_of(problem: Problem, found: Search, verdicts: Sequence[AxisVerdict]) -> float:
@@ -35,65 +39,54 @@ def floor_of(problem: Problem, found: Search, verdicts: Sequence[AxisVerdict]) -
     return float(each.amin(0).sum())
 
 
-def where_is(problem: Problem, before: Tensor, spread: Spread) -> dict[str, Any]:
+def where_is(problem: Problem, before: Tensor, draws: Draws) -> dict[str, Any]:
     """`where` and `where_ci95`: shares of the gap by joint and by phase of the motion."""
     data = problem.data
-    squares = before.square() * data.judged
-    joints = {f"q{i + 1}": squares[i].sum(-1) for i in range(len(squares))}
-    phase = phases_of(data)
+    squares, phase = before.square() * data.judged, phases_of(data)
+    joints = {f"q{i + 1}": own.sum(-1) for i, own in enumerate(squares)}
     phases = {name: (squares * (phase == k)).sum((0, -1)) for k, name in enumerate(PHASES)}
-    whole = squares.sum((0, -1))
+    whole, q = squares.sum((0, -1)), torch.tensor(INTERVAL, dtype=torch.float64)
+    drawn = (draws.counts @ whole).clamp_min(1e-300)
 
     def shares(parts: Mapping[str, Tensor]) -> dict[str, float]:
         return {name: float(v.sum() / whole.sum().clamp_min(1e-300)) for name, v in parts.items()}
 
     def ends(parts: Mapping[str, Tensor]) -> dict[str, list[float]]:
-        drawn = resampled(spread, whole).clamp_min(1e-300)
-        q = torch.tensor(INTERVAL, dtype=torch.float64)
-        return {name: torch.quantile(resampled(spread, v) / drawn, q).clamp(0, 1).tolist() for name, v in parts.items()}
+        return {n: torch.quantile(draws.counts @ v / drawn, q).clamp(0, 1).tolist() for n, v in parts.items()}
 
-    samples = {name: float(((phase == k) & data.judged).double().mean()) for k, name in enumerate(PHASES)}
-    all_ = sum(samples.values()) or 1.0
+    samples = torch.stack([((phase == k) & data.judged).double().sum() for k in range(len(PHASES))])
+    time = dict(zip(PHASES, (samples / samples.sum().clamp_min(1)).tolist(), strict=True))
     empty: dict[str, Any] = {"outputs": {}, "legs": {}, "regions": [], "covariates": {}}
+    by_phase = {n: {"share": s, "samples": time[n]} for n, s in shares(phases).items()}
     return {
-        "where": empty
-        | {
-            "joints": shares(joints),
-            "phases": {n: {"share": s, "samples": samples[n] / all_} for n, s in shares(phases).items()},
-        },
+        "where": empty | {"joints": shares(joints), "phases": by_phase},
         "where_ci95": empty | {"joints": ends(joints), "phases": ends(phases)},
     }
 
 
 def effects_of(
-    problem: Problem,
-    found: Search,
-    verdicts: Sequence[AxisVerdict],
-    spread: Spread,
-    before: Tensor,
-    alone: Mapping[str, Tensor],
-    floor: float,
+    problem: Problem, found: Search, verdicts: Sequence[AxisVerdict], alone: Mapping[str, Gap]
 ) -> list[dict[str, Any]]:
+    """`effects`; alone: the gap with each effect alone in the model."""
     library = problem.library
     rows = []
-    for name, squares in alone.items():
+    for name, own in alone.items():
         e = library.names.index(name)
-        own = shrink_of(spread, before, squares, floor)
         like = dict.fromkeys(library.names[o] for v in verdicts for o in v.classes.get(e, ()))
         parameters: dict[str, Any] = {}
         for i, v in enumerate(verdicts):
-            fit = v.best if e in v.best.members else _alone(found.found[i], e)
+            fit = v.best if e in v.best.members else next((f for f in found.found[i] if f.members == (e,)), None)
             if fit is not None and (e in v.best.members or not any(e in w.best.members for w in verdicts)):
-                parameters |= parameters_of(library, i, fit, e)
+                parameters |= _parameters(library, i, fit, e)
         rows.append(
             {
                 "name": name,
                 "probability": 1 - math.prod(1 - v.marginal.get(e, 0.0) for v in verdicts),
                 "parameters": parameters,
-                "gap_before": own[0],
-                "gap_after": own[1],
-                "shrink": own[2],
-                "shrink_ci95": own[3],
+                "gap_before": own.before,
+                "gap_after": own.after,
+                "shrink": own.shrink,
+                "shrink_ci95": own.interval,
                 "indistinguishable_from": list(like),
                 "signatures": {},
             }
@@ -101,23 +94,12 @@ def effects_of(
     return sorted(rows, key=lambda e: (-e["probability"], e["gap_after"], e["name"]))
 
 
-def _alone(fits: Sequence[Fit], effect: int) -> Fit | None:
-    return next((f for f in fits if f.members == (effect,)), None)
-
-
-def notes_of(
-    problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None, dropped: Sequence[str]
-) -> list[str]:
+def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None) -> list[str]:
     data = problem.data
     notes = [*data.notes, *nominal.notes]
     library = problem.library
     notes += [unseen_text(n, why) for n, why in zip(library.names, library.lacking, strict=True) if why]
-    if dropped:
-        notes.append(
-            f"{listed(dropped)} fit these runs as well, and take nothing away on runs that were not fitted: not named"
-        )
-    runs = len(set(data.run.tolist()))
-    folds = int(folds_of(problem).max()) + 1
+    runs, folds = len(set(data.run.tolist())), int(problem.fold.max()) + 1
     if runs > 1:
         notes.append(f"held out were whole runs, {runs} of them in {folds} folds")
     else:
@@ -144,3 +126,46 @@ def _resolution(data: Stretches) -> float:
     if len(values) > 0.5 * int(data.judged.sum()) or not len(steps):
         return 0.0
     return float(np.quantile(steps, 0.1))
+
+
+def _unit(unit: str, axis: Facts) -> tuple[str, float]:
+    """The unit of a number in words of the axis, and the factor to it: torques by the gain, where it is known."""
+    gain = axis.gain or 1.0
+    force = "N*m" if axis.unit == "rad" else "N"
+    known = {
+        "joint": (axis.unit, 1.0),
+        "speed": (f"{axis.unit}/s", 1.0),
+        "torque": (force if axis.gain else axis.unit, gain),
+        "inertia": ("kg*m^2" if axis.unit == "rad" else "kg", gain) if axis.gain else ("s^2", 1.0),
+        "viscous": (f"{force}*s/{axis.unit}", gain) if axis.gain else ("s", 1.0),
+    }
+    return known.get(unit, (unit, 1.0))
+
+
+def _parameters(library: Library, axis: int, fit: Fit, effect: int) -> dict[str, dict[str, Any]]:
+    """The numbers of one effect of a fit, as `parameters` of diagnosis.json; value: the difference to the model."""
+    facts = library.facts[axis]
+    found: dict[str, dict[str, Any]] = {}
+    flat = fit.spec.flat
+    deviation = fit.covariance.diagonal().clamp_min(0).sqrt()
+    for j in library.places[effect]:
+        number: Number = library.numbers[axis][j]
+        unit, factor = _unit(number.unit, facts)
+        value = float(fit.spec.theta[j]) * number.scale
+        sd = float(deviation[flat.index(j)]) * number.scale
+        if number.inverse:
+            value += facts.nominal.get(number.acts[0][0], 0.0)
+            value, sd = 1 / max(value, _TINY), sd / max(value, _TINY) ** 2
+        found[f"q{axis + 1} {number.name}"] = {
+            "value": value * factor,
+            "sd": sd * factor,
+            "unit": unit,
+            "part": f"joint {axis + 1}",
+        }
+    own = {place for variant in library.variants[effect] for place in variant.held}
+    for name, place in library.held.items():
+        value = float(fit.spec.theta[place])
+        if place in own and value:
+            unit = _SHAPE_UNITS.get(name, f"{facts.unit}/s")
+            found[f"q{axis + 1} {name}"] = {"value": value, "sd": None, "unit": unit, "part": f"joint {axis + 1}"}
+    return found

@@ -17,8 +17,8 @@ from ccnn_torch.motion.problem import Problem
 
 __all__ = ["Driver", "driver_columns"]
 
-# Knots of a piecewise linear function of a driver, and of one of the time.
-_KNOTS, _TIMES = 7, 9
+# Knots of a piecewise linear function: at quantiles of a driver, and evenly spaced ones of a position and of the time.
+_KNOTS, _EVENLY = 7, 9
 # Time constants of what fades after a reversal [s].
 _FADING = (0.03, 0.1, 0.3)
 # Share of the mean speed at which a direction is settled.
@@ -27,9 +27,8 @@ _SOFT = 0.1
 _WARMER = 5.0
 # Share of the motion from which the lead of the command over the position is a torque.
 _LOADED = 1e-4
-# Quantiles between which the knots lie; those of a position are evenly spaced.
+# Quantiles between which the knots lie.
 _ENDS = (0.02, 0.98)
-_EVENLY = 9
 # Share of the motion by which a torque moves the axis for its columns, and how far the columns reach.
 _STEP, _SIZE = 1e-3, 0.05
 
@@ -97,8 +96,8 @@ def _hats(driver: Tensor, judged: Tensor) -> Tensor:
     """Piecewise linear functions with their knots at quantiles, `n x m x b x s`."""
     found = []
     for one in driver:
-        grid = torch.linspace(*_ENDS, _KNOTS, dtype=one.dtype)
-        knots = torch.tensor(sorted(set(torch.quantile(_few(one[judged]), grid).tolist())), dtype=one.dtype)
+        some = one[judged][:: max(int(judged.sum()) // 10_000, 1)]
+        knots = torch.unique(torch.quantile(some, torch.linspace(*_ENDS, _KNOTS, dtype=one.dtype)))
         if len(knots) < 3:
             found.append(torch.zeros(_KNOTS, *one.shape, dtype=one.dtype))
             continue
@@ -115,14 +114,13 @@ def _evenly(driver: Tensor, judged: Tensor) -> Tensor:
     """Piecewise linear functions with evenly spaced knots, `n x m x b x s`."""
     low = torch.stack([one[judged].min() for one in driver])[:, None, None]
     high = torch.stack([one[judged].max() for one in driver])[:, None, None]
-    share = (driver - low) / (high - low).clamp_min(1e-12)
-    knots = torch.linspace(0, 1, _EVENLY, dtype=driver.dtype)[:, None, None]
+    return _tents((driver - low) / (high - low).clamp_min(1e-12))
+
+
+def _tents(share: Tensor) -> Tensor:
+    """Of a driver from 0 to 1, `n x b x s`."""
+    knots = torch.linspace(0, 1, _EVENLY, dtype=share.dtype)[:, None, None]
     return (1 - (share[:, None] - knots).abs() * (_EVENLY - 1)).clamp_min(0)
-
-
-def _few(values: Tensor) -> Tensor:
-    """Enough of many values for quantiles."""
-    return values[:: max(len(values) // 10_000, 1)]
 
 
 def _fading(speed: Tensor, time: Tensor) -> Tensor:
@@ -130,16 +128,11 @@ def _fading(speed: Tensor, time: Tensor) -> Tensor:
     sign = torch.sign(speed)
     turned = torch.zeros_like(sign)
     turned[..., 1:] = 0.5 * (sign[..., 1:] - sign[..., :-1])
-    columns = [torch.zeros_like(sign) for _ in _FADING]
-    step = time.diff(dim=-1)
-    for column, constant in zip(columns, _FADING, strict=True):
-        now = torch.zeros_like(sign[..., 0])
-        for k in range(sign.shape[-1]):
-            now = now + turned[..., k]
-            column[..., k] = now
-            if k < sign.shape[-1] - 1:
-                now = now * torch.exp(-step[:, k] / constant)
-    return torch.stack(columns, 1)
+    fall = torch.exp(-time.diff(dim=-1) / torch.tensor(_FADING, dtype=time.dtype)[:, None, None])
+    columns = turned[:, None].repeat(1, len(_FADING), 1, 1)
+    for k in range(1, sign.shape[-1]):
+        columns[..., k] += columns[..., k - 1] * fall[..., k - 1]
+    return columns
 
 
 def _over_time(problem: Problem) -> Tensor:
@@ -150,6 +143,4 @@ def _over_time(problem: Problem) -> Tensor:
         mine = data.run == run
         ends = data.time[mine][data.judged[mine]]
         share[mine] = ((data.time[mine] - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)).clamp(0, 1)
-    knots = torch.linspace(0, 1, _TIMES, dtype=share.dtype)
-    hats = (1 - (share[None] - knots[:, None, None]).abs() * (_TIMES - 1)).clamp_min(0)
-    return hats.expand(len(problem.followed), -1, -1, -1)
+    return _tents(share[None]).expand(len(problem.followed), -1, -1, -1)

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.progress import at_step
+from ccnn_torch.diagnosis.shrink.held_out import draws
 from ccnn_torch.diagnosis.verdict.text import verdict_text
 from ccnn_torch.motion.content import effects_of, floor_of, notes_of, where_is
 from ccnn_torch.motion.effects import motion_effects
 from ccnn_torch.motion.effects.own_parameter import OWN
-from ccnn_torch.motion.held_names import how_many_hold, in_order, none_of, only, reduced, singles
-from ccnn_torch.motion.held_out import Spread, held_out, shrink_of
+from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
+from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
 from ccnn_torch.motion.judge import AxisVerdict, judge_axes
 from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.next_motion import Motion, next_motions
@@ -29,8 +30,6 @@ __all__ = ["MotionDiagnosis", "diagnose_motion"]
 
 # Searches about a simulator's parameters as found.
 _RECENTRED = 2
-# Marginal probability from which something is there even where no names hold, which are then no surer than that.
-_CONFIRMED = 0.5
 
 
 @dataclass(frozen=True)
@@ -87,80 +86,53 @@ def diagnose_motion(
     verdicts = judge_axes(found)
     at_step("judging on held-out rows")
     library, data = problem.library, problem.data
-    alone = singles(found)
-    none = [none_of(library) for _ in verdicts]
-    whole = [v.best.spec for v in verdicts]
-    names = in_order(problem, verdicts)
-    steps = [
-        [only(library, s, [library.names.index(m) for m in names[: k + 1]]) for s in whole] for k in range(len(names))
-    ]
-    sets = [none, *steps, *alone.values()]
-    residuals = held_out(problem, found.whitening, sets)
+    alone, names = singles(found), in_order(problem, verdicts)
+    members = [library.names.index(name) for name in names]
+    steps = [[only(library, v.best.spec, members[:k]) for v in verdicts] for k in range(len(names) + 1)]
+    residuals = held_out(problem, found.whitening, [*steps, *alone.values()])
     # Of the model itself, also where it was linearised elsewhere.
     residuals[0] = nothing
-    spread = Spread(problem, seed)
-    squares = [spread.squares(r) for r in residuals]
-    floor = noise**2 * len(whole) if noise else floor_of(problem, found, verdicts)
-    total = shrink_of(spread, squares[0], squares[len(steps)], floor)
-    outside = any(v.driver is not None for v in verdicts)
-    probability = math.prod(v.probability for v in verdicts)
-    kept = how_many_hold(squares[: len(steps) + 1]) if names else 0
-    helped = min((float(v.sum()) for v in squares[1 : len(steps) + 1]), default=math.inf) < float(squares[0].sum())
-    seen = any(m > _CONFIRMED for v in verdicts for m in v.marginal.values())
-    unconfirmed = not kept and seen and helped and not outside
-    if unconfirmed:
-        # More is seen than chance, and what it takes away elsewhere is little: the names that take most.
-        kept = 1 + min(range(len(names)), key=lambda k: float(squares[k + 1].sum()))
-    dropped = names[kept:]
-    if dropped:
-        # A name has to take something away on runs that no fit saw.
-        verdicts = [reduced(library, found.found[i], v, names[:kept]) for i, v in enumerate(verdicts)]
-        names, steps = names[:kept], steps[:kept]
-        probability = math.prod(v.probability for v in verdicts)
-        total = shrink_of(spread, squares[0], squares[kept], floor)
-    probability = min(probability, _CONFIRMED) if unconfirmed else probability
-    unit = data.units[0]
+    floor = noise**2 * len(verdicts) if noise else floor_of(problem, found, verdicts)
+    drawn = draws(len(data.run), seed)
+    gaps = [gap_of(problem, nothing, left, floor, noise is not None, drawn) for left in residuals]
+    total, in_steps = gaps[len(names)], gaps[1 : len(names) + 1]
     drivers = list(dict.fromkeys(v.driver for v in verdicts if v.driver))
-    after = residuals[len(names)]
-    each = dict(zip(alone, squares[-len(alone) :], strict=True))
-    every = effects_of(problem, found, verdicts, spread, squares[0], each, floor)
+    each = dict(zip(alone, gaps[len(steps) :], strict=True))
+    every = effects_of(problem, found, verdicts, each)
     at_step("next measurements")
     wanted, proposed = next_motions(found, verdicts)
     verdict: dict[str, Any] = {
         "effects": names,
-        "probability": probability,
-        "shrink": total[2],
-        "shrink_ci95": total[3],
-        "none": not names and not outside,
-        "outside_library": outside,
+        "probability": math.prod(v.probability for v in verdicts),
+        "shrink": total.shrink,
+        "shrink_ci95": total.interval,
+        "none": not names and not drivers,
+        "outside_library": bool(drivers),
         "driver": drivers[0] if drivers else None,
         "drivers": drivers,
         "text": "",
     }
-    before2, floor_rms = total[0] ** 2, math.sqrt(floor)
     content: dict[str, Any] = {
         "motion": True,
         "mechanism": {
             "name": nominal.name,
             "joints": [f"q{i + 1}" for i in range(len(data.units))],
-            "gravity": [0.0, 0.0, -9.80665],
+            "gravity": [0.0, 0.0, -STANDARD_GRAVITY],
         },
         "noise": "given" if noise else "estimated",
         "gap": {
-            "unit": unit,
-            "before": total[0],
-            "after": total[1],
-            "noise_floor": floor_rms,
-            "reducible_share": max(0.0, 1 - floor / before2) if before2 else 0.0,
+            "unit": data.units[0],
+            "before": total.before,
+            "after": total.after,
+            "noise_floor": total.floor,
+            "reducible_share": max(0.0, 1 - floor / total.before**2) if total.before else 0.0,
         },
         "gap_rotation": None,
-        **where_is(problem, residuals[0], spread),
+        **where_is(problem, nothing, drawn),
         "effects": every,
         "in_order": [
-            {"name": name, "gap_after": own[1], "shrink": own[2], "shrink_ci95": own[3]}
-            for name, own in (
-                (name, shrink_of(spread, squares[0], squares[k + 1], floor)) for k, name in enumerate(names)
-            )
+            {"name": name, "gap_after": gap.after, "shrink": gap.shrink, "shrink_ci95": gap.interval}
+            for name, gap in zip(names, in_steps, strict=True)
         ],
         "by_block": None,
         "network": None,
@@ -171,10 +143,10 @@ def diagnose_motion(
         "rows_set_aside": [],
         "why_set_aside": [],
         "cautions": [],
-        "notes": notes_of(problem, nominal, found, floor_rms, noise, dropped),
+        "notes": notes_of(problem, nominal, found, total.floor, noise),
     }
     verdict["text"] = verdict_text(content)
-    return MotionDiagnosis(content, problem, found, verdicts, residuals[0], after, proposed)
+    return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed)
 
 
 def _searched(problem: Problem, logs: Sequence[Log], nominal: Nominal) -> Search:

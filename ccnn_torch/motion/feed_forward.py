@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from ccnn_torch.motion.axis import ABSENT, Drive, simulate_axes
+from ccnn_torch.motion.mistakes import lag_of
 from ccnn_torch.motion.nominal import Nominal
 
 __all__ = ["Corrected", "corrected_command", "moved"]
@@ -61,8 +62,8 @@ def moved(nominal: Nominal, axes: Sequence[Mapping[str, float]], time: Array, co
     asked = np.concatenate([np.repeat(commands[:, :1], len(before), 1), commands], 1)
     torque = simulated = None
     followed = asked
-    if nominal.simulator is not None and nominal.simulator.loaded is not None:
-        made = [nominal.simulator.loaded(clock.numpy(), one) for one in asked]
+    if nominal.loaded is not None:
+        made = [nominal.loaded(clock.numpy(), one) for one in asked]
         simulated, torque = (np.stack([m[k] for m in made]) for k in range(2))
     elif nominal.simulator is not None:
         followed = np.stack([nominal.simulator.positions(clock.numpy(), one) for one in asked])
@@ -70,24 +71,17 @@ def moved(nominal: Nominal, axes: Sequence[Mapping[str, float]], time: Array, co
     def rows(values: Array) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values.transpose(0, 2, 1).reshape(p * n, -1)))
 
-    still = torch.zeros(p * n, len(clock), dtype=torch.float64)
     begin = rows(followed if simulated is None else simulated)[:, 0]
     drive = Drive(
         clock.expand(p * n, -1),
         rows(followed),
         torch.stack([begin, torch.zeros_like(begin)], -1),
-        still,
-        still,
-        None if torque is None else rows(torque),
+        torque=None if torque is None else rows(torque),
     )
 
     def simulate(own: Sequence[Mapping[str, float]]) -> torch.Tensor:
-        names = {name for axis in own for name in axis}
-        values = {
-            name: torch.tensor([[axis.get(name, ABSENT[name]) for _ in range(p) for axis in own]], dtype=torch.float64)
-            for name in names
-        }
-        return simulate_axes(drive, values)[0]
+        values = {name: [[axis.get(name, ABSENT[name]) for axis in own] * p] for axis in own for name in axis}
+        return simulate_axes(drive, {name: torch.tensor(v, dtype=torch.float64) for name, v in values.items()})[0]
 
     found = simulate(axes)
     if simulated is not None:
@@ -117,7 +111,7 @@ def corrected_command(
     plain = moved(nominal, axes, time, wanted[None])[0]
     error = wanted - plain
     limit = _BOUND * np.abs(error).max(0) if bound is None else np.asarray(bound, dtype=np.float64)
-    late = [_lateness(time, wanted[:, i], plain[:, i]) for i in range(wanted.shape[1])]
+    late = [lag_of(time, wanted[:, i], plain[:, i]) for i in range(wanted.shape[1])]
     command, position, left = wanted, plain, _rms(error)
     for _ in range(_STEPS):
         ahead = np.stack([np.interp(time + t, time, e) for t, e in zip(late, error.T, strict=True)], -1)
@@ -140,11 +134,3 @@ def corrected_command(
 
 def _rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.square(values).mean(0)))
-
-
-def _lateness(time: Array, wanted: Array, position: Array) -> float:
-    """By how much a position is behind what is wanted [s], of shifts of up to 0.3 s the best."""
-    step = float(np.median(np.diff(time)))
-    shifts = np.arange(0, min(0.3, 0.25 * (time[-1] - time[0])), step)
-    left = [float(np.square(np.interp(time - s, time, wanted) - position).mean()) for s in shifts]
-    return float(shifts[int(np.argmin(left))]) if len(left) else 0.0

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, grams_of
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening
 
-__all__ = ["Fit", "Spec", "evidence_of", "fit_many", "sensitivities", "started"]
+__all__ = ["Fit", "Spec", "fit_many", "places_of", "sensitivities", "squares_unseen", "started"]
 
 # Of a difference quotient, in plausible sizes.
 _STEP = 1e-3
@@ -70,22 +70,19 @@ class Fit(NamedTuple):
         spec: the set, with `theta` where the fit ended.
         log_evidence: of the linearised model.
         noise: variance of the whitened residual.
-        mean, covariance: of the active numbers in plausible sizes, `m`, `m x m`.
-        squares: of the whitened residual by stretch, `b`.
-        rss: their sum.
-        effective: number of coefficients that the data determine.
+        covariance: of the active numbers in plausible sizes, `m x m`.
+        rss: squares of the whitened residual.
+        unseen: the same on runs that its numbers were not fitted to.
         left: mean square of the residual itself [rad^2 or m^2].
-        grams: of the linearised model's whitened columns, in plausible sizes.
+        grams: of the linearised model's whitened columns, in plausible sizes, and of `loose` after them.
     """
 
     spec: Spec
     log_evidence: float
     noise: float
-    mean: Tensor
     covariance: Tensor
-    squares: Tensor
     rss: float
-    effective: float
+    unseen: float
     left: float
     grams: Grams
 
@@ -116,6 +113,7 @@ def fit_many(
     specs: Sequence[Sequence[Spec]],
     steps: int = _STEPS,
     chosen: Tensor | None = None,
+    loose: Tensor | None = None,
 ) -> list[list[Fit]]:
     """Fit sets side by side.
 
@@ -125,6 +123,7 @@ def fit_many(
         specs: for each of `h` sets, one a joint, `n`.
         steps: Gauss-Newton steps.
         chosen: stretches that count; all when None.
+        loose: whitened, what the nominal values of each axis may be off by, `n x k x v`; nothing when None.
     """
     wide = max((len(s.moved) for row in specs for s in row), default=0)
     judged = problem.data.judged if chosen is None else problem.data.judged[chosen]
@@ -132,8 +131,14 @@ def fit_many(
     lot = max(int(_VALUES / per), 1)
     found: list[list[Fit]] = []
     for k in range(0, len(specs), lot):
-        found += _fit_lot(problem, whitening, specs[k : k + lot], steps, chosen)
+        found += _fit_lot(problem, whitening, specs[k : k + lot], steps, chosen, loose)
     return found
+
+
+def places_of(places: Sequence[Sequence[Sequence[int]]]) -> Tensor:
+    """Places of the numbers of each axis of each set, `h x n x m`, padded with -1."""
+    wide = max((len(own) for row in places for own in row), default=0)
+    return torch.tensor([[[*own, *[-1] * (wide - len(own))] for own in row] for row in places], dtype=torch.int64)
 
 
 def sensitivities(
@@ -159,15 +164,17 @@ def sensitivities(
 
 
 def _fit_lot(
-    problem: Problem, whitening: Whitening, specs: Sequence[Sequence[Spec]], steps: int, chosen: Tensor | None
+    problem: Problem,
+    whitening: Whitening,
+    specs: Sequence[Sequence[Spec]],
+    steps: int,
+    chosen: Tensor | None,
+    loose: Tensor | None,
 ) -> list[list[Fit]]:
     h, n = len(specs), len(specs[0])
     theta = torch.stack([torch.stack([s.theta for s in row]) for row in specs])
     wide = max(len(s.moved) for row in specs for s in row)
-    active = torch.full((h, n, wide), -1)
-    for a, row in enumerate(specs):
-        for b, spec in enumerate(row):
-            active[a, b, : len(spec.moved)] = torch.tensor(spec.moved, dtype=torch.int64)
+    active = places_of([[s.moved for s in row] for row in specs])
     safe, real = active.clamp_min(0), (active >= 0).to(theta.dtype)
     low, high = problem.library.bounds
     damping = torch.full((h, n), _DAMPING, dtype=theta.dtype)
@@ -199,40 +206,55 @@ def _fit_lot(
     # Here, since the whitened residual does not tell it.
     plain = problem.pooled(problem.residual(theta, chosen))
     left = (plain.square() * judged).sum((-1, -2)) / values
-    squares = residual.square().reshape(n, h, *judged.shape).sum(-1)
+    fold = problem.fold if chosen is None else problem.fold[chosen]
+    fold = fold[:, None].expand(judged.shape).flatten()
     found = []
     for a, row in enumerate(specs):
         fits = []
         for b, spec in enumerate(row):
             mine = spec._replace(theta=theta[a, b])
             x = columns[b, a, : len(spec.flat)]
-            fits.append(evidence_of(mine, residual[b, a], x, squares[b, a], values, float(left[a, b])))
+            beside = x[:0] if loose is None else loose[b]
+            fits.append(_fit_of(mine, residual[b, a], x, values, float(left[a, b]), fold, beside))
         found.append(fits)
     return found
 
 
-def evidence_of(
-    spec: Spec, residual: Tensor, columns: Tensor, squares: Tensor, values: float, left: float = 0.0
-) -> Fit:
-    """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`, the rest as of `Fit`."""
-    own = spec.theta[list(spec.flat)]
-    y = residual + own @ columns
-    grams = grams_of(columns.mT[:, None, :], y[:, None])._replace(values=values)
+def _fit_of(spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, fold: Tensor, loose: Tensor) -> Fit:
+    """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`, fold of each value `v`."""
+    y = residual + spec.theta[list(spec.flat)] @ x
+    grams = grams_of(torch.cat([x, loose]).mT[:, None, :], y[:, None])._replace(values=values)
     fit = fit_sets(grams, [spec.groups], 0.0)
-    m = len(own)
-    evidence = float(fit.log_evidence[0])
+    m, evidence = len(x), float(fit.log_evidence[0])
     return Fit(
         spec,
         evidence if math.isfinite(evidence) else -math.inf,
         float(fit.noise[0]),
-        fit.mean[0, :m],
         fit.covariance[0, :m, :m],
-        squares,
         float(residual.square().sum()),
-        float(fit.effective[0]),
+        squares_unseen(x, y, fit, spec.groups, fold),
         left,
         grams,
     )
+
+
+def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Tensor], fold: Tensor) -> float:
+    """Squares that a linear model leaves of runs that it was not fitted to; its scales are those of all runs.
+
+    Args:
+        x, y: whitened columns, `m x v`, and what they explain, `v`.
+        fit: to all runs.
+        groups: of columns.
+        fold: of each value, `v`.
+    """
+    size = torch.cat([x.new_zeros(0), *(fit.log_scale[0, g].expand(len(c)) for g, c in enumerate(groups))])
+    ridge = torch.diag(torch.exp(-size) * fit.noise[0])
+    if int(fold.max()) == 0:
+        return float((y - fit.mean[0, : len(x)] @ x).square().sum())
+    parts = [(x[:, fold == f], y[fold == f]) for f in range(int(fold.max()) + 1)]
+    whole, along = x @ x.mT + ridge, x @ y
+    means = [torch.linalg.solve(whole - a @ a.mT, along - a @ b) for a, b in parts]
+    return sum(float((b - mean @ a).square().sum()) for mean, (a, b) in zip(means, parts, strict=True))
 
 
 def _cost(residual: Tensor, theta: Tensor, values: float) -> Tensor:

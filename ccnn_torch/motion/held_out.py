@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.shrink.held_out import INTERVAL
+from ccnn_torch.diagnosis.shrink.held_out import Draws, Gap, HeldOut, shrink_of
 from ccnn_torch.motion.fit import Spec, fit_many
+from ccnn_torch.motion.judge import AxisVerdict
+from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem, Whitening
+from ccnn_torch.motion.search import Search, without
 
-__all__ = ["Spread", "folds_of", "held_out", "resampled", "shrink_of"]
+__all__ = ["gap_of", "held_out", "in_order", "only", "singles"]
 
-_FOLDS, _REPEATS, _STEPS = 5, 400, 3
-# Reducible residual of a bootstrap sample, at least, as a share of that of all stretches.
-_LEAST_GAP = 1e-3
-
-
-def folds_of(problem: Problem) -> Tensor:
-    """Fold of each stretch: whole runs, dealt out in order; parts of the run where there is one alone."""
-    run = problem.data.run
-    runs = torch.tensor(sorted(set(run.tolist())))
-    count = len(run)
-    if len(runs) < 2:
-        return torch.arange(count) * min(_FOLDS, count) // count
-    fold = torch.arange(len(runs)) % min(_FOLDS, len(runs))
-    return fold[torch.searchsorted(runs, run)]
+_STEPS = 3
 
 
 def held_out(problem: Problem, whitening: Whitening, sets: Sequence[Sequence[Spec]]) -> Tensor:
@@ -38,60 +27,60 @@ def held_out(problem: Problem, whitening: Whitening, sets: Sequence[Sequence[Spe
         whitening: of the residual.
         sets: `h` sets of each of `n` axes; what they hold and its shapes are those of all runs, the numbers are not.
     """
-    fold = folds_of(problem)
-    nominal = problem.residual(torch.stack([torch.stack([s.theta for s in row]) for row in sets]))
-    left = nominal.clone()
-    if int(fold.max()) == 0:
-        return left
-    for k in range(int(fold.max()) + 1):
-        here, rest = (fold == k).nonzero()[:, 0], (fold != k).nonzero()[:, 0]
+    left = problem.residual(torch.stack([torch.stack([s.theta for s in row]) for row in sets]))
+    folds = int(problem.fold.max()) + 1
+    for k in range(folds if folds > 1 else 0):
+        here, rest = (problem.fold == k).nonzero()[:, 0], (problem.fold != k).nonzero()[:, 0]
         fits = fit_many(problem, whitening, sets, _STEPS, rest)
         theta = torch.stack([torch.stack([f.spec.theta for f in row]) for row in fits])
         left[:, :, here] = problem.residual(theta, here)
     return left
 
 
-class Spread:
-    """Stretches drawn with replacement, and squares of residuals of them."""
-
-    def __init__(self, problem: Problem, seed: int) -> None:
-        self.judged = problem.data.judged
-        count = len(self.judged)
-        generator = torch.Generator().manual_seed(seed)
-        drawn = torch.randint(count, (_REPEATS, count), generator=generator)
-        self.counts = torch.zeros(_REPEATS, count, dtype=torch.float64).scatter_add_(
-            1, drawn, torch.ones(drawn.shape, dtype=torch.float64)
-        )
-        self.samples = self.judged.sum(-1).double()
-
-    def squares(self, residual: Tensor) -> Tensor:
-        """Of all axes together by stretch, `b`; residual: `n x b x s`."""
-        return (residual.square() * self.judged).sum((0, -1))
-
-
-def resampled(spread: Spread, squares: Tensor) -> Tensor:
-    """Mean squares of the drawn stretches, `400`."""
-    return (spread.counts @ squares) / (spread.counts @ spread.samples).clamp_min(1.0)
-
-
-def shrink_of(
-    spread: Spread, before: Tensor, after: Tensor, floor: float
-) -> tuple[float, float, float | None, list[float] | None]:
-    """RMS before and after, the shrink above the noise, and its 95 % interval.
+def gap_of(problem: Problem, before: Tensor, after: Tensor, floor: float, known: bool, draws: Draws) -> Gap:
+    """RMS before and after, and the shrink above the noise; stretches are drawn.
 
     Args:
-        spread: the draws.
-        before, after: squares by stretch, `b`.
+        problem: the data.
+        before, after: residuals, `n x b x s`.
         floor: variance of the noise of all axes together.
+        known: whether it was given.
+        draws: of the stretches.
     """
-    total = float(spread.samples.sum())
-    b2, a2 = float(before.sum()) / total, float(after.sum()) / total
-    if b2 <= floor:
-        return math.sqrt(b2), math.sqrt(a2), None, None
-    share = min(max(1 - (a2 - floor) / (b2 - floor), 0.0), 1.0)
-    gap = (resampled(spread, before) - floor).clamp_min(_LEAST_GAP * (b2 - floor))
-    drawn = (1 - (resampled(spread, after) - floor) / gap).clamp(0, 1)
-    low, high = torch.quantile(drawn, torch.tensor(INTERVAL, dtype=drawn.dtype)).tolist()
-    # What is taken for noise may be another cause: then all that is left belongs to the gap.
-    least = 1 - a2 / b2
-    return math.sqrt(b2), math.sqrt(a2), share, [max(min(low, share, least), 0.0), max(high, share)]
+    judged = problem.data.judged
+    per = judged.sum() / len(judged)
+    rows = [((v.square() * judged).sum((0, -1)) / per).sqrt()[:, None] for v in (before, after)]
+    held = HeldOut(rows[1], torch.zeros_like(rows[1]))
+    dof = 0.0 if known else float(judged.sum())
+    return shrink_of(rows[0], held, torch.tensor([floor], dtype=per.dtype), torch.tensor([True]), dof, draws)
+
+
+def only(library: Library, spec: Spec, members: Sequence[int]) -> Spec:
+    """The set with these members alone."""
+    while extra := [k for k, m in enumerate(spec.members) if m not in members]:
+        spec = without(library, spec, extra[0])
+    return spec
+
+
+def singles(found: Search) -> dict[str, list[Spec]]:
+    """Of each effect alone its fit on every axis; an axis that cannot show it has none."""
+    library = found.problem.library
+    none = Spec((), torch.zeros(library.size, dtype=torch.float64), (), 0.0)
+    alone = [{f.members[0]: f.spec for f in fits if len(f.members) == 1} for fits in found.found]
+    return {
+        name: [own.get(e, none) for own in alone]
+        for e, name in enumerate(library.names)
+        if any(e in own for own in alone)
+    }
+
+
+def in_order(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
+    """Names of the verdict, the one without which most is left first."""
+    names = problem.library.names
+    there = list(dict.fromkeys(m for v in verdicts for m in v.best.members))
+    if not there:
+        return []
+    specs = [[only(problem.library, v.best.spec, [m for m in there if m != e]) for v in verdicts] for e in there]
+    left = problem.residual(torch.stack([torch.stack([s.theta for s in row]) for row in specs]))
+    size = (left.square() * problem.data.judged).sum((1, 2, 3))
+    return [names[there[k]] for k in torch.argsort(size, descending=True).tolist()]

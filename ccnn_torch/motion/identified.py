@@ -6,7 +6,7 @@ What a model cannot hold (a delay, a play, ...) stands beside it, as parameters 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ __all__ = ["IDENTIFIED", "Identified", "is_identified", "load_identified", "writ
 
 IDENTIFIED, _MODEL = "identified_motion.json", "identified.xml"
 # What an MJCF can hold of an axis.
-_IN_MJCF = ("gain", "inertia", "viscous", "coulomb", "weakness")
+_IN_MJCF = ("gain", "inertia", "load", "viscous", "coulomb", "weakness")
 
 # Of what is left of a weight that the MJCF holds.
 _ROUNDING = 1e-12
@@ -60,11 +60,10 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
         keys: of the mechanism, as given.
     """
     library = found.problem.library
-    axes: list[dict[str, float]] = []
     values = library.parameters(torch.stack([v.best.spec.theta for v in found.verdicts]))
     own = {name.removeprefix(OWN): values.pop(name) for name in [*values] if name.startswith(OWN)}
-    for i in range(len(found.verdicts)):
-        axes.append({name: float(v[i]) for name, v in values.items() if float(v[i]) != ABSENT[name]})
+    count = len(found.verdicts)
+    axes = [{name: float(v[i]) for name, v in values.items() if float(v[i]) != ABSENT[name]} for i in range(count)]
     content: dict[str, Any] = {
         "mechanism": nominal.name,
         "mechanism_keys": dict(keys),
@@ -76,12 +75,12 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
     files = [IDENTIFIED]
     if nominal.name == "servo":
         content["mechanism_keys"] = axis_keys(nominal, axes, _mass(found))
-    elif nominal.simulator is not None and nominal.simulator.loaded is None:
+    elif nominal.simulator is not None:
         parameters = dict(nominal.simulator.parameters)
         for name, v in own.items():
             parameters[name] += float(v.sum() / (v != 0).sum().clamp_min(1))
         content["mechanism_keys"] = parameters
-    elif nominal.simulator is not None:
+    elif nominal.loaded is not None:
         from ccnn_torch.motion.mujoco_write import write_mjcf
 
         added = _mass(found)
@@ -118,22 +117,16 @@ def load_identified(path: Path, allow_code: bool = False) -> Identified:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: is no {IDENTIFIED}, which ccnn diagnose --motion writes ({error})") from None
     if unknown is not None or not len(axes) == len(units) == len(left) or not {*map(str, units)} <= {"rad", "m"}:
-        what = (
-            f"an axis has no number '{unknown}'" if unknown else f"{len(axes)} axes for {len(units)} joints in rad or m"
-        )
+        what = f"an axis has no number '{unknown}'"
+        what = what if unknown else f"{len(axes)} axes for {len(units)} joints in rad or m"
         raise InputError(f"{path}: {what}; write it anew with ccnn diagnose --motion")
     beside = path.parent / str(mechanism)
     name = str(beside) if mechanism == _MODEL else str(mechanism)
     with code_refused(f"{path}: its simulator", allow_code):
         nominal = nominal_of(name, keys, units)
-    return Identified(nominal, _axes_of(nominal, axes), left, effects, tuple(units))
-
-
-def _axes_of(nominal: Nominal, axes: Sequence[Axis]) -> tuple[Axis, ...]:
-    """Parameters of the axes of a model with the new values in it."""
-    if nominal.name == "servo":
-        return nominal.axes
-    return tuple({**axis, **own} for axis, own in zip(axes, nominal.axes, strict=True))
+    if nominal.name != "servo":
+        axes = tuple({**axis, **own} for axis, own in zip(axes, nominal.axes, strict=True))
+    return Identified(nominal, nominal.axes if nominal.name == "servo" else axes, left, effects, tuple(units))
 
 
 def _beside(nominal: Nominal, i: int, axis: Axis, mass: float) -> dict[str, float]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ccnn_torch.config.sizes import size
 from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.diagnosis.page.compensate import typed_path
 from ccnn_torch.diagnosis.page.data import NEXT, RESULT, about_of, load_labels
+from ccnn_torch.diagnosis.page.report import print_diagnosis, write_diagnosis_report
 from ccnn_torch.diagnosis.progress import watched
 from ccnn_torch.display import short_path
 from ccnn_torch.errors import InputError
@@ -17,15 +19,15 @@ from ccnn_torch.motion.engine import MotionDiagnosis, diagnose_motion
 from ccnn_torch.motion.identified import IDENTIFIED, write_identified
 from ccnn_torch.motion.log import load_logs
 from ccnn_torch.motion.nominal import Nominal, nominal_of
-from ccnn_torch.motion.page import print_motion, write_motion_report, write_next_motion
 from ccnn_torch.motion.phases import phases_of
+from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.screen import say_place, stdout, step_bar
 from ccnn_torch.report.table import print_text
 from ccnn_torch.run_folder.interrupt import if_stopped
 from ccnn_torch.run_folder.lock import locked
 
-__all__ = ["run_motion", "verdict_of"]
+__all__ = ["diagnosed", "run_motion"]
 
 _STEPS = {
     "reading the records": 1.0,
@@ -33,6 +35,7 @@ _STEPS = {
     "judging on held-out rows": 4.0,
     "next measurements": 1.0,
 }
+_NOISE = ("The noise is what the most probable model leaves; it may hold another cause.", "The noise was given.")
 
 
 def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = False) -> Path:
@@ -49,8 +52,8 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
     if config.out is None:
         raise InputError("name the folder to write with --out DIR")
     stopped = if_stopped("interrupted before there was a verdict; nothing was written")
-    with stopped, step_bar(_STEPS, quiet) as tell:
-        found, nominal = _diagnosed(config, tell)
+    with stopped, step_bar(_STEPS, quiet) as tell, watched(tell):
+        found, nominal = diagnosed(config)
     folder, results = Path(config.out), dict(plain(found.to_json()))
     with locked(folder):
         sweep(folder)
@@ -59,73 +62,48 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
         with if_stopped(kept):
             if not quiet:
                 print_text(results["verdict"]["text"], stdout, "bold")
-            write_next_motion(folder / NEXT, list(found.proposed), results["next_measurements"], results["gap"]["unit"])
             written = write_identified(folder, found, nominal, config.mechanism_keys)
-            labels = {"about": _about(config, folder, found)}
-            write_motion_report(folder, results, motion_arrays(found), labels)
+            _report(config, folder, results, found)
             if not quiet:
-                print_motion(results, stdout, about_of(load_labels(folder)), verdict=False, details=details)
+                print_diagnosis(results, stdout, about_of(load_labels(folder)), verdict=False, details=details)
                 say_place(f"Written: {folder / RESULT}, and beside it report.html, {', '.join(written)}")
     return folder
 
 
-def verdict_of(config: DiagnoseConfig, tell: Callable[..., None] | None = None) -> MotionDiagnosis:
-    """Diagnose what a config names; nothing is written."""
-    return _diagnosed(config, tell)[0]
-
-
-def _diagnosed(config: DiagnoseConfig, tell: Callable[..., None] | None) -> tuple[MotionDiagnosis, Nominal]:
+def diagnosed(config: DiagnoseConfig) -> tuple[MotionDiagnosis, Nominal]:
+    """Diagnose what a config names, and the model that was; nothing is written."""
     if not config.motion:
         raise InputError("motion: is missing; give --motion LOG.csv")
     if config.mechanism is None:
         raise InputError("mechanism: is missing; give --mechanism servo, a machine, or path/to/file.py:NAME")
     if config.records is not None:
-        raise InputError(
-            "records and motion: a diagnosis is of poses or of a motion; give one of --records and --motion"
-        )
-    files = [config.motion] if isinstance(config.motion, str) else config.motion
-    logs = load_logs(files, config.columns)
+        raise InputError("records and motion: a diagnosis is of poses or of a motion; give --records or --motion")
+    logs = load_logs([config.motion] if isinstance(config.motion, str) else config.motion, config.columns)
     nominal = nominal_of(config.mechanism, config.mechanism_keys, logs[0].units)
-    noise = config.noise
-    if isinstance(noise, dict):
+    if isinstance(config.noise, dict):
         raise InputError("noise: of a motion must be one standard deviation of the position, such as 1e-3 or 0.1mrad")
-    from ccnn_torch.config.sizes import size
-
-    deviation = None if noise is None else size(noise, None, "noise")
-    with watched(tell or (lambda step, share: None)):
-        return diagnose_motion(logs, nominal, config.effects, deviation, config.seed), nominal
+    noise = None if config.noise is None else size(config.noise, None, "noise")
+    return diagnose_motion(logs, nominal, config.effects, noise, config.seed), nominal
 
 
-def motion_arrays(found: MotionDiagnosis) -> dict[str, Any]:
-    """What the figures draw, by name; see `course_plot`."""
-    data = found.problem.data
-    return {
-        "time": data.time,
-        "command": data.command,
-        "position": data.position,
-        "before": found.before,
-        "after": found.after,
-        "phase": phases_of(data).double(),
-        "judged": data.judged.double(),
-        "run": data.run.double(),
-    }
-
-
-def _about(config: DiagnoseConfig, folder: Path, found: MotionDiagnosis) -> dict[str, Any]:
-    files = [config.motion] if isinstance(config.motion, str) else list(config.motion or [])
-    noise = (
-        "The noise was given."
-        if config.noise is not None
-        else ("The noise is what the most probable model leaves; it may hold another cause.")
-    )
-    line = f"ccnn compensate {typed_path(str(folder / IDENTIFIED))} MOTION.csv COMMANDS.csv"
-    named = bool(found.content["verdict"]["effects"])
-    return {
-        "compensate": ["A wanted motion becomes the commands at which the machine follows it.", line] if named else [],
+def _report(config: DiagnoseConfig, folder: Path, results: Mapping[str, Any], found: MotionDiagnosis) -> None:
+    data, files = found.problem.data, config.motion if isinstance(config.motion, list) else [config.motion]
+    if found.proposed:
+        # The commands of the first proposed motion, to be played.
+        number = str(results["next_measurements"][0]["motion"]["joint"]).removeprefix("q")
+        rows = zip(found.proposed[0].time.tolist(), found.proposed[0].command.tolist(), strict=True)
+        write_rows(folder / NEXT, ["time[s]", f"command{number}[{data.units[0]}]"], map(list, rows))
+    named = ["A wanted motion becomes the commands at which the machine follows it."]
+    named += [f"ccnn compensate {typed_path(str(folder / IDENTIFIED))} MOTION.csv COMMANDS.csv"]
+    about = {
+        "compensate": named if results["verdict"]["effects"] else [],
         "name": folder.name,
         "mechanism": short_path(str(config.mechanism)),
         "records": ", ".join(short_path(str(file)) for file in files),
-        "noise": noise,
+        "noise": _NOISE[config.noise is not None],
         "folder": typed_path(str(folder)),
-        "units": {f"q{i + 1}": unit for i, unit in enumerate(found.problem.data.units)},
+        "units": {f"q{i + 1}": unit for i, unit in enumerate(data.units)},
     }
+    drawn = {n: getattr(data, n).double() for n in ("time", "command", "position", "judged", "run")}
+    drawn |= {"before": found.before, "after": found.after, "phase": phases_of(data).double()}
+    write_diagnosis_report(folder, results, drawn, {"about": about}, tensorboard=False)

@@ -11,13 +11,15 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from ccnn_torch.diagnosis.search.form_error import LEVELS
-from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN
+import torch
+
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets
+from ccnn_torch.diagnosis.search.form_error import LEVELS, OF_SMOOTH
+from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN, is_same
 from ccnn_torch.motion.drivers import Driver, driver_columns
 from ccnn_torch.motion.fit import Fit
 from ccnn_torch.motion.form import weighed
 from ccnn_torch.motion.outside import Candidate, Members, essential, holds, prior_of, with_drivers
-from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 
 __all__ = ["AxisVerdict", "judge_axes"]
@@ -59,14 +61,19 @@ def judge_axes(found: Search) -> list[AxisVerdict]:
 def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     problem, fits = found.problem, found.found[axis]
     by_members = {f.members: f for f in fits}
-    slight = _slight(problem, axis)
+    # Mean square of what a shift of the time stamps moves the axis by [rad^2 or m^2]: less is no effect.
+    step, speed = float(problem.data.time.diff(dim=-1).median()), problem.data.speed[axis][problem.data.judged]
+    slight = (_STAMP * step) ** 2 * float(speed.square().mean())
     left = {f.members: f.left for f in fits}
-    sets = [Candidate((essential(f.members, left, slight), None), f.grams, f.spec.groups, prior_of(f)) for f in fits]
+    unseen = {f.members: f.unseen for f in fits}
+    sets = [
+        Candidate((essential(f.members, left, slight, unseen), None), f.grams, f.spec.groups, prior_of(f)) for f in fits
+    ]
     sets += with_drivers(found, axis, drivers, by_members, slight)
     share: dict[tuple[Members, str | None], float] = {}
     usual: list[float] = []
-    for variance in (fits[0].noise + level * found.form[axis] for level in LEVELS):
-        weights = [float(weighed(one.grams, one.groups, variance).log_evidence[0]) + one.log_prior for one in sets]
+    for level in LEVELS:
+        weights = _weights(sets, fits[0].noise, level * found.form[axis], level * OF_SMOOTH)
         usual = usual or weights
         top = max(weights)
         total = math.fsum(math.exp(w - top) for w in weights)
@@ -88,14 +95,33 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     sure = tuple(m for m in members if sum(p for (own, _), p in ranked if like[m] & {*own}) >= _NAMED)
     if inside.get(sure, 0.0) * _LIKE > inside[members]:
         members, classes = sure, _classes(sure, inside)
-    same = sum(p for own, p in inside.items() if _equals(own, members, classes))
+    same = sum(p for own, p in inside.items() if is_same(frozenset(own), frozenset(members), classes))
     return AxisVerdict(by_members[members], same, marginal, classes, None)
 
 
-def _slight(problem: Problem, axis: int) -> float:
-    """Mean square of what a shift of the time stamps moves the axis by [rad^2 or m^2]: less is no effect."""
-    step = float(problem.data.time.diff(dim=-1).median())
-    return (_STAMP * step) ** 2 * float(problem.data.speed[axis][problem.data.judged].square().mean())
+def _weights(sets: Sequence[Candidate], noise: float, form: float, smooth: float) -> list[float]:
+    """Log posterior of each set under noise and form errors, not normalised.
+
+    What follows a driver is smooth where its cause need not be: beside one, where that is the best, a name has to do
+    more than that share of what the driver does.
+    """
+
+    def under(variance: float) -> list[float]:
+        return [
+            float(weighed(one.grams, [one.groups], sum(map(len, one.groups)), variance).log_evidence[0]) + one.log_prior
+            for one in sets
+        ]
+
+    weights = under(noise + form)
+    best = sets[weights.index(max(weights))]
+    if best.rows is None:
+        return weights
+    does = float(fit_sets(best.grams, [best.groups], 0.0).energy[0, len(best.groups) - 1])
+    smeared = under(noise + form + smooth * does)
+    least = torch.tensor([0.0 if one.rows is not None else -math.inf for one in sets], dtype=torch.float64)
+    whole, beside = (torch.logsumexp(torch.tensor(w, dtype=torch.float64) + least, 0) for w in (weights, smeared))
+    pairs = zip(sets, weights, smeared, strict=True)
+    return [w if one.rows is None else v + float(whole - beside) for one, w, v in pairs]
 
 
 def _classes(members: Members, inside: Mapping[Members, float]) -> dict[int, tuple[int, ...]]:
@@ -106,11 +132,3 @@ def _classes(members: Members, inside: Mapping[Members, float]) -> dict[int, tup
         others = [(own, {*own} - rest) for own, p in inside.items() if rest <= {*own} and p * _LIKE > inside[members]]
         found[m] = tuple(new.pop() for own, new in others if len(new) == 1 and m not in own)
     return found
-
-
-def _equals(own: Members, named: Members, classes: Mapping[int, tuple[int, ...]]) -> bool:
-    """Whether a set has every named effect, or one of its class in its place, and nothing else."""
-    left = {*own}
-    for m in named:
-        left.discard(next((e for e in (m, *classes[m]) if e in left), m))
-    return not left and len(own) == len(named)

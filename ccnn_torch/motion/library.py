@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -61,10 +60,10 @@ class Library(NamedTuple):
     """Effects of `n` axes whose numbers, in plausible sizes, stand in vectors of `k`.
 
     Attributes:
-        effects: what is tried.
+        names: of the effects that are tried.
         facts: of each axis.
         numbers: of each axis, those of every effect one after the other; shapes that are held have none.
-        owner: effect of each number, `k`; -1 for a shape.
+        size: `k`.
         places: places of each effect's numbers.
         variants: of each effect.
         held: place of every shape by the axis' parameter.
@@ -73,10 +72,10 @@ class Library(NamedTuple):
         there: whether an axis can show an effect, `n x effects`.
     """
 
-    effects: tuple[MotionEffect, ...]
+    names: tuple[str, ...]
     facts: tuple[Facts, ...]
     numbers: tuple[tuple[Number, ...], ...]
-    owner: tuple[int, ...]
+    size: int
     places: tuple[tuple[int, ...], ...]
     variants: tuple[tuple[Variant, ...], ...]
     held: dict[str, int]
@@ -101,15 +100,6 @@ class Library(NamedTuple):
         if "stribeck_speed" in self.held:
             high[:, self.held["stribeck_speed"]] = torch.tensor([_SLOW * axis.speed for axis in self.facts])
         return low, high
-
-    @property
-    def size(self) -> int:
-        """`k`."""
-        return len(self.owner)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(effect.name for effect in self.effects)
 
     def parameters(self, theta: Tensor) -> dict[str, Tensor]:
         """Parameters of the axes.
@@ -142,79 +132,51 @@ class Library(NamedTuple):
 def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Library:
     """The library for some axes."""
     lacking = [[effect.missing(axis) for axis in facts] for effect in effects]
-    there = torch.tensor([[not lacking[e][i] for e in range(len(effects))] for i in range(len(facts))])
     numbers: list[list[Number]] = [[] for _ in facts]
-    owner: list[int] = []
     places: list[tuple[int, ...]] = []
-    for e, effect in enumerate(effects):
-        own = [effect.numbers(axis) for axis in facts]
-        # An axis that is driven otherwise than the first one has other numbers of the same length, or the first one's.
-        own = [o if len(o) == len(own[0]) else own[0] for o in own]
-        begin = len(owner)
-        for i, those in enumerate(own):
-            numbers[i] += those
-        owner += [e] * len(own[0])
-        places.append(tuple(range(begin, len(owner))))
+    for effect in effects:
+        own = [tuple(effect.numbers(axis)) for axis in facts]
+        begin = len(numbers[0])
+        for of_axis, those in zip(numbers, own, strict=True):
+            # An axis that is driven otherwise than the first one has as many numbers, or the first one's.
+            of_axis += those if len(those) == len(own[0]) else own[0]
+        places.append(tuple(range(begin, len(numbers[0]))))
+    names = [{numbers[0][j].name for j in own} for own in places]
     shapes = [[effect.shapes(axis) for axis in facts] for effect in effects]
-    held: dict[str, int] = {}
-    for e in range(len(effects)):
-        own_names = {numbers[0][j].name for j in places[e]}
-        for name in itertools.chain.from_iterable(one.keys() for one in shapes[e][0]):
-            if name not in own_names and name not in held:
-                held[name] = len(owner)
-                owner.append(-1)
-    variants = []
-    for e in range(len(effects)):
-        count = min(len(s) for s in shapes[e])
-        variants.append(
-            tuple(_variant(e, effects[e].name, k, places[e], numbers, shapes[e], held, count) for k in range(count))
+    fixed = dict.fromkeys(n for s, own in zip(shapes, names, strict=True) for one in s[0] for n in one if n not in own)
+    held = {name: len(numbers[0]) + k for k, name in enumerate(fixed)}
+
+    def variant(e: int, k: int, count: int) -> Variant:
+        of_axes = [s[k] for s in shapes[e]]
+        own = [name for name in of_axes[0] if name not in names[e]]
+        values = [
+            [given[n.name] / n.scale if n.name in given else n.start for n in (axis[j] for j in places[e])]
+            for given, axis in zip(of_axes, numbers, strict=True)
+        ]
+        return Variant(
+            e,
+            places[e],
+            torch.tensor(values, dtype=torch.float64),
+            tuple(held[name] for name in own),
+            torch.tensor([[given[name] for name in own] for given in of_axes], dtype=torch.float64),
+            -math.log(count) + _RARER.get(effects[e].name, 0.0),
         )
+
+    counts = [min(map(len, s)) for s in shapes]
     nominal = {
-        name: torch.tensor([axis.nominal.get(name, ABSENT[name]) for axis in facts], dtype=torch.float64)
-        for name in ABSENT
-        if any(axis.nominal.get(name, ABSENT[name]) != ABSENT[name] for axis in facts)
+        name: torch.tensor([axis.nominal.get(name, value) for axis in facts], dtype=torch.float64)
+        for name, value in ABSENT.items()
+        if any(axis.nominal.get(name, value) != value for axis in facts)
     }
     return Library(
-        tuple(effects),
+        tuple(effect.name for effect in effects),
         tuple(facts),
         tuple(map(tuple, numbers)),
-        tuple(owner),
+        len(numbers[0]) + len(held),
         tuple(places),
-        tuple(variants),
+        tuple(tuple(variant(e, k, count) for k in range(count)) for e, count in enumerate(counts)),
         held,
         nominal,
         tuple("" if not all(why) else why[0] for why in lacking),
-        there,
-    )
-
-
-def _variant(
-    effect: int,
-    name: str,
-    k: int,
-    places: tuple[int, ...],
-    numbers: list[list[Number]],
-    shapes: Sequence[Sequence[Mapping[str, float]]],
-    held: dict[str, int],
-    count: int,
-) -> Variant:
-    first = shapes[0][k]
-    names = [numbers[0][j].name for j in places]
-    values = [
-        [
-            shapes[i][k][numbers[i][j].name] / numbers[i][j].scale
-            if numbers[i][j].name in shapes[i][k]
-            else numbers[i][j].start
-            for j in places
-        ]
-        for i in range(len(numbers))
-    ]
-    own = [name for name in first if name not in names]
-    return Variant(
-        effect,
-        places,
-        torch.tensor(values, dtype=torch.float64),
-        tuple(held[name] for name in own),
-        torch.tensor([[s[k][name] for name in own] for s in shapes], dtype=torch.float64),
-        -math.log(count) + _RARER.get(name, 0.0),
+        torch.tensor([[not why[i] for why in lacking] for i in range(len(facts))]),
     )

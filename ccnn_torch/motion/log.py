@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +20,7 @@ from ccnn_torch.units import si_unit_of
 __all__ = ["Log", "load_logs", "refuse_time", "runs_of"]
 
 Array = NDArray[np.float64]
-_RUN, _POSITION = "run", re.compile(r"q(\d+)")
-_COMMAND = re.compile(r"command(\d+)")
+_RUN, _POSITION, _COMMAND = "run", re.compile(r"q(\d+)"), re.compile(r"command(\d+)")
 _SHARED = {"supply": "V", "temperature": "K", "torque_on": "1"}
 _EACH = {"speed": None, "torque": "N*m", "current": "A", "pwm": "1"}
 # Steps longer than this many usual ones are gaps; longer than so many, late samples that the simulation can bridge.
@@ -47,7 +46,6 @@ class Log:
         beside: columns that were recorded beside them, in SI, by name: `supply`, `temperature`, `speed1`, `pwm1`, …
         on: whether the drive was on and the sample is usable, `s`.
         cut: whether something is missing before the sample, so that it begins anew, `s`.
-        lines: line of each sample in the file, `s`.
         notes: what was recognised and left out, one sentence each without a full stop.
     """
 
@@ -59,13 +57,7 @@ class Log:
     beside: Mapping[str, Array]
     on: NDArray[np.bool_]
     cut: NDArray[np.bool_]
-    lines: NDArray[np.int64]
-    notes: tuple[str, ...] = field(default=())
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """`q1`, `q2`, …"""
-        return tuple(f"q{i + 1}" for i in range(self.command.shape[1]))
+    notes: tuple[str, ...] = ()
 
 
 def load_logs(sources: Sequence[str | Path | Frame | Table], columns: Mapping[str, str] | None = None) -> list[Log]:
@@ -81,7 +73,7 @@ def load_logs(sources: Sequence[str | Path | Frame | Table], columns: Mapping[st
     """
     if not sources:
         raise InputError("motion: name at least one log with --motion LOG.csv")
-    logs = [log for source in sources for log in _of_table(_table(source, columns))]
+    logs = [log for source in sources for log in _of_source(source, columns)]
     first = logs[0]
     for log in logs[1:]:
         if log.units != first.units:
@@ -93,28 +85,28 @@ def load_logs(sources: Sequence[str | Path | Frame | Table], columns: Mapping[st
     return logs
 
 
-def _table(source: str | Path | Frame | Table, columns: Mapping[str, str] | None) -> Table:
+def _of_source(source: str | Path | Frame | Table, columns: Mapping[str, str] | None) -> list[Log]:
     if isinstance(source, Table):
-        return source
-    return read_table(source, columns) if isinstance(source, str | Path) else read_frame(source, columns)
-
-
-def _of_table(table: Table) -> list[Log]:
+        table = source
+    else:
+        table = read_table(source, columns) if isinstance(source, str | Path) else read_frame(source, columns)
     count = _joints(table)
     units = tuple(_unit(table, f"q{i}", f"command{i}") for i in range(1, count + 1))
-    stacked = [
+    command, position = (
         np.stack([table.column(f"{kind}{i + 1}", units[i]) for i in range(count)], -1) for kind in ("command", "q")
-    ]
+    )
     time = table.column("time", "s")
     beside = {n: table.column(n, unit) for n, unit in _SHARED.items() if n in table}
     for kind, unit in _EACH.items():
         for i in range(1, count + 1):
             if (name := f"{kind}{i}") in table:
                 beside[name] = table.column(name, unit if kind != "speed" else f"{units[i - 1]}/s")
-    parts = runs_of(table)
-    return [
-        _log(table, name, rows, time[rows], stacked[0][rows], stacked[1][rows], units, beside) for name, rows in parts
-    ]
+    found = []
+    for name, rows in runs_of(table):
+        refuse_time(table, rows, time[rows])
+        own = {n: v[rows] for n, v in beside.items()}
+        found.append(_log(name, time[rows], command[rows], position[rows].copy(), units, own))
+    return found
 
 
 def runs_of(table: Table) -> list[tuple[str, NDArray[np.int64]]]:
@@ -161,18 +153,9 @@ def _unit(table: Table, position: str, command: str) -> str:
 
 
 def _log(
-    table: Table,
-    name: str,
-    rows: NDArray[np.int64],
-    time: Array,
-    command: Array,
-    position: Array,
-    units: tuple[str, ...],
-    beside: Mapping[str, Array],
+    name: str, time: Array, command: Array, position: Array, units: tuple[str, ...], own: Mapping[str, Array]
 ) -> Log:
-    refuse_time(table, rows, time)
     steps = np.diff(time)
-    own = {n: v[rows] for n, v in beside.items()}
     notes: list[str] = []
     cut = np.zeros(len(time), dtype=np.bool_)
     usual = float(np.median(steps)) if len(steps) else 1.0
@@ -182,7 +165,6 @@ def _log(
         notes.append(f"{name}: {count_text(int(gaps.sum()), 'gap')} of {steps[gaps].sum():.3g} s in all, left out")
     if late.any():
         notes.append(f"{name}: {count_text(int(late.sum()), 'sample')} came late; the simulation uses their own times")
-    position = position.copy()
     for i, unit in enumerate(units):
         moved = np.diff(position[:, i])
         # Beside what the command moves, which across a gap may be much.
@@ -202,7 +184,7 @@ def _log(
             notes.append(f"{name}: q{i + 1} jumps {count_text(int(jump.sum()), 'time')}; the log is cut there")
     on = _drive_on(name, time, command, position, own, notes)
     cut[1:] |= on[1:] & ~on[:-1]
-    return Log(name, time, command, position, units, own, on, cut, table.lines[rows], tuple(notes))
+    return Log(name, time, command, position, units, own, on, cut, tuple(notes))
 
 
 def refuse_time(table: Table, rows: NDArray[np.int64], time: Array) -> None:
@@ -221,6 +203,8 @@ def _drive_on(
     name: str, time: Array, command: Array, position: Array, beside: Mapping[str, Array], notes: list[str]
 ) -> NDArray[np.bool_]:
     """Where the drive was on: as recorded; else where it gives no output at all although the position is off."""
+    from scipy.ndimage import binary_opening
+
     on = np.ones(len(time), dtype=np.bool_)
     if "torque_on" in beside:
         on = beside["torque_on"] > 0.5
@@ -233,7 +217,7 @@ def _drive_on(
                 error = np.abs(command[:, i] - position[:, i])
                 if output is None or not np.any(output):
                     continue
-                off = _runs_of((output == 0) & (error > _OFF_ERROR * np.ptp(command[:, i])), _OFF)
+                off = binary_opening((output == 0) & (error > _OFF_ERROR * np.ptp(command[:, i])), np.ones(_OFF))
                 if off.any():
                     on &= ~off
                     source = f"{kind}{i + 1}, which is 0 although the position is off"
@@ -241,12 +225,3 @@ def _drive_on(
         lost = float(np.diff(time, append=time[-1])[~on].sum())
         notes.append(f"{name}: the drive was off for {lost:.3g} s ({source}), left out")
     return on
-
-
-def _runs_of(flags: NDArray[np.bool_], least: int) -> NDArray[np.bool_]:
-    """The flags without runs of fewer than `least`."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    kept = np.zeros_like(flags)
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
-        kept[a:b] = b - a >= least
-    return kept

@@ -56,7 +56,8 @@ def refuse_mistakes(logs: Sequence[Log]) -> None:
                     "this log out"
                 )
     longest = max(usable, key=lambda log: len(log.time))
-    lag = max(lag_of(longest, i) for i in range(command.shape[1]))
+    pairs = zip(longest.command[longest.on].T, longest.position[longest.on].T, strict=True)
+    lag = max(lag_of(longest.time, u, q) for u, q in pairs)
     if lag * _LAGS > lasted:
         raise InputError(
             f"{names}: the position lags {lag:.3g} s behind the command, and the log lasts {lasted:.3g} s; record at "
@@ -64,12 +65,11 @@ def refuse_mistakes(logs: Sequence[Log]) -> None:
         )
 
 
-def lag_of(log: Log, joint: int) -> float:
-    """The time shift at which a position is most like its command [s]; 0 where it does not move."""
-    command, position = log.command[log.on, joint], log.position[log.on, joint]
+def lag_of(time: Array, command: Array, position: Array) -> float:
+    """The time shift at which a position is most like its command [s], `s` each; 0 where it does not move."""
     if len(command) < 3 or not np.ptp(command) or not np.ptp(position):
         return 0.0
-    step = float(np.median(np.diff(log.time)))
+    step = float(np.median(np.diff(time)))
     c, q = command - command.mean(), position - position.mean()
     size = 1 << (2 * len(c) - 1).bit_length()
     like = np.fft.irfft(np.fft.rfft(q, size) * np.conj(np.fft.rfft(c, size)), size)[

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.files.read import CONFIG_LIMIT, read_text
-from ccnn_torch.motion.simulators import Simulator
+from ccnn_torch.motion.nominal import Nominal
 
-__all__ = ["is_mjcf", "mujoco_simulator"]
+__all__ = ["mujoco_nominal"]
 
 Array = NDArray[np.float64]
 # Seconds at the first command before a log begins: the machine rests there.
@@ -22,13 +21,8 @@ _SETTLING = 1.0
 _TINY = 1e-9
 
 
-def is_mjcf(path: Path) -> bool:
-    """Whether an XML file is a MuJoCo model."""
-    return "<mujoco" in read_text(str(path), CONFIG_LIMIT, "write an MJCF")
-
-
-def mujoco_simulator(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> Simulator:
-    """The simulator of an MJCF whose actuators hold the positions of joints, one for each command in their order.
+def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> Nominal:
+    """The model of an MJCF whose actuators hold the positions of joints, one for each command in their order.
 
     Raises:
         InputError: MuJoCo is not installed, the model cannot be read, or it has other actuators.
@@ -60,21 +54,20 @@ def mujoco_simulator(path: str, keys: Mapping[str, Any], units: Sequence[str]) -
     gain, limit = model.actuator_gainprm[position, 0], model.actuator_forcerange[position, 1]
     values = {
         "inertia": model.dof_M0[dofs] / gain,
+        "load": (model.dof_M0[dofs] - model.dof_armature[dofs]) / gain,
         "viscous": (model.dof_damping[dofs] - model.actuator_biasprm[position, 2]) / gain,
         "coulomb": model.dof_frictionloss[dofs] / gain,
         "weakness": model.actuator_forcelimited[position] * gain / np.maximum(limit, _TINY),
     }
     levers = [_lever(model, j) for j in joints]
-    return Simulator(
+    return Nominal(
         path,
-        lambda time, commands, parameters: _moved(model, joints, values, time, commands)[0],
-        {},
-        (f"{Path(path).name}: simulated from rest at each log's first command",),
         tuple({name: float(v[i]) for name, v in values.items() if v[i]} for i in range(len(joints))),
         tuple(gain.tolist()),
         tuple(lever and lever[0] for lever in levers),
-        tuple(lever and lever[1] for lever in levers),
-        lambda time, commands: _moved(model, joints, values, time, commands),
+        weights=tuple(lever and lever[1] for lever in levers),
+        loaded=lambda time, commands: _moved(model, joints, values, time, commands),
+        notes=(f"{Path(path).name}: simulated from rest at each log's first command",),
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -53,7 +52,11 @@ def write_mjcf(
         joint.damping = [new, *damping[1:]] if damping.ndim else new
         joint.frictionloss = unit * axis["coulomb"]
         if mass:
-            _heavier(spec, model, body, mass)
+            own = next(b for b in spec.bodies if b.id == body)
+            own.explicitinertial, own.mass = True, max(float(model.body_mass[body]) + mass, _LEAST)
+            own.ipos, own.iquat = model.body_ipos[body], model.body_iquat[body]
+            # A point mass at the centre leaves the inertia about it as it is.
+            own.inertia = model.body_inertia[body]
         more = unit * axis["inertia"] - float(model.dof_M0[dof]) - mass * (lever or 0.0) ** 2
         joint.armature = max(float(model.dof_armature[dof]) + more, 0.0)
         if axis["weakness"]:
@@ -61,12 +64,3 @@ def write_mjcf(
             actuator.forcelimited, actuator.forcerange = 1, [-most, most]
     spec.modelfiledir = str(Path(source).resolve().parent)
     write_whole(path, spec.to_xml())
-
-
-def _heavier(spec: Any, model: Any, body: int, mass: float) -> None:
-    own = next(b for b in spec.bodies if b.id == body)
-    own.explicitinertial = True
-    own.mass = max(float(model.body_mass[body]) + mass, _LEAST)
-    own.ipos, own.iquat = model.body_ipos[body], model.body_iquat[body]
-    # A point mass at the centre leaves the inertia about it as it is.
-    own.inertia = model.body_inertia[body]

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.motion.fit import Fit, sensitivities
+from ccnn_torch.motion.fit import Fit, places_of, sensitivities
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem, Whitening
 from ccnn_torch.motion.search import Search
-from ccnn_torch.motion.stretches import Stretches
 
 __all__ = ["Motion", "motions", "next_motions"]
 
@@ -97,8 +96,7 @@ def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[d
         middle, amplitude = float(position.mean()), 0.5 * float(position.max() - position.min())
         if not amplitude:
             continue
-        # Two effects that do the same to this model are distinguished by no motion.
-        rivals = [f for f in _rivals(found.found[i], verdict) if not _alike(library, i, verdict.best, f)]
+        rivals, best = _rivals(library, i, found.found[i], verdict), {*verdict.best.members}
         for motion in motions(middle, amplitude, library.facts[i].speed, library.facts[i].unit):
             problem = _problem_of(found.problem, i, motion)
             whitening = Whitening(found.whitening.coefficients[i : i + 1])
@@ -117,7 +115,8 @@ def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[d
             others: list[Fit | None] = [*rivals] or [None]
             for rival in others:
                 gain = _gain(problem, whitening, i, verdict.best, rival)
-                names = [] if rival is None else _apart(library.names, verdict.best, rival)
+                other = best if rival is None else {*rival.members}
+                names = [library.names[e] for e in (*sorted(best - other), *sorted(other - best))]
                 entries.append((entry | {"separates": names, "gain": gain}, motion))
     entries = [e for e in entries if math.isfinite(e[0]["gain"])]
     entries.sort(key=lambda e: -e[0]["gain"])
@@ -131,60 +130,40 @@ def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[d
     return [c[0] for c in chosen], [c[1] for c in chosen]
 
 
-def _rivals(fits: Sequence[Fit], verdict: AxisVerdict) -> list[Fit]:
-    """The most probable sets in which a member of the verdict is replaced by one of its class."""
-    found = []
-    for member, like in verdict.classes.items():
-        for other in like:
-            wanted = tuple(sorted({*verdict.best.members} - {member} | {other}))
-            found += [f for f in fits if f.members == wanted]
-    return found[:_RIVALS]
+def _rivals(library: Library, axis: int, fits: Sequence[Fit], verdict: AxisVerdict) -> list[Fit]:
+    """The most probable sets in which a member of the verdict is replaced by one of its class, and acts otherwise."""
 
+    def acts(f: Fit) -> list[Any]:
+        return sorted(a for member in f.members for j in library.places[member] for a in library.numbers[axis][j].acts)
 
-def _alike(library: Library, axis: int, best: Fit, rival: Fit) -> bool:
-    """Whether two sets act on the same parameters of the axis."""
-    acts = [
-        sorted(act for member in f.members for j in library.places[member] for act in library.numbers[axis][j].acts)
-        for f in (best, rival)
-    ]
-    return acts[0] == acts[1]
-
-
-def _apart(names: Sequence[str], best: Fit, rival: Fit) -> list[str]:
-    return [
-        names[e] for e in (*sorted({*best.members} - {*rival.members}), *sorted({*rival.members} - {*best.members}))
-    ]
+    own = {*verdict.best.members}
+    sets = [tuple(sorted(own - {m} | {other})) for m, like in verdict.classes.items() for other in like]
+    found = [f for wanted in sets for f in fits if f.members == wanted][:_RIVALS]
+    # Two effects that do the same to this model are distinguished by no motion.
+    return [f for f in found if acts(f) != acts(verdict.best)]
 
 
 def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
     """One axis that is commanded by a motion."""
-    s = len(motion.time)
-    row = motion.command[None]
-    judged = (motion.time > _LEAD)[None]
-    facts = problem.library.facts[axis]
-    nominal = dict(facts.nominal)
-    nominal["gain"] = nominal.get("gain", 1.0) * motion.gain
-    nominal["gravity_sin"] = nominal.get("gravity_sin", 0.0) + motion.load
-    library = _only(problem, axis, nominal)
-    data = Stretches(
-        motion.time[None],
-        row[None],
-        row[None],
-        torch.zeros(1, 1, s, dtype=torch.float64),
-        judged,
-        torch.zeros(1, dtype=torch.int64),
-        {},
-        torch.zeros(1, s, dtype=torch.int64),
-        ("next",),
-        (facts.unit,),
-        (),
+    library, row = problem.library, motion.command[None]
+    still = torch.zeros_like(row)
+    nominal = {n: v[axis : axis + 1] for n, v in library.nominal.items()}
+    nominal["gain"] = nominal.get("gain", torch.ones(1, dtype=row.dtype)) * motion.gain
+    nominal["gravity_sin"] = nominal.get("gravity_sin", torch.zeros(1, dtype=row.dtype)) + motion.load
+    data = problem.data._replace(
+        time=motion.time[None],
+        command=row[None],
+        position=row[None],
+        speed=still[None],
+        judged=(motion.time > _LEAD)[None],
+        run=torch.zeros(1, dtype=torch.int64),
+        beside={},
     )
-    still = torch.zeros(1, s, dtype=torch.float64)
     step = float(problem.data.time.diff(dim=-1).median()) * problem.pool
     return replace(
         problem,
         data=data,
-        library=library,
+        library=library._replace(facts=(), numbers=(library.numbers[axis],), nominal=nominal),
         followed=row[None],
         supply=still,
         warm=still,
@@ -195,20 +174,10 @@ def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
     )
 
 
-def _only(problem: Problem, axis: int, nominal: Mapping[str, float]) -> Any:
-    """The library of one axis."""
-    library = problem.library
-    return library._replace(
-        facts=(replace(library.facts[axis], nominal=nominal),),
-        numbers=(library.numbers[axis],),
-        nominal={n: torch.tensor([v], dtype=torch.float64) for n, v in nominal.items()},
-    )
-
-
 def _gain(problem: Problem, whitening: Whitening, axis: int, best: Fit, rival: Fit | None) -> float:
     """In nats."""
     other = best if rival is None else rival
-    active = torch.tensor([[list(other.spec.flat)]], dtype=torch.int64).reshape(1, 1, -1)
+    active = places_of([[other.spec.flat]])
     mine = problem.positions(torch.stack([best.spec.theta])[None])[0]
     there = replace(problem, data=problem.data._replace(position=mine))
     difference, columns = sensitivities(there, whitening, other.spec.theta[None, None], active)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,13 +14,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.read import CONFIG_LIMIT, read_text
+from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.motion.axis import ABSENT
 from ccnn_torch.motion.effects import MotionEffect
-from ccnn_torch.motion.effects.own_parameter import OwnParameter
+from ccnn_torch.motion.effects.own_parameter import own_parameter
 from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
 from ccnn_torch.motion.log import Log
-from ccnn_torch.motion.simulators import Simulator, simulator_of
+from ccnn_torch.motion.simulators import Simulator, own_simulator
 from ccnn_torch.motion.stretches import Stretches
+from ccnn_torch.plugins import is_plugin
 from ccnn_torch.spelling import nearest
 
 __all__ = ["KEYS", "TORQUES", "Driven", "Nominal", "axis_keys", "nominal_of"]
@@ -66,6 +70,9 @@ _SAME = {
 }
 
 
+Array = NDArray[np.float64]
+
+
 class Driven(NamedTuple):
     """What drives the axes, `n x b x s` each.
 
@@ -94,6 +101,8 @@ class Nominal:
         weights: of 1 kg there, as of `Facts`.
         supply: nominal supply voltage; None where the motor's strength is not known to follow it.
         simulator: makes the positions that the axes follow; None where they follow the commands.
+        loaded: `time, commands` -> positions, and what resists the motors beside those of `axes`, over the gains,
+            `s x n` each; None where the axes tell the positions.
         notes: sentences without a full stop.
     """
 
@@ -103,14 +112,15 @@ class Nominal:
     lengths: tuple[float | None, ...]
     supply: float | None = None
     simulator: Simulator | None = None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
     weights: tuple[tuple[float, float] | None, ...] = ()
+    loaded: Callable[[Array, Array], tuple[Array, Array]] | None = None
 
     @property
     def own_effects(self) -> list[MotionEffect]:
         """Wrong values of a simulator's own parameters."""
-        own = self.simulator.parameters if self.simulator is not None and self.simulator.loaded is None else {}
-        return [OwnParameter(name, value) for name, value in own.items()]
+        own = self.simulator.parameters if self.simulator is not None else {}
+        return [own_parameter(name, value) for name, value in own.items()]
 
     def driven(self, logs: Sequence[Log], data: Stretches, about: Mapping[str, float] | None = None) -> Driven:
         """What drives the axes: the commands, or where a simulator tells no more than positions these.
@@ -124,9 +134,11 @@ class Nominal:
             InputError: the simulator fails.
         """
         simulator = self.simulator
-        if simulator is None:
-            return Driven(data.command)
-        if simulator.loaded is None:
+        if self.loaded is not None:
+            pairs = [self.loaded(log.time, log.command) for log in logs]
+            simulated, torque = (_along([pair[k] for pair in pairs], data) for k in range(2))
+            return Driven(data.command, torque, simulated)
+        if simulator is not None:
             centre = {name: value + (about or {}).get(name, 0.0) for name, value in simulator.parameters.items()}
 
             def made_with(**other: float) -> Tensor:
@@ -139,12 +151,10 @@ class Nominal:
                 own[name] = (made_with(**{name: value + step}) - made_with(**{name: value - step})) / (2 * step)
                 made = made - (value - simulator.parameters[name]) * own[name]
             return Driven(made, own=own)
-        pairs = [simulator.loaded(log.time, log.command) for log in logs]
-        simulated, torque = (_along([pair[k] for pair in pairs], data) for k in range(2))
-        return Driven(data.command, torque, simulated)
+        return Driven(data.command)
 
 
-def _along(made: Sequence[NDArray[np.float64]], data: Stretches) -> Tensor:
+def _along(made: Sequence[Array], data: Stretches) -> Tensor:
     """What was made for each log, at the samples of the stretches, `n x b x s`."""
     found = data.command.clone()
     for k, number in enumerate(data.run.tolist()):
@@ -169,12 +179,21 @@ def nominal_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) ->
     n = len(units)
     if mechanism == "servo":
         return _servo(keys, n)
-    simulator = simulator_of(mechanism, keys, units)
-    if simulator is None:
-        return Nominal(mechanism, ({},) * n, (None,) * n, (None,) * n)
-    axes, gains = simulator.axes or ({},) * n, simulator.gains or (None,) * n
-    lengths = simulator.lengths or (None,) * n
-    return Nominal(mechanism, axes, gains, lengths, None, simulator, simulator.notes, simulator.weights)
+    nothing = Nominal(mechanism, ({},) * n, (None,) * n, (None,) * n)
+    if is_plugin(mechanism):
+        return replace(nothing, simulator=own_simulator(mechanism, keys))
+    if Path(mechanism).suffix.lower() in (".xml", ".mjcf") and Path(mechanism).is_file():
+        from ccnn_torch.motion.mujoco_model import mujoco_nominal
+
+        if "<mujoco" in read_text(mechanism, CONFIG_LIMIT, "write an MJCF"):
+            return mujoco_nominal(mechanism, keys, units)
+    own = [joint.unit for joint in load_mechanism(mechanism, **keys).joints]
+    if own != list(units):
+        raise InputError(
+            f"{mechanism}: has {len(own)} joints ({', '.join(own)}), and the logs {len(units)} ({', '.join(units)}); "
+            "name the commands command1… and the positions q1… in the mechanism's order"
+        )
+    return nothing
 
 
 def _servo(keys: Mapping[str, Any], n: int) -> Nominal:
@@ -242,15 +261,13 @@ def axis_keys(nominal: Nominal, axes: Sequence[Mapping[str, float]], added: Sequ
 
 def _numbers(key: str, value: Any, n: int) -> list[float]:
     values = value if isinstance(value, list | tuple) else [value] * n
-    signed = key in _SIGNED
+    signed, above = key in _SIGNED, key in ("gain", "supply", "length")
     fine = len(values) == n and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and (signed or v >= 0)
         for v in values
     )
-    if not fine or (key in ("gain", "supply", "length") and not all(v > 0 for v in values)):
-        what = (
-            "a number" if signed else "a number not below 0" if key not in ("gain", "supply", "length") else "above 0"
-        )
+    if not fine or (above and not all(v > 0 for v in values)):
+        what = "a number" if signed else "above 0" if above else "a number not below 0"
         raise InputError(
             f"mechanism_keys: {key} must be {what}, or a list with one for each of the {n} joints, not {value}"
         )

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, grams_of
 from ccnn_torch.motion.drivers import Driver
-from ccnn_torch.motion.fit import Fit, sensitivities
-from ccnn_torch.motion.held_out import folds_of
+from ccnn_torch.motion.fit import Fit, places_of, sensitivities, squares_unseen
 from ccnn_torch.motion.problem import Problem, Whitening
 from ccnn_torch.motion.search import CROWD, Search, log_posterior
 
@@ -22,6 +21,8 @@ __all__ = ["Candidate", "Members", "essential", "holds", "prior_of", "with_drive
 _OUTSIDE = math.log(0.001)
 # Sets beside which drivers are tried, besides those that lead from the best one to none.
 _BASES = 6
+# Share of what is left of runs that were not fitted up to which a set without a member is as good.
+_NEARLY = 1.02
 
 Members = tuple[int, ...]
 
@@ -47,14 +48,25 @@ def prior_of(fit: Fit) -> float:
     return log_posterior(fit) - fit.log_evidence
 
 
-def essential(members: Members, left: Mapping[Members, float], slight: float) -> Members:
-    """The set without members that do next to nothing, the least first; left: mean square that each set leaves."""
+def essential(
+    members: Members, left: Mapping[Members, float], slight: float, unseen: Mapping[Members, float]
+) -> Members:
+    """The set without members that do next to nothing, the least first.
+
+    Args:
+        members: of the set.
+        left: mean square that each set leaves.
+        slight: of what is next to nothing.
+        unseen: squares that each set leaves of runs that it was not fitted to, of which a member has to take something
+            away as well; where it is not told it has not.
+    """
+    most = _NEARLY**2 * unseen.get(members, 0.0)
     while members:
-        rest = [tuple(m for m in members if m != e) for e in members]
-        least = min((r for r in rest if r in left), key=lambda r: left[r], default=None)
-        if least is None or left[least] - left[members] >= slight:
+        rest = [r for e in members if (r := tuple(m for m in members if m != e)) in left]
+        rest = [r for r in rest if left[r] - left[members] < slight or unseen.get(r, math.inf) <= most]
+        if not rest:
             break
-        members = least
+        members = min(rest, key=lambda r: left[r])
     return members
 
 
@@ -62,7 +74,8 @@ def with_drivers(
     found: Search, axis: int, drivers: Sequence[Driver], fits: Mapping[Members, Fit], slight: float
 ) -> list[Candidate]:
     """Drivers beside the most probable sets, and those that lead from the best one to none."""
-    problem, judged, one = found.problem, found.problem.data.judged, _one(found, axis)
+    problem, judged = found.problem, found.problem.data.judged
+    one = Whitening(found.whitening.coefficients[axis : axis + 1])
     values = float(problem.judged.sum())
     white = [problem.whitened(driver.columns[axis][:, None], one)[0] for driver in drivers]
     chain = [found.found[axis][0]]
@@ -75,15 +88,14 @@ def with_drivers(
     for base in {f.members: f for f in [*found.found[axis][:_BASES], *chain]}.values():
         theta = torch.stack([base.spec.theta if i == axis else own[0].spec.theta for i, own in enumerate(found.found)])
         flat = list(base.spec.flat)
-        active = torch.full((1, len(theta), len(flat)), -1)
-        active[0, axis] = torch.tensor(flat, dtype=torch.int64)
+        active = places_of([[flat if i == axis else () for i in range(len(theta))]])
         residual, own = sensitivities(problem, found.whitening, theta[None], active)
         plain = problem.residual(theta[None])[0, axis]
         y = residual[axis, 0] + base.spec.theta[flat] @ own[axis, 0]
         prior = prior_of(base) + _OUTSIDE + (CROWD if len(base.members) >= 2 else 0.0)
         for k, (driver, columns) in enumerate(zip(drivers, white, strict=True)):
             x = torch.cat([own[axis, 0], columns])
-            grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
+            grams = grams_of(torch.cat([x, found.loose[axis]]).mT[:, None, :], y[:, None])._replace(values=values)
             groups = [*base.spec.groups, torch.arange(len(flat), len(x))]
             # What it takes away of the position itself, not of its whitened form.
             mean = fit_sets(grams, [groups], 0.0).mean[0, len(flat) :]
@@ -93,7 +105,7 @@ def with_drivers(
             sets.append((k, Candidate((base.members, there), grams, groups, prior, (own[axis, 0], columns, y))))
     # Beside a driver a name has to do what the driver does not do as well.
     return [
-        one._replace(key=(essential(one.key[0], taken[k] if one.key[1] else left, slight), one.key[1]))
+        one._replace(key=(essential(one.key[0], taken[k] if one.key[1] else left, slight, {}), one.key[1]))
         for k, one in sets
     ]
 
@@ -102,22 +114,9 @@ def holds(problem: Problem, candidate: Candidate) -> bool:
     """Whether a driver takes something away on runs that no fit saw; the scales are those of all runs."""
     assert candidate.rows is not None
     own, columns, y = candidate.rows
-    fold = folds_of(problem)[:, None].expand(problem.judged.shape).flatten()
-    left = [0.0, 0.0]
-    for k, (x, groups) in enumerate(((own, candidate.groups[:-1]), (torch.cat([own, columns]), candidate.groups))):
-        grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=candidate.grams.values)
-        fit = fit_sets(grams, [groups], 0.0)
-        size = torch.cat(
-            [torch.zeros(0, dtype=x.dtype), *(fit.log_scale[0, g].expand(len(c)) for g, c in enumerate(groups))]
-        )
-        ridge = torch.diag(torch.exp(-size) * fit.noise[0])
-        for f in range(int(fold.max()) + 1):
-            here, rest = fold == f, fold != f
-            mean = torch.linalg.solve(x[:, rest] @ x[:, rest].mT + ridge, x[:, rest] @ y[rest])
-            left[k] += float((y[here] - mean @ x[:, here]).square().sum())
-    return left[1] < left[0]
-
-
-def _one(found: Search, axis: int) -> Whitening:
-    """The whitening of one axis."""
-    return Whitening(found.whitening.coefficients[axis : axis + 1])
+    fold = problem.fold[:, None].expand(problem.judged.shape).flatten()
+    less, more = (
+        squares_unseen(x, y, fit_sets(candidate.grams, [groups], 0.0), groups, fold)
+        for x, groups in ((own, candidate.groups[:-1]), (torch.cat([own, columns]), candidate.groups))
+    )
+    return more < less

@@ -26,9 +26,8 @@ def phases_of(data: Stretches) -> Tensor:
         moving = speed.abs() > _STILL * most
         sign = torch.sign(speed) * moving
         # The last direction in which it moved, so that a stop between two directions is a reversal too.
-        last = sign.clone()
-        for k in range(1, last.shape[-1]):
-            last[..., k] = torch.where(sign[..., k] != 0, sign[..., k], last[..., k - 1])
+        place = torch.arange(sign.shape[-1]).expand(sign.shape)
+        last = sign.gather(-1, torch.where(sign != 0, place, 0).cummax(-1).values)
         turned = torch.zeros_like(last)
         turned[..., 1:] = (last[..., 1:] * last[..., :-1] < 0).double()
         near = torch.nn.functional.max_pool1d(turned[:, None], width, 1, width // 2)[:, 0] > 0

@@ -19,6 +19,11 @@ __all__ = ["Problem", "Whitening", "white_noise"]
 
 # Of an axis that ran away: no residual is larger, in units of the motion.
 _FARTHEST = 10.0
+_FOLDS = 5
+# Share to which the values of a nominal model are known (standard deviation), and those that are.
+_KNOWN = 0.03
+_WEIGHT = ("gravity_sin", "gravity_cos")
+_LOOSE = (*_WEIGHT, "gain", "inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "delay")
 
 
 class Whitening(NamedTuple):
@@ -117,6 +122,24 @@ class Problem:
         moved = wide.positions(theta[None])[0].reshape(n, m, b, s)
         return moved if self.simulated is None else moved + self._beyond[:, None]
 
+    def loose(self, theta: Tensor) -> Tensor:
+        """What the positions change by when a nominal parameter is off by what it is known to, `k x n x b x s`.
+
+        About `theta`, `n x k`, the machine as it seems to be: a model that is wrong may be near to its stability.
+        """
+        n, rows, nominal = len(self.followed), torch.arange(len(self.data.time)), self.library.nominal
+        start = torch.stack([self.data.position[:, :, 0], self.data.speed[:, :, 0]], -1)
+        plain, columns = self._moved(theta[None], rows, start), [theta.new_zeros(0, *self.followed.shape)]
+        absent = torch.zeros(n, dtype=torch.float64)
+        weight = torch.hypot(*(nominal.get(name, absent) for name in _WEIGHT))
+        sizes = {"gain": torch.ones_like(absent), **nominal, **dict.fromkeys(_WEIGHT, weight)}
+        for name, size in sizes.items() if nominal else ():
+            if name in _LOOSE and bool((size != 0).any()):
+                before = nominal.get(name, sizes["gain"] if name == "gain" else absent)
+                other = self.library._replace(nominal={**nominal, name: before + _KNOWN * size})
+                columns.append(replace(self, library=other)._moved(theta[None], rows, start) - plain)
+        return torch.cat(columns)
+
     def _moved(self, theta: Tensor, rows: Tensor, start: Tensor) -> Tensor:
         data, n, b = self.data, len(self.followed), len(rows)
         time = data.time[rows].expand(n, -1, -1).reshape(n * b, -1)
@@ -151,7 +174,16 @@ class Problem:
         """Means over `pool` samples each, `... x s` -> `... x t`."""
         m = self.pool
         kept = residual[..., : residual.shape[-1] // m * m]
-        return kept.reshape(*kept.shape[:-1], -1, m).mean(-1)
+        return kept.reshape(*kept.shape[:-1], kept.shape[-1] // m, m).mean(-1)
+
+    @cached_property
+    def fold(self) -> Tensor:
+        """Fold of each stretch, `b`: whole runs, dealt out in order; parts of the run where there is one alone."""
+        run, count = self.data.run, len(self.data.run)
+        runs = torch.tensor(sorted(set(run.tolist())))
+        if len(runs) < 2:
+            return torch.arange(count) * min(_FOLDS, count) // count
+        return (torch.arange(len(runs)) % min(_FOLDS, len(runs)))[torch.searchsorted(runs, run)]
 
     @property
     def judged(self) -> Tensor:

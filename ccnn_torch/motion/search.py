@@ -12,10 +12,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.dictionary import CERTAIN
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of, scaled
-from ccnn_torch.motion.fit import Fit, Spec, fit_many, sensitivities, started
-from ccnn_torch.motion.form import form_errors, weighed
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
+from ccnn_torch.motion.fit import Fit, Spec, fit_many, places_of, sensitivities, started
+from ccnn_torch.motion.form import form_errors, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening, white_noise
 from ccnn_torch.motion.whiten import fitted_whitening
@@ -44,6 +43,7 @@ class Search(NamedTuple):
         found: of each axis the fits of all sets, most probable first.
         rich: residual of each axis under the white fit with the most effects, `n x b x s` [rad or m].
         form: variance of the form errors of each axis, as of `form_errors`.
+        loose: as of `fit_many`.
     """
 
     problem: Problem
@@ -51,6 +51,7 @@ class Search(NamedTuple):
     found: tuple[tuple[Fit, ...], ...]
     rich: Tensor
     form: tuple[float, ...]
+    loose: Tensor
 
 
 def log_posterior(fit: Fit) -> float:
@@ -73,29 +74,33 @@ def search(problem: Problem) -> Search:
     # The noise of what is left by what is most probable now.
     theta = torch.stack([f.spec.theta for f in pool.best()])[None]
     left = problem.residual(theta)[0]
-    final = _Pool(problem, fitted_whitening(problem.pooled(left), problem.judged))
+    final = _Pool(problem, fitted_whitening(problem.pooled(left), problem.judged), theta[0])
     final.again(pool)
     final.neighbours()
     final.reduced()
     ranked = tuple(tuple(p) for p in final.ranked())
     # Sets that are probable although forms are wrong are smaller than those above.
-    noise = [fits[0].noise for fits in ranked]
+    noise = [own[0].noise for own in ranked]
+    unseen = unseen_errors([fits[:_KEPT] for fits in ranked])
     for _ in range(2):
-        form = form_errors(problem, final.whitening, final.best())
+        form = form_errors(problem, final.whitening, final.best(), unseen)
         final.variance = [a + b for a, b in zip(noise, form, strict=True)]
     final.forward()
     final.neighbours()
-    form = form_errors(problem, final.whitening, final.best())
+    form = form_errors(problem, final.whitening, final.best(), unseen)
     final.variance = None
     final.reduced()
-    return Search(problem, final.whitening, tuple(tuple(p) for p in final.ranked()), rich, tuple(form))
+    return Search(problem, final.whitening, tuple(tuple(p) for p in final.ranked()), rich, tuple(form), final.loose)
 
 
 class _Pool:
     """Fits of each axis by their members, under one noise."""
 
-    def __init__(self, problem: Problem, whitening: Whitening) -> None:
+    def __init__(self, problem: Problem, whitening: Whitening, about: Tensor | None = None) -> None:
         self.problem, self.whitening = problem, whitening
+        # Nothing, as long as each set has the noise that it leaves.
+        loose = problem.followed.new_zeros(0, *problem.followed.shape) if about is None else problem.loose(about)
+        self.loose = problem.whitened(loose, whitening)
         self.library: Library = problem.library
         self.axes = len(problem.followed)
         zero = torch.zeros(self.library.size, dtype=torch.float64)
@@ -118,7 +123,9 @@ class _Pool:
         key = (axis, fit.members, self.variance[axis])
         old = self.scores.get(key)
         if old is None or old[0] is not fit:
-            evidence = float(weighed(fit.grams, fit.spec.groups, self.variance[axis]).log_evidence[0])
+            evidence = float(
+                weighed(fit.grams, [fit.spec.groups], len(fit.spec.flat), self.variance[axis]).log_evidence[0]
+            )
             old = self.scores[key] = fit, evidence + log_posterior(fit) - fit.log_evidence
         return old[1]
 
@@ -131,7 +138,7 @@ class _Pool:
         spare = [w[0] if w else next(iter(self.found[i].values())).spec for i, w in enumerate(wanted)]
         rows = [[w[k] if k < len(w) else spare[i] for i, w in enumerate(wanted)] for k in range(wide)]
         # Sets of one size together, since the others are padded to it.
-        for row in fit_many(self.problem, self.whitening, rows, steps):
+        for row in fit_many(self.problem, self.whitening, rows, steps, loose=self.loose):
             for i, fit in enumerate(row):
                 old = self.found[i].get(fit.members)
                 if old is None or log_posterior(fit) > log_posterior(old):
@@ -158,7 +165,7 @@ class _Pool:
                 d |= {f.members for f in own}
             # Alone every effect is fitted: its own share of the gap is told.
             alone = all(not f.members for own in bases for f in own)
-            self.fit(self.screened(bases, len(self.library.effects) if alone else _FITTED), _SHORT)
+            self.fit(self.screened(bases, len(self.library.names) if alone else _FITTED), _SHORT)
             self.fit([[f.spec for f in ranked[:_BEAM] if f.members] for ranked in self.ranked()], _SHORT)
             after = [self.score(i, f) for i, f in enumerate(self.best())]
             if all(a < b + _GAINED for a, b in zip(after, before, strict=True)):
@@ -241,24 +248,22 @@ class _Pool:
                     changed[:, place] = v.shapes[:, b]
                 moved.append(changed)
                 steps.append(step)
-        wide = max(len(f.spec.flat) for f in bases)
-        active = torch.full((1, len(bases), wide), -1)
-        for i, f in enumerate(bases):
-            active[0, i, : len(f.spec.flat)] = torch.tensor(f.spec.flat, dtype=torch.int64)
+        active = places_of([[f.spec.flat for f in bases]])
         residual, own = sensitivities(problem, self.whitening, theta[None], active)
-        columns = []
+        parts = []
         for k in range(0, len(moved), 16):
             part = torch.stack(moved[k : k + 16])
             left = problem.whitened(problem.residual(part), self.whitening)
-            columns.append((residual - left) / torch.stack(steps[k : k + 16]).mT[..., None])
-        new = torch.cat(columns, 1)
+            parts.append((residual - left) / torch.stack(steps[k : k + 16]).mT[..., None])
+        new = torch.cat(parts, 1)
         values = float(problem.judged.sum())
         found = []
         for i, f in enumerate(bases):
             m = len(f.spec.flat)
             y = residual[i, 0] + f.spec.theta[list(f.spec.flat)] @ own[i, 0, :m]
             x = torch.cat([own[i, 0, :m], new[i]])
-            grams = grams_of(x.mT[:, None, :], y[:, None])._replace(values=values)
+            columns = torch.cat([x, self.loose[i]])
+            grams = grams_of(columns.mT[:, None, :], y[:, None])._replace(values=values)
             base_groups = f.spec.groups
             sets, kept, place = [], [], m
             for v in variants:
@@ -267,10 +272,11 @@ class _Pool:
                     sets.append([*base_groups, torch.arange(place, place + width)])
                     kept.append(v)
                 place += width
-            known = 0.0
-            if self.variance is not None:
-                grams, known = scaled(grams, self.variance[i]), CERTAIN * values
-            scores = fit_sets(grams, sets, known).log_evidence.tolist() if sets else []
+            scores = []
+            if sets and self.variance is None:
+                scores = fit_sets(grams, sets, 0.0).log_evidence.tolist()
+            elif sets and self.variance is not None:
+                scores = weighed(grams, sets, len(x), self.variance[i]).log_evidence.tolist()
             found.append(
                 [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, kept, strict=True)]
             )

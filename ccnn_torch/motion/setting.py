@@ -23,15 +23,13 @@ _POOLED = 0.02
 _NEARLY = 0.98
 
 
-def problem_of(
-    logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEffect], most: int | None = None
-) -> Problem:
+def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEffect]) -> Problem:
     """Logs and a nominal model as what is fitted.
 
     Raises:
         InputError: the logs cannot show any of the effects, or cannot be used.
     """
-    data = cut_stretches(logs) if most is None else cut_stretches(logs, most=most)
+    data = cut_stretches(logs)
     driven = nominal.driven(logs, data)
     supply = torch.zeros_like(data.time)
     if "supply" in data.beside:
@@ -45,23 +43,20 @@ def problem_of(
     if all(library.lacking):
         need = "; ".join(f"{name} needs {why}" for name, why in zip(library.names, library.lacking, strict=True))
         raise InputError(f"effects: these logs can show none of the candidates: {need}")
-    step = float(data.time.diff(dim=-1).median())
-    pool = max(round(_POOLED / step), 1)
+    pool = max(round(_POOLED / float(data.time.diff(dim=-1).median())), 1)
     return Problem(data, library, driven.followed, supply, warm, pool, driven.torque, driven.simulated, driven.own)
 
 
 def _facts(data: Stretches, i: int, nominal: Nominal, followed: Tensor, supply: Tensor, warm: Tensor) -> Facts:
     judged = data.judged
-    step = data.time.diff(dim=-1)
-    speed = data.speed[i]
-    rise = speed.diff(dim=-1) / step
 
     def nearly(values: Tensor) -> float:
         kept = values.abs().flatten()
         return float(torch.quantile(kept[:: max(len(kept) // 100_000, 1)], _NEARLY))
 
-    most = nearly(speed[judged]) or 1.0
     span = float(data.command[i][judged].max() - data.command[i][judged].min())
+    # Between runs other things than the temperature change as well.
+    runs = [warm[data.run == run][judged[data.run == run]] for run in set(data.run.tolist())]
     return Facts(
         unit=data.units[i],
         nominal=nominal.axes[i],
@@ -69,15 +64,8 @@ def _facts(data: Stretches, i: int, nominal: Nominal, followed: Tensor, supply: 
         length=nominal.lengths[i],
         weight=nominal.weights[i] if nominal.weights else None,
         span=span or 1.0,
-        speed=most,
-        acceleration=nearly(rise[judged[:, 1:]]) or 1.0,
+        speed=nearly(data.speed[i][judged]) or 1.0,
         error=nearly((followed[i] - data.position[i])[judged]) or 1e-6,
         supply=float(supply[judged].abs().max()) if "supply" in data.beside else 0.0,
-        temperature=_within_runs(data, warm),
+        temperature=max(float(v.max() - v.min()) for v in runs),
     )
-
-
-def _within_runs(data: Stretches, warm: Tensor) -> float:
-    """The largest change of the temperature in one run: between runs other things change as well."""
-    own = [warm[data.run == run][data.judged[data.run == run]] for run in set(data.run.tolist())]
-    return max(float(v.max() - v.min()) for v in own)

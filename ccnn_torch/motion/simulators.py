@@ -1,21 +1,19 @@
-"""Simulators as nominal models: a user's function, a mechanism, and an MJCF with position actuators."""
+"""Simulators as nominal models."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.plugins import failure, is_plugin, load_plugin
+from ccnn_torch.plugins import failure, load_plugin
 
-__all__ = ["Simulator", "simulator_of"]
+__all__ = ["Simulator", "own_simulator"]
 
 Array = NDArray[np.float64]
 
@@ -28,21 +26,11 @@ class Simulator:
         name: as given.
         simulate: `simulate(time, commands, parameters)`: `s`, `s x n`, a dict, and `s x n` back.
         parameters: what it is given.
-        notes: sentences without a full stop.
-        axes, gains: parameters of each axis as in `ABSENT`, and its gain [N m/rad], where it tells them.
-        lengths, weights: of a load at each joint, as of `Facts`, where it tells them.
-        loaded: where it does, positions and what resists the motors beside those, over the gains, `s x n` each.
     """
 
     name: str
     simulate: Callable[[Array, Array, dict[str, float]], Array]
     parameters: Mapping[str, float]
-    notes: tuple[str, ...] = ()
-    axes: tuple[Mapping[str, float], ...] = ()
-    gains: tuple[float, ...] = ()
-    lengths: tuple[float | None, ...] = ()
-    weights: tuple[tuple[float, float] | None, ...] = ()
-    loaded: Callable[[Array, Array], tuple[Array, Array]] | None = None
 
     def positions(self, time: Array, command: Array) -> Array:
         """Positions of one run, `s x n`; time `s`, command `s x n`.
@@ -77,30 +65,12 @@ class Simulator:
         return values
 
 
-def simulator_of(mechanism: str, keys: Mapping[str, Any], units: Sequence[str]) -> Simulator | None:
-    """The simulator of a name; None for a mechanism, whose joints follow their commands.
+def own_simulator(spec: str, keys: Mapping[str, Any]) -> Simulator:
+    """A user's simulator; keys: values of its parameters in the place of its own.
 
     Raises:
-        InputError: there is none of that name, or it has other joints than the logs.
+        InputError: it is none.
     """
-    if is_plugin(mechanism):
-        return _own(mechanism, keys)
-    if Path(mechanism).suffix.lower() in (".xml", ".mjcf") and Path(mechanism).is_file():
-        from ccnn_torch.motion.mujoco_model import is_mjcf, mujoco_simulator
-
-        if is_mjcf(Path(mechanism)):
-            return mujoco_simulator(mechanism, keys, units)
-    machine = load_mechanism(mechanism, **keys)
-    own = [joint.unit for joint in machine.joints]
-    if own != list(units):
-        raise InputError(
-            f"{mechanism}: has {len(own)} joints ({', '.join(own)}), and the logs {len(units)} ({', '.join(units)}); "
-            "name the commands command1… and the positions q1… in the mechanism's order"
-        )
-    return None
-
-
-def _own(spec: str, keys: Mapping[str, Any]) -> Simulator:
     found = load_plugin(spec, (object,))
     if isinstance(found, type):
         found = found()

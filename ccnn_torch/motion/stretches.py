@@ -44,7 +44,6 @@ class Stretches(NamedTuple):
         run: the number of the log of each, `b`.
         beside: recorded columns by name, `b x s`.
         log: every sample's place in its log, `b x s`, int64.
-        names: of the runs.
         units: of the joints.
         notes: what was left out, one sentence each without a full stop.
     """
@@ -57,18 +56,12 @@ class Stretches(NamedTuple):
     run: Tensor
     beside: dict[str, Tensor]
     log: Tensor
-    names: tuple[str, ...]
     units: tuple[str, ...]
     notes: tuple[str, ...]
 
 
-def cut_stretches(logs: Sequence[Log], whole: bool = False, most: int = _MOST) -> Stretches:
-    """Cut logs into stretches.
-
-    Args:
-        logs: runs of one machine.
-        whole: each uninterrupted part of a log in one piece, for simulators that start where the log does.
-        most: so many stretches at most.
+def cut_stretches(logs: Sequence[Log]) -> Stretches:
+    """Cut logs of one machine into stretches.
 
     Raises:
         InputError: no part with the drive on is long enough.
@@ -81,9 +74,10 @@ def cut_stretches(logs: Sequence[Log], whole: bool = False, most: int = _MOST) -
         # Half a step more, so that 3.9 ms are not thinned to 7.8.
         stride = max(int((_STEP + 0.5 * step) / step), 1)
         strides.append(stride)
-        for part in _uninterrupted(log):
+        ends = np.flatnonzero(log.cut | np.diff(log.on, prepend=log.on[:1]))
+        for part in np.split(np.arange(len(log.time)), ends):
             rows = part[::stride]
-            pieces += [(number, *piece) for piece in _pieces(log.time[rows], rows, whole)]
+            pieces += [(number, *piece) for piece in _pieces(log.time[rows], rows) if log.on[part].all()]
     if not pieces:
         raise InputError(
             f"{', '.join(log.name for log in logs)}: no part with the drive on and without gaps lasts "
@@ -91,9 +85,9 @@ def cut_stretches(logs: Sequence[Log], whole: bool = False, most: int = _MOST) -
         )
     if max(strides) > 1:
         notes.append(f"of the samples every {max(strides)}. was evaluated, one in {_STEP * 1e3:.0f} ms or so")
-    if len(pieces) > most:
-        notes.append(f"{most} of {count_text(len(pieces), 'stretch')}, spread evenly over the logs, were evaluated")
-        pieces = [pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, most).round().astype(int))]
+    if len(pieces) > _MOST:
+        notes.append(f"{_MOST} of {count_text(len(pieces), 'stretch')}, spread evenly over the logs, were evaluated")
+        pieces = [pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, _MOST).round().astype(int))]
     return _padded(logs, pieces, notes)
 
 
@@ -111,19 +105,11 @@ def smooth_speed(time: NDArray[np.float64], position: NDArray[np.float64]) -> ND
     return np.asarray(slope / steps[:, None])
 
 
-def _uninterrupted(log: Log) -> list[NDArray[np.int64]]:
-    rows = np.arange(len(log.time))
-    ends = np.flatnonzero(log.cut | (np.diff(log.on, prepend=log.on[:1])))
-    return [part for part in np.split(rows, ends) if len(part) and log.on[part].all()]
-
-
-def _pieces(time: NDArray[np.float64], rows: NDArray[np.int64], whole: bool) -> list[tuple[NDArray[np.int64], int]]:
+def _pieces(time: NDArray[np.float64], rows: NDArray[np.int64]) -> list[tuple[NDArray[np.int64], int]]:
     """Rows of each stretch with its lead, and the number of samples of the lead."""
     if len(time) < 8 or time[-1] - time[0] < _LEAD + _SHORTEST:
         return []
     lead = int(np.searchsorted(time, time[0] + _LEAD))
-    if whole:
-        return [(rows, lead)]
     count = max(round((time[-1] - time[lead]) / _JUDGED), 1)
     begins = np.searchsorted(time, np.linspace(time[lead], time[-1], count + 1))
     found = []
@@ -161,7 +147,6 @@ def _padded(logs: Sequence[Log], pieces: Sequence[tuple[int, NDArray[np.int64], 
         run=torch.tensor([number for number, _, _ in pieces]),
         beside={name: torch.from_numpy(v) for name, v in beside.items()},
         log=torch.from_numpy(place),
-        names=tuple(log.name for log in logs),
         units=logs[0].units,
         notes=tuple(notes),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -15,7 +17,7 @@ from ccnn_torch.motion.library import library_of
 def axis(time: np.ndarray, asked: np.ndarray, **parameters: float) -> np.ndarray:
     t, u = torch.from_numpy(time)[None], torch.from_numpy(asked)[None]
     start = torch.tensor([[asked[0], 0.0]], dtype=torch.float64)
-    drive = Drive(t, u, start, torch.zeros_like(t), torch.zeros_like(t))
+    drive = Drive(t, u, start)
     given = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in parameters.items()}
     return simulate_axes(drive, given)[0, 0].numpy()
 
@@ -66,11 +68,24 @@ def test_each_law_does_what_its_name_says() -> None:
     assert np.sum(np.diff(np.sign(rings)) != 0) in range(26, 32)
 
 
+def test_limits_and_loads_go_on_where_a_stretch_begins() -> None:
+    time = torch.from_numpy(TIME)[None]
+    still, begin = torch.zeros_like(time), torch.zeros(1, 2, dtype=torch.float64)
+    given = {"slowness": torch.tensor([[2.0]], dtype=torch.float64)}
+    late = simulate_axes(Drive(time, still + 1, begin), given)[0, 0].numpy()
+    # The command may be far ahead of a limited axis already.
+    assert np.abs(late - np.minimum(0.5 * (TIME - TIME[0]), 1)).max() < 1e-3
+    # What a simulator loads an axis with presses its play to one side.
+    given = {n: torch.tensor([[v]], dtype=torch.float64) for n, v in {"play": 0.1, "play_loaded": 1.0, **OWN}.items()}
+    hung = simulate_axes(Drive(time, still, begin, torque=still + 0.2), given)[0, 0]
+    assert float(hung[-1]) == pytest.approx(-0.25, abs=1e-3)
+
+
 def test_parameters_are_batched_and_never_run_away() -> None:
     asked = torch.from_numpy(command(0, TIME))[None]
     time = torch.from_numpy(TIME)[None]
     start = torch.zeros(1, 2, dtype=torch.float64)
-    drive = Drive(time, asked, start, torch.zeros_like(time), torch.zeros_like(time))
+    drive = Drive(time, asked, start)
     inertia = torch.tensor([[1e-3], [5e-3], [2e-2]], dtype=torch.float64)
     together = simulate_axes(drive, {"inertia": inertia})
     for k in range(3):
@@ -80,6 +95,13 @@ def test_parameters_are_batched_and_never_run_away() -> None:
         theta = torch.zeros(2, 1, library.size, dtype=torch.float64)
         theta[0, 0, j], theta[1, 0, j] = 200.0, -200.0
         assert torch.isfinite(simulate_axes(drive, library.parameters(theta))).all()
+
+
+def test_an_effect_of_ones_own_is_a_value_or_a_class(tmp_path: Path) -> None:
+    own = "from ccnn_torch.motion.effects import MotionEffect\nONE = MotionEffect('one', lambda axis: ())\n"
+    (tmp_path / "mine.py").write_text(f"{own}class Two:\n    name = 'two'\n")
+    names = [f"{tmp_path}/mine.py:{name}" for name in ("ONE", "Two")]
+    assert [effect.name for effect in motion_effects(names)] == ["one", "two"]
 
 
 def test_every_effect_acts_on_parameters_that_the_axis_has() -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ccnn_torch.diagnosis.page.data import About, used_rows
+from ccnn_torch.diagnosis.page.data import NEXT, About, used_rows
 from ccnn_torch.diagnosis.page.tables import percent, percent_interval
 from ccnn_torch.display import display_unit, number_text, unit_text
 from ccnn_torch.report.csv_file import write_rows
@@ -55,6 +55,9 @@ def shares(results: Block, about: About) -> Iterator[tuple[str, str, float, list
         for name, share in where[group].items():
             part = name if name.startswith(single) else f"{single} {name}"
             yield group, part, share, known.get(group, {}).get(name)
+    for name, phase in where.get("phases", {}).items():
+        part = f"{name} ({100 * phase['samples']:.0f} % of the time)"
+        yield "phases", part, phase["share"], known.get("phases", {}).get(name)
     for name, regimes in where["covariates"].items():
         intervals = known.get("covariates", {}).get(name) or [None] * len(regimes)
         for regime, interval in zip(regimes, intervals, strict=True):
@@ -76,7 +79,7 @@ def regime_words(name: str, regime: Block, unit: str) -> str:
 
 
 def where_table(results: Block, about: About, *, telling: bool = False) -> Table | None:
-    """Shares of the gap by output, joint, leg and covariate regime.
+    """Shares of the gap by output, joint, leg, covariate regime and phase of a motion.
 
     Args:
         telling: leave covariates out none of whose regimes differs from an even share.
@@ -124,6 +127,8 @@ def next_table(results: Block, about: About) -> Table | None:
     wanted = results["next_measurements"]
     if not wanted:
         return None
+    if results.get("motion"):
+        return _next_motion_table(wanted)
     joints, covariates = _columns(results)
     rows = []
     for number, entry in enumerate(wanted, 1):
@@ -140,6 +145,25 @@ def next_table(results: Block, about: About) -> Table | None:
     if len(joints) + len(covariates) > _MOST_COLUMNS:
         columns, *rows = zip(columns, *rows, strict=True)
     return Table("What should be measured next?", columns, tuple(rows), note, ("separates",))
+
+
+def _next_motion_table(wanted: Sequence[Block]) -> Table:
+    rows = [
+        (
+            str(k),
+            e["motion"]["joint"],
+            e["motion"]["text"],
+            " or ".join(e["separates"]) or "–",
+            number_text(e["gain"], 3),
+        )
+        for k, e in enumerate(wanted, 1)
+    ]
+    note = (
+        "Gain: expected log odds by which the motion tells the two apart, or where there is no rival the information "
+        f"on the numbers of the only model. The first as commands to play: {NEXT}."
+    )
+    columns = ("number", "joint", "motion", "separates", "gain [nat]")
+    return Table("What should be recorded next?", columns, tuple(rows), note, ("motion", "separates"))
 
 
 def write_next_csv(path: Path, results: Block, about: About) -> None:

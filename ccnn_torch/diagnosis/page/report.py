@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from rich.console import Console
 from torch import Tensor
 
 from ccnn_torch.diagnosis.page.data import (
+    ARRAYS,
+    CORRECTED,
+    LABELS,
     NEXT,
     RESULT,
     About,
@@ -22,9 +25,9 @@ from ccnn_torch.diagnosis.page.data import (
     signatures_of,
     used_rows,
 )
-from ccnn_torch.diagnosis.page.layout import Section as Section
-from ccnn_torch.diagnosis.page.layout import markdown_of, notes_of, print_page, sections_of, write_page
+from ccnn_torch.diagnosis.page.first_screen import ON_PAGE, first_screen, first_screen_markdown, print_first_screen
 from ccnn_torch.diagnosis.page.localisation import aside_table, next_table, region_table, where_table, write_next_csv
+from ccnn_torch.diagnosis.page.numbers import numbers_table
 from ccnn_torch.diagnosis.page.tables import (
     confusable_table,
     effect_table,
@@ -35,11 +38,12 @@ from ccnn_torch.diagnosis.page.tables import (
     unseen_table,
 )
 from ccnn_torch.diagnosis.page.tensorboard import write_diagnosis_events
-from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, verdict_text
+from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, unseen_text, verdict_text
 from ccnn_torch.display import count_text
-from ccnn_torch.report.html import InlineFigure
+from ccnn_torch.files.write import write_whole
+from ccnn_torch.report.html import InlineFigure, render, trusted
 from ccnn_torch.report.json_files import read_json
-from ccnn_torch.report.table import Table, print_table, print_text
+from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
 
 if TYPE_CHECKING:
     from ccnn_torch.report.figures.style import Plot
@@ -48,8 +52,18 @@ __all__ = ["NEXT", "diagnosis_markdown", "print_diagnosis", "write_diagnosis_rep
 
 Block = Mapping[str, Any]
 Arrays = Mapping[str, NDArray[np.float64]]
+_MARKDOWN = "diagnosis.md"
+_FILES = (RESULT, _MARKDOWN, NEXT, *CORRECTED, ARRAYS, LABELS)
 # On a terminal only what may matter; the page and the Markdown list every candidate.
 _LEAST = 0.01
+
+
+class Section(NamedTuple):
+    """A heading of the page with the pictures and the tables that answer it."""
+
+    title: str
+    figures: list[InlineFigure]
+    tables: list[Table]
 
 
 def write_diagnosis_report(
@@ -71,7 +85,7 @@ def write_diagnosis_report(
         arrays: what is drawn in the figures (`s` rows in the order of the file, `c` pose channels, float64, SI):
             `place` `s x 3`, `joints` `s x n`, `residual` and `remainder` `s x c`, `held_out` and `set_aside` `s`, the
             machine's legs or links `machine.NAME` `k x 3`, and `signature.EFFECT.x`, `.y` and `.fit` `s`; written to
-            the folder first, or read from it when None.
+            the folder first, or read from it when None. Of a motion what `course_plot` takes.
         labels: names and units of the signatures' axes, `{EFFECT: {"x": {"name", "unit"}, "y": …}}`, and under `about`
             what `About` holds; written or read like the arrays.
         tensorboard: whether to write event files, which cost a second.
@@ -88,17 +102,10 @@ def write_diagnosis_report(
         save_diagnosis_arrays(folder, arrays, labels or {})
     numbers, labels = load_diagnosis_arrays(folder), load_labels(folder)
     about = about_of(labels)
-    write_next_csv(folder / NEXT, results, about)
-    pictures = write_page(
-        folder,
-        results,
-        about,
-        lambda figures: _sections(results, numbers, about, figures),
-        _plots(results, numbers, labels, about),
-        _facts(results, numbers, about),
-        notes_of(results, *about.notes),
-        diagnosis_markdown(results, about),
-    )
+    if not results.get("motion"):
+        write_next_csv(folder / NEXT, results, about)
+    write_whole(folder / _MARKDOWN, diagnosis_markdown(results, about))
+    pictures = _write_page(folder, results, numbers, labels, about)
     if tensorboard:
         write_diagnosis_events(folder / "tensorboard", results, verdict_text(results), pictures)
     return folder / "report.html"
@@ -107,7 +114,9 @@ def write_diagnosis_report(
 def diagnosis_markdown(results: Block, about: About | None = None) -> str:
     """Verdict and tables as Markdown (`diagnosis.md`)."""
     about = about or About()
-    return markdown_of(results, about, _sections(results, {}, about, {}), notes_of(results, *about.notes))
+    tables = [markdown_table(table) for section in _sections(results, {}, about, {}) for table in section.tables]
+    first = [verdict_text(results), *first_screen_markdown(results, about)]
+    return "\n\n".join([f"# {about.name}", *first, *tables, *_notes(results, about)]) + "\n"
 
 
 def print_diagnosis(
@@ -126,9 +135,50 @@ def print_diagnosis(
     aside = results["rows_set_aside"]
     why = results.get("why_set_aside") or ["for an unknown reason"] * len(aside)
     sentence = aside_text(aside, why, about.lines)
-    sentences = ([sentence] if sentence else []) + notes_of(results, *about.notes)
-    tables = (lambda: _print_tables(results, console, about)) if details else None
-    print_page(results, console, about, verdict, tables, sentences)
+    if verdict:
+        print_text(verdict_text(results), console, "bold")
+    print_first_screen(results, console, about)
+    if details:
+        _print_tables(results, console, about)
+    for text in ([sentence] if sentence else []) + _notes(results, about):
+        print_text(text, console, "yellow")
+    if not details:
+        said = "All tables are in report.html, diagnosis.md and diagnosis.json; --details shows them here."
+        print_text(said, console, "dim")
+
+
+def _notes(results: Block, about: About) -> list[str]:
+    """Notes as sentences, but those that have a table of their own."""
+    shown = {unseen_text(name, why) for name, why in results.get("not_seen", {}).items()}
+    notes = (note for note in (*results["notes"], *about.notes) if note not in shown)
+    return [note if note.endswith(".") else f"{note}." for note in notes]
+
+
+def _write_page(folder: Path, results: Block, numbers: Arrays, labels: Block, about: About) -> dict[str, Path]:
+    """Write `report.html` and `plots/`; the pictures by name."""
+    from ccnn_torch.report.figures.style import inline_svg, save_figure
+
+    figures, pictures = {}, {}
+    for plot in _plots(results, numbers, labels, about):
+        png, svg = save_figure(plot.figure, folder / "plots" / plot.name)
+        text = inline_svg(svg.read_text(encoding="utf-8"), plot.name)
+        figures[plot.name], pictures[plot.name] = InlineFigure(plot.name, plot.caption, text), png
+    page = render(
+        "diagnosis",
+        results={"name": about.name, "notes": _notes(results, about), "versions": {}},
+        facts=_facts(results, numbers, about),
+        verdict=verdict_text(results),
+        failures=[],
+        answers=first_screen(results, about),
+        numbers=numbers_table(results, ON_PAGE),
+        machine=trusted([figures[name] for name in ("machine",) if name in figures]),
+        sections=_sections(results, numbers, about, figures),
+        files=[f for f in _FILES if f == RESULT or (folder / f).is_file()],
+        config="",
+        best=None,
+    )
+    write_whole(folder / "report.html", page)
+    return pictures
 
 
 def _print_tables(results: Block, console: Console, about: About) -> None:
@@ -151,6 +201,7 @@ def _print_tables(results: Block, console: Console, about: About) -> None:
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
     # Here, so that `ccnn check` and the verdict on the terminal do not wait for matplotlib.
+    from ccnn_torch.diagnosis.page.figure_course import course_plot
     from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
     from ccnn_torch.diagnosis.page.figure_machine import machine_plot
     from ccnn_torch.diagnosis.page.figure_signature import signature_plot
@@ -158,6 +209,7 @@ def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[
 
     effects = list(results["verdict"]["effects"])
     plots = (
+        course_plot(results, arrays),
         machine_plot(arrays, effects),
         gap_plot(results),
         probability_plot(results),
@@ -176,7 +228,7 @@ def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str
         ("What gives it away?", ("signatures",), ()),
         (
             "Where is the gap?",
-            ("map", "where"),
+            ("map", "where", "course"),
             (where_table(results, about), region_table(results, about)),
         ),
         ("Which effects do these rows not distinguish?", (), (confusable_table(results),)),
@@ -184,7 +236,13 @@ def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str
         ("What should be measured next?", (), (next_table(results, about),)),
         ("Which rows were set aside?", (), (aside_table(results, arrays, about),)),
     ]
-    return sections_of(planned, figures)
+    sections = []
+    for title, names, tables in planned:
+        shown = [figures[name] for name in names if name in figures]
+        there = [table for table in tables if table is not None]
+        if shown or there:
+            sections.append(Section(title, trusted(shown), there))
+    return sections
 
 
 def _facts(results: Block, arrays: Arrays, about: About) -> str:

@@ -18,14 +18,14 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.search.beam import probable_sets
 from ccnn_torch.effects import EXACT
 
-__all__ = ["LEVELS", "OF_EXACT", "OF_FORM", "OF_SMOOTH", "Posterior", "form_variance", "is_unexplained"]
+__all__ = ["DIRECTIONS", "LEVELS", "OF_EXACT", "OF_FORM", "OF_SMOOTH", "Posterior", "form_variance", "is_unexplained"]
 __all__ += ["with_form_error"]
 
 OF_EXACT, OF_FORM, OF_SMOOTH = 1e-6, 5e-5, 3e-4
 """Share φ of an effect's squares that its form error adds to the noise in every direction: of an exact form only
 the second order; of other effects; and of a discrepancy term, which is smooth where the cause need not be."""
-# Directions that a form error has, so that all of it is this number times φ of the squares.
-_DIRECTIONS = 100
+DIRECTIONS = 100
+"""Directions that a form error has, so that all of it is this number times φ of the squares."""
 LEVELS = (1.0, 0.25, 4.0)
 """Levels of the form error, equally probable: it is known to a factor of four or so."""
 # Standard deviations of the noise's mean square that a remainder must exceed in any case; and within which it is none.
@@ -111,7 +111,7 @@ def is_unexplained(analysis: Analysis, found: FittedSet) -> bool:
     """Whether a set leaves clearly more than the noise and the form errors of its effects."""
     count = analysis.dictionary.grams.values
     above = _mean_square(found, analysis.dictionary) - analysis.floor
-    allowed = _DIRECTIONS * _form_error(found, analysis.dictionary) / count
+    allowed = DIRECTIONS * _form_error(found, analysis.dictionary) / count
     return above > max(analysis.floor * _CLEARLY * math.sqrt(2 / count), allowed)
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from ccnn_torch.diagnosis.discrepancy.smooth import ANY
 from ccnn_torch.diagnosis.evidence.beside import gain_beside
@@ -14,7 +15,7 @@ from ccnn_torch.diagnosis.search.form_error import Posterior, is_unexplained, wi
 from ccnn_torch.diagnosis.search.sets import scored
 from ccnn_torch.diagnosis.verdict.borrowed import borrowed_names
 
-__all__ = ["BESIDE_UNKNOWN", "Judgement", "judge", "without_names"]
+__all__ = ["BESIDE_UNKNOWN", "Judgement", "is_same", "judge", "without_names"]
 
 # Odds up to which the data do not distinguish one name from another.
 _ODDS = math.log(20.0)
@@ -93,7 +94,7 @@ def judge(analysis: Analysis) -> Judgement:
     if outside:
         told = [p for _, some, p, _ in leading if some] if leading[0][1] else []
     else:
-        told = [p for members, some, p, _ in leading if not some and _equals(members, names, classes)]
+        told = [p for members, some, p, _ in leading if not some and is_same(members, names, classes)]
     more = (f for f in analysis.found if found.members and set(found.members) <= set(f.members))
     return Judgement(
         found=found,
@@ -226,7 +227,7 @@ def _classes(
     return classes
 
 
-def _equals(members: frozenset[str], names: frozenset[str], classes: dict[str, tuple[str, ...]]) -> bool:
+def is_same(members: frozenset[Any], names: frozenset[Any], classes: Mapping[Any, tuple[Any, ...]]) -> bool:
     """Whether a set of names is the verdict's, up to its classes."""
     if len(members) != len(names):
         return False

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ccnn_torch.motion.effects.protocol import Plain
+from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
 __all__ = ["DELAY"]
 
 # Seconds: a bus of a few ms to a network of tens.
-DELAY = Plain("delay", "delay", "s", 0.02)
+DELAY = MotionEffect("delay", lambda axis: (Number("delay", "s", 0.02, (add("delay"),)),))

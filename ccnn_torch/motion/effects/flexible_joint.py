@@ -6,9 +6,8 @@ Its number is the inertia of that side over the stiffness; 1 / (2 pi sqrt(number
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
-from ccnn_torch.motion.effects.protocol import Facts, Number, add
+from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
 __all__ = ["FLEXIBLE_JOINT"]
 
@@ -17,21 +16,12 @@ def _of(frequency: float) -> float:
     return 1 / (2 * math.pi * frequency) ** 2
 
 
-class _FlexibleJoint:
-    name = "flexible_joint"
-
-    def missing(self, axis: Facts) -> str:
-        return ""
-
-    def numbers(self, axis: Facts) -> tuple[Number, ...]:
-        return (Number("inertia over stiffness", "s^2", _of(8.0), (add("flexibility"),)),)
-
-    def shapes(self, axis: Facts) -> tuple[Mapping[str, float], ...]:
-        return tuple(
-            {"inertia over stiffness": _of(frequency), "flexible_damping": damping}
-            for frequency in (3.0, 8.0, 16.0)
-            for damping in (0.03, 0.2)
-        )
-
-
-FLEXIBLE_JOINT = _FlexibleJoint()
+FLEXIBLE_JOINT = MotionEffect(
+    "flexible_joint",
+    lambda axis: (Number("inertia over stiffness", "s^2", _of(8.0), (add("flexibility"),)),),
+    lambda axis: [
+        {"inertia over stiffness": _of(frequency), "flexible_damping": damping}
+        for frequency in (3.0, 8.0, 16.0)
+        for damping in (0.03, 0.2)
+    ],
+)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ccnn_torch.motion.effects.protocol import Plain
+from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
 __all__ = ["OFFSET"]
 
-OFFSET = Plain("offset", "offset", "joint", 0.02, 0.0)
+OFFSET = MotionEffect("offset", lambda axis: (Number("offset", "joint", 0.02, (add("offset"),), 0.0),))

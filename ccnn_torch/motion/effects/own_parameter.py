@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from ccnn_torch.effects.parameter import PARAMETER
-from ccnn_torch.motion.effects.protocol import Facts, Number, add
+from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
-__all__ = ["OWN", "OwnParameter"]
+__all__ = ["OWN", "own_parameter"]
 
 OWN = "own "
 """What the names of a simulator's own parameters begin with among those of an axis."""
 
 
-class OwnParameter:
+def own_parameter(key: str, value: float) -> MotionEffect:
     """What the simulator gives at another value of one of its parameters, to first order."""
-
-    def __init__(self, key: str, value: float) -> None:
-        self.key, self.name = key, f"{PARAMETER}{key}"
-        # Half of it is a plausible error; of one that is 0 nothing is known.
-        self.size = 0.5 * abs(value) or 1.0
-
-    def missing(self, axis: Facts) -> str:
-        return ""
-
-    def numbers(self, axis: Facts) -> tuple[Number, ...]:
-        return (Number(self.key, "1", self.size, (add(f"{OWN}{self.key}"),), 0.0),)
-
-    def shapes(self, axis: Facts) -> tuple[Mapping[str, float], ...]:
-        return ({},)
+    # Half of it is a plausible error; of one that is 0 nothing is known.
+    number = Number(key, "1", 0.5 * abs(value) or 1.0, (add(f"{OWN}{key}"),), 0.0)
+    return MotionEffect(f"{PARAMETER}{key}", lambda axis: (number,))

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from ccnn_torch.motion.effects.protocol import Facts, Number, add
+from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add
 
 __all__ = ["PAYLOAD", "STANDARD_GRAVITY"]
 
@@ -12,29 +10,24 @@ STANDARD_GRAVITY = 9.80665
 """m/s^2."""
 
 
-class _Payload:
-    name = "payload"
-
-    def missing(self, axis: Facts) -> str:
-        if axis.unit != "rad":
-            return "a turning joint"
-        return "" if axis.length and axis.gain else "the axis' gain and the lever of its load (keys gain and length)"
-
-    def numbers(self, axis: Facts) -> tuple[Number, ...]:
-        lever, gain = axis.length or 1.0, axis.gain or 1.0
-        sine, cosine = axis.weight or (STANDARD_GRAVITY * lever, 0.0)
-        acts = (
-            add("gravity_sin", sine / gain),
-            add("gravity_cos", cosine / gain),
-            add("inertia", lever**2 / gain),
-            # The model knows which part of the inertia is behind the gear.
-            add("load", lever**2 / gain if axis.nominal.get("load") else 0.0),
-        )
-        # A mass whose weight differs the command and the position by a tenth of a radian.
-        return (Number("mass", "kg", 0.1 * gain / (STANDARD_GRAVITY * lever), acts),)
-
-    def shapes(self, axis: Facts) -> tuple[Mapping[str, float], ...]:
-        return ({},)
+def _missing(axis: Facts) -> str:
+    if axis.unit != "rad":
+        return "a turning joint"
+    return "" if axis.length and axis.gain else "the axis' gain and the lever of its load (keys gain and length)"
 
 
-PAYLOAD = _Payload()
+def _numbers(axis: Facts) -> tuple[Number, ...]:
+    lever, gain = axis.length or 1.0, axis.gain or 1.0
+    sine, cosine = axis.weight or (STANDARD_GRAVITY * lever, 0.0)
+    acts = (
+        add("gravity_sin", sine / gain),
+        add("gravity_cos", cosine / gain),
+        add("inertia", lever**2 / gain),
+        # The model knows which part of the inertia is behind the gear.
+        add("load", lever**2 / gain if axis.nominal.get("load") else 0.0),
+    )
+    # A mass whose weight differs the command and the position by a tenth of a radian.
+    return (Number("mass", "kg", 0.1 * gain / (STANDARD_GRAVITY * lever), acts),)
+
+
+PAYLOAD = MotionEffect("payload", _numbers, missing=_missing)

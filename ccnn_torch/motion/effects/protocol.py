@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 __all__ = ["Act", "Facts", "MotionEffect", "Number", "add", "scaled"]
 
@@ -22,7 +22,7 @@ class Facts:
         weight: torque of the weight of 1 kg there, times the sine and the cosine of the position [N m]; None: that of a
             lever that hangs down at 0.
         span: of the command [rad or m].
-        speed, acceleration: nearly the largest ones of the command [per s, per s^2].
+        speed: nearly the largest one [per s].
         error: nearly the largest difference of command and position [rad or m].
         supply, temperature: largest relative change of the supply voltage, and of the temperature [K], in the logs.
     """
@@ -34,7 +34,6 @@ class Facts:
     weight: tuple[float, float] | None = None
     span: float = 1.0
     speed: float = 1.0
-    acceleration: float = 1.0
     error: float = 0.1
     supply: float = 0.0
     temperature: float = 0.0
@@ -45,23 +44,22 @@ class Facts:
         return any(self.nominal.get(name, 0.0) for name in ("inertia", "viscous", "gravity_sin", "gravity_cos"))
 
 
-class Act(tuple[str, float, Literal["add", "factor", "set"]]):
-    """How a number changes a parameter of the axis: the parameter's name, a factor, and the operation.
+class Act(NamedTuple):
+    """How a number changes a parameter of the axis: to it + factor * number, or to it * exp(factor * number)."""
 
-    `add`: parameter + factor * number; `factor`: parameter * exp(factor * number); `set`: the number itself.
-    """
-
-    __slots__ = ()
+    parameter: str
+    factor: float
+    how: Literal["add", "factor"]
 
 
 def add(parameter: str, factor: float = 1.0) -> Act:
     """The number times a factor is added to a parameter."""
-    return Act((parameter, factor, "add"))
+    return Act(parameter, factor, "add")
 
 
 def scaled(parameter: str, factor: float = 1.0) -> Act:
     """The parameter is multiplied by exp(factor * number)."""
-    return Act((parameter, factor, "factor"))
+    return Act(parameter, factor, "factor")
 
 
 @dataclass(frozen=True)
@@ -85,54 +83,19 @@ class Number:
     inverse: bool = False
 
 
-class MotionEffect(Protocol):
-    """One physical cause of a gap in motion; an entry of `EFFECTS`."""
-
-    @property
-    def name(self) -> str:
-        """As in `diagnosis.json`."""
-        ...
-
-    def missing(self, axis: Facts) -> str:
-        """What these logs or this model lack to show it; empty where they can."""
-        ...
-
-    def numbers(self, axis: Facts) -> tuple[Number, ...]:
-        """Its numbers; every axis of a machine has the same ones."""
-        ...
-
-    def shapes(self, axis: Facts) -> tuple[Mapping[str, float], ...]:
-        """Values that are tried for what a fit cannot reach step by step.
-
-        By the name of a number (its start, in its unit), or of a parameter of the axis (held at it).
-        """
-        ...
-
-
 @dataclass(frozen=True)
-class Plain:
-    """An effect with one number that is added to a parameter of the axis and can always be seen.
+class MotionEffect:
+    """One physical cause of a gap in motion; an entry of `EFFECTS`.
 
     Attributes:
-        name: of the effect and of its number.
-        parameter: of the axis.
-        unit: as of `Number`.
-        scale: plausible size.
-        start: as of `Number`.
+        name: as in `diagnosis.json`.
+        numbers: of an axis; every axis of a machine has the same ones.
+        shapes: values that are tried for what a fit cannot reach step by step, by the name of a number (its start, in
+            its unit), or of a parameter of the axis (held at it).
+        missing: what these logs or this model lack to show it; empty where they can.
     """
 
     name: str
-    parameter: str
-    unit: str
-    scale: float
-    start: float = 0.3
-    needs: str = field(default="")
-
-    def missing(self, axis: Facts) -> str:
-        return self.needs
-
-    def numbers(self, axis: Facts) -> tuple[Number, ...]:
-        return (Number(self.name, self.unit, self.scale, (add(self.parameter),), self.start),)
-
-    def shapes(self, axis: Facts) -> tuple[Mapping[str, float], ...]:
-        return ({},)
+    numbers: Callable[[Facts], Sequence[Number]]
+    shapes: Callable[[Facts], Sequence[Mapping[str, float]]] = lambda axis: ({},)
+    missing: Callable[[Facts], str] = lambda axis: ""

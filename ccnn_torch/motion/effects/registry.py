@@ -50,8 +50,9 @@ def motion_effects(names: Sequence[str] | None = None) -> list[MotionEffect]:
         if name == "all":
             found |= EFFECTS
         elif is_plugin(name):
-            own: MotionEffect = load_plugin(name)()
-            found[own.name] = own
+            own = load_plugin(name, (MotionEffect,))
+            effect: MotionEffect = own() if isinstance(own, type) else own
+            found[effect.name] = effect
         elif name in EFFECTS:
             found[name] = EFFECTS[name]
         else:

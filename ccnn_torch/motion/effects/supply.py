@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from ccnn_torch.motion.effects.protocol import Facts, Number, add, scaled
+from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add, scaled
 
 __all__ = ["SUPPLY"]
 
@@ -12,23 +10,21 @@ __all__ = ["SUPPLY"]
 _LEAST = 0.03
 
 
-class _Supply:
-    name = "supply"
-
-    def missing(self, axis: Facts) -> str:
-        if axis.nominal.get("weakness", 0.0) and axis.driven:
-            return ""
-        if axis.supply < _LEAST:
-            return f"a column supply[V] that changes by {100 * _LEAST:.0f} %, or a model with the motor's limit"
+def _missing(axis: Facts) -> str:
+    if axis.supply >= _LEAST or (axis.nominal.get("weakness", 0.0) and axis.driven):
         return ""
-
-    def numbers(self, axis: Facts) -> tuple[Number, ...]:
-        if axis.supply >= _LEAST:
-            return (Number("share of its change", "1", 1.0, (add("supply"),), 0.5),)
-        return (Number("log voltage", "1", 0.3, (scaled("gain"), scaled("weakness", -1.0)), 0.0),)
-
-    def shapes(self, axis: Facts) -> tuple[Mapping[str, float], ...]:
-        return ({},) if axis.supply >= _LEAST else ({"log voltage": 0.3}, {"log voltage": -0.3})
+    return f"a column supply[V] that changes by {100 * _LEAST:.0f} %, or a model with the motor's limit"
 
 
-SUPPLY = _Supply()
+def _numbers(axis: Facts) -> tuple[Number, ...]:
+    if axis.supply >= _LEAST:
+        return (Number("share of its change", "1", 1.0, (add("supply"),), 0.5),)
+    return (Number("log voltage", "1", 0.3, (scaled("gain"), scaled("weakness", -1.0)), 0.0),)
+
+
+SUPPLY = MotionEffect(
+    "supply",
+    _numbers,
+    lambda axis: ({},) if axis.supply >= _LEAST else ({"log voltage": 0.3}, {"log voltage": -0.3}),
+    _missing,
+)

@@ -45,35 +45,25 @@ def course_plot(results: Mapping[str, Any], arrays: Arrays) -> Plot | None:
     for k, i in enumerate(joints):
         top, low = grid[2 * k], grid[2 * k + 1]
         scale, shown = display_unit(unit, float(np.abs(before[i][:, :][judged]).max()) or 1.0)
-        labels = True
         for b in mine:
-            on = judged[b]
+            on, first = judged[b], b == mine[0]
             t = arrays["time"][b][on]
-            named = {
-                "command": "command",
-                "position": "position",
-                "before": "model as it is",
-                "after": "with the effects",
-            }
-            named = named if labels else dict.fromkeys(named, "")
-            top.plot(t, arrays["command"][i, b][on], color=FLOOR, linestyle="--", label=named["command"] or None)
-            top.plot(t, arrays["position"][i, b][on], color=SERIES[2], label=named["position"] or None)
-            low.plot(t, before[i, b][on] / scale, color=BEFORE, label=named["before"] or None)
-            low.plot(t, arrays["after"][i, b][on] / scale, color=AFTER, label=named["after"] or None)
+            for axes, name, unit_, look, label in (
+                (top, "command", 1.0, {"color": FLOOR, "linestyle": "--"}, "command"),
+                (top, "position", 1.0, {"color": SERIES[2]}, "position"),
+                (low, "before", scale, {"color": BEFORE}, "model as it is"),
+                (low, "after", scale, {"color": AFTER}, "with the effects"),
+            ):
+                axes.plot(t, arrays[name][i, b][on] / unit_, label=label if first else None, **look)
             for name, colour in _SHADED.items():
                 there = arrays["phase"][i, b][on] == PHASES.index(name)
-                low.fill_between(
-                    t,
-                    0,
-                    1,
-                    where=there,
-                    transform=low.get_xaxis_transform(),
-                    color=colour,
-                    alpha=0.18,
-                    linewidth=0,
-                    label=name if labels else None,
-                )
-            labels = False
+                shade: dict[str, Any] = {
+                    "color": colour,
+                    "alpha": 0.18,
+                    "linewidth": 0,
+                    "label": name if first else None,
+                }
+                low.fill_between(t, 0, 1, where=there, transform=low.get_xaxis_transform(), **shade)
         top.set_ylabel(f"q{i + 1} [{unit}]")
         low.set_ylabel(f"residual [{shown}]")
         top.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=2)
