@@ -1,6 +1,7 @@
 """Jumps, products of two drivers, and the noise that records show without a model."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -98,3 +99,13 @@ def test_what_columns_add_to_a_set_is_their_evidence_under_what_the_set_leaves_o
     wanted = (fits.log_evidence[1:] - fits.log_evidence[0]).tolist()
     assert gain_beside(dictionary, found[0], groups, y) == pytest.approx(wanted, rel=1e-6)
     assert wanted[1] > 5 > max(wanted[0], wanted[2])
+
+
+def test_a_load_that_moves_no_joint_is_no_error() -> None:
+    rows = rows_of("five_bar", 100, 1)
+    moment = torch.randn(100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    more = replace(rows, covariates={**rows.covariates, "load_rx": moment})
+    found = diagnose_rows(more, reached_with(more, [acting(more, "backlash", q1=6e-4)], 3))
+    assert found.verdict["effects"] == ["backlash"]
+    # Its torques on the joints, all 0, are no columns.
+    assert all(bool(a.columns.any()) for a in found.analysis.dictionary.atoms)

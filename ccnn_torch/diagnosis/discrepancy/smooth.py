@@ -264,7 +264,8 @@ def reduced(moves: Tensor, features: Tensor, most: int) -> Tensor:
     """
     n, f = features.shape[1:]
     square = (moves.square() * features.square().sum(-1)[:, None]).mean((0, 2), keepdim=True) / f
-    scaled = moves / square.sqrt().clamp_min(1e-300)
+    # A load that moves no joint has no features.
+    scaled = torch.where(square > 0, moves / square.sqrt(), 0.0)
     inner = scaled.mT @ scaled
     gram = [features[:, i].mT @ (inner[:, i, :, None] * features).flatten(1) for i in range(n)]
     _, vectors = torch.linalg.eigh(torch.cat(gram))

@@ -214,9 +214,8 @@ def _search_about_nominal(rows: _Rows, effects: Sequence[Effect]) -> tuple[Analy
     atoms = [without_unused_rows(default_atom(situation, situation, e), usable) for e in effects]
     names = [e.name for e in effects]
     rest = [*smooth_discrepancies(situation, names), *linear_discrepancies(situation, names)]
-    rest = [
-        without_unused_rows(a, usable) for a in rest if bool((torch.isfinite(a.columns.sum((1, 2))) | ~usable).all())
-    ]
+    known = [a for a in rest if bool((torch.isfinite(a.columns.sum((1, 2))) | ~usable).all())]
+    rest = [without_unused_rows(a, usable) for a in known if bool(a.columns[usable].any())]
     # What does not show at all in these rows is no candidate (latency at rest).
     largest = rows.residual[usable][:, channels].abs().amax(0).clamp_min(1e-15)
     atoms = [a for a in atoms if float((a.columns[:, channels] / largest[:, None]).abs().max()) > _SHOWN]
