@@ -25,7 +25,19 @@ SHIPPED = ROOT / "checkpoints" / "tripod"
 # A package imports only from lower floors; on its own floor only what stands before it here.
 # A module may import those that stand before it; a folder stands where its longest entry is.
 FLOORS = [
-    ["version", "errors", "coordinates", "units", "display", "spelling", "files", "plugins", "numerics", "records"],
+    [
+        "version",
+        "errors",
+        "coordinates",
+        "units",
+        "unit_words",
+        "display",
+        "spelling",
+        "files",
+        "plugins",
+        "numerics",
+        "records",
+    ],
     ["mechanisms", "pseudoerror"],
     ["learners/protocol", "training", "evolution", "learners", "effects"],
     ["identification/problems", "identification/solvers", "identification/identifiability", "identification/__init__"],
