@@ -71,7 +71,7 @@ def judge(analysis: Analysis) -> Judgement:
         without |= borrowed
         leading = _leading(analysis, levels, without)
         names, drivers, _, chosen = leading[0]
-    sure = frozenset(n for n in names if _marginal(leading, n) >= _NAMED)
+    sure, likely = frozenset(n for n in names if _marginal(leading, n) >= _NAMED), names
     names, drivers, chosen = next(
         ((n, d, f) for n, d, _, f in leading if n == sure and bool(d) == bool(drivers)), (names, drivers, chosen)
     )
@@ -95,6 +95,10 @@ def judge(analysis: Analysis) -> Judgement:
         told = [p for _, some, p, _ in leading if some] if leading[0][1] else []
     else:
         told = [p for members, some, p, _ in leading if not some and is_same(members, names, classes)]
+        if names and names < likely:
+            # What was left out for want of a sure name mends the form of what is named, as a rule, and is no cause.
+            told += [p for members, some, p, _ in leading if not some and names < members]
+            told = [min(sum(told), _NAMED)]
     more = (f for f in analysis.found if found.members and set(found.members) <= set(f.members))
     return Judgement(
         found=found,
