@@ -259,6 +259,14 @@ def test_backlash_whose_direction_was_not_recorded_is_seen_by_the_scatter_of_a_j
         assert not any("scatters as if" in t for t in diagnose_rows(here, measured(rows, causes, 12)).cautions)
 
 
+def test_poses_that_are_no_numbers_are_refused_in_a_sentence() -> None:
+    rows = rows_of("five_bar", 60, 2)
+    nothing = torch.full_like(rows.pose, torch.nan)
+    for pose in (nothing, torch.where(torch.arange(60)[:, None] < 40, nothing, rows.pose + 0.5)):
+        with pytest.raises(InputError):
+            diagnose_rows(rows, pose)
+
+
 @pytest.mark.parametrize(("frequency", "doubted"), [(1.0, True), (9.0, False)])
 def test_an_error_that_is_not_seen_to_repeat_is_not_surely_periodic(frequency: float, doubted: bool) -> None:
     rows = rows_of("five_bar", 200, 2)

@@ -39,7 +39,10 @@ def frame_remedy(situation: Situation, measured: Tensor, size: Size) -> str:
         measured: poses, `s x p` [SI].
         size: of the machine.
     """
-    mechanism, joints = situation.mechanism, situation.joints
+    mechanism, finite = situation.mechanism, torch.isfinite(measured).all(-1)
+    joints, measured = situation.joints[finite], measured[finite]
+    if not len(joints):
+        return ""
     seen = mechanism.frame(measured)
     if isinstance(mechanism, Framed) or (isinstance(mechanism, SerialArm) and mechanism.unknown_frames):
         return ""
