@@ -16,7 +16,7 @@ __all__ = ["Scatter", "joint_scatter"]
 _VARIANCES = torch.logspace(-2, 3, 41, dtype=torch.float64)
 # Log likelihood that the scatter of one joint adds, from which it is no chance: noise alone adds up to 2 in trials.
 # And its share of the mean square that is left, below which it is the scatter of a sound joint.
-_CLEARLY, _SHARE = 6.0, 0.1
+_CLEARLY, _SHARE = 5.0, 0.1
 
 
 class Scatter(NamedTuple):
@@ -32,7 +32,9 @@ def joint_scatter(analysis: Analysis, judgement: Judgement) -> Scatter | None:
 
     What is left of a row, whitened, is N(0, σ²(I + ρ a aᵀ)), a being what the joint does there: 1 + ρ|a|² is the
     determinant, and ρ(a·r)² / (1 + ρ|a|²) the square that the joint takes (Sherman and Morrison); σ² is profiled out.
-    Only joints whose direction of approach was not recorded are asked, and verdicts that say that nothing is left.
+    Before that the channels are made alike and independent on average: noise of which one has more than another is no
+    scatter of a joint, which changes with the pose. Only joints whose direction of approach was not recorded are asked,
+    and verdicts that say that nothing is left.
     """
     situation, white = analysis.situation, analysis.whitening
     joints = [i for i in range(len(situation.mechanism.joints)) if f"direction{i + 1}" not in situation.covariates]
@@ -42,8 +44,9 @@ def joint_scatter(analysis: Analysis, judgement: Judgement) -> Scatter | None:
     found = judgement.found
     used = torch.cat([torch.arange(0), *(analysis.dictionary.groups[i] for i in found.members)])
     left = y - columns[..., used] @ torch.cat([y.new_zeros(0), *found.mean])
-    keep = white.keep()
-    moved = white(situation.jacobian)[keep][..., joints]
+    alike = torch.linalg.cholesky_ex(left.mT @ left / len(left)).L
+    left = torch.linalg.solve_triangular(alike, left.mT, upper=False).mT
+    moved = torch.linalg.solve_triangular(alike, white(situation.jacobian)[white.keep()][..., joints], upper=False)
     along, square = torch.einsum("scj,sc->sj", moved, left), moved.square().sum(1)
     usual = square.median(0).values.clamp_min(1e-300)
     rho = _VARIANCES[:, None] / usual
