@@ -80,7 +80,8 @@ _WORDS = {
     "thermal": Words(
         "growth with temperature",
         "thermal growth",
-        "Growth of lengths for each kelvin.",
+        "Growth of lengths for each kelvin; reference: all lengths at 20 °C against the model's, which a geometry may "
+        "stand for as well.",
         "Warm-up before work, and heat near {where}: motors, sun, coolant.",
     ),
     "drift": Words(
