@@ -49,8 +49,8 @@ def blind_check(
     experiments/data), multibody changes MuJoCo models, adversarial has noise, plans and causes that are not of the
     textbook's form, shop has machines of a workshop by somebody who had read the documentation only (seeds 1 to 3 were
     looked at during repairs: take others), and motion has logs of axes in motion, simulated in MuJoCo (by the author of
-    its effects, but before they were tuned). For these --seed is the seed of the first case of each family, and the folder holds
-    source.json, source.csv and source.md.
+    its effects, but before they were tuned). For these --seed is the seed of the first case of each family, and the
+    folder holds source.json, source.csv and source.md.
 
     Examples:
 
