@@ -23,7 +23,7 @@ def blind_check(
         str, typer.Option(help="Any of single, pair, none, outside, separated by commas.")
     ] = "single,pair,none,outside",
     source: Annotated[
-        str, typer.Option(help="Who made the cases: blind, semi_real, multibody, adversarial or motion.")
+        str, typer.Option(help="Who made the cases: blind, semi_real, multibody, adversarial, motion or shop.")
     ] = "blind",
     engine: Annotated[
         str | None,
@@ -44,12 +44,13 @@ def blind_check(
     interrupted one. Mechanisms: five_bar, tripod, machine_tool, stewart, delta, delta_linear, arm, and mujoco_five_bar
     (an independent simulator, pip install 'ccnn-torch[mujoco]').
 
-    Four more sources share no formula with the library or each other. They were written without a look at its code:
+    Five more sources share no formula with the library or each other. They were written without a look at its code:
     semi_real adds a known error to measured rows of real arms (folder CCNN_MEASURED; without it the UR10 of
     experiments/data), multibody changes MuJoCo models, adversarial has noise, plans and causes that are not of the
-    textbook's form, and motion has logs of axes in motion, simulated in MuJoCo (by the author of its effects, but
-    before they were tuned). For these --seed is the seed of the first case of each family, and the folder holds
-    source.json, source.csv and source.md.
+    textbook's form, shop has machines of a workshop by somebody who had read the documentation only (seeds 1 to 3 were
+    looked at during repairs: take others), and motion has logs of axes in motion, simulated in MuJoCo (by the author of
+    its effects, but before they were tuned). For these --seed is the seed of the first case of each family, and the
+    folder holds source.json, source.csv and source.md.
 
     Examples:
 

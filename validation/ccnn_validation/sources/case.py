@@ -22,6 +22,7 @@ class Truth:
         outside: True = the answer must say that something is outside the library, False = it must not, None = either.
         drivers: drivers that are right where the answer says outside; () = any.
         mention: where not empty, one of these texts must be in a caution or a note (lower case).
+        enough: sets of effect names that are right without "outside the library" where `outside` is True.
     """
 
     kind: str
@@ -30,6 +31,7 @@ class Truth:
     outside: bool | None = False
     drivers: tuple[str, ...] = ()
     mention: tuple[str, ...] = ()
+    enough: tuple[frozenset[str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -37,14 +39,14 @@ class SourceCase:
     """A case.
 
     Attributes:
-        family: name within the source.
-        mechanism: a name of `load_mechanism`, or the text of a geometry file (YAML with the key `joints`).
+        family: name within the source, by which its figures are counted.
+        mechanism: a name of `load_mechanism`, or the text of a geometry file (YAML) or a URDF.
         mechanism_keys: keys of the mechanism's constructor, where it has a name.
         columns: header `name[unit]` -> values, `s` each, as they stand in the CSV.
         noise: standard deviation of a measured position [m] and angle [rad] by unit (`{"m": 1e-5, "rad": 1e-5}`) as the
             diagnosis gets it; None = it is not given.
         truth: the right answers.
-        clean: measured columns without noise, by the same headers (only pose columns); None where unknown.
+        clean: measured columns without noise [m, rad] (only pose columns); None where unknown.
         baseline: columns without the cause, of records whose own errors are unknown: then the names of the verdict
             are compared with those of the verdict on `baseline`, and `accepted` lists the names that are added.
         noise_kind: "white", or what else the noise is.

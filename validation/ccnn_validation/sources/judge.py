@@ -35,6 +35,7 @@ def judged(truth: Truth, answer: Mapping[str, Any], baseline: Mapping[str, Any] 
     gained = names - before
     named = gained in truth.accepted or (baseline is not None and names in truth.accepted)
     said = truth.outside is None or outside == truth.outside or (baseline is not None and truth.outside is False)
+    said = said or gained in truth.enough
     driven = not outside or truth.outside is False or not truth.drivers or follows(drivers, truth)
     texts = " ".join([*answer["cautions"], *answer["notes"], verdict["text"]]).lower()
     if frozenset({_OUTLIER}) in truth.accepted and not gained and (names or outside):

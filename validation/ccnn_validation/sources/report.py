@@ -23,6 +23,7 @@ _NOTES = {
     "multibody": "Machines are simulated in MuJoCo; a cause is a change of its model.",
     "motion": "Axes in motion, simulated in MuJoCo; a cause changes its model or what its controller is told.",
     "adversarial": "Noise, designs and causes that are not of the textbook's form.",
+    "shop": "Machines of a workshop, by somebody who had read the documentation only.",
 }
 _KINDS = ("none", "single", "pair", "several", "outside", "data")
 

@@ -35,7 +35,7 @@ __all__ = ["SOURCES", "diagnosed", "run_source", "source_of"]
 
 _Task = tuple[str, str, int, Path]
 """Source, family, seed, and the file of its answer."""
-SOURCES = ("semi_real", "multibody", "adversarial", "motion")
+SOURCES = ("semi_real", "multibody", "adversarial", "motion", "shop")
 
 
 def source_of(name: str) -> Source:
@@ -108,7 +108,7 @@ def _one(task: _Task) -> str:
         return "skipped, the machine has the cause already"
     found = {
         "source": name,
-        "family": family,
+        "family": case.family,
         "seed": seed,
         "kind": truth.kind,
         "causes": list(truth.causes),
@@ -166,7 +166,8 @@ def _mechanism(case: SourceCase, folder: Path) -> Mechanism:
     if "\n" not in case.mechanism:
         return load_mechanism(case.mechanism, **keys)
     # The name says which machine it is: the same text has the same name.
-    path = folder / f"machine-{zlib.crc32(case.mechanism.encode()):08x}.yaml"
+    kind = "urdf" if case.mechanism.startswith("<robot") else "yaml"
+    path = folder / f"machine-{zlib.crc32(case.mechanism.encode()):08x}.{kind}"
     write_whole(path, case.mechanism)
     return load_mechanism(str(path), **keys)
 
