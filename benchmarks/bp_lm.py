@@ -11,7 +11,8 @@ from scipy.optimize import least_squares
 from benchmarks.measure import Row, compare
 from benchmarks.training import training_rows
 from ccnn_torch.evolution.gauss_newton import dense_jacobian, network_of, residual
-from ccnn_torch.evolution.refinement import RefinementSettings, refine
+from ccnn_torch.evolution.refinement import refine
+from ccnn_torch.evolution.refinement_state import RefinementSettings
 
 STARTS, HIDDEN, ITERATIONS = 6, 20, 20
 

@@ -22,8 +22,6 @@ from ccnn_torch.sweep.config import load_sweep
 from ccnn_torch.sweep.job import Row, run_sweep
 from ccnn_torch.verification.job import verify_model
 
-__all__ = ["calibrate", "diagnose_motion", "identify", "sweep", "verify"]
-
 
 def calibrate(**keys: Any) -> Calibration:
     """Train on measured records or on a case study, judge on held-out rows; nothing is written.

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["Condition", "Coordinate", "Parameter", "plausible_error"]
-
 
 @dataclass(frozen=True)
 class Coordinate:

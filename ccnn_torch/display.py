@@ -7,18 +7,6 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
-__all__ = [
-    "count_text",
-    "display_unit",
-    "interval_text",
-    "is_shown",
-    "number_text",
-    "removed_percent",
-    "short_path",
-    "unit_text",
-    "visible",
-]
-
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 

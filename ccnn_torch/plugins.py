@@ -19,8 +19,6 @@ from typing import Any
 from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 
-__all__ = ["class_hint", "code_refused", "failure", "file_that_names", "is_plugin", "load_plugin"]
-
 # Lines of this package, of Python and of installed packages are not reported: they are not the user's.
 _OTHERS = (f"{Path(__file__).parent}{os.sep}", f"{sysconfig.get_path('stdlib')}{os.sep}", "<")
 

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from ccnn_torch.mechanisms import Mechanism, PoseError
 
-__all__ = ["Pseudoerror", "joint_deviations", "pose_energy"]
-
 # Rows x repeats solved at once: about 100 MB for a six-joint arm.
 _CHUNK = 20_000
 

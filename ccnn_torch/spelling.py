@@ -5,8 +5,6 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 
-__all__ = ["nearest"]
-
 
 def nearest(name: str, candidates: Sequence[str], cutoff: float = 0.6) -> str | None:
     """The candidate most similar to a misspelt name, without regard to case; None if none is similar enough.

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from functools import cache
 
-__all__ = ["as_read"]
-
 # Not grad, which is a degree to some and a 400th of a turn to others. pint would read Grad as gigaradians, MM as
 # megamolar, Min as megainches, Nm as textile number metres, and C as coulombs.
 _WORDS = {

@@ -19,8 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from ccnn_torch.errors import InputError
 from ccnn_torch.unit_words import as_read
 
-__all__ = ["LARGEST", "from_si", "parse_header", "si_unit_of", "split_header", "to_si", "write_hint"]
-
 LARGEST = 1e12
 """No number of a record or a geometry file is larger in SI: it is 7 times the Earth's distance from the Sun in m, a
 stiffness or a pressure beyond steel's, and sums of its square still keep the smaller terms."""

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor, nn
 from toy import Descent
 
+from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
-from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.learners.ccnn import CCNN
 from ccnn_torch.learners.constant import Constant
 from ccnn_torch.learners.enn import ENN, ENNSettings
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings

@@ -20,8 +20,8 @@ from ccnn_torch.calibration.config import (
     method_names,
 )
 from ccnn_torch.errors import InputError
+from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.files.yaml_file import dump_yaml, parse_yaml
-from ccnn_torch.learners.ccnn import CCNNSettings
 
 TRIPOD = """
 case: tripod

@@ -14,8 +14,9 @@ from toy import Descent
 from ccnn_torch.calibration.learning.early_stop import Plan, choose, fold_dataset
 from ccnn_torch.calibration.learning.fitting import fit_method
 from ccnn_torch.errors import InputError
+from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.learners.ccnn import CCNN
 from ccnn_torch.learners.rows import thinned
 from ccnn_torch.records.splits import Split, fold_splits, split_rows
 from ccnn_torch.training import train, weighted_mse

@@ -13,8 +13,9 @@ from torch.profiler import ProfilerActivity, profile
 from ccnn_torch.evolution.evaluation import make_task, network_errors
 from ccnn_torch.evolution.gauss_newton import linearise, network_of, residual
 from ccnn_torch.evolution.genome import Genome
+from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.learners.ccnn import CCNN
 from ccnn_torch.learners.gp import GaussianProcess, GPSettings
 from ccnn_torch.numerics.blocks import blocks, memory_budget
 from ccnn_torch.training import train

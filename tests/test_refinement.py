@@ -8,9 +8,6 @@ from torch import Tensor
 
 from ccnn_torch.evolution.gauss_newton import dense_jacobian, linearise, network_of, residual
 from ccnn_torch.evolution.refinement import (
-    Refined,
-    RefinementSettings,
-    RefinementState,
     finish_refinement,
     log_evidence,
     pose_refinement,
@@ -19,6 +16,7 @@ from ccnn_torch.evolution.refinement import (
     start_refinement,
     step_refinement,
 )
+from ccnn_torch.evolution.refinement_state import Refined, RefinementSettings, RefinementState
 
 Layers = list[Tensor]
 

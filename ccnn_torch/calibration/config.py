@@ -25,8 +25,8 @@ from ccnn_torch.config.tree import (
     written,
 )
 from ccnn_torch.engine import Engine
+from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners.bp_lm import BPLMSettings
-from ccnn_torch.learners.ccnn import CCNNSettings
 from ccnn_torch.learners.enn import ENNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings

@@ -31,8 +31,6 @@ from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.run_folder.interrupt import Stopped
 from ccnn_torch.version import __version__
 
-__all__ = ["main"]
-
 # Maximum characters of a message. The longest of this package, which lists wrong keys, has some hundreds.
 _LONGEST = 2000
 

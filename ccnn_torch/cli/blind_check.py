@@ -9,8 +9,6 @@ import typer
 
 from ccnn_torch.run_folder.interrupt import if_stopped
 
-__all__ = ["blind_check"]
-
 
 def blind_check(
     cases: Annotated[int, typer.Option(help="Number of machines.")],

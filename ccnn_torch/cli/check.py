@@ -12,8 +12,6 @@ from ccnn_torch.cli.diagnose_options import configured
 from ccnn_torch.cli.loading import loading
 from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
 
-__all__ = ["check"]
-
 
 def check(
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     Model = LoadedModel | IdentifiedGeometry
     Array = NDArray[np.float64]
 
-__all__ = ["compensate"]
-
 # Largest pose error of the nominal machine at the joints found [m, rad].
 _CLOSE = 1e-8
 # Initial guesses solved at once where that of the previous row does not converge.

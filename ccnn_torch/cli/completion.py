@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["complete_mechanism"]
-
 # The registry's names, so that completion need not load torch; a test compares the two.
 MECHANISMS = (
     "tripod",

@@ -11,8 +11,6 @@ from ccnn_torch.cli.completion import complete_mechanism
 from ccnn_torch.cli.diagnose_options import configured
 from ccnn_torch.cli.loading import loading
 
-__all__ = ["diagnose"]
-
 
 def diagnose(
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ccnn_torch.diagnosis.config import DiagnoseConfig
 
-__all__ = ["configured"]
-
 
 def configured(
     overrides: list[str] | None,

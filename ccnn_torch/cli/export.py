@@ -9,8 +9,6 @@ import typer
 
 from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
 
-__all__ = ["export"]
-
 
 def export(
     model: Annotated[Path, typer.Argument(help="A .safetensors file with its card, or an identified.yaml.")],

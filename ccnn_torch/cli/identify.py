@@ -9,8 +9,6 @@ import typer
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["identify"]
-
 
 def identify(
     config: Annotated[Path | None, typer.Argument(help="A YAML config, e.g. experiments/five_bar.yaml.")] = None,

@@ -8,8 +8,6 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["keys"]
-
 
 class Command(StrEnum):
     """The commands that take a config."""

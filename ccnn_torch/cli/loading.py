@@ -7,8 +7,6 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["loading"]
-
 
 @contextmanager
 def loading() -> Iterator[None]:

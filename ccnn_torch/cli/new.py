@@ -11,8 +11,6 @@ import typer
 from ccnn_torch.cli.completion import complete_mechanism
 from ccnn_torch.errors import InputError
 
-__all__ = ["new"]
-
 
 def new(
     records: Annotated[Path, typer.Argument(metavar="RECORDS.csv", help="Measured rows, with a line of headers.")],

@@ -9,8 +9,6 @@ import typer
 
 from ccnn_torch.cli.completion import complete_mechanism
 
-__all__ = ["plan"]
-
 
 def plan(
     mechanism: Annotated[

@@ -9,8 +9,6 @@ import typer
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["run"]
-
 
 def run(
     config: Annotated[

@@ -9,8 +9,6 @@ import typer
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["sign"]
-
 
 def sign(
     model: Annotated[Path | None, typer.Argument(help="A .safetensors or .onnx file, or identified.yaml.")] = None,

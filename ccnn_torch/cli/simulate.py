@@ -10,8 +10,6 @@ import typer
 from ccnn_torch.cli.completion import complete_mechanism
 from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
 
-__all__ = ["simulate"]
-
 
 def simulate(
     mechanism: Annotated[

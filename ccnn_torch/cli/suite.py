@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["suite"]
-
 
 def suite(
     config: Annotated[Path, typer.Argument(help="A YAML file with base and cases, e.g. experiments/realistic.yaml.")],

@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["sweep"]
-
 
 def sweep(
     config: Annotated[Path, typer.Argument(help="A YAML config of a run, e.g. experiments/tripod.yaml.")],

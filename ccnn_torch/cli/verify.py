@@ -10,8 +10,6 @@ import typer
 from ccnn_torch.cli.completion import complete_mechanism
 from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
 
-__all__ = ["verify"]
-
 
 def verify(
     model: Annotated[Path, typer.Argument(help="A .safetensors or .onnx file, or identified.yaml.")],

@@ -14,8 +14,6 @@ from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.table import Table, markdown_table
 
-__all__ = ["read_runs", "runs_csv", "runs_table", "write_runs"]
-
 Results = Mapping[str, Any]
 _CSV = ("run", "name", "case", "seed", "repeats", "train", "validation", "test", "data_sha256", "method", "best",
         "quantity", "unit", "before", "after", "ratio_to_floor", "seconds")  # fmt: skip

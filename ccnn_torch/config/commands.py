@@ -6,8 +6,6 @@ from typing import Any
 
 from ccnn_torch.config.keys import config_model, list_keys
 
-__all__ = ["config_schema", "keys_by_section"]
-
 
 def keys_by_section(command: str) -> dict[str, list[tuple[str, str, str]]]:
     """Key, default and description of every key, by section; those at the top first, under ``""``."""

@@ -15,8 +15,6 @@ from ccnn_torch.records import Records
 from ccnn_torch.records.sources import Source
 from ccnn_torch.records.splits import Column, Split, split_rows
 
-__all__ = ["Given", "given_records", "held_out_notes", "name_given", "rows_of_test_file", "split_by", "with_test_file"]
-
 Given = Source | Records
 """Records given in Python in place of the config's file: a DataFrame, several, or loaded records."""
 

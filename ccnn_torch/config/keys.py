@@ -16,8 +16,6 @@ from pydantic import BaseModel, ValidationError
 from ccnn_torch.files.yaml_file import read_yaml
 from ccnn_torch.spelling import nearest
 
-__all__ = ["config_model", "explain", "list_keys"]
-
 # Maximum number of wrong keys in one message.
 _FEW = 8
 

@@ -9,8 +9,6 @@ from ccnn_torch.config.sizes import Size, size, sizes_by_name
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 
-__all__ = ["Noise", "noise_of_pose", "read_noise"]
-
 Noise = Size | dict[str, Size]
 
 

@@ -11,8 +11,6 @@ from typing import Any
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import check_values, parse_yaml
 
-__all__ = ["apply_overrides", "listed_files", "relate_paths", "resolve_paths"]
-
 # Keys whose value is always text: a path may hold a colon, a name may be 2024.
 _TEXT = ("name", "out", "records", "transfer", "mechanism")
 

@@ -8,8 +8,6 @@ from ccnn_torch.config.sizes import Size, size
 from ccnn_torch.coordinates import Parameter
 from ccnn_torch.identification.problems.parameters import match_parameters
 
-__all__ = ["prior_sizes"]
-
 
 def prior_sizes(given: Mapping[str, Size], geometry: Sequence[Parameter], key: str) -> dict[str, float]:
     """Standard deviation of each prior [SI] by its name or pattern; a text has the unit of what it fits.

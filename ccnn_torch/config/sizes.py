@@ -14,8 +14,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import to_si
 
-__all__ = ["ANGLE_ARM", "Size", "size", "sizes_by_name", "sizes_of_pose"]
-
 ANGLE_ARM = 0.3
 """Distance of the points that determine orientation [m]: the noise of an angle is that of a length over this."""
 

@@ -9,8 +9,6 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from ccnn_torch.config.tree import Names, Section
 
-__all__ = ["HeldOutConfig", "SplitConfig"]
-
 
 def _share_or_file(value: Any) -> Any:
     """A number as it is, for pydantic to judge; a text that is no number must name a file."""

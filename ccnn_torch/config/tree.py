@@ -14,18 +14,6 @@ from ccnn_torch.config.overrides import apply_overrides, relate_paths, resolve_p
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import dump_yaml, read_yaml
 
-__all__ = [
-    "Columns",
-    "Files",
-    "Names",
-    "Section",
-    "config_from_file",
-    "config_from_keys",
-    "config_from_options",
-    "validated",
-    "written",
-]
-
 Config = TypeVar("Config", bound=BaseModel)
 
 

@@ -15,8 +15,6 @@ from ccnn_torch.config.sizes import size
 from ccnn_torch.config.tree import Columns, Files, Names, Section, config_from_options
 from ccnn_torch.errors import InputError
 
-__all__ = ["DiagnoseConfig", "describe_diagnose_keys", "load_diagnose_config"]
-
 _WRONG_NOISE = (
     "must be a standard deviation of the pose, a size above 0 (10um, or 1e-5 in SI) or one for each coordinate; leave "
     "it out to have it estimated"

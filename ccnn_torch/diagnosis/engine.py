@@ -37,17 +37,6 @@ from ccnn_torch.effects import (
 )
 from ccnn_torch.errors import InputError, RowsError
 
-__all__ = [
-    "OUTLIER",
-    "UNSHOWN",
-    "candidates",
-    "diagnose_rows",
-    "drawn_rows",
-    "gross_outliers",
-    "usable_rows",
-    "why_set_aside",
-]
-
 OUTLIER = "outlier"
 # More rows, and more measured values, than this name a cause no better: so many are drawn.
 _MOST_ROWS, _MOST_VALUES = 2000, 9000

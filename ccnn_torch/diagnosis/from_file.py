@@ -15,8 +15,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import parse_json, read_text
 from ccnn_torch.units import LARGEST
 
-__all__ = ["Known", "Verdict", "not_held_notes", "one_row_at_a_time", "read_verdict"]
-
 # A diagnosis has some 100 kB.
 _LARGEST = 100_000_000
 

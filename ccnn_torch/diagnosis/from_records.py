@@ -27,8 +27,6 @@ from ccnn_torch.records.covariates import DEFAULT_COVARIATES
 from ccnn_torch.records.read_table import Frame
 from ccnn_torch.records.sources import FILE, is_frame
 
-__all__ = ["diagnose", "naming", "noise_of", "situation_of"]
-
 _POSITION = {"x": 0, "y": 1, "z": 2}
 # Names that a note lists.
 _FEW_NAMES = 6

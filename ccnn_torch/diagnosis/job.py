@@ -27,8 +27,6 @@ from ccnn_torch.report.table import print_text
 from ccnn_torch.run_folder.interrupt import if_stopped
 from ccnn_torch.run_folder.lock import locked
 
-__all__ = ["run_check", "run_diagnosis"]
-
 
 def run_diagnosis(config: DiagnoseConfig, quiet: bool = False, details: bool = False) -> Path:
     """Diagnose, and write the folder of the config; the verdict is shown and kept before all that takes longer.

@@ -20,8 +20,6 @@ from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames
 from ccnn_torch.mechanisms.files.write_machine import write_machine
 from ccnn_torch.report.json_files import plain, write_json
 
-__all__ = ["write_check", "write_diagnosis", "write_result"]
-
 
 def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
     """Write `diagnosis.json` alone.

@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-__all__ = ["TO_REPORT", "TO_VERDICT", "Told", "at_step", "watched"]
-
 Told = Callable[[str, float], None]
 """Called with the name of a step and the share of it that is done, 0 to 1."""
 

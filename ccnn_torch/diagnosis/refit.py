@@ -16,8 +16,6 @@ from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, Whitening, moving_channels, reweighted
 from ccnn_torch.effects import Acting, Situation
 
-__all__ = ["refit"]
-
 # Gauss-Newton steps; the first comes from the nominal machine.
 _ROUNDS = 3
 

@@ -10,8 +10,6 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Acting
 
-__all__ = ["Diagnosis"]
-
 _NOT_WRITTEN = ("acting", "analysis", "judgement", "lines")
 
 

@@ -12,8 +12,6 @@ from ccnn_torch.effects.protocol import Effect
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
-__all__ = ["Acting", "measured_pose", "pose_residual", "reached", "signature"]
-
 # Each squares what is left, from a millimetre on.
 _ROUNDS = 4
 

@@ -13,8 +13,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Backlash"]
-
 _SCALE = {"m": 1.5e-4, "rad": 2e-4}
 # Pushes at which a joint leaves its flank, in units of the usual one; and how soft the change is.
 _HOLDS = (0.1, 0.2, 0.4, 0.7, 1.2, 2.0, 3.5, 6.0, 60.0)

@@ -11,19 +11,6 @@ from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import skew
 
-__all__ = [
-    "TWIST",
-    "by_joint",
-    "caused_by",
-    "of_rows",
-    "one_by_one",
-    "own_parameters",
-    "parameter_columns",
-    "per_force",
-    "shown_columns",
-    "twist_columns",
-]
-
 _SHOWN = 1e-9
 
 TWIST = (("x", "m"), ("y", "m"), ("z", "m"), ("rx", "rad"), ("ry", "rad"), ("rz", "rad"))

@@ -13,8 +13,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
-__all__ = ["SCALE", "Compliance"]
-
 SCALE = {"m": 1e-7, "rad": 2e-6}
 """Plausible compliance of a drive: 1e-7 m/N (10 N/µm), 2e-6 rad/(N·m)."""
 _SECONDARY = 0.3

@@ -12,8 +12,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Coupling"]
-
 
 class Coupling:
     """Δq_i = Σ c_ij (q_j - middle of its workspace) + z_i over j ≠ i; z (secondary): it may be 0 elsewhere."""

@@ -11,8 +11,6 @@ from torch import Tensor
 from ccnn_torch.effects.thermal import REFERENCE
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["SHIFT", "covariate_units", "draw_covariates"]
-
 SHIFT = 8 * 3600.0
 """Rows are spread evenly over a shift [s]."""
 # Standard deviations of the load along a coordinate [N], [N·m].

@@ -14,8 +14,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Drift"]
-
 # In an hour.
 _SCALE = {"m": 3e-5, "rad": 5e-5}
 _HOUR = 3600.0

@@ -12,8 +12,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Frame"]
-
 _SCALE = {"m": 1e-3, "rad": 1e-3}
 
 

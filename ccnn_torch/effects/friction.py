@@ -14,8 +14,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Friction"]
-
 # A joint's friction is some tenths of what it carries, its constant part like that of a tenth of the platform's weight.
 _SHARE = 0.3
 # Small: the part that does not depend on the load is backlash, and is called so unless the rest of friction is there.

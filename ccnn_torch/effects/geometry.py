@@ -12,8 +12,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
-__all__ = ["Geometry"]
-
 
 class Geometry:
     """Δp_k = c_k, p = the mechanism's own lengths, angles and gains; base and tool frames are effects of their own.

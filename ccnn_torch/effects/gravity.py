@@ -13,8 +13,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
-__all__ = ["Gravity"]
-
 _SECONDARY = 0.3
 # What an arm may carry elsewhere than evenly: no correction of a form.
 _MASSES = ("tool", "inner links")

@@ -13,8 +13,6 @@ from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
-__all__ = ["Instrument"]
-
 _AXES = "xyz"
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 _COEFFICIENTS = (

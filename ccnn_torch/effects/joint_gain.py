@@ -12,8 +12,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["ZERO", "JointGain"]
-
 _GAIN = 1e-3
 ZERO = {"m": 3e-4, "rad": 1e-3}
 """What a gain makes between the middle of a joint's workspace and where the joint counts from [joint's unit]."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["elapsed", "lagged", "velocity"]
-
 # Rows farther apart are not one trajectory [s].
 _SAME_MOTION = 1.0
 

@@ -13,8 +13,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Latency"]
-
 _DELAY = 5e-3
 
 

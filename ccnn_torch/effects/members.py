@@ -11,8 +11,6 @@ from ccnn_torch.effects.columns import own_parameters
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
-__all__ = ["Member", "arm_axes", "members"]
-
 
 class Member(NamedTuple):
     """A part of the machine: what results call it, and the numbers of its parameters that are lengths."""

@@ -12,8 +12,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["PARAMETER", "ParameterCause", "parameter_causes"]
-
 PARAMETER = "parameter "
 """What the names of these effects begin with, before the cause's own."""
 

@@ -11,8 +11,6 @@ from torch import Tensor
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Coefficient", "Effect", "Kind", "Shape", "missing_verbs"]
-
 Kind = Literal["joints", "parameters", "pose"]
 
 

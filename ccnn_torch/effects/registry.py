@@ -28,8 +28,6 @@ from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.plugins import class_hint, failure, is_plugin, load_plugin
 
-__all__ = ["EFFECTS", "EXACT", "OUTLIER", "effect_names", "make_effect"]
-
 EFFECTS: dict[str, Callable[[], Effect]] = {
     "geometry": Geometry,
     "joint_offset": JointOffset,

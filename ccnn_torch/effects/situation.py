@@ -13,8 +13,6 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
-__all__ = ["PLATFORM_WEIGHT", "WEIGHTS", "Situation", "default_gravity"]
-
 PLATFORM_WEIGHT = 100.0
 """Weight of a platform of which nothing is known [N]."""
 WEIGHTS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)

@@ -14,8 +14,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["REFERENCE", "Thermal"]
-
 REFERENCE = 293.15
 """Temperature at which a machine has its dimensions, ISO 1 [K]."""
 _STEEL = 1.2e-5

@@ -13,8 +13,6 @@ from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Transmission"]
-
 _SCALE = {"m": 5e-5, "rad": 1e-4}
 # Waves: harmonics of the period, and how large they are likely to be.
 _HARMONICS = tuple(

@@ -16,8 +16,6 @@ from ccnn_torch.effects.user_effect import OwnEffect, of_library
 from ccnn_torch.errors import InputError
 from ccnn_torch.units import to_si
 
-__all__ = ["refuse_one_name", "tried"]
-
 
 def tried(effect: Effect, situation: Situation) -> str:
     """What the rows lack for an effect, as `Effect.missing` states it; a user's own is tried on them where that is ''.

@@ -16,8 +16,6 @@ from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.batching import leading_shape
 from ccnn_torch.plugins import failure
 
-__all__ = ["OwnEffect", "label_of", "of_library", "owned"]
-
 _Part = TypeVar("_Part", Coefficient, Shape)
 
 

@@ -7,8 +7,6 @@ from typing import NamedTuple
 from ccnn_torch.effects.parameter import PARAMETER
 from ccnn_torch.effects.registry import OUTLIER
 
-__all__ = ["Words", "words_of"]
-
 
 class Words(NamedTuple):
     """What is said of an effect.

@@ -13,8 +13,6 @@ from pydantic import AfterValidator
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["Engine", "check_engine", "open_engine"]
-
 _NAMES = ("local", "processes", "dask")
 _ADDRESS = re.compile(r"(tcp|tls)://.+:\d+")
 # Seconds to wait for a scheduler that is not there, as one that is started again.

@@ -19,8 +19,6 @@ import torch
 from ccnn_torch.engine.engine import open_engine
 from ccnn_torch.errors import CcnnError, InputError
 
-__all__ = ["Failure", "Job", "run_jobs"]
-
 # How often a job is tried whose worker is lost, and seconds between, twice as many each time.
 _TRIES, _PAUSE = 3, 2.0
 # What may go wrong in a worker beside a sentence of ours; it is told by its name, and the other jobs go on.

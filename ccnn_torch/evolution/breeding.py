@@ -24,16 +24,6 @@ from ccnn_torch.evolution.operators import (
 )
 from ccnn_torch.evolution.random import uniform
 
-__all__ = [
-    "BreedingDraws",
-    "BreedingSettings",
-    "breed",
-    "breed_networks",
-    "breeding_shapes",
-    "initial_population",
-    "with_elites",
-]
-
 
 class BreedingSettings(Protocol):
     """What breeding reads of a learner's settings; the names of `CCNNSettings`."""

@@ -11,8 +11,6 @@ from torch import Tensor, nn
 from ccnn_torch.evolution.network import average, average_waves
 from ccnn_torch.evolution.waves import Waves
 
-__all__ = ["Bundle", "averaged", "choose", "mapped", "resized", "without_waves"]
-
 
 class Bundle(NamedTuple):
     """Networks of one shape.

@@ -20,8 +20,6 @@ from ccnn_torch.evolution.genome import Genome, active, select
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import CCNNSettings
 
-__all__ = ["Coevolution", "advance", "density", "diversity", "keep_refined", "start"]
-
 _T = TypeVar("_T")
 
 # Streams of random numbers: one for the generations, one for each layer's first individuals.

@@ -13,8 +13,6 @@ from torch import Tensor
 
 from ccnn_torch.evolution.genome import Genome, active
 
-__all__ = ["decode", "encode"]
-
 
 def encode(mask: Tensor, weight: Tensor) -> tuple[str, list[float]]:
     """One individual as strings.

@@ -17,8 +17,6 @@ from torch import Tensor
 from ccnn_torch.evolution.genome import Genome
 from ccnn_torch.numerics.blocks import block_size
 
-__all__ = ["Task", "fitness", "joined_errors", "make_task", "network_errors"]
-
 # Input of an unfed node: sigmoid(-1e4) is exactly 0, and unlike -inf it never makes a NaN.
 _FORCED_OFF = -1e4
 # Doubles in one block of activations. On a CPU small blocks lose more to thin matrix products than they win in the

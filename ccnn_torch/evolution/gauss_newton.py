@@ -18,8 +18,6 @@ from torch import Tensor
 from ccnn_torch.evolution.waves import Waves, wave_inputs
 from ccnn_torch.numerics.blocks import blocks
 
-__all__ = ["Linearised", "Network", "dense_jacobian", "linearise", "network_of", "residual"]
-
 # Bytes of rows that are worked on at a time: what the caches of one core hold, measured with 6 and 24 networks.
 _CACHED = 1 << 25
 

@@ -7,8 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Genome", "active", "select"]
-
 
 class Genome(NamedTuple):
     """Individuals of one layer of connections.

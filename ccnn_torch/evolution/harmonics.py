@@ -16,8 +16,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Harmonics", "fit_harmonics", "harmonic_count"]
-
 # Rows that a harmonic of one joint needs, and each turning joint at least: with fewer the harmonics follow everything
 # else there is, which the network then does not see. On simulated six-joint arms with compliance or backlash, 140 rows,
 # the error was 1.5 to 1.8 times as large with them, with everything at once and 280 rows 1.5 times; on a UR10 with 350

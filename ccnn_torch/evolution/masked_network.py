@@ -12,8 +12,6 @@ from ccnn_torch.evolution.harmonics import Harmonics
 from ccnn_torch.evolution.network import alive_nodes, prune
 from ccnn_torch.evolution.waves import Waves
 
-__all__ = ["MaskedNetwork"]
-
 
 class MaskedNetwork(nn.Module):
     """A pruned network as dense double-precision linear layers with sigmoids between, ready for export.

@@ -11,8 +11,6 @@ from torch import Tensor
 from ccnn_torch.evolution.genome import Genome, active
 from ccnn_torch.evolution.waves import Waves, wave_signal
 
-__all__ = ["alive_nodes", "average", "average_waves", "fed_nodes", "forward", "hidden_signal", "prune"]
-
 
 def fed_nodes(masks: Sequence[Tensor]) -> list[Tensor]:
     """Hidden nodes that some network input reaches; biases do not count as inputs.

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from ccnn_torch.evolution.genome import Genome, active
 
-__all__ = ["crossover", "flip_connections", "nonuniform_mutation", "swap_genes", "tournament", "weakest_draw"]
-
 
 def tournament(fitness: Tensor, draws: Tensor) -> Tensor:
     """Tournament selection with replacement.

@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-__all__ = ["prior_groups", "resized_prior", "wave_groups"]
-
 
 def prior_groups(shapes: list[torch.Size], bias: bool, slots: int = 0) -> Tensor:
     """Group of every weight in the flat order, `k`, int64; the last group holds the output's biases and frequencies.

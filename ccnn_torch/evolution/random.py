@@ -13,8 +13,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["member_seeds", "uniform", "uniform_parts"]
-
 
 def _signed(word: int) -> int:
     return word - (1 << 64) if word >= 1 << 63 else word

@@ -36,24 +36,6 @@ from ccnn_torch.evolution.refinement_state import (
 )
 from ccnn_torch.evolution.waves import Waves
 
-__all__ = [
-    "Precisions",
-    "Refined",
-    "RefinementProblem",
-    "RefinementSettings",
-    "RefinementState",
-    "SecondOrder",
-    "finish_refinement",
-    "part_of_problem",
-    "part_of_state",
-    "pose_refinement",
-    "put_part",
-    "refine",
-    "second_order",
-    "start_refinement",
-    "step_refinement",
-]
-
 _PRECISION_RANGE = (1e-8, 1e12)
 _DAMPING_RANGE = (1e-12, 1e12)
 _VAGUE = 1e-4

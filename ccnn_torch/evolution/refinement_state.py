@@ -11,19 +11,6 @@ from torch import Tensor
 from ccnn_torch.evolution.gauss_newton import Network
 from ccnn_torch.evolution.waves import Waves
 
-__all__ = [
-    "Precisions",
-    "Refined",
-    "RefinementProblem",
-    "RefinementSettings",
-    "RefinementState",
-    "SecondOrder",
-    "chosen_state",
-    "part_of_problem",
-    "part_of_state",
-    "put_part",
-]
-
 # Calm iterations after which a network is done.
 _CALM = 3
 

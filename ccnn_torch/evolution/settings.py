@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-__all__ = ["CCNNSettings", "check_evolution"]
-
 _NODES_AN_OUTPUT, _FEWEST_NODES = 8, 24
 _RIVAL, _RIVAL_OUTPUTS = (12, 12), 3
 

@@ -19,8 +19,6 @@ from ccnn_torch.evolution.genome import Genome, active
 from ccnn_torch.evolution.network import forward, hidden_signal
 from ccnn_torch.evolution.waves import Waves
 
-__all__ = ["Spread", "readout_spread", "spread_variance"]
-
 _SMALLEST_NOISE = 1e-12
 # The mean of an output is not held back by a prior; this only keeps the matrix regular.
 _FLAT = 1e-6

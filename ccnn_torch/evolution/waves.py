@@ -16,8 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Waves", "find_waves", "no_waves", "wave_signal"]
-
 # Inputs span 2, so that a wave of frequency pi has one period. Slower ones are left to the sigmoids.
 _SLOWEST, _FASTEST = 4.0, 130.0
 # Width of a spectral line is pi over the span; a quarter of its half finds every line near its top.

@@ -10,8 +10,6 @@ from typing import Any
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["CONFIG_LIMIT", "parse_json", "read_bytes", "read_text"]
-
 CONFIG_LIMIT = 1_000_000
 """Largest config or geometry file in bytes. Usual ones have some kB; the limit bounds the time of the parser."""
 

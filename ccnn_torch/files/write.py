@@ -13,8 +13,6 @@ from uuid import uuid4
 
 from ccnn_torch.errors import WriteError
 
-__all__ = ["make_folder", "sweep", "write_whole"]
-
 _PREFIX, _SUFFIX = ".ccnn-", ".part"
 
 

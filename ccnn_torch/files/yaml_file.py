@@ -17,8 +17,6 @@ from ruamel.yaml.events import AliasEvent, MappingEndEvent, MappingStartEvent, S
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 
-__all__ = ["check_values", "dump_yaml", "parse_yaml", "read_yaml"]
-
 _DEEPEST = 30
 
 

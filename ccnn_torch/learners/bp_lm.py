@@ -13,23 +13,23 @@ from ccnn_torch.evolution.masked_network import MaskedNetwork
 from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.random import uniform
 from ccnn_torch.evolution.refinement import (
-    RefinementSettings,
-    RefinementState,
-    SecondOrder,
     finish_refinement,
-    part_of_problem,
-    part_of_state,
     pose_refinement,
-    put_part,
     second_order,
     start_refinement,
     step_refinement,
 )
+from ccnn_torch.evolution.refinement_state import (
+    RefinementSettings,
+    RefinementState,
+    SecondOrder,
+    part_of_problem,
+    part_of_state,
+    put_part,
+)
 from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import mean_square, usable_rows
-
-__all__ = ["BPLM", "BPLMSettings"]
 
 _STARTS = 0
 

@@ -22,8 +22,6 @@ from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import thinned
 from ccnn_torch.learners.structure import MemberRows, Structure
 
-__all__ = ["CCNN", "CCNNSettings"]
-
 # A training with rows held out, which chooses the number of steps, has one in so many of a refinement's iterations; the
 # one on all rows goes on from its networks with the others.
 _CHOOSING = 3

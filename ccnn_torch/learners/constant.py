@@ -10,8 +10,6 @@ from torch import Tensor, nn
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import mean_square, usable_rows
 
-__all__ = ["Constant", "ConstantNetwork"]
-
 _SMALLEST_VARIANCE = 1e-12
 
 

@@ -27,8 +27,6 @@ from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import mean_square, usable_rows
 
-__all__ = ["ENN", "ENNSettings"]
-
 # Streams of random numbers: one for the generations, one for each layer's first individuals.
 _GENERATIONS, _FIRST = 0, 1
 

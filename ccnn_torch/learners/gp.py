@@ -24,8 +24,6 @@ from ccnn_torch.numerics.blocks import block_size
 if TYPE_CHECKING:
     from ccnn_torch.learners.gp_evidence import GPPrior
 
-__all__ = ["GPSettings", "GaussianProcess"]
-
 # Numbers in one matrix worked on at a time: what fits into the processor's cache is several times faster than one
 # batch of everything.
 _CHUNK = 1 << 18

@@ -28,8 +28,6 @@ _LENGTH, _LENGTH_SPREAD = 4.0, 1.0
 _SCALE = (-1.0, 1.5)
 _NOISE = (-2.0, 2.0)
 
-__all__ = ["Evidence", "GPPrior", "log_evidence"]
-
 
 class Evidence(NamedTuple):
     """Of `b` processes side by side.

@@ -10,8 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-__all__ = ["KERNELS", "GPNetwork", "covariance", "spread_factor"]
-
 KERNELS = ("matern32", "matern52", "rbf")
 
 # Squared distances below this are rounding; the square root of 0 has no derivative.

@@ -15,8 +15,6 @@ from ccnn_torch.learners.kernel import FARTHEST, blocked_means
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import mean_square, usable_rows
 
-__all__ = ["GRNN", "GRNNSettings"]
-
 # Streams of random numbers: which rows are judged, and the moves of each step.
 _ROWS, _MOVES = 0, 1
 

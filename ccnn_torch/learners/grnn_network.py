@@ -10,8 +10,6 @@ from torch import Tensor, nn
 
 from ccnn_torch.learners.kernel import block_size
 
-__all__ = ["GRNNNetwork", "KernelVariance"]
-
 # Rows' worth of belief in the overall variance: a few squared residuals scatter by a factor of several.
 _PRIOR_ROWS = 10.0
 # A power of two: the ONNX exporter rounds numbers in the code to single precision.

@@ -12,8 +12,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["FARTHEST", "KernelMeans", "block_size", "blocked_means", "kernel_means"]
-
 # Features are about [-1, 1]; further out nothing changes any more, and squares stay finite.
 FARTHEST = 1e6
 # Doubles of one block. On a CPU 4 MB stay in the cache (measured: twice as fast as 64 MB); an accelerator wants more.

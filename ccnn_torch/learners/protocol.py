@@ -7,8 +7,6 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
-__all__ = ["Learner", "TrainingData", "missing_verbs"]
-
 
 @dataclass(frozen=True)
 class TrainingData:

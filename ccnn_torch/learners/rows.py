@@ -10,8 +10,6 @@ from torch import Tensor
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners.protocol import TrainingData
 
-__all__ = ["mean_square", "thinned", "usable_rows"]
-
 
 def usable_rows(data: TrainingData) -> TrainingData:
     """The same rows with zeros in those of weight 0, which may hold anything, NaN included.

@@ -15,12 +15,11 @@ from ccnn_torch.evolution.evaluation import Task, fitness, joined_errors
 from ccnn_torch.evolution.genome import Genome
 from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.priors import prior_groups, resized_prior
-from ccnn_torch.evolution.refinement import Precisions, RefinementSettings, refine
+from ccnn_torch.evolution.refinement import refine
+from ccnn_torch.evolution.refinement_state import Precisions, RefinementSettings
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves
 from ccnn_torch.numerics.blocks import blocks
-
-__all__ = ["MemberRows", "Structure"]
 
 # Passes of one search: after each, what was found before is fitted anew.
 _PASSES = 2

@@ -21,8 +21,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-__all__ = ["ABSENT", "Drive", "delayed", "simulate_axes"]
-
 ABSENT: dict[str, float] = {
     "gain": 1.0,
     "inertia": 0.0,

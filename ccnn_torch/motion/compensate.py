@@ -14,8 +14,6 @@ from ccnn_torch.motion.log import refuse_time, runs_of
 from ccnn_torch.records import read_table, write_table
 from ccnn_torch.units import from_si
 
-__all__ = ["compensate_motion"]
-
 _FEWEST = 20
 
 

@@ -15,8 +15,6 @@ from torch import Tensor
 from ccnn_torch.motion.fit import Spec
 from ccnn_torch.motion.problem import Problem
 
-__all__ = ["Driver", "driver_columns"]
-
 # Knots of a piecewise linear function: at quantiles of a driver, and evenly spaced ones of a position and of the time.
 _KNOTS, _EVENLY = 7, 9
 # Time constants of what fades after a reversal [s].

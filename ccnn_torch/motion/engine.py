@@ -26,8 +26,6 @@ from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, search
 from ccnn_torch.motion.setting import problem_of
 
-__all__ = ["MotionDiagnosis", "diagnose_motion"]
-
 # Searches about a simulator's parameters as found.
 _RECENTRED = 2
 

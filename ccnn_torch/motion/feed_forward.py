@@ -18,8 +18,6 @@ from ccnn_torch.motion.axis import ABSENT, Drive, simulate_axes
 from ccnn_torch.motion.mistakes import lag_of
 from ccnn_torch.motion.nominal import Nominal
 
-__all__ = ["Corrected", "corrected_command", "moved"]
-
 Array = NDArray[np.float64]
 _STEPS, _SHARES = 30, (1.0, 0.5, 0.2)
 # Share of the error's RMS that a step must take away, or it is the last.

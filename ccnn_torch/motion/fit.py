@@ -13,8 +13,6 @@ from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_s
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening
 
-__all__ = ["Fit", "Spec", "fit_many", "places_of", "sensitivities", "squares_unseen", "started"]
-
 # Of a difference quotient, in plausible sizes.
 _STEP = 1e-3
 # Standard deviation of the numbers in plausible sizes while they are fitted; the evidence has scales of its own.

@@ -14,8 +14,6 @@ from ccnn_torch.motion.effects import EXACT
 from ccnn_torch.motion.fit import Fit
 from ccnn_torch.motion.problem import Problem, Whitening
 
-__all__ = ["form_errors", "weighed"]
-
 # Share φ of what the nominal model makes of the command: as of an effect, but most of it is right.
 _OF_NOMINAL = 1e-5
 

@@ -14,8 +14,6 @@ from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem, Whitening
 from ccnn_torch.motion.search import Search, without
 
-__all__ = ["gap_of", "held_out", "in_order", "only", "singles"]
-
 _STEPS = 3
 
 

@@ -20,8 +20,6 @@ from ccnn_torch.motion.nominal import TORQUES, Nominal, axis_keys, nominal_of
 from ccnn_torch.plugins import code_refused
 from ccnn_torch.report.json_files import read_json, write_json
 
-__all__ = ["IDENTIFIED", "Identified", "is_identified", "load_identified", "write_identified"]
-
 IDENTIFIED, _MODEL = "identified_motion.json", "identified.xml"
 # What an MJCF can hold of an axis.
 _IN_MJCF = ("gain", "inertia", "load", "viscous", "coulomb", "weakness")

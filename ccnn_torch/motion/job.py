@@ -27,8 +27,6 @@ from ccnn_torch.report.table import print_text
 from ccnn_torch.run_folder.interrupt import if_stopped
 from ccnn_torch.run_folder.lock import locked
 
-__all__ = ["diagnosed", "run_motion"]
-
 _STEPS = {
     "reading the records": 1.0,
     "searching the effects": 20.0,

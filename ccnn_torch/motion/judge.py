@@ -22,8 +22,6 @@ from ccnn_torch.motion.form import weighed
 from ccnn_torch.motion.outside import Candidate, Members, essential, holds, prior_of, with_drivers
 from ccnn_torch.motion.search import Search
 
-__all__ = ["AxisVerdict", "judge_axes"]
-
 # Odds up to which the logs do not distinguish one name from another.
 _LIKE = 20.0
 # Share of a sampling step by which the time stamps of commands and positions may differ.

@@ -12,8 +12,6 @@ from torch import Tensor
 from ccnn_torch.motion.axis import ABSENT
 from ccnn_torch.motion.effects import Facts, MotionEffect, Number
 
-__all__ = ["Library", "Variant", "library_of"]
-
 # What may not be below 0, and what not above.
 _POSITIVE = (
     *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "play"),

@@ -17,8 +17,6 @@ from ccnn_torch.records.read_table import Frame, read_frame, read_table
 from ccnn_torch.records.table import Table
 from ccnn_torch.units import si_unit_of
 
-__all__ = ["Log", "load_logs", "refuse_time", "runs_of"]
-
 Array = NDArray[np.float64]
 _RUN, _POSITION, _COMMAND = "run", re.compile(r"q(\d+)"), re.compile(r"command(\d+)")
 _SHARED = {"supply": "V", "temperature": "K", "torque_on": "1"}

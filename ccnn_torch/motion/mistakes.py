@@ -13,8 +13,6 @@ from ccnn_torch.errors import InputError
 if TYPE_CHECKING:
     from ccnn_torch.motion.log import Log
 
-__all__ = ["lag_of", "refuse_mistakes"]
-
 Array = NDArray[np.float64]
 # A joint that follows another command by this much more than its own, and at least so well, is that of the other.
 _MORE, _WELL = 0.25, 0.8

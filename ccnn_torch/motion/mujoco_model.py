@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion.nominal import Nominal
 
-__all__ = ["mujoco_nominal"]
-
 Array = NDArray[np.float64]
 # Seconds at the first command before a log begins: the machine rests there.
 _SETTLING = 1.0

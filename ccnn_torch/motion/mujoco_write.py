@@ -9,8 +9,6 @@ import numpy as np
 
 from ccnn_torch.files.write import write_whole
 
-__all__ = ["write_mjcf"]
-
 # No body is lighter [kg].
 _LEAST = 1e-9
 

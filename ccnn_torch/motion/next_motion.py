@@ -16,8 +16,6 @@ from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem, Whitening
 from ccnn_torch.motion.search import Search
 
-__all__ = ["Motion", "motions", "next_motions"]
-
 # Seconds of a proposed motion, its sampling, and the lead that is not judged.
 _SECONDS, _STEP, _LEAD = 8.0, 0.01, 0.3
 # So many are proposed.

@@ -26,8 +26,6 @@ from ccnn_torch.motion.stretches import Stretches
 from ccnn_torch.plugins import is_plugin
 from ccnn_torch.spelling import nearest
 
-__all__ = ["KEYS", "TORQUES", "Driven", "Nominal", "axis_keys", "nominal_of"]
-
 KEYS: dict[str, str] = {
     "gain": "proportional gain [N*m/rad]; without it torques are told as angles",
     "inertia": "of the axis without its load [kg*m^2]",

@@ -15,8 +15,6 @@ from ccnn_torch.motion.fit import Fit, places_of, sensitivities, squares_unseen
 from ccnn_torch.motion.problem import Problem, Whitening
 from ccnn_torch.motion.search import CROWD, Search, log_posterior
 
-__all__ = ["Candidate", "Members", "essential", "holds", "prior_of", "with_drivers"]
-
 # Log prior odds of a driver.
 _OUTSIDE = math.log(0.001)
 # Sets beside which drivers are tried, besides those that lead from the best one to none.

@@ -7,8 +7,6 @@ from torch import Tensor
 
 from ccnn_torch.motion.stretches import Stretches
 
-__all__ = ["PHASES", "phases_of"]
-
 PHASES = ("standstill", "reversal", "fast", "slow")
 # Shares of nearly the largest speed.
 _STILL, _FAST = 0.03, 0.5

@@ -15,8 +15,6 @@ from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.stretches import Stretches
 
-__all__ = ["Problem", "Whitening", "white_noise"]
-
 # Of an axis that ran away: no residual is larger, in units of the motion.
 _FARTHEST = 10.0
 _FOLDS = 5

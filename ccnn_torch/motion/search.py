@@ -19,8 +19,6 @@ from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening, white_noise
 from ccnn_torch.motion.whiten import fitted_whitening
 
-__all__ = ["Search", "log_posterior", "search"]
-
 # Log prior odds of an effect, and what a third and every further one at once costs beside it, as for effects of a pose.
 LOG_ODDS, CROWD = math.log(0.1), math.log(0.1)
 # Sets that are extended, effects that are fitted for each of them after the screen, and members at most.

@@ -15,8 +15,6 @@ from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.stretches import Stretches, cut_stretches
 
-__all__ = ["problem_of"]
-
 # Seconds over which samples are averaged before they are judged.
 _POOLED = 0.02
 # Quantile of what counts as nearly the largest.

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from ccnn_torch.errors import InputError
 from ccnn_torch.plugins import failure, load_plugin
 
-__all__ = ["Simulator", "own_simulator"]
-
 Array = NDArray[np.float64]
 
 

@@ -19,8 +19,6 @@ from ccnn_torch.display import count_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion.log import Log
 
-__all__ = ["Stretches", "cut_stretches", "smooth_speed"]
-
 # Seconds of the part that is judged, and of the lead.
 _JUDGED, _LEAD = 1.2, 0.3
 # A stretch is judged over at least so long.

@@ -9,8 +9,6 @@ from torch import Tensor
 
 from ccnn_torch.motion.problem import Whitening
 
-__all__ = ["fitted_whitening"]
-
 _HIGHEST = 8
 # A residual that is a constant or a ramp would give a root outside the unit circle: so much is added to the diagonal.
 _RIDGE = 1e-9

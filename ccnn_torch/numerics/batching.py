@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["expand_leading", "leading_shape", "stack_last"]
-
 
 def leading_shape(*tensors: Tensor) -> torch.Size:
     """Common leading dims of tensors `... x d` with any last dims."""

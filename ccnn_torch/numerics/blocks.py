@@ -7,8 +7,6 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from itertools import pairwise
 
-__all__ = ["block_size", "blocks", "memory_budget"]
-
 # Of one step where nobody sets a budget. A constant, not a share of what is free: sums over other blocks differ in
 # their last digit, and a seed gives the same digits on every machine. On one core normal matrices of 4,000 rows take a
 # third less time in blocks of so much than all at once.

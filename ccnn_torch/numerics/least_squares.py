@@ -9,8 +9,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Solution", "jacobian_of", "levenberg_marquardt"]
-
 _EPS = torch.finfo(torch.float64).eps
 _DAMPING_FLOOR, _DAMPING_CEILING = 1e-15, 1e15
 

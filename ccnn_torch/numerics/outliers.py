@@ -7,8 +7,6 @@ from functools import cache
 import torch
 from torch import Tensor
 
-__all__ = ["FAR", "chi_quantile", "inlying", "residual_scale"]
-
 FAR = 10.0
 """Standard deviations beyond which a residual is a gross outlier. The errors of real arms are no normal noise (a
 cable-driven one reaches six), so that a closer bound would drop rows that are right."""

@@ -15,21 +15,6 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = [
-    "euler_zyx_to_matrix",
-    "geodesic_angle",
-    "matrix_to_euler_zyx",
-    "matrix_to_quaternion",
-    "matrix_to_rotation_vector",
-    "nearest_rotation",
-    "quaternion_to_matrix",
-    "rotation_vector_rate",
-    "rotation_vector_to_matrix",
-    "skew",
-    "vee",
-    "wrap_angle",
-]
-
 # Below this angle the series' first terms are exact to rounding.
 _SMALL = 1e-9
 

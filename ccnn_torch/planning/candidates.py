@@ -18,8 +18,6 @@ from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.least_squares import jacobian_of
 from ccnn_torch.spelling import nearest
 
-__all__ = ["Candidates", "Seen", "common_coordinates", "draw_candidates", "identification_rows", "what_is_seen"]
-
 Limits = Mapping[str, tuple[float, float]]
 
 # Candidates drawn and evaluated in one call.

@@ -11,9 +11,6 @@ from pydantic import Field
 from ccnn_torch.config.keys import list_keys
 from ccnn_torch.config.tree import Names, Section, config_from_options
 
-__all__ = ["PlanConfig", "describe_plan_keys", "load_plan_config"]
-
-
 Size = float | str
 """A number in SI, or a text of number and unit, such as `0.1 mm` or `0.03 deg`."""
 

@@ -20,8 +20,6 @@ from torch import Tensor
 from ccnn_torch.identification.problems.problem import Progress
 from ccnn_torch.planning.small_matrices import forward_substitute, log_determinant, small_cholesky
 
-__all__ = ["Design", "add_best", "exchange", "make_design", "order_by_worth", "removal_loss", "tightest_bound"]
-
 # A gain of the determinant's logarithm that counts, against rounding and endless exchanges.
 _GAIN = 1e-9
 # Information that the first poses start from where there is no prior, as a share of that of an average pose.

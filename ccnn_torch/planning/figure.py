@@ -11,8 +11,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.planning import Plan
 from ccnn_torch.report.figures.style import FLOOR, GREY, SERIES, Plot, styled
 
-__all__ = ["plan_plot"]
-
 
 @styled
 def plan_plot(pose: Sequence[Coordinate], plans: Sequence[Plan], least_gain: float) -> Plot:

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from ccnn_torch.planning.observability import Observability, observability
 
-__all__ = ["Gains", "gains_of", "recommended_count"]
-
 # Successive poses of small gain before the search for more ends: single gains scatter.
 _WINDOW = 3
 

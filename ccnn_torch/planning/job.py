@@ -21,8 +21,6 @@ from ccnn_torch.planning.page import plan_markdown
 from ccnn_torch.records import write_table
 from ccnn_torch.report.figures.style import save_figure
 
-__all__ = ["check_plan_file", "make_plan", "write_plan"]
-
 
 def make_plan(
     mechanism: str | Mechanism, poses: int, config: PlanConfig | None = None, progress: Progress | None = None

@@ -9,8 +9,6 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 
-__all__ = ["INDICES", "Observability", "index_of", "observability"]
-
 INDICES = ("O1", "O2", "O3", "O4", "O5")
 
 

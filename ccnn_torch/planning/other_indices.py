@@ -8,8 +8,6 @@ from torch import Tensor
 from ccnn_torch.identification.problems.problem import Progress
 from ccnn_torch.planning.observability import index_of
 
-__all__ = ["exchange_by_index"]
-
 # Candidates whose index is computed in full in place of a chosen pose; the derivative of the index picks them.
 _SHORTLIST = 256
 _SWEEPS = 50

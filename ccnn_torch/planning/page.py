@@ -8,8 +8,6 @@ from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.planning import Plan
 from ccnn_torch.report.table import Table, markdown_table
 
-__all__ = ["gain_table", "left_out_sentence", "parameter_table", "plan_markdown", "plan_sentence"]
-
 
 def plan_sentence(plan: Plan, least_gain: float) -> str:
     """The gain of a plan over random poses, and the recommended number of poses."""

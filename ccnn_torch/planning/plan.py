@@ -35,8 +35,6 @@ from ccnn_torch.planning.observability import INDICES
 from ccnn_torch.planning.other_indices import exchange_by_index
 from ccnn_torch.spelling import nearest
 
-__all__ = ["Choice", "Plan", "choose_poses", "plan_poses"]
-
 # Draws of random poses that a plan is compared with; odd, for the median.
 _RANDOM = 101
 # Candidates shown in pictures.

@@ -9,8 +9,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["forward_substitute", "log_determinant", "small_cholesky"]
-
 
 def small_cholesky(matrix: Tensor) -> Tensor:
     """Lower factors of symmetric matrices `c x c x ...`; NaN where one is not positive definite."""

@@ -14,8 +14,6 @@ from ccnn_torch.records.table import FILE, Table
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import parse_header, si_unit_of, to_si
 
-__all__ = ["DEFAULT_COVARIATES", "choose_covariates"]
-
 # A cell so many times farther from the column's median than every other one leaves nothing of the others to learn.
 _EXTREME = 1e3
 # A column that varies by less than this share is constant but for how its numbers were written.

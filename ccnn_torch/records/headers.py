@@ -10,8 +10,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import si_unit_of, split_header, to_si
 
-__all__ = ["IGNORE", "Header", "columns_there", "is_number", "read_header"]
-
 # Characters of a name.
 _LONGEST = 100
 IGNORE = "ignore"

@@ -24,20 +24,6 @@ from ccnn_torch.records.table import name_lines as name_lines
 from ccnn_torch.records.table import write_table as write_table
 from ccnn_torch.units import to_si
 
-__all__ = [
-    "DEFAULT_COVARIATES",
-    "JOINT_LIMIT",
-    "Records",
-    "Table",
-    "check_rows",
-    "load_records",
-    "name_lines",
-    "read_pose",
-    "read_table",
-    "stack_columns",
-    "write_table",
-]
-
 # Two turns of a joint, rounded up as the limit of a pose angle is.
 JOINT_LIMIT = 12.6
 # The tool of an arm whose frames are unknown may lengthen its reach by this share.

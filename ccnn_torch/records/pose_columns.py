@@ -21,16 +21,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.records.table import Table
 from ccnn_torch.units import si_unit_of
 
-__all__ = [
-    "EULER_ANGLES",
-    "HasCoordinates",
-    "check_joints",
-    "read_pose",
-    "refuse_lost_orientation",
-    "stack_columns",
-    "unused_joints",
-]
-
 EULER_ANGLES = {
     "kuka": (("kuka_a", "kuka_b", "kuka_c"), "ZYX"),
     "fanuc": (("fanuc_w", "fanuc_p", "fanuc_r"), "xyz"),

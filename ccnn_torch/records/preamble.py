@@ -10,8 +10,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.records.headers import is_number
 from ccnn_torch.units import split_header
 
-__all__ = ["SEPARATORS", "bare_header", "header_row", "is_comment", "refuse_title"]
-
 SEPARATORS = ",;\t"
 """What may stand between the cells of a line of text."""
 

@@ -22,8 +22,6 @@ from ccnn_torch.records.headers import Header, read_header
 from ccnn_torch.records.preamble import SEPARATORS, bare_header, header_row, is_comment, refuse_title
 from ccnn_torch.records.table import Table, name_lines
 
-__all__ = ["Frame", "read_frame", "read_table"]
-
 # Bytes; a million rows of twenty columns. Read, it takes some ten times that in memory.
 _LARGEST_FILE = 500_000_000
 # Exceptions of openpyxl, zipfile and the XML parser on a damaged workbook.

@@ -14,8 +14,6 @@ from ccnn_torch.records.read_table import Frame, read_frame, read_table
 from ccnn_torch.records.table import FILE as FILE
 from ccnn_torch.records.table import Table
 
-__all__ = ["FILE", "Source", "is_frame", "read_source"]
-
 Source = str | Path | Frame | Sequence[str | Path | Frame]
 
 

@@ -36,8 +36,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import to_si
 
-__all__ = ["DEFAULT_BY", "KINDS", "Column", "Split", "fold_splits", "split_rows"]
-
 KINDS = ("random", "group", "block", "column")
 DEFAULT_BY = "position:5mm"
 

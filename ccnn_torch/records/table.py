@@ -18,8 +18,6 @@ from ccnn_torch.files.write import write_whole
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import LARGEST, parse_header, split_header, to_si, write_hint
 
-__all__ = ["FILE", "Table", "name_lines", "write_table"]
-
 FILE = "file"
 """The column that numbers the files where there are several: 0, 1, …"""
 

@@ -39,8 +39,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 
-__all__ = ["ARRAYS_FILE", "RunArrays", "load_arrays", "load_history", "save_arrays", "save_history"]
-
 ARRAYS_FILE = "arrays.safetensors"
 Array = NDArray[np.float64]
 

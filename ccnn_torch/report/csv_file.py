@@ -10,8 +10,6 @@ from typing import Any
 
 from ccnn_torch.files.write import write_whole
 
-__all__ = ["tidy_rows", "write_csv", "write_rows"]
-
 HEADER = ("method", "split", "quantity", "joint", "unit", "median", "low", "high")
 Row = tuple[str, str, str, str, str, float | None, float | None, float | None]
 

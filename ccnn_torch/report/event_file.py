@@ -11,8 +11,6 @@ import time
 from pathlib import Path
 from typing import Any, Self
 
-__all__ = ["EventFile"]
-
 _numbers = itertools.count()
 
 

@@ -10,8 +10,6 @@ from markupsafe import Markup
 
 from ccnn_torch.report.table import Table
 
-__all__ = ["InlineFigure", "page_text", "render", "trusted"]
-
 
 class InlineFigure(NamedTuple):
     """A figure on the page: its name (the id), one sentence, and an `<svg>` element made by this package."""

@@ -17,8 +17,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import parse_json, read_text
 from ccnn_torch.files.write import write_whole
 
-__all__ = ["load_schema", "plain", "read_json", "write_json"]
-
 # Results with all their repeats have some MB.
 _LARGEST = 500_000_000
 

@@ -11,8 +11,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressC
 
 from ccnn_torch.report.table import print_text
 
-__all__ = ["note", "progress_bar", "say", "say_place", "stderr", "stdout", "step_bar", "with_status"]
-
 _Result = TypeVar("_Result")
 
 # Without rich's markup: a name or a path may have [brackets] in it.

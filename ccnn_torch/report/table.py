@@ -12,8 +12,6 @@ from rich.text import Text
 
 from ccnn_torch.display import visible
 
-__all__ = ["Table", "fitting_columns", "markdown_table", "print_labelled", "print_table", "print_text", "table_of"]
-
 # Characters that the first column and columns of words get where the terminal is too narrow for their longest cell.
 _LEAST_FIRST = 14
 _LEAST_WORDS = 24

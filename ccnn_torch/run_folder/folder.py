@@ -13,8 +13,6 @@ from ccnn_torch.errors import InputError, WriteError
 from ccnn_torch.files.write import sweep, write_whole
 from ccnn_torch.run_folder.lock import LOCK, locked
 
-__all__ = ["RunFolder", "kept_for"]
-
 
 @contextmanager
 def kept_for(command: str) -> Iterator[None]:

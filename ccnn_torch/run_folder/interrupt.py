@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["NOTHING_WRITTEN", "Stopped", "if_stopped"]
-
 NOTHING_WRITTEN = "interrupted; nothing was written"
 
 

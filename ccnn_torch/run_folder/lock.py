@@ -17,8 +17,6 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-__all__ = ["LOCK", "locked"]
-
 LOCK = ".lock"
 
 # Offset of the locked byte, far beyond the process number, which others must be able to read (Windows).

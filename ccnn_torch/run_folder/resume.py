@@ -13,8 +13,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.training import load_checkpoint
 from ccnn_torch.version import __version__
 
-__all__ = ["facts_of", "refuse_changes"]
-
 # Keys that may differ: the folder may have been moved, and where it runs and what is written last change no result.
 _FREE = ("out", "save_models", "save_report", "engine", "max_bytes")
 _MOST = 3

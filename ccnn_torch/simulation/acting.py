@@ -16,8 +16,6 @@ from ccnn_torch.simulation.limits import refuse_impossible
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import to_si
 
-__all__ = ["Injected", "Wanted", "act", "read_wanted", "units_of"]
-
 _FORM = re.compile(r"(?P<name>.+?\.py:[^:]+|[^:]+)(?::(?P<rest>.*))?")
 _VALUE = re.compile(r"(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\s\d].*)?")
 SIZE = "size"

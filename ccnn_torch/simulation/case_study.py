@@ -13,8 +13,6 @@ from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.simulation.cases import CaseStudy
 from ccnn_torch.simulation.machines.realistic import RealisticMachine
 
-__all__ = ["CaseSimulation", "RealisticSimulation", "Simulation", "simulate_realistic"]
-
 
 class Simulation(Protocol):
     """A machine with known true behaviour.

@@ -18,8 +18,6 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, PoseError, load_mechanism
 
-__all__ = ["CASES", "VARIANTS", "CaseStudy", "build_case"]
-
 CASES = ("tripod", "machine_tool")
 VARIANTS = ("printed", "tabulated")
 

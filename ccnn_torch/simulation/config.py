@@ -12,8 +12,6 @@ from ccnn_torch.config.keys import list_keys
 from ccnn_torch.config.tree import Section, config_from_options
 from ccnn_torch.effects.covariates import SHIFT
 
-__all__ = ["SimulateConfig", "describe_simulate_keys", "load_simulate_config"]
-
 Positive = Annotated[float, Field(gt=0)]
 
 

@@ -14,8 +14,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["Instrument", "PointsView", "make_instrument"]
-
 
 @dataclass(frozen=True)
 class Instrument:

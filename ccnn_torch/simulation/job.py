@@ -20,8 +20,6 @@ from ccnn_torch.simulation.limits import refuse_beyond_bounds
 from ccnn_torch.simulation.outliers import bad_rows
 from ccnn_torch.simulation.rows import draw_moves, draw_poses
 
-__all__ = ["Simulated", "simulate_records"]
-
 
 @dataclass(frozen=True)
 class Simulated:

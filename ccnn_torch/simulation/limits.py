@@ -10,8 +10,6 @@ from ccnn_torch.coordinates import Parameter
 from ccnn_torch.effects import Acting, Effect, Situation
 from ccnn_torch.errors import InputError
 
-__all__ = ["refuse_beyond_bounds", "refuse_impossible"]
-
 # Times its plausible size: beyond this the unit must be wrong (mm for m, degrees for radians).
 _ABSURD = 1000.0
 

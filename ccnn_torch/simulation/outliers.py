@@ -8,8 +8,6 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.simulation.acting import Wanted
 
-__all__ = ["bad_rows"]
-
 _KEYS = {"share": (0.03, "share of the rows"), "size": (1e-3, "standard deviation, in m and rad")}
 
 

@@ -14,8 +14,6 @@ from ccnn_torch.records import name_lines, write_table
 from ccnn_torch.report.table import Table
 from ccnn_torch.simulation.job import Simulated
 
-__all__ = ["injected_table", "write_simulated"]
-
 
 def write_simulated(path: Path, simulated: Simulated) -> None:
     """Write the records: joints, pose, covariates, in SI.

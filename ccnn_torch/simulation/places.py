@@ -12,8 +12,6 @@ from ccnn_torch.config.sizes import Size, size
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
 
-__all__ = ["Places"]
-
 # Rounds of drawing before a box counts as out of reach.
 _ROUNDS = 50
 

@@ -8,8 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["generator_of", "normal_draws"]
-
 
 def generator_of(*seeds: int) -> torch.Generator:
     """A generator of its own for each tuple of seeds; numpy's hashing makes neighbouring seeds independent."""

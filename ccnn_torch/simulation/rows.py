@@ -12,8 +12,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.simulation.config import SimulateConfig
 
-__all__ = ["draw_moves", "draw_poses"]
-
 # Between two moves; rows so far apart are not taken for one trajectory [s].
 _PAUSE = 2.0
 # For velocities, as a share of a move.

@@ -19,8 +19,6 @@ from ccnn_torch.calibration.learning.uncertainty import sd_scale
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.training import Scaling, Training, train
 
-__all__ = ["LearnerRegressor", "SteppedRegressor"]
-
 _Floats = NDArray[np.float64]
 
 

@@ -24,8 +24,6 @@ from ccnn_torch.starter.recognise import (
 )
 from ccnn_torch.units import to_si
 
-__all__ = ["starter_config"]
-
 Ask = Callable[[str], str]
 _ORIENTATION = {"rx": "a rotation vector, as Universal Robots gives it", "kuka_a": "KUKA's A, B, C (Rz Ry Rx)",
                 "fanuc_w": "Fanuc's W, P, R (fixed axes x, y, z)", "staubli_rx": "Stäubli's Rx, Ry, Rz",

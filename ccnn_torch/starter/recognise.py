@@ -16,8 +16,6 @@ from ccnn_torch.records.pose_columns import EULER_ANGLES
 from ccnn_torch.records.table import Table
 from ccnn_torch.units import si_unit_of
 
-__all__ = ["Recognised", "recognise", "suitable_mechanisms", "unit_pair"]
-
 _JOINT = re.compile(r"(q|j|a|joint|axis|achse|theta)0*(\d+)")
 _POSITION = {"x", "y", "z"}
 # Names of conditions in German, French, Italian and Spanish; taken only where unit and values fit, too.

@@ -19,8 +19,6 @@ from ccnn_torch.engine import Engine
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import read_yaml
 
-__all__ = ["Suite", "SuiteFile", "load_suite"]
-
 # Keys of the suite itself, where they come from the command line.
 _OWN = ("name", "out", "engine")
 

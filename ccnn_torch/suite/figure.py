@@ -10,8 +10,6 @@ from matplotlib.figure import Figure
 from ccnn_torch.display import count_text
 from ccnn_torch.report.figures.style import FLOOR, GREY, SERIES, Plot, styled
 
-__all__ = ["suite_plot"]
-
 # The methods of a row are offset, so that their intervals do not overlap.
 _SPREAD = 0.62
 

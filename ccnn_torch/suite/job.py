@@ -22,8 +22,6 @@ from ccnn_torch.suite.config import Suite
 from ccnn_torch.suite.page import compare, write_suite
 from ccnn_torch.suite.tables import case_line, print_suite
 
-__all__ = ["check_folder", "finish_cases", "run_suite"]
-
 
 def run_suite(suite: Suite, quiet: bool = False) -> Path:
     """Run the cases that are not finished yet, then compare the methods over all of them.

@@ -24,8 +24,6 @@ from ccnn_torch.report.json_files import write_json
 from ccnn_torch.suite.figure import suite_plot
 from ccnn_torch.suite.tables import suite_markdown
 
-__all__ = ["CLOSE", "compare", "write_suite"]
-
 CLOSE = 1.05
 DEFINITIONS = {
     "best": "lowest median, over the repeats, of the held-out mean squared error over all joints",

@@ -11,8 +11,6 @@ from rich.console import Console
 from ccnn_torch.display import count_text, display_unit, interval_text, number_text
 from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
 
-__all__ = ["case_line", "print_suite", "suite_markdown", "suite_tables"]
-
 # The learner whose rank is shown in each case, if it was run.
 _WATCHED = "ccnn"
 

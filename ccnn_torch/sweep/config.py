@@ -13,8 +13,6 @@ from ccnn_torch.calibration.config import RunConfig, load_config
 from ccnn_torch.engine import check_engine
 from ccnn_torch.errors import InputError
 
-__all__ = ["Sweep", "load_sweep"]
-
 _LONGEST = 80
 
 

@@ -18,8 +18,6 @@ from ccnn_torch.run_folder.lock import locked
 from ccnn_torch.suite.job import check_folder, finish_cases
 from ccnn_torch.sweep.config import Sweep
 
-__all__ = ["Row", "run_sweep", "sweep_rows"]
-
 _FIGURES = (
     *("best_method", "joint_mse", "joint_mse_low", "joint_mse_high", "joint_unit", "ratio_to_floor[1]"),
     *("position_before[m]", "position_after[m]", "rotation_before[rad]", "rotation_after[rad]", "seconds[s]", "failed"),

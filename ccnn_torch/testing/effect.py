@@ -17,8 +17,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
-__all__ = ["check_effect"]
-
 _ROWS = 8
 # Differences of `reached` over this share of a plausible size, and how well they fit what is to be linear [1].
 _SHARE, _SLOPE_TOLERANCE = 1e-3, 1e-4

@@ -14,8 +14,6 @@ from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.learners.protocol import missing_verbs
 from ccnn_torch.training import weighted_mse
 
-__all__ = ["check_learner"]
-
 
 def check_learner(factory: Callable[[], Learner], rows: int = 40) -> None:
     """Train fresh learners on small synthetic data, as one repeat and as three, and check the contract of `Learner`.

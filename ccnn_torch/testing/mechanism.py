@@ -13,8 +13,6 @@ from ccnn_torch.mechanisms.assembly_mode import jump_sentence
 from ccnn_torch.mechanisms.protocol import wrong_names
 from ccnn_torch.numerics.rotations import vee
 
-__all__ = ["check_mechanism"]
-
 _BATCHES: tuple[tuple[int, ...], ...] = ((), (2,), (2, 3))
 # A root is settled to about 1e-12; a pose closes to this [m, rad].
 _CLOSES = 1e-8

@@ -8,8 +8,6 @@ from torch import Tensor
 
 from ccnn_torch.learners.protocol import Learner, TrainingData
 
-__all__ = ["Callback"]
-
 
 class Callback(Protocol):
     """Called by `train` in the order given; may add metrics for those after it, must not change the learner."""

@@ -14,8 +14,6 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 
-__all__ = ["load_checkpoint", "save_checkpoint", "tensor_digest"]
-
 
 def tensor_digest(tensors: dict[str, Tensor]) -> str:
     """SHA-256 over names, types, shapes and bytes; safetensors itself does not notice a flipped byte."""

@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["interrupts_held_back"]
-
 
 @contextmanager
 def interrupts_held_back() -> Iterator[None]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Scaling"]
-
 # Share of the largest deviation of the outputs below which one is rounding.
 _ROUNDING = 1e-9
 

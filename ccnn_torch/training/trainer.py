@@ -18,8 +18,6 @@ from ccnn_torch.training.callbacks import Callback
 from ccnn_torch.training.checkpoint import load_checkpoint, save_checkpoint, tensor_digest
 from ccnn_torch.training.interrupt import interrupts_held_back
 
-__all__ = ["Training", "past_of", "train", "weighted_mse"]
-
 
 @dataclass
 class Training:

@@ -9,8 +9,6 @@ from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.figures.style import AFTER, BEFORE, RASTER_ABOVE, Plot, styled
 
-__all__ = ["pose_rows_plot", "predicted_plot"]
-
 
 @styled
 def predicted_plot(arrays: RunArrays) -> Plot:

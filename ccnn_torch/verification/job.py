@@ -25,8 +25,6 @@ from ccnn_torch.verification.promise import configurations, paired_gain, promise
 from ccnn_torch.verification.result import Verified, error_block, figure_arrays, rms
 from ccnn_torch.verification.tables import verify_text
 
-__all__ = ["verify_model"]
-
 # A moved measuring frame is suspected if correcting it halves the remaining RMS error at least.
 _SUSPECT = 0.5
 

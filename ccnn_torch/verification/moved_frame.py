@@ -12,8 +12,6 @@ from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.mechanisms.frames.closed_form_start import rigid_body_frame
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 
-__all__ = ["Motion", "fit_motion"]
-
 # Weight of orientation against position [m/rad], as in fits of an arm's frames.
 _ROTATION_WEIGHT = 0.3
 _NEEDED = 4

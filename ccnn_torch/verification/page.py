@@ -13,8 +13,6 @@ from ccnn_torch.report.html import page_text
 from ccnn_torch.report.json_files import write_json
 from ccnn_torch.verification.tables import verify_tables
 
-__all__ = ["write_verify_report"]
-
 
 def write_verify_report(folder: Path, results: Mapping[str, Any], arrays: RunArrays) -> list[Path]:
     """Write `verify.html` and `verify.json` into a folder, which is made."""

@@ -21,8 +21,6 @@ from ccnn_torch.records.headers import columns_there
 from ccnn_torch.records.sources import read_source
 from ccnn_torch.verification.moved_frame import Motion
 
-__all__ = ["Rows", "judge", "mapped_columns", "nominal_mechanism", "predict", "pseudoerror_settings"]
-
 # As in a run, if no card gives it: weight of orientation [m/rad], and damping of an arm's joint deviation.
 _ROTATION_WEIGHT, _ARM_DAMPING = 0.04, 0.01
 

@@ -16,8 +16,6 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.report.json_files import read_json
 
-__all__ = ["configurations", "paired_gain", "promise_block", "promise_of", "promised"]
-
 # Rows whose commanded joints round to the same cell are one configuration, measured several times [SI].
 _CELL = {"m": 1e-4, "rad": 1e-3}
 # Squared length of independent normal errors in three directions: variance over squared mean.

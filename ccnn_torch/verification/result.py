@@ -13,8 +13,6 @@ from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.verification.prediction import Rows
 
-__all__ = ["Verified", "error_block", "figure_arrays", "rms"]
-
 
 @dataclass(frozen=True)
 class Verified:

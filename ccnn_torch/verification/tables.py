@@ -8,8 +8,6 @@ from typing import Any
 from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.report.table import Table
 
-__all__ = ["verify_tables", "verify_text"]
-
 Results = Mapping[str, Any]
 _KINDS = ("position", "rotation")
 

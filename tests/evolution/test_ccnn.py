@@ -12,8 +12,9 @@ from torch import Tensor
 from ccnn_torch.evolution import Coevolution, forward
 from ccnn_torch.evolution.evaluation import fitness, joined_errors
 from ccnn_torch.evolution.genome import active
+from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.learners.ccnn import CCNN
 from ccnn_torch.training import Scaling
 
 SMALL = CCNNSettings(

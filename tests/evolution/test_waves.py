@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evolution.gauss_newton import dense_jacobian, linearise, network_of, residual
-from ccnn_torch.evolution.refinement import Refined, refine
+from ccnn_torch.evolution.refinement import refine
+from ccnn_torch.evolution.refinement_state import Refined
+from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.evolution.waves import Waves, find_waves, no_waves, wave_signal
 from ccnn_torch.learners import TrainingData, structure
-from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.learners.ccnn import CCNN
 
 QUICK = CCNNSettings(
     hidden=(6,), rival_hidden=(), generations=1, population=10, members=2, kept=2, waves=4, refinement_iterations=40

@@ -10,8 +10,6 @@ from torch import Tensor
 
 from ccnn_torch.effects import Coefficient, Effect, Situation, signature
 
-__all__ = ["Atom", "default_shape", "scaled_signature", "scales"]
-
 
 @dataclass(frozen=True)
 class Atom:

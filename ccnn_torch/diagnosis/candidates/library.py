@@ -17,15 +17,6 @@ from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Acting, Effect, Situation
 
-__all__ = [
-    "Known",
-    "candidates_about_nominal",
-    "candidates_about_set",
-    "default_atom",
-    "has_usual_shape",
-    "without_unused_rows",
-]
-
 LOG_PRIOR = math.log(0.1)
 
 

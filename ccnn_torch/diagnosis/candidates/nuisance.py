@@ -13,8 +13,6 @@ from torch import Tensor, unflatten
 
 from ccnn_torch.diagnosis.evidence.single_groups import GroupProducts, fit_single_groups
 
-__all__ = ["NuisanceFit", "SharedColumns", "TrialColumns", "search_charge"]
-
 _DIGITS = 1e-13
 # Relative ridge of the regression on a candidate.
 _RIDGE = 1e-6

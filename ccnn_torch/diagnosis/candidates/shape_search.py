@@ -14,8 +14,6 @@ from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns,
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Effect, Shape, Situation
 
-__all__ = ["Scan", "SearchRows", "Shaped"]
-
 # The grid, then twice this many values between the neighbours of the best.
 _FINE, _ROUNDS = 9, 3
 # Log odds, less than these being chance, for which values between those of the grid are evaluated.

@@ -14,8 +14,6 @@ from ccnn_torch.diagnosis.evidence.single_groups import GroupProducts, fit_singl
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Situation
 
-__all__ = ["single_joint_atoms", "without_secondary"]
-
 # Spread of the log size of an effect that is in one joint or leg alone.
 _SIZE_SPREAD = 4.0
 # What it costs to be told with secondary coefficients or without.

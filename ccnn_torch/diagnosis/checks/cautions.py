@@ -22,8 +22,6 @@ from ccnn_torch.diagnosis.verdict.plausible import implausible_size
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Situation
 
-__all__ = ["Caution", "cautions", "row_cautions"]
-
 # What a verdict is worth beside a caution; and beside one that says that it rests on nothing.
 _DOUBTED, _HOLLOW = 0.9, 0.5
 # Size of the machine, of which no calibration is so far off.

@@ -17,8 +17,6 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.search.shared_noise import without_fitted
 from ccnn_torch.effects import Situation
 
-__all__ = ["column_mistake"]
-
 # Log odds that an effect must gain by a correction, over all that was found without it: mistakes are rare.
 _GAIN = 10.0
 # Effects that need columns, by how these begin.

@@ -10,8 +10,6 @@ import torch
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 
-__all__ = ["Scatter", "joint_scatter"]
-
 # Variances of a joint that are tried, in units of what would be as much as the noise of the usual row.
 _VARIANCES = torch.logspace(-2, 3, 41, dtype=torch.float64)
 # Log likelihood that the scatter of one joint adds, from which it is no chance: noise alone adds up to 2 in trials.

@@ -15,8 +15,6 @@ from ccnn_torch.mechanisms import Framed, SerialArm
 from ccnn_torch.mechanisms.frames.closed_form_start import best_closed_form
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 
-__all__ = ["frame_remedy", "placed"]
-
 # Share of the usual distance that a fitted frame may leave.
 _LEFT = 0.1
 

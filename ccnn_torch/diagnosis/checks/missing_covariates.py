@@ -18,8 +18,6 @@ from ccnn_torch.effects import Effect, Situation, pose_residual
 from ccnn_torch.effects.covariates import covariate_units, draw_covariates
 from ccnn_torch.errors import InputError
 
-__all__ = ["missing_covariates"]
-
 # Speeds are not among them: rows at rest, as most are, have none.
 _KINDS = ("time", "temperature", "load", "direction")
 # A usual row is found among so many.

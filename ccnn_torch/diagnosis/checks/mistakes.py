@@ -15,8 +15,6 @@ from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.effects import Situation
 from ccnn_torch.mechanisms import BlackBox, Framed
 
-__all__ = ["late_rows", "mistake", "what_is_wrong"]
-
 # A mistake is named where without it so small a share of the distance is left.
 _MENDED = 0.1
 _FEW = 40

@@ -13,8 +13,6 @@ from ccnn_torch.diagnosis.residual.rows import picked
 from ccnn_torch.effects import Situation
 from ccnn_torch.errors import RowsError
 
-__all__ = ["PlausibleRows", "plausible_rows"]
-
 # Sizes of the machine: a row farther off is of other joints.
 _ROW = 1.0
 # Rows astray among which a mistake in common is searched.

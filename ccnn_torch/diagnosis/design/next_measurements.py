@@ -18,8 +18,6 @@ from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Situation
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["next_measurements"]
-
 _CANDIDATES = 400
 _WANTED = 8
 _RIVALS = 3

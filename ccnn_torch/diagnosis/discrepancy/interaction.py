@@ -13,8 +13,6 @@ from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns,
 from ccnn_torch.diagnosis.discrepancy.smooth import LOG_PRIOR, driver_of, unit_range
 from ccnn_torch.effects import Situation
 
-__all__ = ["CROSS", "interaction_discrepancies"]
-
 CROSS = " × "
 """Between the two drivers in the name of such a term."""
 

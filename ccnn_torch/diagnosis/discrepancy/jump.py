@@ -11,8 +11,6 @@ from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns, search_charge
 from ccnn_torch.diagnosis.discrepancy.smooth import LOG_PRIOR
 
-__all__ = ["jump_discrepancies"]
-
 # Rows before the first possible jump and after the last, and places that are tried, at most.
 _FEWEST_ROWS, _PLACES = 5, 120
 

@@ -24,8 +24,6 @@ from ccnn_torch.diagnosis.discrepancy.smooth import (
 )
 from ccnn_torch.effects import Situation
 
-__all__ = ["linear_discrepancies"]
-
 # What bends against what is straight.
 _BEND = 0.5
 _MOST = 60

@@ -22,8 +22,6 @@ from ccnn_torch.diagnosis.discrepancy.smooth import LOG_PRIOR, joint_moves, plat
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Situation
 
-__all__ = ["local_discrepancies"]
-
 # Places evaluated along a joint's track and in the workspace, and radii as shares of half the range.
 _ALONG, _WITHIN = 21, 40
 _RADII_ALONG, _RADII_WITHIN = (0.1, 0.17, 0.3), (0.25, 0.4, 0.65)

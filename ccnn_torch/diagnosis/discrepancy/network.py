@@ -16,11 +16,10 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, folds, resampled
 from ccnn_torch.diagnosis.verdict.blocks import noise_floor
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
+from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners import Learner, TrainingData
-from ccnn_torch.learners.ccnn import CCNN, CCNNSettings
+from ccnn_torch.learners.ccnn import CCNN
 from ccnn_torch.training import Scaling, train
-
-__all__ = ["Progress", "remaining_gain", "with_network"]
 
 Progress = Callable[[float], None]
 """Told the share that is done, 0 to 1."""

@@ -12,8 +12,6 @@ from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns, search_charge
 from ccnn_torch.diagnosis.discrepancy.smooth import LOG_PRIOR
 
-__all__ = ["periodic_discrepancy"]
-
 # Periods in the time of the rows: from where the waves of any course end, to so many rows a period, or so many in all.
 _SLOWEST, _ROWS_A_PERIOD, _MOST = 8.0, 3.0, 130.0
 _STEP = 1 / 3

@@ -16,20 +16,6 @@ from torch import Tensor
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.effects import Situation
 
-__all__ = [
-    "ANY",
-    "LOG_PRIOR",
-    "SPEED",
-    "driver_of",
-    "joint_moves",
-    "platform_moves",
-    "products",
-    "reduced",
-    "smooth_discrepancies",
-    "spread_out",
-    "unit_range",
-]
-
 # A discrepancy term is that much less probable than no deviation of its kind, before the data are seen.
 LOG_PRIOR = math.log(1e-3)
 # And one that holds most of what a library effect does has to be better than that effect by as much again.

@@ -14,8 +14,6 @@ from torch import Tensor
 from ccnn_torch.diagnosis.evidence.hyperparameters import Scales
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams
 
-__all__ = ["BatchedFits", "column_indices", "fit_batched_sets"]
-
 _DIGITS = 1e-13
 
 

@@ -11,8 +11,6 @@ from torch import Tensor
 from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.diagnosis.evidence.single_groups import NO_COLUMNS, GroupProducts, fit_single_groups
 
-__all__ = ["gain_beside"]
-
 
 def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tensor], y: Tensor) -> list[float]:
     """Log evidence that each group of columns adds to a set.

@@ -15,8 +15,6 @@ from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, scaled
 from ccnn_torch.diagnosis.evidence.single_groups import NO_COLUMNS, GroupProducts, fit_single_groups, own_products
 
-__all__ = ["CERTAIN", "Dictionary", "FittedSet", "Singles", "covariance", "dictionary_of", "singles_of", "with_noise"]
-
 # Columns from which their products with all others are worth a call of their own.
 _NARROW = 128
 CERTAIN = 100.0

@@ -12,8 +12,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["FIRST_NOISE", "LIMIT", "SPREAD", "Scales"]
-
 # Spread of log α² about a coefficient's plausible size: a factor of 7 in α, either way.
 SPREAD = 4.0
 LIMIT = 25.0

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.hyperparameters import FIRST_NOISE, LIMIT, SPREAD, Scales
 
-__all__ = ["Fits", "Grams", "fit_sets", "grams_of", "padded", "scaled", "without"]
-
 # Columns up to which XᵀX is made as a whole.
 _NARROW = 128
 # MacKay updates.

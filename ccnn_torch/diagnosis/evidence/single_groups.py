@@ -15,17 +15,6 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.hyperparameters import FIRST_NOISE, LIMIT, SPREAD, Scales
 
-__all__ = [
-    "NO_COLUMNS",
-    "Axes",
-    "GroupProducts",
-    "SingleFits",
-    "axes_of",
-    "fit_in_axes",
-    "fit_single_groups",
-    "own_products",
-]
-
 _UPDATES = 8
 # Principal axes with less than this share of the largest one's squares are rounding.
 _DIGITS = 1e-14

@@ -14,8 +14,6 @@ from ccnn_torch.diagnosis.shrink.held_out import held_out
 from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.mechanisms import SerialArm
 
-__all__ = ["picture_arrays"]
-
 Column = tuple[str, str, Tensor]
 """Name, SI unit and values."""
 # Quantile bins of a driver; the one whose bins hold most of an effect's variance is the signature of the effect.

@@ -7,8 +7,6 @@ from ccnn_torch.diagnosis.verdict.text import aside_text
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.table import Table
 
-__all__ = ["check_table", "check_text"]
-
 # Confusable effects shown for each effect.
 _LIKEST = 3
 

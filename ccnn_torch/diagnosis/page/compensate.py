@@ -18,8 +18,6 @@ from ccnn_torch.effects import OUTLIER, Acting, Situation, reached
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import BlackBox
 
-__all__ = ["compensate_lines", "typed_path"]
-
 
 def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -> tuple[str, ...]:
     """A sentence, and the command lines to copy; () where there is nothing to compensate.

@@ -19,23 +19,6 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.json_files import read_json, write_json
 
-__all__ = [
-    "ARRAYS",
-    "CORRECTED",
-    "LABELS",
-    "NEXT",
-    "RESULT",
-    "About",
-    "Signature",
-    "about_of",
-    "gaps_of",
-    "load_diagnosis_arrays",
-    "load_labels",
-    "save_diagnosis_arrays",
-    "signatures_of",
-    "used_rows",
-]
-
 Array = NDArray[np.float64]
 ARRAYS = "diagnosis.safetensors"
 LABELS = "diagnosis_pictures.json"

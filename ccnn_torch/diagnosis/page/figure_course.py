@@ -13,8 +13,6 @@ from ccnn_torch.display import display_unit
 from ccnn_torch.motion.phases import PHASES
 from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, GREY, SERIES, Plot, styled
 
-__all__ = ["course_plot"]
-
 Arrays = Mapping[str, NDArray[np.float64]]
 # Joints that are drawn, those with the largest gap.
 _MOST = 3

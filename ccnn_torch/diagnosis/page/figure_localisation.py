@@ -15,8 +15,6 @@ from ccnn_torch.diagnosis.page.localisation import shares
 from ccnn_torch.report.figures.style import AFTER, Plot, styled
 from ccnn_torch.report.figures.workspace import draw_pairs, height_of, planes_of
 
-__all__ = ["remainder_map", "where_plot"]
-
 Array = NDArray[np.float64]
 Block = Mapping[str, Any]
 # Groups of shares that are parts of the machine; the others are conditions of the rows.

@@ -16,8 +16,6 @@ from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, GREY, Plot, styled
 
-__all__ = ["machine_plot"]
-
 Array = NDArray[np.float64]
 
 # The prefix of the lines' names among the arrays.

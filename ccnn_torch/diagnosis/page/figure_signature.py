@@ -14,8 +14,6 @@ from ccnn_torch.diagnosis.page.data import Signature, used_rows
 from ccnn_torch.display import display_unit, unit_text
 from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, GREY, RASTER_ABOVE, Plot, styled
 
-__all__ = ["axis_values", "signature_plot"]
-
 Array = NDArray[np.float64]
 _KELVIN = 273.15
 # A driver with no more values than this (a direction, a load put on or not) is drawn as columns of points.

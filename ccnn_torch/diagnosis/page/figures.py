@@ -14,8 +14,6 @@ from ccnn_torch.diagnosis.verdict.text import driver_words, floor_words, probabi
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, GREY, SERIES, Plot, styled
 
-__all__ = ["gap_plot", "probability_plot"]
-
 Block = Mapping[str, Any]
 _LIKE = SERIES[4]
 # Candidates below this probability are not drawn one by one.

@@ -23,8 +23,6 @@ from ccnn_torch.diagnosis.verdict.text import (
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.report.table import markdown_table, print_labelled, print_table, print_text
 
-__all__ = ["ON_PAGE", "Answer", "first_screen", "first_screen_markdown", "print_first_screen"]
-
 Block = Mapping[str, Any]
 # Numbers of all effects on a screen; a page has room for more.
 _ON_SCREEN, ON_PAGE = 6, 16

@@ -16,17 +16,6 @@ from ccnn_torch.display import display_unit, number_text, unit_text
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.table import Table
 
-__all__ = [
-    "aside_table",
-    "next_table",
-    "quantity_text",
-    "regime_words",
-    "region_table",
-    "shares",
-    "where_table",
-    "write_next_csv",
-]
-
 Block = Mapping[str, Any]
 _KELVIN = 273.15
 # Unit that a controller shows in the place of that of the SI, the factor and what is added.

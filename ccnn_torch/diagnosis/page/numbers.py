@@ -11,8 +11,6 @@ from ccnn_torch.display import display_unit, unit_text
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.report.table import Table
 
-__all__ = ["numbers_table"]
-
 Block = Mapping[str, Any]
 _Z95 = 1.96
 # Numbers of an effect, however many effects there are.

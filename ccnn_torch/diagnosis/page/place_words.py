@@ -12,8 +12,6 @@ from ccnn_torch.diagnosis.verdict.findings import places
 from ccnn_torch.diagnosis.verdict.text import listed
 from ccnn_torch.effects import OUTLIER
 
-__all__ = ["where_words"]
-
 Block = Mapping[str, Any]
 
 # Joints that are named, and the share from which.

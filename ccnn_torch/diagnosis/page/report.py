@@ -48,8 +48,6 @@ from ccnn_torch.report.table import Table, markdown_table, print_table, print_te
 if TYPE_CHECKING:
     from ccnn_torch.report.figures.style import Plot
 
-__all__ = ["NEXT", "diagnosis_markdown", "print_diagnosis", "write_diagnosis_report"]
-
 Block = Mapping[str, Any]
 Arrays = Mapping[str, NDArray[np.float64]]
 _MARKDOWN = "diagnosis.md"

@@ -18,19 +18,6 @@ from ccnn_torch.diagnosis.verdict.text import (
 from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.table import Table
 
-__all__ = [
-    "columns_text",
-    "confusable_table",
-    "effect_table",
-    "gap_table",
-    "order_table",
-    "parameter_table",
-    "percent",
-    "percent_interval",
-    "record_table",
-    "unseen_table",
-]
-
 Block = Mapping[str, Any]
 _Z95 = 1.96
 _REMOVED = (

@@ -8,8 +8,6 @@ from typing import Any
 
 from ccnn_torch.report.event_file import EventFile
 
-__all__ = ["write_diagnosis_events"]
-
 
 def write_diagnosis_events(
     folder: Path, results: Mapping[str, Any], verdict: str, pictures: Mapping[str, Path]

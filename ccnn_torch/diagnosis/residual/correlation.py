@@ -13,8 +13,6 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-__all__ = ["INDEPENDENT", "Correlation", "targets_of"]
-
 # Targets from which it can be seen what their readings share.
 _FEWEST_TARGETS = 8
 # Joints that differ by less than this share of their range are of one target.

@@ -9,8 +9,6 @@ from torch import Tensor
 
 from ccnn_torch.effects import Situation, pose_residual
 
-__all__ = ["USUAL", "Size", "distance", "size_of"]
-
 USUAL = 0.3
 """Sizes of the machine: where the usual row is so far off, no small deviation is to be searched in any of them."""
 # What a machine that does not move or turn is taken to [m], [rad].

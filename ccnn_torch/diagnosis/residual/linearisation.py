@@ -12,8 +12,6 @@ from ccnn_torch.diagnosis.candidates.atom import scales
 from ccnn_torch.effects import Acting, Effect, Situation, reached
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
-__all__ = ["moved", "remainder", "signature_at", "tangent"]
-
 
 def moved(situation: Situation, acting: Sequence[Acting]) -> Situation:
     """The same rows with joints and parameters as the effects make them."""

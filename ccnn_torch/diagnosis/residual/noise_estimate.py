@@ -21,8 +21,6 @@ from ccnn_torch.diagnosis.evidence.single_groups import (
 )
 from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, LEAST_NOISE, MAD, NO_NOISE, Whitening, reweighted
 
-__all__ = ["fitted_whitening"]
-
 # The richest fit: at most so many candidates, the log evidence from which one is taken in, the spread of its log size.
 _RICH, _SLIGHT, _ANY_SIZE = 8, 3.0, 6.0
 # Candidates that are evaluated with the rows' weights as they are, the most promising when all weigh alike.

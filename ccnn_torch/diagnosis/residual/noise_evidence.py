@@ -14,8 +14,6 @@ from ccnn_torch.effects import Situation, pose_residual
 from ccnn_torch.records import Records
 from ccnn_torch.units import si_unit_of
 
-__all__ = ["Noise", "column_names", "noise_of_columns", "noise_of_repeats"]
-
 # Readings beyond the first of their target that make an estimate.
 _FEWEST = 20
 # What a column of standard deviations may be called, `{}` being the coordinate.

@@ -9,8 +9,6 @@ from torch import Tensor
 
 from ccnn_torch.effects import Situation
 
-__all__ = ["copies_of", "frame_columns", "near_singular", "picked"]
-
 # Rows are left out where the Jacobian is worse conditioned than this and than ten times the usual.
 _CONDITION = 50.0
 _TIMES_USUAL = 10.0

@@ -15,8 +15,6 @@ from ccnn_torch.mechanisms import BlackBox, Framed, Mechanism
 from ccnn_torch.records import Records
 from ccnn_torch.units import LARGEST, parse_header, si_unit_of
 
-__all__ = ["refuse_lost_rows", "simulator_inputs"]
-
 
 def simulator_inputs(
     records: Records, mechanism: Mechanism, covariates: Mapping[str, Tensor]

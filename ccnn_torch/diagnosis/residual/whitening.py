@@ -10,18 +10,6 @@ from torch import Tensor
 
 from ccnn_torch.effects import Situation
 
-__all__ = [
-    "LEAST_FREE",
-    "LEAST_NOISE",
-    "MAD",
-    "NO_NOISE",
-    "Whitening",
-    "moving_channels",
-    "renewed",
-    "reweighted",
-    "without_frames",
-]
-
 # Degrees of freedom of the row weights (Student t), and beyond how many times its noise a row is set aside.
 _DEGREES = 4.0
 _GROSS = 6.0

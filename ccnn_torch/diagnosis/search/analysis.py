@@ -44,8 +44,6 @@ from ccnn_torch.diagnosis.search.shared_noise import (
 )
 from ccnn_torch.effects import Acting, Effect, Situation, pose_residual
 
-__all__ = ["Analysis", "analyse"]
-
 # Share of the rows at which the machine must be linearised about a set; else it is so about the nominal machine.
 _LINEARISED = 0.9
 # Values for which the weight of a noise that was given grows by one: it is right to some per cent.

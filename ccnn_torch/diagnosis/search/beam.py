@@ -12,8 +12,6 @@ from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet, dictionary_of, singles_of
 from ccnn_torch.diagnosis.search.sets import promising
 
-__all__ = ["probable_sets", "search"]
-
 _MOST = 4
 # Pairs that go on to sets of three; in a quick search, which ends with pairs, the atoms that these are made of.
 _BEAM, _LIKELIEST = 5, 8

@@ -13,8 +13,6 @@ from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.diagnosis.search.sets import subsets_with_one_less
 
-__all__ = ["discrepancy_is_active", "has_new_effects", "is_converged", "known_shapes", "most_probable_shapes"]
-
 # Share of the gap's energy that goes with effects that were added and not without them, below which they are no reason
 # to search again: they correct the form of the others.
 _ADDED = 0.004

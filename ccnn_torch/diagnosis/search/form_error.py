@@ -18,9 +18,6 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.search.beam import probable_sets
 from ccnn_torch.effects import EXACT
 
-__all__ = ["DIRECTIONS", "LEVELS", "OF_EXACT", "OF_FORM", "OF_SMOOTH", "Posterior", "form_variance", "is_unexplained"]
-__all__ += ["with_form_error"]
-
 OF_EXACT, OF_FORM, OF_SMOOTH = 1e-6, 5e-5, 3e-4
 """Share φ of an effect's squares that its form error adds to the noise in every direction: of an exact form only
 the second order; of other effects; and of a discrepancy term, which is smooth where the cause need not be."""

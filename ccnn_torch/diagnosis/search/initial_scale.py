@@ -12,8 +12,6 @@ from ccnn_torch.diagnosis.evidence.batched_sets import column_indices
 from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.diagnosis.evidence.single_groups import fit_in_axes
 
-__all__ = ["added_scale"]
-
 _DIGITS = 1e-13
 # Sets are evaluated in one batch where their widths differ by less than this.
 _ALIKE = 24

@@ -13,8 +13,6 @@ from ccnn_torch.diagnosis.evidence.batched_sets import BatchedFits, fit_batched_
 from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.diagnosis.search.initial_scale import added_scale
 
-__all__ = ["promising", "scored", "subsets_with_one_less"]
-
 # Updates of a fit; after the short one no set that came within 12 of the best in the end was 30 below it, in trials.
 _UPDATES, _SHORT, _HOPELESS = 4, 1, 40.0
 # What is left of a smaller set's noise to begin with. Two groups may explain together what neither nearly does alone:

@@ -13,8 +13,6 @@ from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
 from ccnn_torch.diagnosis.residual.correlation import INDEPENDENT, Correlation, targets_of
 from ccnn_torch.effects import Situation
 
-__all__ = ["Explanation", "likeliest_correlation", "possible_correlations", "without_fitted"]
-
 # Correlations from row to row, and shares of the variance that readings of a target have in common.
 _FROM_ROW, _IN_TARGET = (0.3, 0.6, 0.8, 0.9, 0.95, 0.98), (0.2, 0.5, 0.8, 0.9, 0.95, 0.99)
 # The same of a device that drifts and scatters, with the share of the variance that is of each row alone; and the rows

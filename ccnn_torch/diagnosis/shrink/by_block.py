@@ -19,8 +19,6 @@ from ccnn_torch.diagnosis.residual.rows import frame_columns
 from ccnn_torch.diagnosis.shrink.held_out import HeldOut
 from ccnn_torch.diagnosis.verdict.blocks import Blocks
 
-__all__ = ["by_block", "cut"]
-
 _BLOCKS = 5
 # Directions of the frames with less than this share of the largest one are rounding.
 _DIGITS = 1e-9

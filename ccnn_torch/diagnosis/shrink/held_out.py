@@ -13,8 +13,6 @@ from torch import Tensor
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, without
 from ccnn_torch.diagnosis.search.analysis import Analysis
 
-__all__ = ["INTERVAL", "Draws", "Gap", "HeldOut", "draws", "folds", "held_out", "resampled", "shrink_of"]
-
 _FOLDS = 5
 # Updates of a fit to the first fold, and to the others.
 _UPDATES, _MORE = 5, 4

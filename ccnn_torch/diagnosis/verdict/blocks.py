@@ -14,8 +14,6 @@ from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.diagnosis.verdict.separability import signature_angles
 from ccnn_torch.effects import Coefficient
 
-__all__ = ["Blocks", "blocks", "in_order", "noise_floor"]
-
 
 class Blocks:
     """Gap, effects and shrink, all on the same held-out rows."""

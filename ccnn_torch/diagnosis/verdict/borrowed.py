@@ -9,8 +9,6 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.search.form_error import Posterior
 from ccnn_torch.diagnosis.verdict.plausible import implausible_size
 
-__all__ = ["borrowed_names"]
-
 # Share of an effect's own squares that must not be borrowed from what other effects do.
 _OWN = 0.1
 # Or that must come from other coefficients than those that mend its form, where these are so many times as large, in

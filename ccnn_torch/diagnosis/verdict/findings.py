@@ -13,8 +13,6 @@ from ccnn_torch.display import display_unit, number_text, unit_text
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.effects.words import words_of
 
-__all__ = ["Finding", "clear_parameters", "findings", "frequency_words", "places", "size_words"]
-
 Block = Mapping[str, Any]
 
 # Standard deviations from which a number is clearly not 0.

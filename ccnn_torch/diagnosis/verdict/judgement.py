@@ -15,8 +15,6 @@ from ccnn_torch.diagnosis.search.form_error import Posterior, is_unexplained, wi
 from ccnn_torch.diagnosis.search.sets import scored
 from ccnn_torch.diagnosis.verdict.borrowed import borrowed_names
 
-__all__ = ["BESIDE_UNKNOWN", "Judgement", "is_same", "judge", "without_names"]
-
 # Odds up to which the data do not distinguish one name from another.
 _ODDS = math.log(20.0)
 # Log odds against the most probable set beyond which sets are not considered.

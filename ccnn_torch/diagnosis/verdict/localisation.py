@@ -13,8 +13,6 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, draws
 from ccnn_torch.mechanisms import SerialArm
 
-__all__ = ["localise"]
-
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 # Rows from which on each of two coordinates is cut in three and not in two.
 _MANY = 300

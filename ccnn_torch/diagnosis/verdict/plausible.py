@@ -6,8 +6,6 @@ from ccnn_torch.diagnosis.discrepancy.smooth import joint_moves
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.effects import pose_residual
 
-__all__ = ["implausible_size"]
-
 # Plausible sizes that no cause has on a machine of usual quality: sealed machines whose gap was 30 times the noise had
 # up to 185; a unit mistaken makes 1000.
 _IMPLAUSIBLE = 250.0

@@ -11,8 +11,6 @@ from torch import Tensor
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 
-__all__ = ["signature_angles"]
-
 _RANK = 1e-9
 
 

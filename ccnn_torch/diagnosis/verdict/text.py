@@ -14,27 +14,6 @@ from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.records.table import name_lines
 
-__all__ = [
-    "SURE",
-    "aside_text",
-    "block_text",
-    "capital",
-    "driver_words",
-    "effect_words",
-    "floor_words",
-    "follows_words",
-    "gap_words",
-    "lacking_text",
-    "listed",
-    "network_text",
-    "no_effect_words",
-    "noise_text",
-    "probability_words",
-    "size_text",
-    "unseen_text",
-    "verdict_text",
-]
-
 Block = Mapping[str, Any]
 
 SURE = 0.95

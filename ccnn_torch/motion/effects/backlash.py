@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
-__all__ = ["BACKLASH"]
-
 BACKLASH = MotionEffect(
     "backlash",
     # The whole width of the play.

@@ -6,8 +6,6 @@ import math
 
 from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add
 
-__all__ = ["COGGING"]
-
 # Orders that are tried, and the largest.
 _TRIED, _HIGHEST = 14, 60.0
 

@@ -4,7 +4,5 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
-__all__ = ["DELAY"]
-
 # Seconds: a bus of a few ms to a network of tens.
 DELAY = MotionEffect("delay", lambda axis: (Number("delay", "s", 0.02, (add("delay"),)),))

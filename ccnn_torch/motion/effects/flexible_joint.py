@@ -9,8 +9,6 @@ import math
 
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
-__all__ = ["FLEXIBLE_JOINT"]
-
 
 def _of(frequency: float) -> float:
     return 1 / (2 * math.pi * frequency) ** 2

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
-__all__ = ["GRAVITY"]
-
 GRAVITY = MotionEffect(
     "gravity",
     lambda axis: (

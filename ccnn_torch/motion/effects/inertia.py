@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add
 
-__all__ = ["INERTIA"]
-
 
 def _numbers(axis: Facts) -> tuple[Number, ...]:
     # Of an axis whose inertia is known half of it; else that of an axis of 3 Hz.

@@ -4,6 +4,4 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
-__all__ = ["OFFSET"]
-
 OFFSET = MotionEffect("offset", lambda axis: (Number("offset", "joint", 0.02, (add("offset"),), 0.0),))

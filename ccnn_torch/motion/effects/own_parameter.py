@@ -5,8 +5,6 @@ from __future__ import annotations
 from ccnn_torch.effects.parameter import PARAMETER
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
-__all__ = ["OWN", "own_parameter"]
-
 OWN = "own "
 """What the names of a simulator's own parameters begin with among those of an axis."""
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add
 
-__all__ = ["PAYLOAD", "STANDARD_GRAVITY"]
-
 STANDARD_GRAVITY = 9.80665
 """m/s^2."""
 

@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-__all__ = ["Act", "Facts", "MotionEffect", "Number", "add", "scaled"]
-
 
 @dataclass(frozen=True)
 class Facts:

@@ -25,8 +25,6 @@ from ccnn_torch.motion.effects.viscous import VISCOUS
 from ccnn_torch.plugins import is_plugin, load_plugin
 from ccnn_torch.spelling import nearest
 
-__all__ = ["EFFECTS", "EXACT", "motion_effects"]
-
 EFFECTS: dict[str, MotionEffect] = {
     effect.name: effect
     for effect in (

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
-__all__ = ["SATURATION"]
-
 SATURATION = MotionEffect(
     "saturation",
     lambda axis: (Number("torque", "torque", 2 / axis.error, (add("weakness"),), inverse=True),),

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add, scaled
 
-__all__ = ["SERVO_GAIN"]
-
 
 def _numbers(axis: Facts) -> tuple[Number, ...]:
     if not axis.driven:

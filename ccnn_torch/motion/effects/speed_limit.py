@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
-__all__ = ["SPEED_LIMIT"]
-
 SPEED_LIMIT = MotionEffect(
     "speed_limit",
     lambda axis: (Number("speed", "speed", 2 / axis.speed, (add("slowness"),), inverse=True),),

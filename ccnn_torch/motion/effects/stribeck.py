@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
-__all__ = ["STRIBECK"]
-
 STRIBECK = MotionEffect(
     "stribeck",
     lambda axis: (Number("stribeck", "torque", 0.02, (add("stribeck"),), 0.5),),

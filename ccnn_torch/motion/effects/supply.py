@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add, scaled
 
-__all__ = ["SUPPLY"]
-
 # A smaller change of the recorded voltage shows nothing.
 _LEAST = 0.03
 

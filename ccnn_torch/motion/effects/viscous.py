@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add
 
-__all__ = ["VISCOUS"]
-
 
 def _numbers(axis: Facts) -> tuple[Number, ...]:
     known = axis.nominal.get("viscous", 0.0)

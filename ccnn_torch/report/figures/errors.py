@@ -12,8 +12,6 @@ from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.figures.style import AFTER, BEFORE, FLOOR, RASTER_ABOVE, Plot, styled
 
-__all__ = ["draw_joint_error", "joint_error_plot", "pose_error_plot"]
-
 Array = NDArray[np.float64]
 _FAINT_UP_TO = 200
 """Rows above which the training rows are left out: they would hide the held-out ones."""

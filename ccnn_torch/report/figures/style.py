@@ -22,8 +22,6 @@ from matplotlib.figure import Figure
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.html import InlineFigure
 
-__all__ = ["AFTER", "BEFORE", "FLOOR", "GREY", "RASTER_ABOVE", "SERIES", "Plot", "inline_svg", "save_figure", "styled"]
-
 # Okabe and Ito's palette: distinguishable with every common form of colour blindness, and in grey print.
 BEFORE = "#D55E00"
 AFTER = "#0072B2"

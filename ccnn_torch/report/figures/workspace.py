@@ -17,8 +17,6 @@ from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.figures.errors import draw_joint_error
 from ccnn_torch.report.figures.style import RASTER_ABOVE, Plot, styled
 
-__all__ = ["draw_pairs", "height_of", "overview_plot", "planes_of", "workspace_plot"]
-
 Array = NDArray[np.float64]
 
 

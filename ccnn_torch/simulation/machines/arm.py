@@ -12,8 +12,6 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.simulation.machines.structure import ANGLE_TOLERANCE, EXPANSION, GRAVITY, LENGTH_TOLERANCE
 
-__all__ = ["ArmStructure", "nominal_arm"]
-
 # Standard Denavit-Hartenberg a, alpha, d, theta [m, rad] of an arm with an offset wrist, 1.2 m of reach.
 _LINKS = (
     (0.0, math.pi / 2, 0.16, 0.0),

@@ -10,8 +10,6 @@ from torch import Tensor
 from ccnn_torch.simulation.machines.causes import Causes, Climate
 from ccnn_torch.simulation.machines.structure import Structure
 
-__all__ = ["BuiltMachine"]
-
 # Each round gains a factor of the stiffness's share in the machine's size, about 1e-3.
 _ROUNDS = 6
 _STIFFENING = 0.5

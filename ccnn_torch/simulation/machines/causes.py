@@ -16,8 +16,6 @@ from torch import Tensor
 
 from ccnn_torch.simulation.machines.structure import Structure
 
-__all__ = ["CAUSES", "Causes", "Climate", "draw", "draw_causes", "draw_climate"]
-
 CAUSES = ("geometry", "compliance", "transmission", "thermal", "backlash", "mixed")
 _MIXED = 0.5
 """Of each cause's strength where all act together."""

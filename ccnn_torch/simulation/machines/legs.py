@@ -18,8 +18,6 @@ from ccnn_torch.numerics.batching import stack_last
 from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
 from ccnn_torch.simulation.machines.structure import ANGLE_TOLERANCE, EXPANSION, GRAVITY, LENGTH_TOLERANCE
 
-__all__ = ["LegStructure", "machine_tool_structure", "tripod_structure"]
-
 # Parameters of a leg: base joint, platform joint, length, and two small angles by which the guideway is off.
 _PER_LEG = 9
 _BENDING = 1.5e-5

@@ -19,8 +19,6 @@ from ccnn_torch.simulation.machines.causes import draw, draw_causes, draw_climat
 from ccnn_torch.simulation.machines.legs import machine_tool_structure, tripod_structure
 from ccnn_torch.simulation.machines.structure import Structure
 
-__all__ = ["MACHINES", "RealisticMachine", "build_machine"]
-
 _BUILDERS: dict[str, Callable[[], Structure]] = {
     "tripod": tripod_structure,
     "machine_tool": machine_tool_structure,

@@ -9,8 +9,6 @@ from torch import Tensor
 
 from ccnn_torch.mechanisms import Mechanism
 
-__all__ = ["ANGLE_TOLERANCE", "EXPANSION", "GRAVITY", "LENGTH_TOLERANCE", "Structure"]
-
 GRAVITY = 9.80665
 """[m/s²], along -z of the base frame."""
 LENGTH_TOLERANCE, ANGLE_TOLERANCE = 5e-5, 5e-5
