@@ -12,7 +12,9 @@ from ccnn_validation.sources.shop import FAMILIES, make
 from ccnn_validation.sources.shop.cases import machine_of
 from ccnn_validation.sources.shop.machine import difference
 
+from ccnn_torch.diagnosis import diagnose
 from ccnn_torch.errors import InputError
+from ccnn_torch.records import load_records, write_table
 
 NAMES = {"geometry", "joint_offset", "joint_gain", "transmission", "backlash", "friction", "compliance", "gravity"}
 NAMES |= {"thermal", "drift", "frame", "tool", "coupling", "latency", "instrument", "outlier"}
@@ -58,3 +60,14 @@ def test_families_and_truths():
     assert judged(truth, answer, None)["right"]
     assert not judged(truth, answer | {"verdict": answer["verdict"] | {"effects": ["compliance"]}}, None)["right"]
     assert not judged(truth, answer | {"verdict": answer["verdict"] | {"effects": []}}, None)["right"]
+
+
+def test_a_verdict_without_its_unsure_second_name_is_as_likely_as_its_first(tmp_path):
+    case = make("instrument_3", 1)
+    write_table(tmp_path / "records.csv", dict(case.columns))
+    mechanism = _mechanism(case, tmp_path)
+    found = diagnose(load_records(tmp_path / "records.csv", mechanism, learns=False), mechanism)
+    assert found.verdict["effects"] == ["instrument"]
+    # Which of several small corrections of its form goes with it is not known; none of them is named.
+    best = found.judgement.leading[0]
+    assert best[0] > {"instrument"} and best[2] < 0.9 and found.verdict["probability"] == pytest.approx(0.9)
