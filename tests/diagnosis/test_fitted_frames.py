@@ -13,6 +13,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis import diagnose_rows
 from ccnn_torch.diagnosis.from_records import situation_of
 from ccnn_torch.diagnosis.outputs import write_corrected
+from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.effects import Acting, make_effect, reached
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Framed, SerialArm, load_mechanism
@@ -39,6 +40,8 @@ def test_a_large_error_beside_fitted_frames_leaves_the_noise_and_no_length_of_th
     torch.testing.assert_close(
         base.mT @ measured_about.gravity, torch.tensor([0.0, 0.0, -9.80665], dtype=torch.float64)
     )
+    # And places are told there, too, three metres from the tracker.
+    assert float(own_pose(measured_about).norm(dim=-1).max()) < 1.6 < float(records.pose[:, :3].norm(dim=-1).min())
     effect = make_effect("geometry")
     coefficients = effect.coefficients(measured_about)
     g = torch.Generator().manual_seed(3)

@@ -18,6 +18,7 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import Gap
 from ccnn_torch.diagnosis.verdict.findings import size_words
 from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN, Judgement
+from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.diagnosis.verdict.plausible import implausible_size
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Situation
@@ -96,10 +97,10 @@ def _of_place(analysis: Analysis, judgement: Judgement) -> list[Caution]:
 
     if float((spread(place[drawn]) <= spread(place[aside])).double().mean()) > _BY_CHANCE:
         return []
-    middle = analysis.situation.pose[aside].mean(0).tolist()
+    middle = own_pose(analysis.situation)[aside].mean(0).tolist()
     named = ", ".join(
         f"{c.name} = {number_text(v, 3)} {c.unit}"
-        for c, v in zip(analysis.situation.mechanism.pose, middle, strict=True)
+        for c, v in zip(analysis.situation.mechanism.pose, middle, strict=False)
     )
     words = f"the {count} rows set aside as far off lie together, about {named}: something may act there alone"
     return [Caution(words, _HOLLOW)]

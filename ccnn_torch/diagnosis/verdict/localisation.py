@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, draws
+from ccnn_torch.effects import Situation
 from ccnn_torch.mechanisms import SerialArm
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -131,10 +132,7 @@ def _regions(analysis: Analysis, keep: Tensor) -> tuple[list[dict[str, Any]], Te
     situation = analysis.situation
     coordinates = situation.mechanism.pose
     lengths = [i for i, c in enumerate(coordinates) if c.unit == "m"] or list(range(len(coordinates)))
-    pose = situation.pose
-    if isinstance(situation.mechanism, SerialArm):
-        pose = situation.mechanism.in_own_base(pose[:, :3], pose[:, None, :3], situation.parameters)[0]
-    pose = pose[keep]
+    pose = own_pose(situation)[keep]
     varying = sorted(lengths, key=lambda i: -float(pose[:, i].std()))[:2]
     cuts = 3 if len(keep) >= _MANY and len(varying) == 2 else 2
     cell = torch.zeros(len(keep), dtype=torch.int64)
@@ -162,3 +160,11 @@ def _bins(value: Tensor) -> tuple[list[tuple[float, float]], Tensor]:
     part = torch.bucketize(value.contiguous(), cuts[1:-1].contiguous(), right=True)
     edges = list(pairwise(cuts.tolist()))
     return edges, part[:, None] == torch.arange(len(edges))
+
+
+def own_pose(situation: Situation) -> Tensor:
+    """Poses in the robot's frame: of an arm the position in its own base, `s x 3` [m], else as measured, `s x p`."""
+    pose, arm = situation.pose, situation.mechanism
+    if not isinstance(arm, SerialArm):
+        return pose
+    return arm.in_own_base(pose[:, :3], pose[:, None, :3], situation.parameters)[0]
