@@ -47,6 +47,9 @@ def test_a_config_beside_its_records_gives_verdict_and_report(
 ) -> None:
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
+    # Of an earlier verdict that named a geometry.
+    Path("found").mkdir()
+    Path("found/corrected.yaml").write_text("mechanism: five_bar\n", encoding="utf-8")
     code, shown, told = cli("diagnose", "--config", rows.parent / "config.yaml", "--out", "found", "--details")
     assert code == 0 and told == ""
     results = json.loads(Path("found/diagnosis.json").read_text(encoding="utf-8"))
@@ -66,6 +69,7 @@ def test_a_config_beside_its_records_gives_verdict_and_report(
     assert shown.index("acklash") < shown.index("How large is the gap?") and shown.count("would remove") == 1
     for name in ("report.html", "diagnosis.md", "diagnosis.safetensors", "next_measurements.csv"):
         assert Path("found", name).is_file(), name
+    assert not Path("found/corrected.yaml").exists()
 
 
 def test_without_a_network_the_rest_is_the_same(cli: Cli, rows: Path, tmp_path: Path) -> None:

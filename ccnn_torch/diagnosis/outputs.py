@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from ccnn_torch.diagnosis.page.report import write_diagnosis_report
 from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.verdict.text import noise_text
 from ccnn_torch.effects.covariates import covariate_units
+from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames
 from ccnn_torch.mechanisms.files.write_machine import write_machine
 from ccnn_torch.report.json_files import plain, write_json
@@ -52,7 +54,11 @@ def write_diagnosis(folder: Path, diagnosis: Diagnosis, about: Mapping[str, Any]
         InputError: the folder cannot be written.
     """
     path = write_result(folder, diagnosis)
-    write_corrected(folder, diagnosis)
+    for name in CORRECTED:
+        (folder / name).unlink(missing_ok=True)
+    # A machine that no file describes has no corrected one, and the report does not wait for it.
+    with suppress(InputError):
+        write_corrected(folder, diagnosis)
     arrays, labels = picture_arrays(diagnosis, seed)
     mechanism = diagnosis.analysis.situation.mechanism
     units = covariate_units(mechanism) | {c.name: c.unit for c in (*mechanism.pose, *mechanism.joints)}

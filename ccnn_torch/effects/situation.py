@@ -184,10 +184,7 @@ class Situation:
 
         Of an arm it is spread evenly over the origins of its links and the tool; of others it is the platform's.
         """
-        arm = self.mechanism
-        return (
-            self._links_torque(lambda far: torch.ones_like(far)) if isinstance(arm, SerialArm) else self.weight_torque
-        )
+        return self._links_torque(torch.ones_like) if isinstance(self.mechanism, SerialArm) else self.weight_torque
 
     @cached_property
     def inner_weight_torque(self) -> Tensor:
@@ -209,8 +206,8 @@ class Situation:
             tool = flange + (rotation @ values[..., -6:-3, None]).squeeze(-1)
             places = torch.stack([*(place for _, place in frames[1:]), tool], -2)
             share = heavy(torch.linspace(0, 1, places.shape[-2], dtype=places.dtype))
-            along: Tensor = share @ (places @ down.unsqueeze(-1)) / share.sum()
-            return along
+            down_there: Tensor = share @ (places @ down.unsqueeze(-1)) / share.sum()
+            return down_there
 
         return jacobian_of(height, self.joints)[1].squeeze(-2).detach()
 

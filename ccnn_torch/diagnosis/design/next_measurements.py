@@ -158,7 +158,9 @@ def _columns(analysis: Analysis, found: FittedSet, there: Situation) -> Tensor:
         before = white(_signatures(analysis, found, analysis.situation))[keep].flatten(0, 1)
         taken = torch.linalg.pinv(white(analysis.fitted)[keep].flatten(0, 1)) @ before
         columns = columns - frames @ taken
-    return _whitened(analysis, columns)
+    noise = white.sigma * analysis.floor**0.5
+    whitened: Tensor = columns[:, white.channels] / noise[:, None]
+    return whitened
 
 
 def _signatures(analysis: Analysis, found: FittedSet, situation: Situation) -> Tensor:
@@ -170,12 +172,6 @@ def _signatures(analysis: Analysis, found: FittedSet, situation: Situation) -> T
         full = scaled_signature(situation, atom.effect, atom.shape)
         columns.append(full if atom.used is None else full[..., list(atom.used)])
     return torch.cat(columns, -1)
-
-
-def _whitened(analysis: Analysis, columns: Tensor) -> Tensor:
-    noise = analysis.whitening.sigma * analysis.floor**0.5
-    whitened: Tensor = columns[:, analysis.whitening.channels] / noise[:, None]
-    return whitened
 
 
 def _divergence(difference: Tensor, open_: Tensor) -> Tensor:
