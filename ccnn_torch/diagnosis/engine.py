@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.checks.cautions import cautions
+from ccnn_torch.diagnosis.checks.cautions import cautions, of_inferred
 from ccnn_torch.diagnosis.checks.missing_covariates import missing_covariates
+from ccnn_torch.diagnosis.checks.order_of_rows import directions_of_order, order_shows
 from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows, plausible_rows
 from ccnn_torch.diagnosis.design.next_measurements import next_measurements
 from ccnn_torch.diagnosis.discrepancy.interaction import CROSS
@@ -82,6 +84,7 @@ def diagnose_rows(
     effects: Sequence[Effect | str] | None = None,
     seed: int = 0,
     instrument: Noise | None = None,
+    inferred: Sequence[str] = (),
 ) -> Diagnosis:
     """Diagnose rows of commanded joints and measured poses.
 
@@ -93,6 +96,7 @@ def diagnose_rows(
         seed: of folds and resampling.
         instrument: the noise as columns of the records have it; where there are none, and no `noise`, readings of one
             target show it.
+        inferred: covariates that were not recorded but follow from the order of the rows.
 
     Raises:
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
@@ -100,6 +104,7 @@ def diagnose_rows(
     at_step("searching the effects")
     rows = usable_rows(situation, measured)
     copies = int((rows.fine & copies_of(situation, measured)).sum())
+    every_row = situation, measured
     situation, measured, chosen = drawn_rows(situation, measured, rows.fine, seed)
     residual = pose_residual(situation, measured)
     every = _made(situation, effects)
@@ -113,6 +118,14 @@ def diagnose_rows(
     unseen = lacking | dict.fromkeys(analysis.idle, UNSHOWN)
     at_step("judging on held-out rows")
     judgement = judge(analysis)
+    directions = {} if inferred else directions_of_order(every_row[0])
+    if directions and order_shows(analysis, judgement, {n: way[chosen] for n, way in directions.items()}):
+        whole, poses = every_row
+        whole = replace(whole, covariates={**whole.covariates, **directions})
+        said = diagnose_rows(whole, poses, noise, effects, seed, instrument, [*directions])
+        # Names that could not be asked for before, or a driver that was not there.
+        if lacking.keys() & {*said.judgement.names} or any(d.startswith("direction") for d in said.judgement.drivers):
+            return said
     made = Blocks(analysis, judgement, residual, seed)
     together = made.main(made.together)
     unlikely = bool(judgement.names) and not judgement.outside and judgement.probability < _LIKELY
@@ -125,6 +138,7 @@ def diagnose_rows(
     outlier = nothing and bool(rows.astray.any() or gross_outliers(analysis).any())
     missing = missing_covariates(analysis, every, lacking, judgement.drivers, seed)
     doubts = cautions(analysis, judgement, rows, missing, together)
+    doubts += [of_inferred(inferred)] if inferred else []
     texts = [caution.text for caution in doubts]
     every_driver = dict.fromkeys(d for one in judgement.drivers for d in one.split(CROSS))
     drivers = [d for d in every_driver if not d.startswith(SPEED)]
@@ -171,6 +185,7 @@ def diagnose_rows(
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,
         judgement=judgement,
+        inferred=tuple(inferred),
     )
 
 

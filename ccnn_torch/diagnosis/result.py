@@ -10,7 +10,7 @@ from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.effects import Acting
 
-_NOT_WRITTEN = ("acting", "analysis", "judgement", "lines")
+_NOT_WRITTEN = ("acting", "analysis", "judgement", "lines", "inferred")
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Diagnosis:
         acting: the verdict's effects with their numbers, to be simulated or compensated.
         analysis, judgement: everything that was evaluated.
         lines: line of every row in the file that it came from, the header being line 1; () for rows of no file.
+        inferred: covariates that were not recorded and were taken from the order of the rows.
     """
 
     noise: str
@@ -64,6 +65,7 @@ class Diagnosis:
     analysis: Analysis = field(repr=False)
     judgement: Judgement = field(repr=False)
     lines: tuple[int, ...] = field(default=(), repr=False)
+    inferred: tuple[str, ...] = field(default=(), repr=False)
 
     def to_json(self) -> Mapping[str, Any]:
         """The form of `diagnosis.json` (schema `diagnosis`)."""

@@ -77,6 +77,15 @@ def cautions(
     ]
 
 
+def of_inferred(names: Sequence[str]) -> Caution:
+    """Covariates that were taken from the order of the rows, which may not be that in which they were measured."""
+    columns = ", ".join(f"{name}[1]" for name in names)
+    return Caution(
+        "the directions of approach were not recorded and were taken from the order of the rows: record "
+        f"{columns} (the sign of each joint's last motion)"
+    )
+
+
 def row_cautions(analysis: Analysis, rows: PlausibleRows, names: Sequence[str] = ()) -> list[Caution]:
     """Those of them that need no verdict; names: of one, where there is one."""
     return [*_of_model(analysis, rows), *_of_plan(analysis, names), *_of_temperature(analysis.situation)]

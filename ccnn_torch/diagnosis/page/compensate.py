@@ -32,6 +32,8 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
     verdict, situation = diagnosis.verdict, diagnosis.analysis.situation
     if verdict["none"] or verdict["effects"] == [OUTLIER]:
         return ()
+    recorded = {n: v for n, v in situation.covariates.items() if n not in diagnosis.inferred}
+    situation = replace(situation, covariates=recorded)
     keys = {"records": _records(config), "mechanism": typed_path(str(config.mechanism))}
     for key, value in (("columns", config.columns), ("mechanism_keys", config.mechanism_keys)):
         if value:
