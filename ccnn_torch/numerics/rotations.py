@@ -42,7 +42,8 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
     unit = quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
     scalar, vector = unit[..., :1, None], unit[..., 1:]
     k = skew(vector)
-    return torch.eye(3, dtype=unit.dtype, device=unit.device) + 2 * (scalar * k + k @ k)
+    matrix: Tensor = torch.eye(3, dtype=unit.dtype, device=unit.device) + 2 * (scalar * k + k @ k)
+    return matrix
 
 
 def matrix_to_quaternion(matrix: Tensor) -> Tensor:
@@ -69,7 +70,7 @@ def euler_zyx_to_matrix(angles: Tensor) -> Tensor:
     (cz, cy, cx), (sz, sy, sx) = torch.cos(angles).unbind(-1), torch.sin(angles).unbind(-1)
     entries = [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx]
     entries += [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx, -sy, cy * sx, cy * cx]
-    return torch.stack(entries, -1).unflatten(-1, (3, 3))
+    return torch.stack(entries, -1).reshape(*angles.shape, 3)
 
 
 def matrix_to_euler_zyx(matrix: Tensor) -> Tensor:

@@ -108,10 +108,12 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
         layout.execute(figure)
         figure.set_layout_engine("none")
     # Written by the canvases themselves: `savefig` draws everything once more beforehand, to find the layout.
-    drawn, traced = io.BytesIO(), io.BytesIO()
-    canvas.print_png(drawn, metadata={"Software": None})
-    FigureCanvasSVG(figure).print_svg(traced, metadata={"Date": None, "Creator": None})
-    for path, content in ((png, drawn), (svg, traced)):
+    for path, print_to, about in (
+        (png, canvas.print_png, {"Software": None}),
+        (svg, FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None}),
+    ):
+        content = io.BytesIO()
+        print_to(content, metadata=about)
         write_whole(path, content.getvalue())
     return [png, svg]
 
