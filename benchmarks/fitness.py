@@ -16,7 +16,7 @@ from ccnn_torch.evolution.evaluation import make_task, network_errors
 from ccnn_torch.evolution.genome import Genome
 
 SIZES, ROWS = [3, 12, 12, 3], 125
-# Networks that the numpy loop and the others are timed on at most: more take as long each, or, beyond the cache, longer.
+# Networks that the numpy loop and the others are timed on at most: more take as long each, or longer, out of the cache.
 LOOP, MOST = 240, 2400
 
 
