@@ -1,4 +1,7 @@
-"""Levenberg-Marquardt on sigmoid networks 3-20-3, six starts at once, beside SciPy's on one after the other."""
+"""Levenberg-Marquardt on networks 3-20-3, six starts at once, beside SciPy's and pyrenn's on one after the other.
+
+pyrenn's nodes are hyperbolic tangents, ours and SciPy's sigmoids.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,16 @@ import torch
 from scipy.optimize import least_squares
 
 from benchmarks.measure import Row, compare
+from benchmarks.peers import pyrenn_fit
 from benchmarks.training import training_rows
 from ccnn_torch.evolution.gauss_newton import dense_jacobian, network_of, residual
 from ccnn_torch.evolution.refinement import refine
 from ccnn_torch.evolution.refinement_state import RefinementSettings
 
 STARTS, HIDDEN, ITERATIONS = 6, 20, 20
+# Iterations that pyrenn makes, and their share of all Jacobians of all starts: it makes one before the first, too.
+FEW = 4
+SHARE = (FEW + 1) / (ITERATIONS + 1) / STARTS
 
 
 def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
@@ -39,11 +46,14 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
                 max_nfev=ITERATIONS,
             )
 
+        peers = {"SciPy least_squares (MINPACK)": (scipy_fit, 1 / STARTS)}
+        if (fit := pyrenn_fit([3, HIDDEN, 3], x[0], y[0], FEW)) is not None:
+            peers["pyrenn train_LM"] = (fit, SHARE)
         yield from compare(
             f"{ITERATIONS} iterations of Levenberg-Marquardt, {STARTS} networks 3-{HIDDEN}-3",
             rows,
             "rows",
             lambda x=x, y=y, data=data: refine(masks, weights, x, y, data.weights, settings),
-            {"SciPy least_squares (MINPACK)": (scipy_fit, 1 / STARTS)},
+            peers,
             rounds=1 if quick else 3,
         )

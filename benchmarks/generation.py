@@ -1,6 +1,8 @@
-"""One generation of the coevolution beside a numpy loop over individuals that does what the batched code does.
+"""One generation of the coevolution beside a numpy loop that does the same, and the paper's 120 generations as a whole.
 
 The loop joins every individual with the best and three random representatives (eq. 11), one network after another.
+EvoTorch and EvoX have no cooperating populations: their genetic algorithms breed and judge as many whole networks as
+the coevolution joins and judges, four for each individual, and once as many as it has individuals.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.measure import Row, compare
+from benchmarks.peers import generation_peers
 from ccnn_torch.evolution import CCNNSettings
 from ccnn_torch.evolution.coevolution import advance, start
 from ccnn_torch.evolution.evaluation import make_task
@@ -26,17 +29,32 @@ SIZES, ROWS = [3, 12, 12, 3], 125
 
 
 def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
-    """The paper's population, and larger ones."""
+    """The paper's population, and larger ones; then the paper's evolutions from start to end."""
+    from benchmarks.fitness import row_errors
+
+    rows = torch.from_numpy(np.concatenate(toy_rows(SIZES, ROWS), 1))
     for population in (80,) if quick else (80, 800, 8000):
         settings = CCNNSettings(hidden=tuple(SIZES[1:-1]), population=population, generations=120)
-        loop = NumpyLoop(SIZES, ROWS, settings).generation if population <= 800 else None
+        individuals = 3 * population
+        peers = {}
+        for networks in (individuals * (1 + settings.representatives), individuals) if population <= 800 else ():
+            found = generation_peers(SIZES, row_errors, rows, networks)
+            peers |= {f"{name}, {networks:,} whole networks": call for name, call in found.items()}
+        if population <= 800:
+            peers["numpy loop"] = NumpyLoop(SIZES, ROWS, settings).generation
+        task, ours = f"one generation, 3-12-12-3, {ROWS} rows", batched(SIZES, ROWS, 1, settings)
+        yield from compare(task, individuals, "individuals", ours, peers, rounds=3)
+    for sizes in ([3, 6, 6, 3], [3, 12, 12, 3]):
+        settings = CCNNSettings(hidden=tuple(sizes[1:-1]), population=80, generations=120)
+        name = "-".join(map(str, sizes))
+
+        def evolution(sizes: list[int] = sizes, settings: CCNNSettings = settings) -> None:
+            step = batched(sizes, ROWS, 1, settings)
+            for _ in range(settings.generations):
+                step()
+
         yield from compare(
-            f"one generation, 3-12-12-3, {ROWS} rows",
-            3 * population,
-            "individuals",
-            batched(SIZES, ROWS, 1, settings),
-            {"numpy loop": loop} if loop else None,
-            rounds=3,
+            f"the paper's evolution of {name}, 3 x 80, {ROWS} rows", 120, "generations", evolution, rounds=3
         )
 
 

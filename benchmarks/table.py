@@ -14,6 +14,7 @@ import torch
 from matplotlib.figure import Figure
 
 from benchmarks.measure import Row
+from benchmarks.peers import missing
 
 __all__ = ["growth", "write_results"]
 
@@ -33,6 +34,7 @@ def write_results(folder: Path, found: dict[str, list[Row]], quick: bool) -> Non
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
         "quick": quick,
+        "not_installed": missing(),
     }
     rows = {name: [asdict(row) for row in part] for name, part in found.items()}
     curves = growth([row for part in found.values() for row in part])
@@ -73,9 +75,11 @@ def _by_task(rows: list[Row]) -> dict[tuple[str, str], dict[int, float]]:
 
 def markdown(about: dict[str, object], found: dict[str, list[Row]], curves: list[dict[str, object]]) -> str:
     """Machine, one table, and what the curves say far out."""
+    absent = missing()
     lines = [
         f"{about['processor']}, {about['cores']} cores ({about['threads']} used), torch {about['torch']}, "
         f"{about['date']}{', `--quick`' if about['quick'] else ''}.",
+        *([f"Left out, for they are not installed: {', '.join(absent)}."] if absent else []),
         "",
         "| benchmark | task | size | time | peer | peer / ours | share of gemm | |",
         "| --- | --- | ---: | ---: | --- | ---: | ---: | --- |",

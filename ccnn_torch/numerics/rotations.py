@@ -1,11 +1,8 @@
 """Rotations: the few maps this package needs, float64, any leading batch dims.
 
 Warning:
-    Quaternions are (w, x, y, z) here and (x, y, z, w) in roma; Euler angles are intrinsic Z-Y'-X'' (yaw, pitch, roll).
+    Quaternions are (w, x, y, z), in scipy (x, y, z, w); Euler angles are intrinsic Z-Y'-X'' (yaw, pitch, roll).
     Eq. 2 of the pseudoerror paper (Zhang and Gao 2012) mixes its angle names; this is the proper ZYX matrix.
-
-roma is imported by the functions that call it: it loads torch's compiler, which takes a second. What every diagnosis of
-an arm needs is written out.
 """
 
 from __future__ import annotations
@@ -42,10 +39,10 @@ def matrix_to_rotation_vector(matrix: Tensor) -> Tensor:
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
     """quaternion: `... x 4` (w, x, y, z), of any length but 0; returns `... x 3 x 3`."""
-    import roma
-
     unit = quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
-    matrix: Tensor = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit))
+    scalar, vector = unit[..., :1, None], unit[..., 1:]
+    k = skew(vector)
+    matrix: Tensor = torch.eye(3, dtype=unit.dtype, device=unit.device) + 2 * (scalar * k + k @ k)
     return matrix
 
 
@@ -70,18 +67,20 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
 
 def euler_zyx_to_matrix(angles: Tensor) -> Tensor:
     """angles: `... x 3` [rad], (yaw about z, pitch about y', roll about x''); returns `... x 3 x 3`."""
-    import roma
-
-    matrix: Tensor = roma.euler_to_rotmat("ZYX", angles)
-    return matrix
+    (cz, cy, cx), (sz, sy, sx) = torch.cos(angles).unbind(-1), torch.sin(angles).unbind(-1)
+    entries = [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx]
+    entries += [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx, -sy, cy * sx, cy * cx]
+    return torch.stack(entries, -1).reshape(*angles.shape, 3)
 
 
 def matrix_to_euler_zyx(matrix: Tensor) -> Tensor:
-    """Inverse of `euler_zyx_to_matrix`; pitch in [-pi/2, pi/2]."""
-    import roma
-
-    angles: Tensor = roma.rotmat_to_euler("ZYX", matrix, as_tuple=False)
-    return angles
+    """Inverse of `euler_zyx_to_matrix`; pitch in [-pi/2, pi/2]. Yaw is taken off first, so no pitch is singular."""
+    (a, b, c), (d, e, f), (g, _, _) = (row.unbind(-1) for row in matrix.unbind(-2))
+    yaw = torch.atan2(d, a)
+    cosine, sine = torch.cos(yaw), torch.sin(yaw)
+    pitch = torch.atan2(-g, cosine * a + sine * d)
+    roll = torch.atan2(sine * c - cosine * f, cosine * e - sine * b)
+    return torch.stack([yaw, pitch, roll], -1)
 
 
 def geodesic_angle(first: Tensor, second: Tensor) -> Tensor:

@@ -13,10 +13,14 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms.frames.closed_form_start import closed_form_frames
 from ccnn_torch.mechanisms.machines.serial import SerialArm
-from ccnn_torch.mechanisms.pose import frame_jacobian
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.outliers import FAR, inlying, residual_scale
-from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix, skew
+from ccnn_torch.numerics.rotations import (
+    matrix_to_rotation_vector,
+    rotation_vector_rate,
+    rotation_vector_to_matrix,
+    skew,
+)
 
 ROTATION_WEIGHT = 0.3
 """Of orientation against position [m/rad]: 1 mrad counts as 0.3 mm, about an arm's ratio of the two errors."""
@@ -253,12 +257,12 @@ class _Problem:
         # The derivative of log(R Rmᵀ) is taken as the rate of rotation itself: the gradient is the same.
         base, tool = self.frames(free)
         lever, _, flange = self._placed(base, tool)
-        base_rate = _rotation_rate(base[..., 3:])[..., self.base_of, :, :]
+        base_rate = rotation_vector_rate(base[..., 3:])[..., self.base_of, :, :]
         eye = torch.eye(3, dtype=lever.dtype).expand(*flange.shape)
         none = torch.zeros_like(flange)
         rows = torch.cat([eye, -skew(lever) @ base_rate, flange, none], dim=-1)
         if self.measured_rotation is not None:
-            tool_rate = flange @ _rotation_rate(tool[..., 3:])[..., self.tool_of, :, :]
+            tool_rate = flange @ rotation_vector_rate(tool[..., 3:])[..., self.tool_of, :, :]
             turning = torch.cat([none, base_rate, none, tool_rate], dim=-1)
             rows = torch.cat([rows, self.rotation_weight * turning], dim=-2)
         rows = rows * self.weights.sqrt()[..., None, None]
@@ -276,8 +280,3 @@ class _Problem:
         tools = count - self.tool.shape[-2] * self.free_tool
         column = [self.base_of[:, None] * self.free_base + base, tools + self.tool_of[:, None] * self.free_tool + tool]
         return torch.cat([base, 6 + tool]), torch.cat(column, dim=-1)
-
-
-def _rotation_rate(vector: Tensor) -> Tensor:
-    """Rate of rotation per change of the rotation vector, `... x 3 x 3`."""
-    return frame_jacobian(lambda w: (w, rotation_vector_to_matrix(w)), vector)[..., 3:, :]

@@ -99,15 +99,17 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
         WriteError: they cannot be written.
     """
     png, svg = Path(path).with_suffix(".png"), Path(path).with_suffix(".svg")
-    # The layout is found once and kept: finding it again for each file costs more than the drawing.
+    # The layout is found once and kept: finding it again for each file costs more than the drawing. The canvas that
+    # measures the texts for it draws the PNG, too, and need not measure them again.
+    figure.set_dpi(_PNG_DPI)
+    canvas = FigureCanvasAgg(figure)
     layout = figure.get_layout_engine()
     if layout is not None:
         layout.execute(figure)
         figure.set_layout_engine("none")
     # Written by the canvases themselves: `savefig` draws everything once more beforehand, to find the layout.
-    figure.set_dpi(_PNG_DPI)
     for path, print_to, about in (
-        (png, FigureCanvasAgg(figure).print_png, {"Software": None}),
+        (png, canvas.print_png, {"Software": None}),
         (svg, FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None}),
     ):
         content = io.BytesIO()
