@@ -61,6 +61,12 @@ def test_from_strange_headers_to_a_finished_run(tmp_path: Path, cli: Cli) -> Non
                        "--out", tmp_path / "run", "--quiet")  # fmt: skip
     assert code == 0, err
     assert (tmp_path / "run" / "results.json").is_file()
+    # The same config shows what the rows can show; a direction has no unit but 1.
+    config.write_text(text.replace("columns:", 'columns:\n  "No": "direction1"'), encoding="utf-8")
+    values[:, 0] = np.sign(np.arange(40) % 3 - 0.5)
+    write(records, headers, values)
+    code, out, err = cli("check", "--config", config)
+    assert code == 0 and "direction1" in out, (out, err)
     # What is there is not lost.
     code, _, err = cli("new", records, "--units", "mm,deg", "--mechanism", "delta", "--out", config)
     assert code == 2 and "--force" in err

@@ -31,7 +31,9 @@ def check(
     effects: Annotated[
         str | None, typer.Option(help="Candidates, a,b,…; all = the whole library, which is the default.")
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="A YAML file with keys as for ccnn diagnose.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="A YAML file with keys as for ccnn diagnose, or one for ccnn run.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing; set the exit code alone.")] = False,
 ) -> None:

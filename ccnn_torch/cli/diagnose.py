@@ -34,7 +34,7 @@ def diagnose(
     effects: Annotated[
         str | None, typer.Option(help="Candidates, a,b,…; all = the whole library, which is the default.")
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="A YAML file with keys as below.")] = None,
+    config: Annotated[Path | None, typer.Option(help="A YAML file with keys as below, or one for ccnn run.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
     network: Annotated[
         bool | None, typer.Option(help="Estimate the further gain by a network; the same as network=….")

@@ -36,7 +36,8 @@ def export(
     each of them is. Of an identified.yaml the others make a closed form of the correction, and say what it leaves.
 
     Source code returns the same codes: 0 inside the domain; 1 outside, or where the model broke its limit; 2 where an
-    input is not finite, and then command = joints. Before a file is written its operations are compared with the
+    input is not finite: then command = joints, with the middle of the domain for what is no number and its edge for
+    infinity. Before a file is written its operations are compared with the
     model: in float64 to 1e-12 of the limit (1e-9 with a Gaussian process, an arm's links or physical effects), in
     float32 to 1e-5.
 

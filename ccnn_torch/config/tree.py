@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from ccnn_torch.config.keys import explain
+from ccnn_torch.config.keys import config_model, explain
 from ccnn_torch.config.overrides import apply_overrides, relate_paths, resolve_paths
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import dump_yaml, read_yaml
@@ -68,13 +68,23 @@ def config_from_file(model: type[Config], path: str | Path, overrides: Iterable[
     return validated(model, tree, str(path), given)
 
 
-def config_from_options(model: type[Config], path: Path | None, overrides: Iterable[str]) -> Config:
+def config_from_options(
+    model: type[Config], path: Path | None, overrides: Iterable[str], also: str = "", shared: Sequence[str] = ()
+) -> Config:
     """As `config_from_file` for commands that need no file: defaults where there is none, and for empty keys.
+
+    Args:
+        model: class of the config.
+        path: the file.
+        overrides: ``key.sub=value``.
+        also: another command, of whose configs the `shared` keys are read.
 
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
     tree = {} if path is None else read_yaml(path)
+    if also and not tree.keys() <= {*model.model_fields} and tree.keys() <= {*config_model(also).model_fields}:
+        tree = {key: value for key, value in tree.items() if key in shared}
     if path is not None:
         resolve_paths(tree, path.absolute().parent)
     given = apply_overrides(tree, overrides, Path.cwd())

@@ -33,6 +33,10 @@ def _deviation(value: Any) -> Any:
     return value
 
 
+# What means the same in a config for `ccnn run`.
+_OF_A_RUN = ("records", "columns", "mechanism", "mechanism_keys", "covariates", "seed")
+
+
 class DiagnoseConfig(Section):
     """Options of `ccnn diagnose` and `ccnn check`."""
 
@@ -78,10 +82,12 @@ class DiagnoseConfig(Section):
 def load_diagnose_config(path: Path | None, overrides: Iterable[str] = ()) -> DiagnoseConfig:
     """Read a config file (defaults where there is none) and put overrides ``key.sub=value`` over it.
 
+    A config for `ccnn run`, as `ccnn new` writes it, gives its records, mechanism, columns and seed.
+
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
-    return config_from_options(DiagnoseConfig, path, overrides)
+    return config_from_options(DiagnoseConfig, path, overrides, "run", _OF_A_RUN)
 
 
 def describe_diagnose_keys() -> list[tuple[str, str, str]]:

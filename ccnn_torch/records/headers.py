@@ -128,6 +128,8 @@ def _mapped(cell: str, written: str, target: str, file: str) -> tuple[str, str]:
     where = f"columns: '{target}' for '{cell}'"
     if not name or any(mark in name for mark in "[]"):
         raise InputError(f"{where} is not of the form name[unit]; write e.g. q1[deg], or {IGNORE}")
+    if name.startswith("direction"):
+        unit = unit or "1"
     if not (unit or written):
         raise InputError(f"{where} has no unit; write e.g. {name}[deg], {name}[mm] or {name}[1] (no unit)")
     if unit and written and not _same(unit, written, where):

@@ -255,3 +255,12 @@ def test_plain_play_beside_an_offset_is_play_in_few_rows(tmp_path: Path) -> None
     path.write_text("".join(path.read_text(encoding="utf-8").splitlines(keepends=True)[:61]), encoding="utf-8")
     found = diagnose(load_records(path, machine, learns=False), machine, noise=1e-5)
     assert set(found.verdict["effects"]) == {"joint_offset", "backlash"} and not found.verdict["outside_library"]
+
+
+def test_the_numbers_of_an_effect_are_not_shared_with_one_that_cannot_be_told_from_it() -> None:
+    rows = rows_of("stewart", 120, 1)
+    rows = replace(rows, covariates={n: v for n, v in rows.covariates.items() if not n.startswith("load")})
+    found = diagnose_rows(rows, reached_with(rows, [acting(rows, "backlash", q4=9e-5)], 6, 1e-5))
+    entry = next(e for e in found.effects if e["name"] == "backlash")
+    assert found.verdict["effects"] == ["backlash"] and entry["indistinguishable_from"] == ["friction"]
+    assert entry["parameters"]["q4"]["value"] == pytest.approx(9e-5, rel=0.05)

@@ -196,7 +196,8 @@ def _of_sizes(analysis: Analysis, judgement: Judgement) -> list[Caution]:
             said.append(
                 Caution(
                     f"{atom.name} would have to be {float(size[worst]):.0f} times as large as is plausible "
-                    f"({coefficients[worst].name}): check the units of the columns that it uses"
+                    f"({coefficients[worst].name}): check the units; or another cause looks like it, such "
+                    "as a load that acts elsewhere"
                 )
             )
     return said

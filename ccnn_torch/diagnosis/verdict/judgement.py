@@ -97,7 +97,13 @@ def judge(analysis: Analysis) -> Judgement:
             # What was left out for want of a sure name mends the form of what is named, as a rule, and is no cause.
             told += [p for members, some, p, _ in leading if not some and names < members]
             told = [min(sum(told), _NAMED)]
-    more = (f for f in analysis.found if found.members and set(found.members) <= set(f.members))
+    # Beside its twin an effect would share its coefficients with it.
+    twins = {twin for some in classes.values() for twin in some} - names
+    more = (
+        f
+        for f in analysis.found
+        if found.members and set(found.members) <= set(f.members) and not twins & _named(analysis, f)[0]
+    )
     return Judgement(
         found=found,
         fullest=max(more, key=lambda f: f.log_posterior, default=found),
