@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.yaml_file import read_yaml
 
 
 def run(
@@ -37,6 +38,9 @@ def run(
 
     ccnn run --resume runs/tripod30
     """
+    if config is not None and "=" not in str(config):
+        # Before torch is loaded: a file that is not there need not wait for it.
+        read_yaml(config)
     from ccnn_torch.calibration.config import load_config
     from ccnn_torch.calibration.job import resume_run, start_run
 
