@@ -57,6 +57,7 @@ def test_from_strange_headers_to_a_finished_run(tmp_path: Path, cli: Cli) -> Non
     assert f"ccnn run {config}" in out
     text = config.read_text(encoding="utf-8")
     assert '"Axis_1": "q1[deg]"' in text and '"X": "x[mm]"' in text and "Not used: No" in text
+    assert "# mechanism_keys: {base: " in text
     code, _, err = cli("run", config, "methods=[constant]", "geometry=none", "save_models=false", "save_report=false",
                        "--out", tmp_path / "run", "--quiet")  # fmt: skip
     assert code == 0, err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import numpy as np
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.mechanisms.registry import REGISTRY
 from ccnn_torch.records.sources import read_source
 from ccnn_torch.records.table import Table
 from ccnn_torch.starter.recognise import (
@@ -125,13 +127,22 @@ def _split(found: Recognised, table: Table, columns: dict[str, str]) -> tuple[st
 def _mechanism_lines(name: str | None, why: str, out: Path) -> list[str]:
     if name is not None:
         path = _relative(Path(name), out) if Path(name).is_file() else name
-        return [f"mechanism: {json.dumps(path, ensure_ascii=False)}   # {why}"]
+        return [f"mechanism: {json.dumps(path, ensure_ascii=False)}   # {why}", *_dimension_lines(name)]
     fitting = f" ({why} would fit)" if why else ""
     return [
         f"# FILL IN the machine{fitting}: a built-in name, or an arm's geometry as a DH file (.yaml) or URDF;",
         "# docs/how_to/mechanisms.md shows both. `ccnn run` refuses this config until it is given.",
         "# mechanism: my_arm.yaml",
     ]
+
+
+def _dimension_lines(name: str) -> list[str]:
+    """The dimensions that a built-in machine is taken to have."""
+    parameters = inspect.signature(REGISTRY[name]).parameters.values() if name in REGISTRY else ()
+    sizes = [f"{p.name}: {p.default:g}" for p in parameters if isinstance(p.default, float)]
+    if not sizes:
+        return []
+    return ["# Its dimensions [m, rad]; write those of your machine:", f"# mechanism_keys: {{{', '.join(sizes)}}}"]
 
 
 def _column_lines(columns: dict[str, str], found: Recognised, table: Table) -> list[str]:
