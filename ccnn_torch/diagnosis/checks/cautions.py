@@ -81,7 +81,7 @@ def of_inferred(names: Sequence[str]) -> Caution:
     """Covariates that were taken from the order of the rows, which may not be that in which they were measured."""
     columns = ", ".join(f"{name}[1]" for name in names)
     return Caution(
-        "the directions of approach were not recorded and were taken from the order of the rows: record "
+        "no directions of approach are among the covariates; they were taken from the order of the rows: record "
         f"{columns} (the sign of each joint's last motion)"
     )
 
