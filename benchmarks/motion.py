@@ -59,12 +59,12 @@ def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
 def scipy_fit(logs: Any, nominal: Any) -> Callable[[], object]:
     """`least_squares` on the same residual."""
     problem = problem_of(logs, nominal, motion_effects(["delay", "coulomb"]))
-    zero = torch.zeros(1, 1, problem.library.size, dtype=torch.float64)
+    zero = torch.zeros(1, problem.library.size, dtype=torch.float64)
 
     def residual(values: np.ndarray) -> np.ndarray:
         theta = zero.clone()
-        theta[0, 0, :3] = torch.from_numpy(values)
-        return problem.pooled(problem.residual(theta))[0, 0][problem.judged].numpy()
+        theta[0, :3] = torch.from_numpy(values)
+        return problem.pooled(problem.residual(theta, problem.axes))[0][problem.judged].numpy()
 
     bounds = ([0.0, 0.0, 0.0], [10.0, 10.0, 4.0])
     return lambda: least_squares(residual, np.full(3, 0.3), bounds=bounds, diff_step=1e-4)

@@ -48,8 +48,8 @@ def identified(folder: Path, motions: tuple[str, ...], gains: list[int]) -> np.n
         parts = []
         for gain, own in logs.items():
             problem = problem_of(own, nominal_of("servo", keys(values, gain), ["rad"]), motion_effects(["delay"]))
-            theta = torch.zeros(1, 1, problem.library.size, dtype=torch.float64)
-            parts.append(problem.pooled(problem.residual(theta))[0, 0][problem.judged].numpy())
+            theta = torch.zeros(1, problem.library.size, dtype=torch.float64)
+            parts.append(problem.pooled(problem.residual(theta, problem.axes))[0][problem.judged].numpy())
         return np.concatenate(parts)
 
     start = np.array([*START.values()])

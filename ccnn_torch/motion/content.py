@@ -30,9 +30,8 @@ _TINY = 1e-9
 
 def floor_of(problem: Problem, found: Search, verdicts: Sequence[AxisVerdict]) -> float:
     """Mean square of what the best sets leave, or the richest fit where it leaves less, summed over the axes."""
-    theta = torch.stack([v.best.spec.theta for v in verdicts])[None]
     judged = problem.data.judged
-    left = problem.residual(theta)[0]
+    left = problem.residual(torch.stack([v.best.spec.theta for v in verdicts]), problem.axes)
     each = torch.stack([left[:, judged].square().mean(-1), found.rich[:, judged].square().mean(-1)])
     return float(each.amin(0).sum())
 

@@ -46,8 +46,8 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
         specs: of each axis the set whose motion tells speed, acceleration and torque.
     """
     data = problem.data
-    theta = torch.stack([spec.theta for spec in specs])[None]
-    moved = problem.positions(theta)[0]
+    theta = torch.stack([spec.theta for spec in specs])
+    moved = problem.positions(theta, problem.axes)
     step = data.time.diff(dim=-1).clamp_min(1e-9)
     speed = _slope(moved, step)
     acceleration = _slope(speed, step)
@@ -73,7 +73,7 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
         pushed.append(("temperature", warm * sign))
         direct["temperature"] = warm
     found = [Driver(name, _SIZE * span * columns) for name, columns in direct.items()]
-    under = problem.pushed(theta[0], torch.cat([_STEP * span * columns for _, columns in pushed], 1))
+    under = problem.pushed(theta, torch.cat([_STEP * span * columns for _, columns in pushed], 1))
     columns = (under - moved[:, None]) * (_SIZE / _STEP)
     widths = [c.shape[1] for _, c in pushed]
     return found + [Driver(n, c) for (n, _), c in zip(pushed, torch.split(columns, widths, 1), strict=True)]

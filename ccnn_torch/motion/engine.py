@@ -78,7 +78,7 @@ def diagnose_motion(
     """
     at_step("searching the effects")
     problem = problem_of(logs, nominal, [*motion_effects(effects), *nominal.own_effects])
-    nothing = problem.residual(torch.zeros(1, len(nominal.axes), problem.library.size, dtype=torch.float64))[0]
+    nothing = problem.residual(torch.zeros(len(nominal.axes), problem.library.size, dtype=torch.float64), problem.axes)
     found = _searched(problem, logs, nominal)
     problem = found.problem
     verdicts = judge_axes(found)
@@ -162,5 +162,6 @@ def _searched(problem: Problem, logs: Sequence[Log], nominal: Nominal) -> Search
 def _own_values(found: Search) -> dict[str, float]:
     """What is added to a simulator's own parameters: the mean over the axes whose best set has them."""
     theta = torch.stack([fits[0].spec.theta for fits in found.found])
-    values = {n: v[v != 0] for n, v in found.problem.library.parameters(theta).items() if n.startswith(OWN)}
+    parameters = found.problem.library.parameters(theta, found.problem.axes)
+    values = {n: v[v != 0] for n, v in parameters.items() if n.startswith(OWN)}
     return {name.removeprefix(OWN): float(v.mean()) for name, v in values.items() if len(v)}

@@ -21,6 +21,8 @@ _STEPS = 6
 # Shares of a Gauss-Newton step that are tried, and what a step is damped by.
 _SHARES = (1.0, 0.25)
 _DAMPING, _LESS, _MORE = 1e-3, 0.2, 10.0
+# A set whose step fails at this damping has ended.
+_STIFF = 10.0
 # Plausible sizes that a number moves at most in a step.
 _FARTHEST = 5.0
 # Simulated values that are held in memory at a time.
@@ -108,114 +110,147 @@ def started(library: Library, spec: Spec, variant: Variant, axis: int) -> Spec:
 def fit_many(
     problem: Problem,
     whitening: Whitening,
-    specs: Sequence[Sequence[Spec]],
+    specs: Sequence[tuple[int, Spec]],
     steps: int = _STEPS,
     chosen: Tensor | None = None,
     loose: Tensor | None = None,
-) -> list[list[Fit]]:
+) -> list[Fit]:
     """Fit sets side by side.
 
     Args:
         problem: what is fitted.
         whitening: of the residual of each axis.
-        specs: for each of `h` sets, one a joint, `n`.
+        specs: the axis and the set of each fit.
         steps: Gauss-Newton steps.
         chosen: stretches that count; all when None.
         loose: whitened, what the nominal values of each axis may be off by, `n x k x v`; nothing when None.
     """
-    wide = max((len(s.moved) for row in specs for s in row), default=0)
     judged = problem.data.judged if chosen is None else problem.data.judged[chosen]
-    per = problem.followed.shape[0] * judged.numel() * (wide + 2)
-    lot = max(int(_VALUES / per), 1)
-    found: list[list[Fit]] = []
-    for k in range(0, len(specs), lot):
-        found += _fit_lot(problem, whitening, specs[k : k + lot], steps, chosen, loose)
+    found: list[Fit] = []
+    lot: list[tuple[int, Spec]] = []
+    for k, (axis, spec) in enumerate(specs):
+        lot.append((axis, spec))
+        simulated = sum(len(one.moved) + 2 for _, one in lot) * judged.numel()
+        if simulated > _VALUES or k == len(specs) - 1:
+            found += _fit_lot(problem, whitening, lot, steps, chosen, loose)
+            lot = []
     return found
 
 
-def places_of(places: Sequence[Sequence[Sequence[int]]]) -> Tensor:
-    """Places of the numbers of each axis of each set, `h x n x m`, padded with -1."""
-    wide = max((len(own) for row in places for own in row), default=0)
-    return torch.tensor([[[*own, *[-1] * (wide - len(own))] for own in row] for row in places], dtype=torch.int64)
-
-
 def sensitivities(
-    problem: Problem, whitening: Whitening, theta: Tensor, active: Tensor, chosen: Tensor | None = None
+    problem: Problem,
+    whitening: Whitening,
+    theta: Tensor,
+    axis: Tensor,
+    places: Sequence[Sequence[int]],
+    chosen: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Whitened residuals and what the active numbers change in the positions.
+    """Whitened residuals and what numbers change in the positions.
 
     Args:
-        theta: `h x n x k`.
-        active: places, `h x n x m`, -1 = none.
+        theta: `p x k`.
+        axis: of each row, `p`.
+        places: of the numbers of each row.
 
     Returns:
-        `n x h x v` and `n x h x m x v`, `v` values.
+        `p x v` and `p x m x v`, `v` values; beyond a row's own numbers 0.
     """
-    h, n, m = active.shape
-    moved = theta[:, None].expand(h, m + 1, n, -1).clone()
-    index = active.clamp_min(0).transpose(1, 2)
-    step = torch.where(active >= 0, _STEP, 0.0).transpose(1, 2).to(theta.dtype)
-    moved[:, 1:].scatter_add_(-1, index[..., None], step[..., None])
-    residual = problem.residual(moved.flatten(0, 1), chosen)
-    white = problem.whitened(residual, whitening, chosen).reshape(n, h, m + 1, -1)
-    return white[:, :, 0], (white[:, :, :1] - white[:, :, 1:]) / _STEP
+    counts = torch.tensor([len(own) for own in places], dtype=torch.int64)
+    # One row for every number that is moved, after those where none is.
+    which = torch.repeat_interleave(torch.arange(len(places)), counts)
+    moved = theta[which]
+    if len(which):
+        moved[torch.arange(len(which)), torch.tensor([j for own in places for j in own])] += _STEP
+    both = torch.cat([axis, axis[which]])
+    residual = problem.residual(torch.cat([theta, moved]), both, chosen)
+    white = problem.whitened(residual, both, whitening, chosen)
+    base, changed = white[: len(theta)], white[len(theta) :]
+    columns = white.new_zeros(len(theta), int(counts.max()) if len(counts) else 0, white.shape[1])
+    if len(which):
+        column = torch.cat([torch.arange(int(c)) for c in counts])
+        columns[which, column] = (base[which] - changed) / _STEP
+    return base, columns
 
 
 def _fit_lot(
     problem: Problem,
     whitening: Whitening,
-    specs: Sequence[Sequence[Spec]],
+    specs: Sequence[tuple[int, Spec]],
     steps: int,
     chosen: Tensor | None,
     loose: Tensor | None,
-) -> list[list[Fit]]:
-    h, n = len(specs), len(specs[0])
-    theta = torch.stack([torch.stack([s.theta for s in row]) for row in specs])
-    wide = max(len(s.moved) for row in specs for s in row)
-    active = places_of([[s.moved for s in row] for row in specs])
-    safe, real = active.clamp_min(0), (active >= 0).to(theta.dtype)
+) -> list[Fit]:
+    axis = torch.tensor([i for i, _ in specs])
+    theta = torch.stack([s.theta for _, s in specs])
+    places = [s.moved for _, s in specs]
     low, high = problem.library.bounds
-    damping = torch.full((h, n), _DAMPING, dtype=theta.dtype)
-    residual, columns = sensitivities(problem, whitening, theta, active, chosen)
+    damping = torch.full((len(specs),), _DAMPING, dtype=theta.dtype)
+    residual, columns = sensitivities(problem, whitening, theta, axis, places, chosen)
     judged = problem.judged if chosen is None else problem.judged[chosen]
     values = float(judged.sum())
-    for _ in range(steps if wide else 0):
-        cost = _cost(residual, theta, values)
-        noise = residual.square().sum(-1).mT / values
-        gram = (columns @ columns.mT).transpose(0, 1) / noise[..., None, None].clamp_min(1e-300)
-        push = (columns @ residual[..., None])[..., 0].transpose(0, 1) / noise[..., None].clamp_min(1e-300)
-        own = theta.gather(-1, safe) * real
-        push = push - own / _WIDE**2
-        diagonal = gram.diagonal(dim1=-2, dim2=-1)
-        inner = gram + torch.diag_embed(damping[..., None] * diagonal + 1 / _WIDE**2 + (1 - real))
-        move = torch.linalg.solve(inner, push[..., None])[..., 0] * real
-        move = move.clamp(-_FARTHEST, _FARTHEST)
-        trials = torch.stack([theta.scatter_add(-1, safe, share * move).clamp(low, high) for share in _SHARES])
-        left = problem.whitened(problem.residual(trials.flatten(0, 1), chosen), whitening, chosen)
-        costs = _cost(left, trials.flatten(0, 1), values).reshape(len(_SHARES), h, n)
-        best, which = costs.min(0)
-        better = best < cost
-        taken = trials.gather(0, which[None, ..., None].expand(1, *theta.shape))[0]
-        theta = torch.where(better[..., None], taken, theta)
-        damping = torch.where(better & (which == 0), damping * _LESS, damping * _MORE).clamp(1e-8, 1e8)
-        residual, columns = sensitivities(problem, whitening, theta, active, chosen)
-        if bool(((cost - best) < _GAINED * values).all()):
+    # Those whose last step gained something, or whose next one may be shorter.
+    run = torch.tensor([k for k, own in enumerate(places) if own], dtype=torch.int64)
+    for _ in range(steps):
+        if not len(run):
             break
+        active, real = _padded([places[k] for k in run.tolist()])
+        x, y = columns[run, : active.shape[1]], residual[run]
+        cost = _cost(y, theta[run], values)
+        move = _step(x, y, theta[run].gather(-1, active) * real, real, damping[run], values)
+        most, least = high[axis[run]], low[axis[run]]
+        trials = torch.stack([theta[run].scatter_add(-1, active, share * move) for share in _SHARES])
+        trials = torch.maximum(torch.minimum(trials, most), least)
+        both = axis[run].repeat(len(_SHARES))
+        left = problem.whitened(problem.residual(trials.flatten(0, 1), both, chosen), both, whitening, chosen)
+        best, which = _cost(left, trials.flatten(0, 1), values).reshape(len(_SHARES), -1).min(0)
+        better = best < cost
+        theta[run[better]] = trials[which[better], better.nonzero()[:, 0]]
+        damping[run] = torch.where(better & (which == 0), damping[run] * _LESS, damping[run] * _MORE).clamp(1e-8, 1e8)
+        moved = run[better]
+        if len(moved):
+            residual[moved], own = sensitivities(
+                problem, whitening, theta[moved], axis[moved], [places[k] for k in moved.tolist()], chosen
+            )
+            columns[moved, : own.shape[1]] = own
+        gained = torch.where(better, cost - best, 0.0) >= _GAINED * values
+        run = run[gained | (~better & (damping[run] < _STIFF))]
     # Here, since the whitened residual does not tell it.
-    plain = problem.pooled(problem.residual(theta, chosen))
+    plain = problem.pooled(problem.residual(theta, axis, chosen))
     left = (plain.square() * judged).sum((-1, -2)) / values
     fold = problem.fold if chosen is None else problem.fold[chosen]
     fold = fold[:, None].expand(judged.shape).flatten()
     found = []
-    for a, row in enumerate(specs):
-        fits = []
-        for b, spec in enumerate(row):
-            mine = spec._replace(theta=theta[a, b])
-            x = columns[b, a, : len(spec.flat)]
-            beside = x[:0] if loose is None else loose[b]
-            fits.append(_fit_of(mine, residual[b, a], x, values, float(left[a, b]), fold, beside))
-        found.append(fits)
+    for k, (i, spec) in enumerate(specs):
+        x = columns[k, : len(spec.flat)]
+        beside = x[:0] if loose is None else loose[i]
+        found.append(_fit_of(spec._replace(theta=theta[k]), residual[k], x, values, float(left[k]), fold, beside))
     return found
+
+
+def _padded(places: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
+    """Places of the numbers of each row, `p x m`, padded with 0, and 1 where there is one, else 0."""
+    wide = max(map(len, places))
+    active = torch.tensor([[*own, *[0] * (wide - len(own))] for own in places])
+    real = torch.tensor([[k < len(own) for k in range(wide)] for own in places])
+    return active, real.double()
+
+
+def _step(x: Tensor, y: Tensor, own: Tensor, real: Tensor, damping: Tensor, values: float) -> Tensor:
+    """Damped Gauss-Newton steps, `p x m`.
+
+    Args:
+        x, y: columns `p x m x v` and residuals `p x v`.
+        own: the numbers, `p x m`.
+        real: 1 where there is a number, else 0.
+        damping: share of the diagonal, `p`.
+        values: how many count.
+    """
+    noise = (y.square().sum(-1) / values).clamp_min(1e-300)[:, None]
+    gram, push = (x @ x.mT) / noise[..., None], (x @ y[..., None])[..., 0] / noise - own / _WIDE**2
+    diagonal = gram.diagonal(dim1=-2, dim2=-1)
+    inner = gram + torch.diag_embed(damping[:, None] * diagonal + 1 / _WIDE**2 + (1 - real))
+    move = torch.linalg.solve(inner, push[..., None])[..., 0] * real
+    return move.clamp(-_FARTHEST, _FARTHEST)
 
 
 def _fit_of(spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, fold: Tensor, loose: Tensor) -> Fit:
@@ -256,6 +291,6 @@ def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Tensor], fo
 
 
 def _cost(residual: Tensor, theta: Tensor, values: float) -> Tensor:
-    """Half the deviance, `h x n`; residual `n x h x v`, theta `h x n x k`."""
-    rss = residual.square().sum(-1).mT
+    """Half the deviance, `p`; residual `p x v`, theta `p x k`."""
+    rss = residual.square().sum(-1)
     return 0.5 * values * torch.log(rss.clamp_min(1e-300)) + 0.5 * theta.square().sum(-1) / _WIDE**2

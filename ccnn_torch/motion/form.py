@@ -27,11 +27,11 @@ def form_errors(problem: Problem, whitening: Whitening, best: list[Fit], least: 
         best: a set of each axis.
         least: the variance of each axis is at least that.
     """
-    theta = torch.zeros(1, len(best), problem.library.size, dtype=torch.float64)
+    theta = torch.zeros(len(best), problem.library.size, dtype=torch.float64)
     command, names = problem.data.command, problem.library.names
     does, most = (
-        problem.whitened(v - command, whitening)[:, 0].square().sum(-1).tolist()
-        for v in (problem.positions(theta), problem.data.position[None])
+        problem.whitened(v - command, problem.axes, whitening).square().sum(-1).tolist()
+        for v in (problem.positions(theta, problem.axes), problem.data.position)
     )
     found = []
     for i, fit in enumerate(best):

@@ -25,14 +25,15 @@ def held_out(problem: Problem, whitening: Whitening, sets: Sequence[Sequence[Spe
         whitening: of the residual.
         sets: `h` sets of each of `n` axes; what they hold and its shapes are those of all runs, the numbers are not.
     """
-    left = problem.residual(torch.stack([torch.stack([s.theta for s in row]) for row in sets]))
+    pairs = [(i, spec) for row in sets for i, spec in enumerate(row)]
+    axis = problem.axes.repeat(len(sets))
+    left = problem.residual(torch.stack([spec.theta for _, spec in pairs]), axis)
     folds = int(problem.fold.max()) + 1
     for k in range(folds if folds > 1 else 0):
         here, rest = (problem.fold == k).nonzero()[:, 0], (problem.fold != k).nonzero()[:, 0]
-        fits = fit_many(problem, whitening, sets, _STEPS, rest)
-        theta = torch.stack([torch.stack([f.spec.theta for f in row]) for row in fits])
-        left[:, :, here] = problem.residual(theta, here)
-    return left
+        fits = fit_many(problem, whitening, pairs, _STEPS, rest)
+        left[:, here] = problem.residual(torch.stack([f.spec.theta for f in fits]), axis, here)
+    return left.unflatten(0, (len(sets), -1))
 
 
 def gap_of(problem: Problem, before: Tensor, after: Tensor, floor: float, known: bool, draws: Draws) -> Gap:
@@ -78,7 +79,7 @@ def in_order(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
     there = list(dict.fromkeys(m for v in verdicts for m in v.best.members))
     if not there:
         return []
-    specs = [[only(problem.library, v.best.spec, [m for m in there if m != e]) for v in verdicts] for e in there]
-    left = problem.residual(torch.stack([torch.stack([s.theta for s in row]) for row in specs]))
-    size = (left.square() * problem.data.judged).sum((1, 2, 3))
+    specs = [only(problem.library, v.best.spec, [m for m in there if m != e]) for e in there for v in verdicts]
+    left = problem.residual(torch.stack([s.theta for s in specs]), problem.axes.repeat(len(there)))
+    size = (left.square() * problem.data.judged).sum((1, 2)).unflatten(0, (len(there), -1)).sum(1)
     return [names[there[k]] for k in torch.argsort(size, descending=True).tolist()]

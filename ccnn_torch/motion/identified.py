@@ -58,7 +58,7 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
         keys: of the mechanism, as given.
     """
     library = found.problem.library
-    values = library.parameters(torch.stack([v.best.spec.theta for v in found.verdicts]))
+    values = library.parameters(torch.stack([v.best.spec.theta for v in found.verdicts]), found.problem.axes)
     own = {name.removeprefix(OWN): values.pop(name) for name in [*values] if name.startswith(OWN)}
     count = len(found.verdicts)
     axes = [{name: float(v[i]) for name, v in values.items() if float(v[i]) != ABSENT[name]} for i in range(count)]

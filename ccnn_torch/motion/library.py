@@ -99,25 +99,27 @@ class Library(NamedTuple):
             high[:, self.held["stribeck_speed"]] = torch.tensor([_SLOW * axis.speed for axis in self.facts])
         return low, high
 
-    def parameters(self, theta: Tensor) -> dict[str, Tensor]:
-        """Parameters of the axes.
+    def parameters(self, theta: Tensor, axis: Tensor) -> dict[str, Tensor]:
+        """Parameters of axes.
 
         Args:
-            theta: numbers in plausible sizes, `... x n x k`.
+            theta: numbers in plausible sizes, `p x k`.
+            axis: which axis each row is of, `p`.
 
         Returns:
-            Of every parameter that is not absent everywhere, `... x n`.
+            Of every parameter that is not absent everywhere, `p`.
         """
-        found = {name: value.expand(theta.shape[:-1]).clone() for name, value in self.nominal.items()}
+        found = {name: value[axis] for name, value in self.nominal.items()}
         for j in range(len(self.numbers[0])):
-            if not bool((theta[..., j] != 0).any()):
+            if not bool((theta[:, j] != 0).any()):
                 continue
             for a, (name, _, how) in enumerate(self.numbers[0][j].acts):
-                amount = theta[..., j] * theta.new_tensor([axis[j].scale * axis[j].acts[a][1] for axis in self.numbers])
+                size = theta.new_tensor([own[j].scale * own[j].acts[a][1] for own in self.numbers])
+                amount = theta[:, j] * size[axis]
                 before = found.get(name, torch.full_like(amount, ABSENT.get(name, 0.0)))
                 found[name] = before + amount if how == "add" else before * amount.clamp(-5, 5).exp()
         for name, place in self.held.items():
-            value = theta[..., place]
+            value = theta[:, place]
             value = torch.where(value != 0, value.clamp_min(_LEAST.get(name, 0.0)), value)
             if bool((value != 0).any()):
                 found[name] = torch.where(value != 0, value, found.get(name, torch.full_like(value, ABSENT[name])))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.motion.fit import Fit, places_of, sensitivities
+from ccnn_torch.motion.fit import Fit, sensitivities
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.problem import Problem, Whitening
@@ -175,15 +175,14 @@ def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
 def _gain(problem: Problem, whitening: Whitening, axis: int, best: Fit, rival: Fit | None) -> float:
     """In nats."""
     other = best if rival is None else rival
-    active = places_of([[other.spec.flat]])
-    mine = problem.positions(torch.stack([best.spec.theta])[None])[0]
+    mine = problem.positions(best.spec.theta[None], problem.axes)
     there = replace(problem, data=problem.data._replace(position=mine))
-    difference, columns = sensitivities(there, whitening, other.spec.theta[None, None], active)
-    x = columns[0, 0].mT / math.sqrt(best.noise)
+    difference, columns = sensitivities(there, whitening, other.spec.theta[None], problem.axes, [other.spec.flat])
+    x = columns[0].mT / math.sqrt(best.noise)
     if rival is None:
         inner = torch.eye(x.shape[1], dtype=x.dtype) + x.mT @ x @ best.covariance
         return 0.5 * float(torch.linalg.slogdet(inner).logabsdet) if x.shape[1] else 0.0
-    y = difference[0, 0] / math.sqrt(best.noise)
+    y = difference[0] / math.sqrt(best.noise)
     if x.shape[1]:
         u, values, _ = torch.linalg.svd(x, full_matrices=False)
         u = u[:, values > _DIGITS * values[0]]

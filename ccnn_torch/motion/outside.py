@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, grams_of
 from ccnn_torch.motion.drivers import Driver
-from ccnn_torch.motion.fit import Fit, places_of, sensitivities, squares_unseen
-from ccnn_torch.motion.problem import Problem, Whitening
+from ccnn_torch.motion.fit import Fit, sensitivities, squares_unseen
+from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import CROWD, Search, log_posterior
 
 # Log prior odds of a driver.
@@ -73,9 +73,11 @@ def with_drivers(
 ) -> list[Candidate]:
     """Drivers beside the most probable sets, and those that lead from the best one to none."""
     problem, judged = found.problem, found.problem.data.judged
-    one = Whitening(found.whitening.coefficients[axis : axis + 1])
-    values = float(problem.judged.sum())
-    white = [problem.whitened(driver.columns[axis][:, None], one)[0] for driver in drivers]
+    mine, values = torch.tensor([axis]), float(problem.judged.sum())
+    white = [
+        problem.whitened(driver.columns[axis], mine.expand(len(driver.columns[axis])), found.whitening)
+        for driver in drivers
+    ]
     chain = [found.found[axis][0]]
     while chain[-1].members:
         less = [tuple(m for m in chain[-1].members if m != e) for e in chain[-1].members]
@@ -84,15 +86,13 @@ def with_drivers(
     taken: list[dict[Members, float]] = [{} for _ in drivers]
     left = {members: fit.left for members, fit in fits.items()}
     for base in {f.members: f for f in [*found.found[axis][:_BASES], *chain]}.values():
-        theta = torch.stack([base.spec.theta if i == axis else own[0].spec.theta for i, own in enumerate(found.found)])
-        flat = list(base.spec.flat)
-        active = places_of([[flat if i == axis else () for i in range(len(theta))]])
-        residual, own = sensitivities(problem, found.whitening, theta[None], active)
-        plain = problem.residual(theta[None])[0, axis]
-        y = residual[axis, 0] + base.spec.theta[flat] @ own[axis, 0]
+        theta, flat = base.spec.theta, list(base.spec.flat)
+        residual, columns = sensitivities(problem, found.whitening, theta[None], mine, [flat])
+        own, plain = columns[0], problem.residual(theta[None], mine)[0]
+        y = residual[0] + theta[flat] @ own
         prior = prior_of(base) + _OUTSIDE + (CROWD if len(base.members) >= 2 else 0.0)
         for k, (driver, columns) in enumerate(zip(drivers, white, strict=True)):
-            x = torch.cat([own[axis, 0], columns])
+            x = torch.cat([own, columns])
             grams = grams_of(torch.cat([x, found.loose[axis]]).mT[:, None, :], y[:, None])._replace(values=values)
             groups = [*base.spec.groups, torch.arange(len(flat), len(x))]
             # What it takes away of the position itself, not of its whitened form.
@@ -100,7 +100,7 @@ def with_drivers(
             rest = (plain - (mean[:, None, None] * driver.columns[axis]).sum(0))[judged].square().mean()
             taken[k][base.members] = float(rest)
             there = driver.name if float(plain[judged].square().mean() - rest) >= slight else None
-            sets.append((k, Candidate((base.members, there), grams, groups, prior, (own[axis, 0], columns, y))))
+            sets.append((k, Candidate((base.members, there), grams, groups, prior, (own, columns, y))))
     # Beside a driver a name has to do what the driver does not do as well.
     return [
         one._replace(key=(essential(one.key[0], taken[k] if one.key[1] else left, slight, {}), one.key[1]))

@@ -29,12 +29,11 @@ class Whitening(NamedTuple):
 
     coefficients: Tensor
 
-    def __call__(self, residual: Tensor) -> Tensor:
-        """`n x ... x s`, of the same shape; the first samples, which lack some before them, are as they are."""
+    def __call__(self, residual: Tensor, axis: Tensor) -> Tensor:
+        """Of residuals `p x b x s` of the axes `p`; the first samples, which lack some before them, are as they are."""
         white = residual.clone()
-        shape = [-1] + [1] * (residual.dim() - 1)
         for k in range(1, self.coefficients.shape[1] + 1):
-            white[..., k:] -= self.coefficients[:, k - 1].reshape(shape) * residual[..., :-k]
+            white[..., k:] -= self.coefficients[axis, k - 1, None, None] * residual[..., :-k]
         return white
 
 
@@ -67,13 +66,29 @@ class Problem:
     simulated: Tensor | None = None
     own: Mapping[str, Tensor] = field(default_factory=dict)
 
-    def positions(self, theta: Tensor, chosen: Tensor | None = None) -> Tensor:
-        """Simulated positions, `p x n x b x s`; theta: `p x n x k`; chosen: stretches, all when None."""
-        data = self.data
-        rows = torch.arange(len(data.time)) if chosen is None else chosen
-        start = torch.stack([data.position[:, :, 0], data.speed[:, :, 0]], -1)
-        moved = self._moved(theta, rows, start)
-        return moved if self.simulated is None else moved + self._beyond[:, rows]
+    @property
+    def axes(self) -> Tensor:
+        """The number of each axis, `n`."""
+        return torch.arange(len(self.followed))
+
+    @cached_property
+    def _start(self) -> Tensor:
+        return torch.stack([self.data.position[:, :, 0], self.data.speed[:, :, 0]], -1)
+
+    def positions(self, theta: Tensor, axis: Tensor, chosen: Tensor | None = None) -> Tensor:
+        """Simulated positions of models of axes.
+
+        Args:
+            theta: numbers of each model, `p x k`.
+            axis: which axis each is of, `p`.
+            chosen: stretches, all when None.
+
+        Returns:
+            `p x b x s` [rad or m].
+        """
+        rows = torch.arange(len(self.data.time)) if chosen is None else chosen
+        moved = self._moved(theta, axis, rows, self._start)
+        return moved if self.simulated is None else moved + self._beyond[axis][:, rows]
 
     @cached_property
     def _beyond(self) -> Tensor:
@@ -81,8 +96,8 @@ class Problem:
         assert self.simulated is not None
         begin, rows = self.simulated[..., :2], torch.arange(len(self.data.time))
         speed = begin.diff(dim=-1) / self.data.time[:, :2].diff(dim=-1)
-        theta = torch.zeros(1, len(begin), self.library.size, dtype=torch.float64)
-        return self.simulated - self._moved(theta, rows, torch.cat([begin[..., :1], speed], -1))[0]
+        theta = torch.zeros(len(begin), self.library.size, dtype=torch.float64)
+        return self.simulated - self._moved(theta, self.axes, rows, torch.cat([begin[..., :1], speed], -1))
 
     def pushed(self, theta: Tensor, torque: Tensor) -> Tensor:
         """Positions under torques that resist the motors, over the gain, one after the other.
@@ -117,7 +132,7 @@ class Problem:
             simulated=None,
             own={name: v.repeat(1, m, 1) for name, v in self.own.items()},
         )
-        moved = wide.positions(theta[None])[0].reshape(n, m, b, s)
+        moved = wide.positions(theta, self.axes).reshape(n, m, b, s)
         return moved if self.simulated is None else moved + self._beyond[:, None]
 
     def loose(self, theta: Tensor) -> Tensor:
@@ -126,8 +141,7 @@ class Problem:
         About `theta`, `n x k`, the machine as it seems to be: a model that is wrong may be near to its stability.
         """
         n, rows, nominal = len(self.followed), torch.arange(len(self.data.time)), self.library.nominal
-        start = torch.stack([self.data.position[:, :, 0], self.data.speed[:, :, 0]], -1)
-        plain, columns = self._moved(theta[None], rows, start), [theta.new_zeros(0, *self.followed.shape)]
+        plain, columns = self._moved(theta, self.axes, rows, self._start), []
         absent = torch.zeros(n, dtype=torch.float64)
         weight = torch.hypot(*(nominal.get(name, absent) for name in _WEIGHT))
         sizes = {"gain": torch.ones_like(absent), **nominal, **dict.fromkeys(_WEIGHT, weight)}
@@ -135,37 +149,40 @@ class Problem:
             if name in _LOOSE and bool((size != 0).any()):
                 before = nominal.get(name, sizes["gain"] if name == "gain" else absent)
                 other = self.library._replace(nominal={**nominal, name: before + _KNOWN * size})
-                columns.append(replace(self, library=other)._moved(theta[None], rows, start) - plain)
-        return torch.cat(columns)
+                columns.append(replace(self, library=other)._moved(theta, self.axes, rows, self._start) - plain)
+        return torch.stack(columns) if columns else theta.new_zeros(0, *plain.shape)
 
-    def _moved(self, theta: Tensor, rows: Tensor, start: Tensor) -> Tensor:
-        data, n, b = self.data, len(self.followed), len(rows)
-        time = data.time[rows].expand(n, -1, -1).reshape(n * b, -1)
+    def _moved(self, theta: Tensor, axis: Tensor, rows: Tensor, start: Tensor) -> Tensor:
+        data, p, b = self.data, len(theta), len(rows)
+
+        def of_axis(values: Tensor) -> Tensor:
+            return values[axis[:, None], rows].flatten(0, 1)
+
+        def of_all(values: Tensor) -> Tensor:
+            return values[rows].expand(p, -1, -1).flatten(0, 1)
+
         drive = Drive(
-            time,
-            self.followed[:, rows].reshape(n * b, -1),
-            start[:, rows].reshape(n * b, 2),
-            self.supply[rows].expand(n, -1, -1).reshape(n * b, -1),
-            self.warm[rows].expand(n, -1, -1).reshape(n * b, -1),
-            None if self.torque is None else self.torque[:, rows].reshape(n * b, -1),
+            of_all(data.time),
+            of_axis(self.followed),
+            of_axis(start),
+            of_all(self.supply),
+            of_all(self.warm),
+            None if self.torque is None else of_axis(self.torque),
         )
-        parameters = self.library.parameters(theta)
+        parameters = self.library.parameters(theta, axis)
         own = {name: parameters.pop(f"{OWN}{name}", None) for name in self.own}
-        values = {
-            name: value[..., None].expand(*value.shape, b).reshape(len(theta), n * b)
-            for name, value in parameters.items()
-        }
-        moved = simulate_axes(drive, values).reshape(-1, n, b, time.shape[-1])
+        values = {name: value.repeat_interleave(b)[None] for name, value in parameters.items()}
+        moved = simulate_axes(drive, values)[0].reshape(p, b, -1)
         for name, value in own.items():
             if value is not None:
-                moved = moved + value[..., None, None] * self.own[name][:, rows]
-        return moved.expand(len(theta), -1, -1, -1)
+                moved = moved + value[:, None, None] * self.own[name][axis[:, None], rows]
+        return moved
 
-    def residual(self, theta: Tensor, chosen: Tensor | None = None) -> Tensor:
-        """Measured less simulated, `p x n x b x s` [rad or m]; finite."""
+    def residual(self, theta: Tensor, axis: Tensor, chosen: Tensor | None = None) -> Tensor:
+        """Measured less simulated, as `positions`; finite."""
         measured = self.data.position if chosen is None else self.data.position[:, chosen]
-        far = _FARTHEST * (measured.amax((-1, -2)) - measured.amin((-1, -2)))[:, None, None] + 1e-12
-        left = measured - self.positions(theta, chosen)
+        far = _FARTHEST * (measured.amax((-1, -2)) - measured.amin((-1, -2)))[axis, None, None] + 1e-12
+        left = measured[axis] - self.positions(theta, axis, chosen)
         return torch.maximum(torch.minimum(torch.nan_to_num(left, nan=torch.inf), far), -far)
 
     def pooled(self, residual: Tensor) -> Tensor:
@@ -188,7 +205,7 @@ class Problem:
         """Which of the means count, `b x t`."""
         return self.pooled(self.data.judged.double()) == 1
 
-    def whitened(self, residual: Tensor, whitening: Whitening, chosen: Tensor | None = None) -> Tensor:
-        """Whitened means of the residuals, `n x p x (b t)`; 0 where they do not count."""
+    def whitened(self, residual: Tensor, axis: Tensor, whitening: Whitening, chosen: Tensor | None = None) -> Tensor:
+        """Whitened means of residuals `p x b x s` of the axes `p`, `p x (b t)`; 0 where they do not count."""
         judged = self.judged if chosen is None else self.judged[chosen]
-        return (whitening(self.pooled(residual).transpose(0, 1)) * judged).flatten(2)
+        return (whitening(self.pooled(residual), axis) * judged).flatten(1)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
-from ccnn_torch.motion.fit import Fit, Spec, fit_many, places_of, sensitivities, started
+from ccnn_torch.motion.fit import Fit, Spec, fit_many, sensitivities, started
 from ccnn_torch.motion.form import form_errors, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
 from ccnn_torch.motion.problem import Problem, Whitening, white_noise
@@ -63,16 +63,14 @@ def search(problem: Problem) -> Search:
     n = len(problem.followed)
     plain = _Pool(problem, white_noise(n))
     plain.forward()
-    best = plain.best()
-    theta = torch.stack([f.spec.theta for f in best])[None]
-    rich = problem.residual(theta)[0]
+    rich = problem.residual(torch.stack([f.spec.theta for f in plain.best()]), problem.axes)
     pool = _Pool(problem, fitted_whitening(problem.pooled(rich), problem.judged))
     pool.again(plain)
     pool.forward()
     # The noise of what is left by what is most probable now.
-    theta = torch.stack([f.spec.theta for f in pool.best()])[None]
-    left = problem.residual(theta)[0]
-    final = _Pool(problem, fitted_whitening(problem.pooled(left), problem.judged), theta[0])
+    theta = torch.stack([f.spec.theta for f in pool.best()])
+    left = problem.residual(theta, problem.axes)
+    final = _Pool(problem, fitted_whitening(problem.pooled(left), problem.judged), theta)
     final.again(pool)
     final.neighbours()
     final.reduced()
@@ -97,10 +95,11 @@ class _Pool:
     def __init__(self, problem: Problem, whitening: Whitening, about: Tensor | None = None) -> None:
         self.problem, self.whitening = problem, whitening
         # Nothing, as long as each set has the noise that it leaves.
-        loose = problem.followed.new_zeros(0, *problem.followed.shape) if about is None else problem.loose(about)
-        self.loose = problem.whitened(loose, whitening)
-        self.library: Library = problem.library
         self.axes = len(problem.followed)
+        loose = problem.followed.new_zeros(0, *problem.followed.shape) if about is None else problem.loose(about)
+        white = problem.whitened(loose.flatten(0, 1), problem.axes.repeat(len(loose)), whitening)
+        self.loose = white.unflatten(0, (len(loose), self.axes)).transpose(0, 1)
+        self.library: Library = problem.library
         zero = torch.zeros(self.library.size, dtype=torch.float64)
         # Of noise and form errors of each axis; None: the noise that each set leaves.
         self.variance: list[float] | None = None
@@ -129,18 +128,12 @@ class _Pool:
 
     def fit(self, wanted: Sequence[Sequence[Spec]], steps: int) -> None:
         """Fit sets of each axis; one that was fitted before stays if it was better."""
-        wide = max((len(w) for w in wanted), default=0)
-        if not wide:
-            return
-        # An axis with fewer sets repeats one.
-        spare = [w[0] if w else next(iter(self.found[i].values())).spec for i, w in enumerate(wanted)]
-        rows = [[w[k] if k < len(w) else spare[i] for i, w in enumerate(wanted)] for k in range(wide)]
-        # Sets of one size together, since the others are padded to it.
-        for row in fit_many(self.problem, self.whitening, rows, steps, loose=self.loose):
-            for i, fit in enumerate(row):
-                old = self.found[i].get(fit.members)
-                if old is None or log_posterior(fit) > log_posterior(old):
-                    self.found[i][fit.members] = fit
+        pairs = [(i, spec) for i, own in enumerate(wanted) for spec in own]
+        fits = fit_many(self.problem, self.whitening, pairs, steps, loose=self.loose)
+        for (i, _), fit in zip(pairs, fits, strict=True):
+            old = self.found[i].get(fit.members)
+            if old is None or log_posterior(fit) > log_posterior(old):
+                self.found[i][fit.members] = fit
 
     def again(self, other: _Pool) -> None:
         """Fit the most probable sets of another pool under this noise, and every effect alone."""
@@ -151,22 +144,25 @@ class _Pool:
     def forward(self) -> None:
         """Add effects one after the other, as long as that brings evidence."""
         done: list[set[tuple[int, ...]]] = [set() for _ in range(self.axes)]
+        gains = [True] * self.axes
         for _ in range(_MOST):
             before = [self.score(i, f) for i, f in enumerate(self.best())]
             bases = [
-                [f for f in ranked[:_BEAM] if f.members not in d and len(f.members) < _MOST]
-                for ranked, d in zip(self.ranked(), done, strict=True)
+                [f for f in ranked[:_BEAM] if gains[i] and f.members not in done[i] and len(f.members) < _MOST]
+                for i, ranked in enumerate(self.ranked())
             ]
-            if not any(bases):
-                return
             for d, own in zip(done, bases, strict=True):
                 d |= {f.members for f in own}
             # Alone every effect is fitted: its own share of the gap is told.
             alone = all(not f.members for own in bases for f in own)
             self.fit(self.screened(bases, len(self.library.names) if alone else _FITTED), _SHORT)
-            self.fit([[f.spec for f in ranked[:_BEAM] if f.members] for ranked in self.ranked()], _SHORT)
+            self.fit(
+                [[f.spec for f in r[:_BEAM] if f.members and own] for r, own in zip(self.ranked(), bases, strict=True)],
+                _SHORT,
+            )
             after = [self.score(i, f) for i, f in enumerate(self.best())]
-            if all(a < b + _GAINED for a, b in zip(after, before, strict=True)):
+            gains = [a >= b + _GAINED for a, b in zip(after, before, strict=True)]
+            if not any(gains):
                 return
 
     def neighbours(self) -> None:
@@ -211,74 +207,55 @@ class _Pool:
 
     def screened(self, bases: Sequence[Sequence[Fit]], most: int = _FITTED) -> list[list[Spec]]:
         """For each base the effects that promise most, by what a difference quotient of each explains."""
-        library, wide = self.library, max(map(len, bases))
-        spare = [b[0] if b else next(iter(self.found[i].values())) for i, b in enumerate(bases)]
         wanted: list[dict[tuple[int, ...], Spec]] = [{} for _ in bases]
-        for k in range(wide):
-            row = [b[k] if k < len(b) else spare[i] for i, b in enumerate(bases)]
-            promise = self.promise(row)
-            for i, fit in enumerate(row):
-                if k >= len(bases[i]):
-                    continue
-                scores: dict[int, tuple[float, Variant]] = {}
-                for score, variant in promise[i]:
-                    if variant.effect not in scores or score > scores[variant.effect][0]:
-                        scores[variant.effect] = (score, variant)
-                for _, variant in sorted(scores.values(), key=lambda item: -item[0])[:most]:
-                    spec = started(library, fit.spec, variant, i)
-                    if spec.members not in self.found[i]:
-                        wanted[i].setdefault(spec.members, spec)
+        for i, fit in [(i, fit) for i, own in enumerate(bases) for fit in own]:
+            scores: dict[int, tuple[float, Variant]] = {}
+            for score, variant in self.promise(i, fit):
+                if variant.effect not in scores or score > scores[variant.effect][0]:
+                    scores[variant.effect] = (score, variant)
+            for _, variant in sorted(scores.values(), key=lambda item: -item[0])[:most]:
+                spec = started(self.library, fit.spec, variant, i)
+                if spec.members not in self.found[i]:
+                    wanted[i].setdefault(spec.members, spec)
         return [list(w.values()) for w in wanted]
 
-    def promise(self, bases: Sequence[Fit]) -> list[list[tuple[float, Variant]]]:
-        """Of each axis, for every variant of an effect that is not in its base, the evidence of both together."""
-        problem, library = self.problem, self.library
-        theta = torch.stack([f.spec.theta for f in bases])
-        variants = [v for own in library.variants for v in own]
+    def promise(self, i: int, base: Fit) -> list[tuple[float, Variant]]:
+        """For every variant of an effect that axis `i` can show and `base` lacks, the evidence of both together."""
+        problem, library, theta, flat = self.problem, self.library, base.spec.theta, list(base.spec.flat)
+        variants = [
+            v
+            for own in library.variants
+            for v in own
+            if v.effect not in base.members and bool(library.there[i, v.effect])
+        ]
+        if not variants:
+            return []
         moved, steps = [], []
         for v in variants:
             for a, j in enumerate(v.active):
-                changed = theta.clone()
-                value = v.values[:, a]
-                step = torch.where(value.abs() > 1e-6, value, torch.full_like(value, _STEP))
-                changed[:, j] += step
-                for b, place in enumerate(v.held):
-                    changed[:, place] = v.shapes[:, b]
+                changed, value = theta.clone(), float(v.values[i, a])
+                steps.append(value if abs(value) > 1e-6 else _STEP)
+                changed[j] += steps[-1]
+                changed[list(v.held)] = v.shapes[i]
                 moved.append(changed)
-                steps.append(step)
-        active = places_of([[f.spec.flat for f in bases]])
-        residual, own = sensitivities(problem, self.whitening, theta[None], active)
-        parts = []
-        for k in range(0, len(moved), 16):
-            part = torch.stack(moved[k : k + 16])
-            left = problem.whitened(problem.residual(part), self.whitening)
-            parts.append((residual - left) / torch.stack(steps[k : k + 16]).mT[..., None])
-        new = torch.cat(parts, 1)
-        values = float(problem.judged.sum())
-        found = []
-        for i, f in enumerate(bases):
-            m = len(f.spec.flat)
-            y = residual[i, 0] + f.spec.theta[list(f.spec.flat)] @ own[i, 0, :m]
-            x = torch.cat([own[i, 0, :m], new[i]])
-            columns = torch.cat([x, self.loose[i]])
-            grams = grams_of(columns.mT[:, None, :], y[:, None])._replace(values=values)
-            base_groups = f.spec.groups
-            sets, kept, place = [], [], m
-            for v in variants:
-                width = len(v.active)
-                if v.effect not in f.members and bool(library.there[i, v.effect]):
-                    sets.append([*base_groups, torch.arange(place, place + width)])
-                    kept.append(v)
-                place += width
-            scores = []
-            if sets and self.variance is None:
-                scores = fit_sets(grams, sets, 0.0).log_evidence.tolist()
-            elif sets and self.variance is not None:
-                scores = weighed(grams, sets, len(x), self.variance[i]).log_evidence.tolist()
-            found.append(
-                [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, kept, strict=True)]
-            )
-        return found
+        residual, own = sensitivities(problem, self.whitening, theta[None], torch.tensor([i]), [flat])
+        axis = torch.full((len(moved),), i)
+        left = problem.whitened(problem.residual(torch.stack(moved), axis), axis, self.whitening)
+        new = (residual - left) / left.new_tensor(steps)[:, None]
+        x = torch.cat([own[0], new])
+        y = residual[0] + theta[flat] @ own[0]
+        grams = grams_of(torch.cat([x, self.loose[i]]).mT[:, None, :], y[:, None])
+        grams = grams._replace(values=float(problem.judged.sum()))
+        ends = torch.tensor([len(v.active) for v in variants]).cumsum(0) + len(flat)
+        sets = [
+            [*base.spec.groups, torch.arange(int(end) - len(v.active), int(end))]
+            for v, end in zip(variants, ends, strict=True)
+        ]
+        if self.variance is None:
+            scores = fit_sets(grams, sets, 0.0).log_evidence.tolist()
+        else:
+            scores = weighed(grams, sets, len(x), self.variance[i]).log_evidence.tolist()
+        return [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, variants, strict=True)]
 
 
 def without(library: Library, spec: Spec, place: int) -> Spec:

@@ -92,9 +92,10 @@ def test_parameters_are_batched_and_never_run_away() -> None:
         assert torch.equal(together[k], simulate_axes(drive, {"inertia": inertia[k : k + 1]})[0])
     library = library_of(motion_effects(), [Facts("rad", {}, gain=2.0, length=0.1)])
     for j in range(len(library.numbers[0])):
-        theta = torch.zeros(2, 1, library.size, dtype=torch.float64)
-        theta[0, 0, j], theta[1, 0, j] = 200.0, -200.0
-        assert torch.isfinite(simulate_axes(drive, library.parameters(theta))).all()
+        theta = torch.zeros(2, library.size, dtype=torch.float64)
+        theta[0, j], theta[1, j] = 200.0, -200.0
+        parameters = library.parameters(theta, torch.zeros(2, dtype=torch.int64))
+        assert torch.isfinite(simulate_axes(drive, {name: v[:, None] for name, v in parameters.items()})).all()
 
 
 def test_an_effect_of_ones_own_is_a_value_or_a_class(tmp_path: Path) -> None:
