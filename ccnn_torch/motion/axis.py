@@ -155,19 +155,31 @@ def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[
     for k in range(len(steps)):
         h = steps[k] * (_GAMMA / parts)
         dry = a["coulomb"] if warm is None else a["coulomb"] * np.maximum(1 + a["thermal"] * warm[k], 0)
-        strength = None if share is None else share[k + 1]
+        fixed = rule.fixed(h, None if share is None else share[k + 1], dry)
         slope = (u[k + 1] - u[k]) / parts
         for i in range(parts):
             before = u[k] + i * slope
             against = (None, None) if push is None else tuple(_between(push, k, (i + c) / parts) for c in (_GAMMA, 1.0))
-            q1, v1 = rule.step(q, v, before + _GAMMA * slope, h, strength, dry, against[0])
-            q, v = rule.step(q + ahead * (q1 - q), v + ahead * (v1 - v), before + slope, h, strength, dry, against[1])
+            q1, v1 = rule.step(q, v, before + _GAMMA * slope, fixed, against[0])
+            q, v = rule.step(q + ahead * (q1 - q), v + ahead * (v1 - v), before + slope, fixed, against[1])
         found[k + 1] = q
     return found
 
 
 def _between(values: Array, k: int, share: float) -> Array:
     return np.asarray(values[k] + share * (values[k + 1] - values[k]))
+
+
+class _Fixed(NamedTuple):
+    """Of one sample: length of a stage, gain, limit and dry friction, inertia and damping over it, stiffness."""
+
+    h: Array
+    gain: Array
+    limit: Array
+    dry: Array
+    mass: Array
+    light: Array
+    stiff: Array
 
 
 class _Rule:
@@ -184,16 +196,18 @@ class _Rule:
         self.weight, self.hang = _wave(a["gravity_sin"], a["gravity_cos"])
         self.wave, self.phase = _wave(a["cogging_sin"], a["cogging_cos"])
 
-    def step(
-        self, q: Array, v: Array, u: Array, h: Array, share: Array | None, dry: Array, push: Array | None
-    ) -> tuple[Array, Array]:
-        """Position and speed at the end; share: of the motor's nominal strength that the supply allows."""
-        a, gain, limit = self.a, self.a["gain"], self.limit
-        if share is not None:
-            gain, limit = gain * share, limit * share
-        mass = a["inertia"] / h
-        motor = gain * (u - q)
-        free = mass * v
+    def fixed(self, h: Array, share: Array | None, dry: Array) -> _Fixed:
+        """What all stages of a sample have in common; share: of the motor's strength that the supply allows."""
+        gain, limit = (self.a["gain"], self.limit) if share is None else (self.a["gain"] * share, self.limit * share)
+        mass = self.a["inertia"] / h
+        light = np.maximum(mass + self.a["viscous"], _TINY)
+        return _Fixed(h, gain, limit, dry, mass, light, gain * h)
+
+    def step(self, q: Array, v: Array, u: Array, fixed: _Fixed, push: Array | None) -> tuple[Array, Array]:
+        """Position and speed at the end of a stage."""
+        a, h, limit = self.a, fixed.h, fixed.limit
+        motor = fixed.gain * (u - q)
+        free = fixed.mass * v
         # What the gear carries beside the motor's torque.
         carried: Array | float = 0.0
         if self.heavy:
@@ -203,25 +217,26 @@ class _Rule:
         free = free - carried
         if self.waves:
             free = free - self.wave * np.sin(a["cogging_order"] * q + self.phase)
-        friction = dry
+        friction = fixed.dry
         if self.has["stribeck"]:
             friction = friction + a["stribeck"] * np.exp(-np.square(v / a["stribeck_speed"]))
-        light = np.maximum(mass + a["viscous"], _TINY)
-        speed = self.solved(free + motor, friction, motor + carried, light, gain * h)
+        speed = self.solved(free, motor, friction, carried, fixed.light, fixed.stiff)
         if self.has["weakness"]:
-            torque = motor - gain * h * speed
+            torque = motor - fixed.stiff * speed
             held = np.minimum(np.maximum(torque, -limit), limit)
             if not np.array_equal(held, torque):
-                weak = self.solved(free + held, friction, held + carried, light, 0 * held)
+                weak = self.solved(free, held, friction, carried, fixed.light, 0 * held)
                 speed = np.where(torque == held, speed, weak)
         speed = np.minimum(np.maximum(speed, -_FASTEST), _FASTEST)
         return q + h * speed, speed
 
-    def solved(self, push: Array, friction: Array, load: Array, light: Array, stiff: Array) -> Array:
-        """Speed under a push against dry friction; stiff: how fast the motor's part of the load falls with it."""
-        resistance = light + stiff
+    def solved(
+        self, free: Array, motor: Array, friction: Array, carried: Array | float, light: Array, stiff: Array
+    ) -> Array:
+        """Speed under all torques against dry friction; stiff: how fast the motor's falls with it."""
+        resistance, push = light + stiff, free + motor
         if self.has["load_friction"]:
-            share = self.a["load_friction"]
+            share, load = self.a["load_friction"], motor + carried
             friction = friction + share * np.abs(load)
             resistance = resistance - share * stiff * np.sign(push * load)
         if self.dry:

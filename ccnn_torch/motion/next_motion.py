@@ -95,27 +95,30 @@ def next_motions(found: Search, verdicts: Sequence[AxisVerdict]) -> tuple[list[d
         if not amplitude:
             continue
         rivals, best = _rivals(library, i, found.found[i], verdict), {*verdict.best.members}
-        for motion in motions(middle, amplitude, library.facts[i].speed, library.facts[i].unit):
-            problem = _problem_of(found.problem, i, motion)
-            whitening = Whitening(found.whitening.coefficients[i : i + 1])
-            entry = {
-                "joints": {f"q{i + 1}": amplitude},
-                "covariates": {},
-                "motion": {
-                    "joint": f"q{i + 1}",
-                    "kind": motion.kind,
-                    "text": motion.text,
-                    "seconds": _SECONDS,
-                    "gain": motion.gain,
-                    "load": motion.load,
-                },
-            }
-            others: list[Fit | None] = [*rivals] or [None]
-            for rival in others:
-                gain = _gain(problem, whitening, i, verdict.best, rival)
-                other = best if rival is None else {*rival.members}
-                names = [library.names[e] for e in (*sorted(best - other), *sorted(other - best))]
-                entries.append((entry | {"separates": names, "gain": gain}, motion))
+        proposed = motions(middle, amplitude, library.facts[i].speed, library.facts[i].unit)
+        problem = _problem_of(found.problem, i, proposed)
+        whitening = Whitening(found.whitening.coefficients[i].expand(len(proposed), -1))
+        others: list[Fit | None] = [*rivals] or [None]
+        for rival in others:
+            gains = _gains(problem, whitening, verdict.best, rival)
+            other = best if rival is None else {*rival.members}
+            names = [library.names[e] for e in (*sorted(best - other), *sorted(other - best))]
+            for motion, gain in zip(proposed, gains, strict=True):
+                entry = {
+                    "joints": {f"q{i + 1}": amplitude},
+                    "covariates": {},
+                    "motion": {
+                        "joint": f"q{i + 1}",
+                        "kind": motion.kind,
+                        "text": motion.text,
+                        "seconds": _SECONDS,
+                        "gain": motion.gain,
+                        "load": motion.load,
+                    },
+                    "separates": names,
+                    "gain": gain,
+                }
+                entries.append((entry, motion))
     entries = [e for e in entries if math.isfinite(e[0]["gain"])]
     entries.sort(key=lambda e: -e[0]["gain"])
     chosen: list[tuple[dict[str, Any], Motion]] = []
@@ -141,19 +144,22 @@ def _rivals(library: Library, axis: int, fits: Sequence[Fit], verdict: AxisVerdi
     return [f for f in found if acts(f) != acts(verdict.best)]
 
 
-def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
-    """One axis that is commanded by a motion."""
-    library, row = problem.library, motion.command[None]
-    still = torch.zeros_like(row)
-    nominal = {n: v[axis : axis + 1] for n, v in library.nominal.items()}
-    nominal["gain"] = nominal.get("gain", torch.ones(1, dtype=row.dtype)) * motion.gain
-    nominal["gravity_sin"] = nominal.get("gravity_sin", torch.zeros(1, dtype=row.dtype)) + motion.load
+def _problem_of(problem: Problem, axis: int, proposed: Sequence[Motion]) -> Problem:
+    """One axis that is commanded by each motion: as many axes as there are motions, of one stretch each."""
+    library, count = problem.library, len(proposed)
+    command = torch.stack([motion.command for motion in proposed])[:, None]
+    still = torch.zeros_like(command[0])
+    nominal = {n: v[axis].expand(count) for n, v in library.nominal.items()}
+    one = torch.ones(count, dtype=command.dtype)
+    nominal["gain"] = nominal.get("gain", one) * one.new_tensor([motion.gain for motion in proposed])
+    nominal["gravity_sin"] = nominal.get("gravity_sin", 0 * one) + one.new_tensor([motion.load for motion in proposed])
+    time = proposed[0].time
     data = problem.data._replace(
-        time=motion.time[None],
-        command=row[None],
-        position=row[None],
-        speed=still[None],
-        judged=(motion.time > _LEAD)[None],
+        time=time[None],
+        command=command,
+        position=command,
+        speed=torch.zeros_like(command),
+        judged=(time > _LEAD)[None],
         run=torch.zeros(1, dtype=torch.int64),
         beside={},
     )
@@ -161,8 +167,8 @@ def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
     return replace(
         problem,
         data=data,
-        library=library._replace(facts=(), numbers=(library.numbers[axis],), nominal=nominal),
-        followed=row[None],
+        library=library._replace(facts=(), numbers=(library.numbers[axis],) * count, nominal=nominal),
+        followed=command,
         supply=still,
         warm=still,
         torque=None,
@@ -172,19 +178,22 @@ def _problem_of(problem: Problem, axis: int, motion: Motion) -> Problem:
     )
 
 
-def _gain(problem: Problem, whitening: Whitening, axis: int, best: Fit, rival: Fit | None) -> float:
-    """In nats."""
-    other = best if rival is None else rival
-    mine = problem.positions(best.spec.theta[None], problem.axes)
+def _gains(problem: Problem, whitening: Whitening, best: Fit, rival: Fit | None) -> list[float]:
+    """Of each motion, in nats."""
+    other, count = best if rival is None else rival, len(problem.axes)
+    mine = problem.positions(best.spec.theta.expand(count, -1), problem.axes)
     there = replace(problem, data=problem.data._replace(position=mine))
-    difference, columns = sensitivities(there, whitening, other.spec.theta[None], problem.axes, [other.spec.flat])
-    x = columns[0].mT / math.sqrt(best.noise)
-    if rival is None:
-        inner = torch.eye(x.shape[1], dtype=x.dtype) + x.mT @ x @ best.covariance
-        return 0.5 * float(torch.linalg.slogdet(inner).logabsdet) if x.shape[1] else 0.0
-    y = difference[0] / math.sqrt(best.noise)
-    if x.shape[1]:
-        u, values, _ = torch.linalg.svd(x, full_matrices=False)
-        u = u[:, values > _DIGITS * values[0]]
-        y = y - u @ (u.mT @ y)
-    return 0.5 * float(y.square().sum())
+    theta, places = other.spec.theta.expand(count, -1), [other.spec.flat] * count
+    difference, columns = sensitivities(there, whitening, theta, problem.axes, places)
+    found = []
+    for y, x in zip(difference / math.sqrt(best.noise), columns.mT / math.sqrt(best.noise), strict=True):
+        if rival is None:
+            inner = torch.eye(x.shape[1], dtype=x.dtype) + x.mT @ x @ best.covariance
+            found.append(0.5 * float(torch.linalg.slogdet(inner).logabsdet) if x.shape[1] else 0.0)
+            continue
+        if x.shape[1]:
+            u, values, _ = torch.linalg.svd(x, full_matrices=False)
+            u = u[:, values > _DIGITS * values[0]]
+            y = y - u @ (u.mT @ y)
+        found.append(0.5 * float(y.square().sum()))
+    return found
