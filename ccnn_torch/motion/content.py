@@ -145,7 +145,7 @@ def _parameters(library: Library, axis: int, fit: Fit, effect: int) -> dict[str,
     found: dict[str, dict[str, Any]] = {}
     flat = fit.spec.flat
     deviation = fit.covariance.diagonal().clamp_min(0).sqrt()
-    for j in library.places[effect]:
+    for j in (j for j in library.places[effect] if j in flat):
         number: Number = library.numbers[axis][j]
         unit, factor = _unit(number.unit, facts)
         value = float(fit.spec.theta[j]) * number.scale

@@ -149,13 +149,14 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
     def variant(e: int, k: int, count: int) -> Variant:
         of_axes = [s[k] for s in shapes[e]]
         own = [name for name in of_axes[0] if name not in names[e]]
+        active = [j for j in places[e] if of_axes[0].get(numbers[0][j].name, 0.0) is not None]
         values = [
-            [given[n.name] / n.scale if n.name in given else n.start for n in (axis[j] for j in places[e])]
+            [given[n.name] / n.scale if n.name in given else n.start for n in (axis[j] for j in active)]
             for given, axis in zip(of_axes, numbers, strict=True)
         ]
         return Variant(
             e,
-            places[e],
+            tuple(active),
             torch.tensor(values, dtype=torch.float64),
             tuple(held[name] for name in own),
             torch.tensor([[given[name] for name in own] for given in of_axes], dtype=torch.float64),

@@ -89,11 +89,11 @@ class MotionEffect:
         name: as in `diagnosis.json`.
         numbers: of an axis; every axis of a machine has the same ones.
         shapes: values that are tried for what a fit cannot reach step by step, by the name of a number (its start, in
-            its unit), or of a parameter of the axis (held at it).
+            its unit; None: it stays 0), or of a parameter of the axis (held at it).
         missing: what these logs or this model lack to show it; empty where they can.
     """
 
     name: str
     numbers: Callable[[Facts], Sequence[Number]]
-    shapes: Callable[[Facts], Sequence[Mapping[str, float]]] = lambda axis: ({},)
+    shapes: Callable[[Facts], Sequence[Mapping[str, float | None]]] = lambda axis: ({},)
     missing: Callable[[Facts], str] = lambda axis: ""

@@ -8,21 +8,35 @@ from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add,
 _LEAST = 0.03
 
 
+def _recorded(axis: Facts) -> bool:
+    return axis.supply >= _LEAST
+
+
+def _limited(axis: Facts) -> bool:
+    """Whether a wrong nominal voltage is more than a wrong gain."""
+    return axis.driven and bool(axis.nominal.get("weakness", 0.0))
+
+
 def _missing(axis: Facts) -> str:
-    if axis.supply >= _LEAST or (axis.nominal.get("weakness", 0.0) and axis.driven):
+    if _recorded(axis) or _limited(axis):
         return ""
     return f"a column supply[V] that changes by {100 * _LEAST:.0f} %, or a model with the motor's limit"
 
 
+_SHARE, _VOLTAGE = "share of its change", "log voltage"
+
+
 def _numbers(axis: Facts) -> tuple[Number, ...]:
-    if axis.supply >= _LEAST:
-        return (Number("share of its change", "1", 1.0, (add("supply"),), 0.5),)
-    return (Number("log voltage", "1", 0.3, (scaled("gain"), scaled("weakness", -1.0)), 0.0),)
+    share = Number(_SHARE, "1", 1.0, (add("supply"),), 0.5)
+    # The gain and the limit that the model has hold at another voltage than the motor's.
+    voltage = Number(_VOLTAGE, "1", 0.3, (scaled("gain"), scaled("weakness", -1.0)))
+    return (*([share] if _recorded(axis) else []), *([voltage] if _limited(axis) else []))
 
 
-SUPPLY = MotionEffect(
-    "supply",
-    _numbers,
-    lambda axis: ({},) if axis.supply >= _LEAST else ({"log voltage": 0.3}, {"log voltage": -0.3}),
-    _missing,
-)
+def _shapes(axis: Facts) -> list[dict[str, float | None]]:
+    """One number or the other."""
+    found: list[dict[str, float | None]] = [{_VOLTAGE: None}] if _recorded(axis) else []
+    return found + ([{_SHARE: None, _VOLTAGE: v} for v in (0.3, -0.3)] if _limited(axis) else [])
+
+
+SUPPLY = MotionEffect("supply", _numbers, _shapes, _missing)
