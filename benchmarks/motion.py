@@ -1,8 +1,9 @@
-"""Diagnosis of motion from logs, and SciPy on the numbers that it names."""
+"""Diagnosis of motion from logs; SciPy and mujoco.sysid on the two true effects, which they have to be told."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,6 +13,7 @@ import torch
 from scipy.optimize import least_squares
 
 from benchmarks.measure import Row, compare
+from benchmarks.motion_sysid import Fit, sysid_fit
 from ccnn_torch.motion import diagnose_motion, load_logs, nominal_of
 from ccnn_torch.motion.axis import Drive, simulate_axes
 from ccnn_torch.motion.effects import motion_effects
@@ -38,25 +40,40 @@ def write_log(path: Path, samples: int) -> None:
 
 
 def run(quick: bool, model: Path | None = None) -> Iterator[Row]:
-    """Logs read and diagnosed; SciPy fits the three numbers of the two true effects, and nothing else."""
+    """Logs read and diagnosed; the peers fit the numbers of the two true effects, and nothing else."""
     nominal = nominal_of("servo", KEYS, ["rad"])
     with TemporaryDirectory() as folder:
         for samples in (2000,) if quick else (10_000, 100_000, 1_000_000):
             path = Path(folder) / f"{samples}.csv"
             write_log(path, samples)
             found = diagnose_motion(load_logs([path]), nominal).content
-            yield from compare(
+            peers = fits(load_logs([path]), nominal) if samples <= 10_000 else {}
+            rows = compare(
                 "diagnose a servo in motion",
                 samples,
                 "samples",
                 lambda p=path: diagnose_motion(load_logs([p]), nominal),
-                {"SciPy, the true effects alone": scipy_fit(load_logs([path]), nominal)} if samples <= 10_000 else None,
+                peers,
                 rounds=1,
                 note=f"named: {', '.join(found['verdict']['effects']) or 'none'}",
             )
+            for row in rows:
+                if row.peer:
+                    delay, friction = peers[row.peer]()
+                    row = replace(row, note=f"{row.note}; the peer's {1e3 * delay:.2f} ms, {1e3 * friction:.1f} mN m")
+                yield row
 
 
-def scipy_fit(logs: Any, nominal: Any) -> Callable[[], object]:
+def fits(logs: Any, nominal: Any) -> dict[str, Fit]:
+    """The peers; mujoco.sysid where it is installed, at steps of the log's own and of a fifth."""
+    return {"SciPy, the true effects alone": scipy_fit(logs, nominal)} | {
+        f"mujoco.sysid, the true effects alone, steps of {1e3 * step:g} ms": fit
+        for step in (0.005, 0.001)
+        if (fit := sysid_fit(logs, KEYS, step)) is not None
+    }
+
+
+def scipy_fit(logs: Any, nominal: Any) -> Fit:
     """`least_squares` on the same residual."""
     problem = problem_of(logs, nominal, motion_effects(["delay", "coulomb"]))
     zero = torch.zeros(1, problem.library.size, dtype=torch.float64)
@@ -67,4 +84,11 @@ def scipy_fit(logs: Any, nominal: Any) -> Callable[[], object]:
         return problem.pooled(problem.residual(theta, problem.axes))[0][problem.judged].numpy()
 
     bounds = ([0.0, 0.0, 0.0], [10.0, 10.0, 4.0])
-    return lambda: least_squares(residual, np.full(3, 0.3), bounds=bounds, diff_step=1e-4)
+    late, rub, _ = (number.scale for number in problem.library.numbers[0])
+
+    def fit() -> tuple[float, float]:
+        found = least_squares(residual, np.full(3, 0.3), bounds=bounds, diff_step=1e-4).x
+        # Torques are over the gain.
+        return found[0] * late, found[1] * rub * KEYS["gain"]
+
+    return fit

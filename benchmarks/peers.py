@@ -1,4 +1,6 @@
-"""EvoTorch, EvoX and pyrenn, where they are installed: `pip install 'ccnn-torch[benchmarks]'`; else they are left out.
+"""EvoTorch, EvoX, pyrenn and mujoco.sysid, where they are installed; else they are left out.
+
+`pip install 'ccnn-torch[benchmarks]'` installs them.
 
 Both libraries of evolution get the networks' errors of `fitness.row_errors` as a PyTorch module, judged as their
 documentation says for populations of networks: EvoTorch by a functional module under `vmap`, EvoX by its
@@ -31,7 +33,18 @@ _CHUNK = 2400
 
 def missing() -> list[str]:
     """Peers that are not installed."""
-    return [name for module, name in PEERS.items() if find_spec(module) is None]
+    absent = [name for module, name in PEERS.items() if find_spec(module) is None]
+    return absent if sysid() else [*absent, "mujoco.sysid"]
+
+
+def sysid() -> Any:
+    """mujoco.sysid; None where MuJoCo, or one of the packages that sysid itself needs, is not installed."""
+    try:
+        tool: Any = importlib.import_module("mujoco.sysid")
+    except ImportError:
+        return None
+    # Without those packages it can be imported, and is empty.
+    return tool if hasattr(tool, "optimize") else None
 
 
 class Network(nn.Module):

@@ -9,6 +9,7 @@ gains. The complete model is identified on two of the motions; the diagnosis see
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,17 @@ from scipy.optimize import least_squares
 from ccnn_torch.motion import diagnose_motion, load_logs, nominal_of
 from ccnn_torch.motion.effects import motion_effects
 from ccnn_torch.motion.setting import problem_of
+from ccnn_torch.records.read_table import read_table
+from ccnn_torch.records.table import Table
 
 MASS, LENGTH, VOLTS = 0.49, 0.1, 7.4
 SPLITS = (("sin_time_square", "up_and_down"), ("sin_sin", "lift_and_drop"))
+# In lift_and_drop the drive is off for the last 4 of 6 s, and the pendulum falls. The model is complete; the columns
+# that tell this are withheld. Decided before it was run: right is that the section is left out and nothing named, as
+# with the columns, or a cause outside the library. No effect of the library sets in amid a run, so that any name, and
+# nothing without a word about the section, is missed.
+WITHHELD: tuple[tuple[str, ...], ...] = (("torque_on",), ("torque_on", "pwm1"))
+Case = tuple[dict[str, float], set[str], tuple[str, ...]]
 START = {
     "gain": 0.9,  # at the servo's gain 400; proportional to it
     "inertia": 0.002,
@@ -81,6 +90,13 @@ def wrong_things(full: dict[str, float], gain: int) -> dict[str, tuple[dict[str,
     }
 
 
+def without(path: Path, columns: tuple[str, ...]) -> Table:
+    """A log as if some columns had not been recorded."""
+    table = read_table(path)
+    units = {name: unit for name, unit in table.units.items() if name not in columns}
+    return replace(table, units=units, values=table.values[:, [table.names.index(name) for name in units]])
+
+
 def main() -> None:
     """Print one line for each case."""
     folder = Path(sys.argv[1])
@@ -90,13 +106,19 @@ def main() -> None:
         values = identified(folder, SPLITS[k], [100, 400, 800])
         print(f"# {SPLITS[k]}: " + ", ".join(f"{n} {v:.4g}" for n, v in zip(START, values, strict=True)))
         for gain in gains:
-            logs = load_logs([folder / f"{m}_kp{gain}.csv" for m in SPLITS[1 - k]])
-            for told, (own, right) in wrong_things(keys(values, gain), gain).items():
+            full, motions = keys(values, gain), SPLITS[1 - k]
+            cases: dict[str, Case] = {told: (*case, ()) for told, case in wrong_things(full, gain).items()}
+            if "lift_and_drop" in motions:
+                cases |= {f"drive off, without {' and '.join(c)}": (full, set(), c) for c in WITHHELD}
+            for told, (own, right, columns) in cases.items():
+                logs = load_logs([without(folder / f"{m}_kp{gain}.csv", columns) for m in motions])
                 found = diagnose_motion(logs, nominal_of("servo", own, ["rad"])).content
                 verdict, gap = found["verdict"], found["gap"]
                 names = set(verdict["effects"])
                 like = {o for e in found["effects"] if e["name"] in names for o in e["indistinguishable_from"]}
                 hit = "right" if (names & right if right else not names) else "class" if like & right else "missed"
+                said = verdict["outside_library"] or any("drive was off" in note for log in logs for note in log.notes)
+                hit = hit if said or not columns else "missed"
                 print(
                     f"{'+'.join(SPLITS[k])} | {gain} | {told} | {', '.join(verdict['effects']) or 'nothing'} | "
                     f"{', '.join(sorted(like)) or '-'} | {verdict['driver'] or '-'} | {verdict['probability']:.2f} | "
