@@ -23,7 +23,7 @@ from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.stretches import Stretches
 
-_SHAPE_UNITS = {"cogging_order": "1", "flexible_damping": "1", "play_loaded": "1"}
+_SHAPE_UNITS = {"cogging_order": "1", "flexible_damping": "1", "play_loaded": "1", "encoder_at_motor": "1"}
 # A limit that is so far away is none.
 _TINY = 1e-9
 

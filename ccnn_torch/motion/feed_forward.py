@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ccnn_torch.motion.axis import ABSENT, Drive, simulate_axes
+from ccnn_torch.motion.axis import Drive, simulate_axes
 from ccnn_torch.motion.mistakes import lag_of
 from ccnn_torch.motion.nominal import Nominal
+from ccnn_torch.motion.stage import ABSENT
 
 Array = NDArray[np.float64]
 _STEPS, _SHARES = 30, (1.0, 0.5, 0.2)

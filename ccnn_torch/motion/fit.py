@@ -249,7 +249,7 @@ def _step(x: Tensor, y: Tensor, own: Tensor, real: Tensor, damping: Tensor, valu
     gram, push = (x @ x.mT) / noise[..., None], (x @ y[..., None])[..., 0] / noise - own / _WIDE**2
     diagonal = gram.diagonal(dim1=-2, dim2=-1)
     inner = gram + torch.diag_embed(damping[:, None] * diagonal + 1 / _WIDE**2 + (1 - real))
-    move = torch.linalg.solve(inner, push[..., None])[..., 0] * real
+    move: Tensor = torch.linalg.solve(inner, push[..., None])[..., 0] * real
     return move.clamp(-_FARTHEST, _FARTHEST)
 
 

@@ -33,7 +33,7 @@ def held_out(problem: Problem, whitening: Whitening, sets: Sequence[Sequence[Spe
         here, rest = (problem.fold == k).nonzero()[:, 0], (problem.fold != k).nonzero()[:, 0]
         fits = fit_many(problem, whitening, pairs, _STEPS, rest)
         left[:, here] = problem.residual(torch.stack([f.spec.theta for f in fits]), axis, here)
-    return left.unflatten(0, (len(sets), -1))
+    return left.reshape(len(sets), -1, *left.shape[1:])
 
 
 def gap_of(problem: Problem, before: Tensor, after: Tensor, floor: float, known: bool, draws: Draws) -> Gap:
@@ -81,5 +81,5 @@ def in_order(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
         return []
     specs = [only(problem.library, v.best.spec, [m for m in there if m != e]) for e in there for v in verdicts]
     left = problem.residual(torch.stack([s.theta for s in specs]), problem.axes.repeat(len(there)))
-    size = (left.square() * problem.data.judged).sum((1, 2)).unflatten(0, (len(there), -1)).sum(1)
+    size = (left.square() * problem.data.judged).sum((1, 2)).reshape(len(there), -1).sum(1)
     return [names[there[k]] for k in torch.argsort(size, descending=True).tolist()]

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import torch
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion.axis import ABSENT
 from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.engine import MotionDiagnosis
 from ccnn_torch.motion.nominal import TORQUES, Nominal, axis_keys, nominal_of
+from ccnn_torch.motion.stage import ABSENT
 from ccnn_torch.plugins import code_refused
 from ccnn_torch.report.json_files import read_json, write_json
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.motion.axis import ABSENT
 from ccnn_torch.motion.effects import Facts, MotionEffect, Number
+from ccnn_torch.motion.stage import ABSENT
 
 # What may not be below 0, and what not above.
 _POSITIVE = (
@@ -20,14 +20,14 @@ _POSITIVE = (
 _MOST = {"load_friction": 0.9}
 # Share of the largest speed up to which friction may fall with the speed: what falls later is plain dry friction.
 _SLOW = 0.5
-# Fewer periods in a turn are a weight or an offset.
-_LEAST = {"cogging_order": 2.0}
+# Fewer periods in a turn are a weight or an offset; a spring without any damping never comes to rest.
+_LEAST = {"cogging_order": 2.0, "flexible_damping": 1e-3}
 # Plausible sizes: no number is larger.
 _WIDEST = 1e3
 # Log odds against what is seen less often than the rest, and can take the form of nearly anything.
 _RARER = {"stribeck": math.log(0.1), "cogging": math.log(0.1)}
 # Shapes that a fit refines from where they begin.
-_REFINED = ("cogging_order", "stribeck_speed")
+_REFINED = ("cogging_order", "stribeck_speed", "flexible_damping")
 
 
 class Variant(NamedTuple):
@@ -143,15 +143,25 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
         places.append(tuple(range(begin, len(numbers[0]))))
     names = [{numbers[0][j].name for j in own} for own in places]
     shapes = [[effect.shapes(axis) for axis in facts] for effect in effects]
-    fixed = dict.fromkeys(n for s, own in zip(shapes, names, strict=True) for one in s[0] for n in one if n not in own)
+    fixed = dict.fromkeys(
+        n
+        for s, own in zip(shapes, names, strict=True)
+        for one in s[0]
+        for n, value in one.items()
+        if n not in own and value is not None
+    )
     held = {name: len(numbers[0]) + k for k, name in enumerate(fixed)}
 
     def variant(e: int, k: int, count: int) -> Variant:
         of_axes = [s[k] for s in shapes[e]]
-        own = [name for name in of_axes[0] if name not in names[e]]
+        own = [name for name, value in of_axes[0].items() if name not in names[e] and value is not None]
         active = [j for j in places[e] if of_axes[0].get(numbers[0][j].name, 0.0) is not None]
         values = [
-            [given[n.name] / n.scale if n.name in given else n.start for n in (axis[j] for j in active)]
+            [
+                n.start if value is None else value / n.scale
+                for n in (axis[j] for j in active)
+                for value in [given.get(n.name)]
+            ]
             for given, axis in zip(of_axes, numbers, strict=True)
         ]
         return Variant(

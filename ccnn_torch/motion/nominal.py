@@ -16,12 +16,12 @@ from torch import Tensor
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import CONFIG_LIMIT, read_text
 from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.motion.axis import ABSENT
 from ccnn_torch.motion.effects import MotionEffect
 from ccnn_torch.motion.effects.own_parameter import own_parameter
 from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
 from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.simulators import Simulator, own_simulator
+from ccnn_torch.motion.stage import ABSENT
 from ccnn_torch.motion.stretches import Stretches
 from ccnn_torch.plugins import is_plugin
 from ccnn_torch.spelling import nearest
@@ -43,6 +43,7 @@ KEYS: dict[str, str] = {
     "cogging_order": "periods of that torque in a turn [1]",
     "flexibility": "inertia of the driven side over the stiffness of the joint [s^2]",
     "flexible_damping": "damping ratio of that spring [1]",
+    "encoder_at_motor": "1 where the encoder is at the motor, and that spring behind it [1]",
     "thermal": "change of the dry friction with the temperature [1/K]",
     "delay": "from command to motor [s]",
     "offset": "of the position from the command [rad]",
@@ -64,6 +65,7 @@ _SAME = {
     **{"delay": "delay", "offset": "offset", "backlash": "play", "backlash_loaded": "play_loaded"},
     **{"load_friction": "load_friction", "stribeck_speed": "stribeck_speed", "cogging_order": "cogging_order"},
     **{"flexibility": "flexibility", "flexible_damping": "flexible_damping", "thermal": "thermal"},
+    "encoder_at_motor": "encoder_at_motor",
     "supply_share": "supply",
 }
 

@@ -98,7 +98,7 @@ class _Pool:
         self.axes = len(problem.followed)
         loose = problem.followed.new_zeros(0, *problem.followed.shape) if about is None else problem.loose(about)
         white = problem.whitened(loose.flatten(0, 1), problem.axes.repeat(len(loose)), whitening)
-        self.loose = white.unflatten(0, (len(loose), self.axes)).transpose(0, 1)
+        self.loose = white.reshape(len(loose), self.axes, white.shape[-1]).transpose(0, 1)
         self.library: Library = problem.library
         zero = torch.zeros(self.library.size, dtype=torch.float64)
         # Of noise and form errors of each axis; None: the noise that each set leaves.

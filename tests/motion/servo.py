@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,9 @@ from scipy.integrate import solve_ivp
 
 Array = NDArray[np.float64]
 GAIN, INERTIA, VISCOUS = 2.0, 0.004, 0.09
+# What of the inertia is behind the gear.
+MASS, LENGTH = 0.3, 0.1
+LOAD = MASS * LENGTH**2
 
 
 def command(kind: int, time: Array) -> Array:
@@ -38,7 +42,27 @@ def moved(
     return np.asarray(found.y[0])
 
 
-def write_log(path: Path, kinds: tuple[int, ...] = (0, 1, 2), seconds: float = 5.0, **real: float) -> Path:
+def moved_on_a_spring(time: Array, asked: Array, spring: float, damping: float, at_motor: bool) -> Array:
+    """Position of the motor, or of the load behind the spring, `LOAD x'' = spring (q - x) + damping (q' - x')`."""
+
+    def rate(t: float, state: Array) -> list[float]:
+        q, v, x, w = state.tolist()
+        pull = spring * (q - x) + damping * (v - w)
+        torque = GAIN * (float(np.interp(t, time, asked)) - q) - VISCOUS * v - pull
+        return [v, torque / (INERTIA - LOAD), w, (pull - MASS * 9.80665 * LENGTH * np.sin(x)) / LOAD]
+
+    begin = [asked[0], 0.0, asked[0], 0.0]
+    found = solve_ivp(rate, (time[0], time[-1]), begin, "LSODA", time, rtol=1e-6, atol=1e-8, max_step=0.01)
+    return np.asarray(found.y[0 if at_motor else 2])
+
+
+def write_log(
+    path: Path,
+    kinds: tuple[int, ...] = (0, 1, 2),
+    seconds: float = 5.0,
+    motion: Callable[..., Array] = moved,
+    **real: float,
+) -> Path:
     """A log of several runs with an encoder of 16384 steps."""
     generator = np.random.default_rng(3)
     lines = ["time[s],run[1],command1[rad],q1[rad]"]
@@ -46,7 +70,7 @@ def write_log(path: Path, kinds: tuple[int, ...] = (0, 1, 2), seconds: float = 5
         time = np.arange(0, seconds, 0.01) + generator.uniform(0, 1e-4, round(seconds / 0.01))
         asked = command(kind, time)
         step = 2 * np.pi / 16384
-        q = np.round(moved(time, asked, **real) / step + 0.3 * generator.standard_normal(len(time))) * step
+        q = np.round(motion(time, asked, **real) / step + 0.3 * generator.standard_normal(len(time))) * step
         lines += [f"{t:.17g},{run},{u:.17g},{x:.17g}" for t, u, x in zip(time, asked, q, strict=True)]
     path.write_text("\n".join(lines) + "\n")
     return path

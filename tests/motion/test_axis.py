@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from motion.servo import GAIN, INERTIA, VISCOUS, command, moved
+from motion.servo import GAIN, INERTIA, LENGTH, LOAD, MASS, VISCOUS, command, moved, moved_on_a_spring
 
 from ccnn_torch.motion.axis import ABSENT, Drive, simulate_axes
 from ccnn_torch.motion.effects import EFFECTS, Facts, motion_effects
@@ -33,6 +33,17 @@ def test_it_moves_as_its_equation_says(real: dict[str, float]) -> None:
     mine = {torques.get(n, n): v / (GAIN if n in torques else 1) for n, v in real.items()}
     error = axis(TIME, asked, **OWN, **mine) - moved(TIME, asked, **real)
     assert np.abs(error).max() < 2e-3 * np.ptp(asked)
+
+
+@pytest.mark.parametrize("at_motor", [False, True])
+def test_a_load_on_a_spring_pulls_at_the_motor(at_motor: bool) -> None:
+    spring, damping, asked = 1.5, 0.01, command(0, TIME)
+    flexibility = LOAD / spring
+    mine = {"load": LOAD / GAIN, "gravity_sin": MASS * 9.80665 * LENGTH / GAIN, "encoder_at_motor": float(at_motor)}
+    soft = {"flexibility": flexibility, "flexible_damping": 0.5 * damping / spring / np.sqrt(flexibility)}
+    found = axis(TIME, asked, **OWN, **mine, **soft)
+    assert np.abs(found - moved_on_a_spring(TIME, asked, spring, damping, at_motor)).max() < 2e-3 * np.ptp(asked)
+    assert np.abs(found - axis(TIME, asked, **OWN, **mine)).max() > 0.005 * np.ptp(asked)
 
 
 def test_without_parameters_the_position_is_the_command() -> None:
