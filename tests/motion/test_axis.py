@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -123,3 +124,13 @@ def test_every_effect_acts_on_parameters_that_the_axis_has() -> None:
         for number in effect.numbers(facts):
             assert number.scale > 0 and all(act[0] in ABSENT for act in number.acts)
         assert len(effect.shapes(facts)) >= 1
+
+
+def test_a_motor_with_a_limit_may_have_another_voltage_than_the_one_recorded() -> None:
+    facts = Facts("rad", {"inertia": 0.01, "weakness": 1.0}, gain=2.0, supply=0.2)
+    library = library_of(motion_effects(["supply"]), [facts])
+    names = [number.name for number in library.numbers[0]]
+    # One number or the other, never both: a short log would share what it shows among them.
+    assert [[names[j] for j in v.active] for v in library.variants[0]] == [names[:1], names[1:], names[1:]]
+    without = library_of(motion_effects(["supply"]), [replace(facts, nominal={"inertia": 0.01})])
+    assert [v.active for v in without.variants[0]] == [(0,)]

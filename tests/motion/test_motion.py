@@ -9,7 +9,7 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
-from motion.servo import GAIN, KEYS, command, moved, write_log
+from motion.servo import GAIN, INERTIA, KEYS, LENGTH, LOAD, MASS, VISCOUS, command, moved, moved_on_a_spring, write_log
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion import (
@@ -227,6 +227,18 @@ def test_causes_have_their_values_and_a_corrected_command_is_followed(tmp_path: 
         model.write_text(json.dumps(good | {change: sentence[0]}))
         code, _, error = cli("compensate", model, tmp_path / "in.csv", sent)
         assert code == 2 and str(sentence[1]) in error and error.count("\n") == 1
+
+
+def test_a_flexible_joint_is_seen_from_the_motor(tmp_path: Path) -> None:
+    spring, seen = 1.5, {"damping": 0.01, "at_motor": True}
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, moved_on_a_spring, spring=spring, **seen)
+    keys = {"gain": GAIN, "inertia": INERTIA - LOAD, "mass": MASS, "length": LENGTH, "viscous": VISCOUS}
+    some = ["delay", "payload", "viscous", "flexible_joint"]
+    found = diagnose_motion(load_logs([log]), nominal_of("servo", keys, ["rad"]), some).content
+    assert found["verdict"]["effects"] == ["flexible_joint"] and found["verdict"]["probability"] > 0.9
+    values = found["effects"][0]["parameters"]
+    assert values["q1 inertia over stiffness"]["value"] == pytest.approx(LOAD / spring, rel=0.05)
+    assert values["q1 encoder_at_motor"]["value"] == 1
 
 
 def test_a_file_that_cannot_be_is_refused_in_one_sentence(tmp_path: Path, cli: Cli) -> None:
