@@ -102,10 +102,11 @@ def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, no
     else:
         notes.append(f"there is one run: its {folds} parts were held out in turn; record a second motion to be surer")
     step = _resolution(data)
-    if noise is None and step and floor > 3 * step:
+    if noise is None and step and not step < floor <= 3 * step:
+        what = "most of it is no noise of the encoder" if floor > step else "rounding alone leaves 0.29 times the step"
         notes.append(
             f"what the best model leaves is {number_text(floor / step, 2)} times the encoder's step of "
-            f"{number_text(step, 2)} {data.units[0]}: most of it is no noise of the encoder"
+            f"{number_text(step, 2)} {data.units[0]}: {what}"
         )
     order = found.whitening.coefficients.shape[1]
     notes.append(
