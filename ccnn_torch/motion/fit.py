@@ -196,10 +196,11 @@ def _fit_lot(
         active, real = _padded([places[k] for k in run.tolist()])
         x, y = columns[run, : active.shape[1]], residual[run]
         cost = _cost(y, theta[run], values)
-        move = _step(x, y, theta[run].gather(-1, active) * real, real, damping[run], values)
-        most, least = high[axis[run]], low[axis[run]]
-        trials = torch.stack([theta[run].scatter_add(-1, active, share * move) for share in _SHARES])
-        trials = torch.maximum(torch.minimum(trials, most), least)
+        own = theta[run].gather(-1, active)
+        move = _step(x, y, own * real, real, damping[run], values)
+        most, least = (bound[axis[run]].gather(-1, active) for bound in (high, low))
+        taken = [torch.maximum(torch.minimum(own + share * move, most), least) - own for share in _SHARES]
+        trials = torch.stack([theta[run].scatter_add(-1, active, real * step) for step in taken])
         both = axis[run].repeat(len(_SHARES))
         left = problem.whitened(problem.residual(trials.flatten(0, 1), both, chosen), both, whitening, chosen)
         best, which = _cost(left, trials.flatten(0, 1), values).reshape(len(_SHARES), -1).min(0)
@@ -208,10 +209,10 @@ def _fit_lot(
         damping[run] = torch.where(better & (which == 0), damping[run] * _LESS, damping[run] * _MORE).clamp(1e-8, 1e8)
         moved = run[better]
         if len(moved):
-            residual[moved], own = sensitivities(
+            residual[moved], new = sensitivities(
                 problem, whitening, theta[moved], axis[moved], [places[k] for k in moved.tolist()], chosen
             )
-            columns[moved, : own.shape[1]] = own
+            columns[moved, : new.shape[1]] = new
         gained = torch.where(better, cost - best, 0.0) >= _GAINED * values
         run = run[gained | (~better & (damping[run] < _STIFF))]
     # Here, since the whitened residual does not tell it.

@@ -26,6 +26,7 @@ _LEAST = {"cogging_order": 2.0, "flexible_damping": 1e-3}
 _WIDEST = 1e3
 # Log odds against what is seen less often than the rest, and can take the form of nearly anything.
 _RARER = {"stribeck": math.log(0.1), "cogging": math.log(0.1)}
+_SMALLEST = 1e-6
 # Shapes that a fit refines from where they begin.
 _REFINED = ("cogging_order", "stribeck_speed", "flexible_damping")
 
@@ -93,8 +94,10 @@ class Library(NamedTuple):
                         nominal = self.facts[i].nominal.get(name, ABSENT[name])
                         low[i, j] = max(float(low[i, j]), -nominal / (factor * number.scale))
                         high[i, j] = min(float(high[i, j]), (_MOST.get(name, math.inf) - nominal) / number.scale)
-        # 0 stands for a shape that is not used.
-        low[:, list(self.held.values())] = 0.0
+        # 0 would stand for a shape that is not used.
+        low[:, list(self.held.values())] = _SMALLEST
+        for name in _LEAST.keys() & self.held.keys():
+            low[:, self.held[name]] = _LEAST[name]
         if "stribeck_speed" in self.held:
             high[:, self.held["stribeck_speed"]] = torch.tensor([_SLOW * axis.speed for axis in self.facts])
         return low, high
@@ -120,7 +123,6 @@ class Library(NamedTuple):
                 found[name] = before + amount if how == "add" else before * amount.clamp(-5, 5).exp()
         for name, place in self.held.items():
             value = theta[:, place]
-            value = torch.where(value != 0, value.clamp_min(_LEAST.get(name, 0.0)), value)
             if bool((value != 0).any()):
                 found[name] = torch.where(value != 0, value, found.get(name, torch.full_like(value, ABSENT[name])))
         for name in _POSITIVE:

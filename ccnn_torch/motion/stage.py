@@ -130,10 +130,10 @@ class Rule:
         against, loose = carried, q
         if self.soft:
             x, w = state[2:]
-            apart = q - x
+            apart, pulled = q - x, self.pulling(x, push)
             # The load's speed at the end of the stage is this and `follows` times the motor's.
-            loose = (fixed.over * w + apart - self.slack * self.pulling(x, push)) / (fixed.over + fixed.drag)
-            carried = np.where(self.hung, self.stiffness * (apart + self.drag * (v - w)), carried)
+            loose = (fixed.over * w + apart - self.slack * pulled) / (fixed.over + fixed.drag)
+            carried = np.where(self.hung, pulled, carried)
             against = np.where(self.hung, self.stiffness * (apart - fixed.drag * loose), against)
         free = fixed.mass * v - against
         if self.waves:
