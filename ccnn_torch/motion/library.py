@@ -17,7 +17,8 @@ _POSITIVE = (
     *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "play"),
     *("flexibility", "gain"),
 )
-_MOST = {"load_friction": 0.9}
+# With more damping a spring is no spring.
+_MOST = {"load_friction": 0.9, "flexible_damping": 0.3}
 # Share of the largest speed up to which friction may fall with the speed: what falls later is plain dry friction.
 _SLOW = 0.5
 # Fewer periods in a turn are a weight or an offset; a spring without any damping never comes to rest.
@@ -95,9 +96,8 @@ class Library(NamedTuple):
                         low[i, j] = max(float(low[i, j]), -nominal / (factor * number.scale))
                         high[i, j] = min(float(high[i, j]), (_MOST.get(name, math.inf) - nominal) / number.scale)
         # 0 would stand for a shape that is not used.
-        low[:, list(self.held.values())] = _SMALLEST
-        for name in _LEAST.keys() & self.held.keys():
-            low[:, self.held[name]] = _LEAST[name]
+        for name, place in self.held.items():
+            low[:, place], high[:, place] = _LEAST.get(name, _SMALLEST), _MOST.get(name, _WIDEST)
         if "stribeck_speed" in self.held:
             high[:, self.held["stribeck_speed"]] = torch.tensor([_SLOW * axis.speed for axis in self.facts])
         return low, high
