@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -15,19 +15,16 @@ from ccnn_torch.diagnosis.shrink.held_out import draws
 from ccnn_torch.diagnosis.verdict.text import verdict_text
 from ccnn_torch.motion.content import effects_of, floor_of, notes_of, where_is
 from ccnn_torch.motion.effects import motion_effects
-from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
 from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
 from ccnn_torch.motion.judge import AxisVerdict, judge_axes
+from ccnn_torch.motion.linearised import searched
 from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.next_motion import Motion, next_motions
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.problem import Problem
-from ccnn_torch.motion.search import Search, search
+from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.setting import problem_of
-
-# Searches about a simulator's parameters as found.
-_RECENTRED = 2
 
 
 @dataclass(frozen=True)
@@ -77,9 +74,10 @@ def diagnose_motion(
         InputError: the logs cannot be diagnosed.
     """
     at_step("searching the effects")
-    problem = problem_of(logs, nominal, [*motion_effects(effects), *nominal.own_effects])
+    candidates = motion_effects(effects)
+    problem = problem_of(logs, nominal, [*candidates, *nominal.own_effects])
     nothing = problem.residual(torch.zeros(len(nominal.axes), problem.library.size, dtype=torch.float64), problem.axes)
-    found = _searched(problem, logs, nominal)
+    found = searched(problem, logs, nominal, lambda: problem_of(logs, nominal, candidates))
     problem = found.problem
     verdicts = judge_axes(found)
     at_step("judging on held-out rows")
@@ -145,23 +143,3 @@ def diagnose_motion(
     }
     verdict["text"] = verdict_text(content)
     return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed)
-
-
-def _searched(problem: Problem, logs: Sequence[Log], nominal: Nominal) -> Search:
-    """The search; a simulator is linearised in its own parameters, and so again about those that were found."""
-    found = search(problem)
-    for _ in range(_RECENTRED):
-        about = _own_values(found)
-        if not about:
-            break
-        driven = nominal.driven(logs, problem.data, about)
-        found = search(replace(problem, followed=driven.followed, own=driven.own))
-    return found
-
-
-def _own_values(found: Search) -> dict[str, float]:
-    """What is added to a simulator's own parameters: the mean over the axes whose best set has them."""
-    theta = torch.stack([fits[0].spec.theta for fits in found.found])
-    parameters = found.problem.library.parameters(theta, found.problem.axes)
-    values = {n: v[v != 0] for n, v in parameters.items() if n.startswith(OWN)}
-    return {name.removeprefix(OWN): float(v.mean()) for name, v in values.items() if len(v)}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.motion.effects import Facts, MotionEffect, Number
+from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.stage import ABSENT
 
 # What may not be below 0, and what not above.
@@ -23,6 +24,8 @@ _MOST = {"load_friction": 0.9, "flexible_damping": 0.3}
 _SLOW = 0.5
 # Fewer periods in a turn are a weight or an offset; a spring without any damping never comes to rest.
 _LEAST = {"cogging_order": 2.0, "flexible_damping": 1e-3}
+# Plausible sizes up to which a simulator is linear in its own parameters.
+_REACH = 0.6
 # Plausible sizes: no number is larger.
 _WIDEST = 1e3
 # Log odds against what is seen less often than the rest, and can take the form of nearly anything.
@@ -70,6 +73,7 @@ class Library(NamedTuple):
         nominal: parameters of the axes, `n` each.
         lacking: of each effect what every axis lacks to show it; "" where one axis can.
         there: whether an axis can show an effect, `n x effects`.
+        about: what is added to each of a simulator's own parameters where it was linearised.
     """
 
     names: tuple[str, ...]
@@ -82,6 +86,7 @@ class Library(NamedTuple):
     nominal: dict[str, Tensor]
     lacking: tuple[str, ...]
     there: Tensor
+    about: Mapping[str, float] = {}
 
     @property
     def bounds(self) -> tuple[Tensor, Tensor]:
@@ -91,6 +96,9 @@ class Library(NamedTuple):
         for i, axis in enumerate(self.numbers):
             for j, number in enumerate(axis):
                 for name, factor, how in number.acts:
+                    if name.startswith(OWN):
+                        centre = self.about.get(number.name, 0.0) / number.scale
+                        low[i, j], high[i, j] = centre - _REACH, centre + _REACH
                     if how == "add" and name in _POSITIVE:
                         nominal = self.facts[i].nominal.get(name, ABSENT[name])
                         low[i, j] = max(float(low[i, j]), -nominal / (factor * number.scale))
