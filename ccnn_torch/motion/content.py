@@ -120,13 +120,14 @@ def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, no
 
 
 def _resolution(data: Stretches) -> float:
-    """The encoder's step: the smallest change that is no rounding; 0 where every sample differs."""
-    values = np.unique(data.position[0][data.judged].numpy())
-    steps = np.diff(values)
+    """The encoder's step: the smallest change, where nearly all are multiples of it; else 0."""
+    steps = np.diff(np.unique(data.position[0][data.judged].numpy()))
     steps = steps[steps > 1e-9]
-    if len(values) > 0.5 * int(data.judged.sum()) or not len(steps):
+    if not len(steps):
         return 0.0
-    return float(np.quantile(steps, 0.1))
+    least = float(np.quantile(steps, 0.1))
+    whole = np.abs(steps / least - np.round(steps / least)) < 0.1
+    return least if whole.mean() > 0.9 else 0.0
 
 
 def _unit(unit: str, axis: Facts) -> tuple[str, float]:
