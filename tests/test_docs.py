@@ -16,6 +16,7 @@ import typer
 from ccnn_torch.cli import app
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.registry import REGISTRY
+from ccnn_torch.motion.nominal import KEYS
 
 ROOT = Path(__file__).parent.parent
 DIAGNOSIS = ROOT / "ccnn_torch" / "diagnosis"
@@ -70,6 +71,13 @@ def test_the_table_of_parallel_machines_is_that_of_the_registry() -> None:
         legs = {g.name for g in machine.geometry if g.leg == 1}
         ones = [{p[:k] + "1" + p[k + 1 :] for k, mark in enumerate(p) if mark == "i"} & legs for p in shown]
         assert all(map(len, ones)) and set().union(*ones) == legs
+
+
+def test_the_table_of_the_servo_has_the_keys_with_their_units() -> None:
+    page = (ROOT / "docs" / "how_to" / "motion.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (\S+) \| (.+) \|$", page.partition("### Keys of the servo")[2], re.M)
+    shown = {key: f"{meaning} [{unit}]".replace("·", "*").replace("\\|", "|") for key, unit, meaning in rows}
+    assert {key: shown[key] for key in KEYS} == KEYS
 
 
 def blocks(page: Path, language: str) -> list[str]:

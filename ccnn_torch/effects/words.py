@@ -127,7 +127,7 @@ _WORDS = {
     "servo_gain": Words(
         "wrong gains of the position control",
         "wrong servo gain",
-        "A log proportional of 0.1: the gain is 10 % higher than in the model. A lag: 1 over the velocity gain.",
+        "How much higher the proportional gain is than in the model. A lag: 1 over the velocity gain.",
         "Proportional and velocity gain of {where} in the drive and in the model.",
     ),
     "offset": Words(
@@ -157,7 +157,8 @@ _WORDS = {
     "coulomb": Words(
         "dry friction",
         "dry friction",
-        "As a torque, or where the gain is not given as the angle by which the command must lead.",
+        "As a torque, or where the gain is not given as the angle by which the command must lead; and a share of the "
+        "torques of motor and load together, at rest twice the load.",
         "Seals, bearings and gear of {where}.",
     ),
     "stribeck": Words(
@@ -187,19 +188,20 @@ _WORDS = {
     "supply": Words(
         "the supply voltage",
         "wrong supply voltage",
-        "A log voltage of 0.1: the motor is 10 % stronger than in the model.",
+        "How much stronger the motor is than in the model; 100 % of the voltage's change: its strength goes with the "
+        "recorded voltage.",
         "Supply voltage of {where}, under load.",
     ),
     "cogging": Words(
         "a torque that repeats with the angle",
         "cogging",
-        "Torque sin · sin(n q) + cos · cos(n q), n its cogging_order.",
+        "Torque sin · sin(n q) + cos · cos(n q), n the times a turn (of a sliding joint 2π over the length).",
         "Motor poles, gear teeth and eccentric wheels of {where}.",
     ),
     "thermal_friction": Words(
         "friction that changes with the temperature",
         "thermal change of friction",
-        "Share of the dry friction for each kelvin.",
+        "Change of the dry friction for each kelvin above the coldest sample, as a share of it.",
         "Grease and warm-up of {where}.",
     ),
     OUTLIER: Words("a few bad rows", "bad rows", "", "The rows set aside: measure them again."),

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, Draws, Gap
-from ccnn_torch.diagnosis.verdict.text import unseen_text
+from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
 from ccnn_torch.display import number_text
 from ccnn_torch.motion.effects import Facts, Number
 from ccnn_torch.motion.fit import Fit
@@ -23,7 +23,7 @@ from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.stretches import Stretches
 
-_SHAPE_UNITS = {"cogging_order": "1", "flexible_damping": "1", "play_loaded": "1", "encoder_at_motor": "1"}
+_SHAPE_UNITS = {"flexible_damping": "1", "play_loaded": "1", "encoder_at_motor": "1"}
 # A limit that is so far away is none.
 _TINY = 1e-9
 
@@ -37,7 +37,7 @@ def floor_of(problem: Problem, found: Search, verdicts: Sequence[AxisVerdict]) -
 
 
 def where_is(problem: Problem, before: Tensor, draws: Draws) -> dict[str, Any]:
-    """`where` and `where_ci95`: shares of the gap by joint and by phase of the motion."""
+    """`where` and `where_ci95`, shares of the gap by joint and by phase of the motion; and the encoder's step."""
     data = problem.data
     squares, phase = before.square() * data.judged, phases_of(data)
     joints = {f"q{i + 1}": own.sum(-1) for i, own in enumerate(squares)}
@@ -58,6 +58,7 @@ def where_is(problem: Problem, before: Tensor, draws: Draws) -> dict[str, Any]:
     return {
         "where": empty | {"joints": shares(joints), "phases": by_phase},
         "where_ci95": empty | {"joints": ends(joints), "phases": ends(phases)},
+        "encoder_step": _resolution(data) or None,
     }
 
 
@@ -94,6 +95,8 @@ def effects_of(
 def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None) -> list[str]:
     data = problem.data
     notes = [*data.notes, *nominal.notes]
+    held = [f"q{i + 1}" for i, asked in enumerate(data.command[:, data.judged]) if bool((asked == asked[0]).all())]
+    notes += [f"no log moves {listed(held)}: of such joints little can be told"] if held else []
     library = problem.library
     notes += [unseen_text(n, why) for n, why in zip(library.names, library.lacking, strict=True) if why]
     runs, folds = len(set(data.run.tolist())), int(problem.fold.max()) + 1
@@ -117,13 +120,14 @@ def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, no
 
 
 def _resolution(data: Stretches) -> float:
-    """The encoder's step: the smallest change that is no rounding; 0 where every sample differs."""
-    values = np.unique(data.position[0][data.judged].numpy())
-    steps = np.diff(values)
+    """The encoder's step: the smallest change, where nearly all are multiples of it; else 0."""
+    steps = np.diff(np.unique(data.position[0][data.judged].numpy()))
     steps = steps[steps > 1e-9]
-    if len(values) > 0.5 * int(data.judged.sum()) or not len(steps):
+    if not len(steps):
         return 0.0
-    return float(np.quantile(steps, 0.1))
+    least = float(np.quantile(steps, 0.1))
+    whole = np.abs(steps / least - np.round(steps / least)) < 0.1
+    return least if whole.mean() > 0.9 else 0.0
 
 
 def _unit(unit: str, axis: Facts) -> tuple[str, float]:
@@ -154,16 +158,19 @@ def _parameters(library: Library, axis: int, fit: Fit, effect: int) -> dict[str,
         if number.inverse:
             value += facts.nominal.get(number.acts[0][0], 0.0)
             value, sd = 1 / max(value, _TINY), sd / max(value, _TINY) ** 2
+        if all(act.how == "factor" for act in number.acts):
+            sd, value = sd * math.exp(value), math.expm1(value)
         found[f"q{axis + 1} {number.name}"] = {
             "value": value * factor,
             "sd": sd * factor,
             "unit": unit,
             "part": f"joint {axis + 1}",
-        }
+        } | ({} if number.model is None else {"nominal": number.model})
     own = {place for variant in library.variants[effect] for place in variant.held}
     for name, place in library.held.items():
         value = float(fit.spec.theta[place])
         if place in own and value:
-            unit = _SHAPE_UNITS.get(name, f"{facts.unit}/s")
+            order = "1" if facts.unit == "rad" else "rad/m"
+            unit = order if name == "cogging_order" else _SHAPE_UNITS.get(name, f"{facts.unit}/s")
             found[f"q{axis + 1} {name}"] = {"value": value, "sd": None, "unit": unit, "part": f"joint {axis + 1}"}
     return found

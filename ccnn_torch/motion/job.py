@@ -12,6 +12,7 @@ from ccnn_torch.diagnosis.page.compensate import typed_path
 from ccnn_torch.diagnosis.page.data import NEXT, RESULT, about_of, load_labels
 from ccnn_torch.diagnosis.page.report import print_diagnosis, write_diagnosis_report
 from ccnn_torch.diagnosis.progress import watched
+from ccnn_torch.diagnosis.verdict.text import in_doubt
 from ccnn_torch.display import short_path
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import sweep
@@ -33,7 +34,7 @@ _STEPS = {
     "judging on held-out rows": 4.0,
     "next measurements": 1.0,
 }
-_NOISE = ("The noise is what the most probable model leaves; it may hold another cause.", "The noise was given.")
+_NOISE = ("The noise is what the most probable model leaves", "The noise was given")
 
 
 def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = False) -> Path:
@@ -98,7 +99,7 @@ def _report(config: DiagnoseConfig, folder: Path, results: Mapping[str, Any], fo
         "name": folder.name,
         "mechanism": short_path(str(config.mechanism)),
         "records": ", ".join(short_path(str(file)) for file in files),
-        "noise": _NOISE[config.noise is not None],
+        "noise": f"{_NOISE[config.noise is not None]}{'; it may hold another cause' if in_doubt(results) else ''}.",
         "folder": typed_path(str(folder)),
         "units": {f"q{i + 1}": unit for i, unit in enumerate(data.units)},
     }

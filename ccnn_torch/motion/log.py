@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -103,17 +103,20 @@ def _of_source(source: str | Path | Frame | Table, columns: Mapping[str, str] | 
     for name, rows in runs_of(table):
         refuse_time(table, rows, time[rows])
         own = {n: v[rows] for n, v in beside.items()}
-        found.append(_log(name, time[rows], command[rows], position[rows].copy(), units, own))
+        found.append(_log(name, time[rows], command[rows], position[rows], units, own))
+        if rows[-1] - rows[0] >= len(rows):
+            apart = f"{name}: its rows are not one after the other; they were gathered in their order"
+            found[-1] = replace(found[-1], notes=(apart, *found[-1].notes))
     return found
 
 
 def runs_of(table: Table) -> list[tuple[str, NDArray[np.int64]]]:
-    """Name and rows of each run in a table."""
+    """Name and rows of each run in a table, in the order in which they begin."""
     if _RUN not in table:
         return [(str(table.path), np.arange(len(table)))]
     number = table.column(_RUN, "1")
-    begins = np.flatnonzero(np.diff(number, prepend=number[:1] - 1))
-    return [(f"{table.path} run {number[rows[0]]:g}", rows) for rows in np.split(np.arange(len(number)), begins[1:])]
+    runs = dict.fromkeys(number.tolist())
+    return [(f"{table.path} run {run:g}", np.flatnonzero(number == run)) for run in runs]
 
 
 def _joints(table: Table) -> int:
@@ -164,17 +167,14 @@ def _log(
     if late.any():
         notes.append(f"{name}: {count_text(int(late.sum()), 'sample')} came late; the simulation uses their own times")
     for i, unit in enumerate(units):
-        moved = np.diff(position[:, i])
-        # Beside what the command moves, which across a gap may be much.
-        beyond = moved - np.diff(command[:, i])
-        turns = np.round(beyond / _TURN)
-        wrapped = (unit == "rad") & (turns != 0) & (np.abs(beyond - turns * _TURN) < _TURN_SLACK * _TURN)
-        wrapped &= np.abs(moved) > _TURN / 2
-        if wrapped.any():
-            position[1:, i] -= _TURN * np.cumsum(np.where(wrapped, turns, 0.0))
-            notes.append(f"{name}: the counter of q{i + 1} wrapped {count_text(int(wrapped.sum()), 'time')}, unwrapped")
-            moved = np.diff(position[:, i])
-        size = np.abs(moved)
+        if unit == "rad":
+            command[:, i], position[:, i], times = _unwrapped(command[:, i], position[:, i])
+            notes += [
+                f"{name}: {what}{i + 1} wrapped {count_text(count, 'time')}, unwrapped"
+                for what, count in zip(("command", "the counter of q"), times, strict=True)
+                if count
+            ]
+        size = np.abs(np.diff(position[:, i]))
         span = float(np.ptp(position[:, i]))
         jump = size > max(_JUMP * float(np.quantile(size, _USUAL)), 0.1 * span) if len(size) > 10 else size < 0
         if jump.any():
@@ -183,6 +183,36 @@ def _log(
     on = _drive_on(name, time, command, position, own, notes)
     cut[1:] |= on[1:] & ~on[:-1]
     return Log(name, time, command, position, units, own, on, cut, tuple(notes))
+
+
+def _unwrapped(command: Array, position: Array) -> tuple[Array, Array, tuple[int, int]]:
+    """A command and a position without jumps by whole turns, and how many each had."""
+    jump = np.diff(command)
+    turns = _turns(jump, jump)
+    whole = command - _TURN * np.cumsum(np.r_[0.0, turns])
+    # A command may jump by a turn, and the position then goes there.
+    tried = [(u, _followed(u, position)) for u in ((command, whole) if turns.any() else (command,))]
+    u, (q, count) = min(reversed(tried), key=lambda one: round(float(np.std(one[0] - one[1][0])), 6))
+    if u is whole or count:
+        # One of them may have wrapped before the log began.
+        q = q + _TURN * np.round(np.median(u - q) / _TURN)
+    return u, q, (int(np.count_nonzero(turns)) if u is whole else 0, count)
+
+
+def _followed(command: Array, position: Array) -> tuple[Array, int]:
+    """The position without jumps by whole turns beside those of its command, and how many it had."""
+    moved = np.diff(position)
+    # Beside what the command moves, which across a gap may be much.
+    turns = _turns(moved - np.diff(command), moved)
+    q = position - _TURN * np.cumsum(np.r_[0.0, turns])
+    return q, int(np.count_nonzero(turns))
+
+
+def _turns(beyond: Array, moved: Array) -> Array:
+    """Whole turns of each step, 0 where it moves less than half a turn or is no whole turn but what is beyond them."""
+    turns = np.round(beyond / _TURN)
+    near = (np.abs(beyond - turns * _TURN) < _TURN_SLACK * _TURN) & (np.abs(moved) > _TURN / 2)
+    return np.where(near, turns, 0.0)
 
 
 def refuse_time(table: Table, rows: NDArray[np.int64], time: Array) -> None:

@@ -24,6 +24,11 @@ _SHORTEST, _FEWEST, _LAGS = 1.0, 100, 8.0
 _LONGEST_LAG = 0.25
 # Correlation from which a position is the delayed command.
 _ALIKE = 0.9
+# Samples farther apart show no motion [s]; what they are farther apart than where their times are in a smaller unit.
+_SPACING, _SMALLER = 0.1, {"ns": 1e5, "us": 100.0, "ms": 0.0}
+# A position that is the command delayed by up to so much [s], or moves by less than that share of it, is not the
+# command with the other sign.
+_TURNED_LAG, _TURNED_SHARE = 1.0, 0.5
 
 
 def refuse_mistakes(logs: Sequence[Log]) -> None:
@@ -39,6 +44,7 @@ def refuse_mistakes(logs: Sequence[Log]) -> None:
             f"{names}: {samples} samples in {lasted:.3g} s with the drive on are too few; record at least {_FEWEST} "
             f"samples in {_SHORTEST:g} s, better ten times as many"
         )
+    _refuse_spacing(usable)
     command = np.concatenate([log.command[log.on] for log in usable])
     position = np.concatenate([log.position[log.on] for log in usable])
     still = [f"command{i + 1}" for i in range(command.shape[1]) if np.ptp(command[:, i]) == 0]
@@ -46,6 +52,7 @@ def refuse_mistakes(logs: Sequence[Log]) -> None:
         raise InputError(f"{names}: no command moves ({', '.join(still)}); record a motion")
     _refuse_units(names, command, position)
     _refuse_swapped(names, command, position)
+    _refuse_turned(usable)
     for log in usable:
         for i in range(command.shape[1]):
             if np.ptp(log.position[log.on, i]) == 0 and np.ptp(log.command[log.on, i]) > 0:
@@ -65,17 +72,47 @@ def refuse_mistakes(logs: Sequence[Log]) -> None:
 
 def lag_of(time: Array, command: Array, position: Array) -> float:
     """The time shift at which a position is most like its command [s], `s` each; 0 where it does not move."""
-    if len(command) < 3 or not np.ptp(command) or not np.ptp(position):
-        return 0.0
-    step = float(np.median(np.diff(time)))
-    c, q = command - command.mean(), position - position.mean()
-    size = 1 << (2 * len(c) - 1).bit_length()
-    like = np.fft.irfft(np.fft.rfft(q, size) * np.conj(np.fft.rfft(c, size)), size)[
-        : max(int(_LONGEST_LAG * len(c)), 1)
-    ]
+    like = _likeness(command, position)
     best = int(np.argmax(like))
     # A position that is not the command at all lags behind it by nothing.
-    return best * step if like[best] > _ALIKE * np.linalg.norm(c) * np.linalg.norm(q) else 0.0
+    return best * float(np.median(np.diff(time))) if like[best] > _ALIKE else 0.0
+
+
+def _likeness(command: Array, position: Array) -> Array:
+    """Correlation of a position with its command at each lag, in samples; 0 where one of them does not move."""
+    if len(command) < 3 or not np.ptp(command) or not np.ptp(position):
+        return np.zeros(1)
+    c, q = command - command.mean(), position - position.mean()
+    size = 1 << (2 * len(c) - 1).bit_length()
+    like = np.fft.irfft(np.fft.rfft(q, size) * np.conj(np.fft.rfft(c, size)), size)
+    found: Array = like[: max(int(_LONGEST_LAG * len(c)), 1)] / (np.linalg.norm(c) * np.linalg.norm(q))
+    return found
+
+
+def _refuse_spacing(logs: Sequence[Log]) -> None:
+    for log in logs:
+        step = float(np.median(np.diff(log.time)))
+        if step > _SPACING:
+            unit = next(unit for unit, beyond in _SMALLER.items() if step > beyond)
+            raise InputError(
+                f"{log.name}: its samples are {step:.3g} s apart, which shows no motion; if the times are in {unit}, "
+                f"write time[{unit}], else record at least {1 / _SPACING:.0f} samples in a second"
+            )
+
+
+def _refuse_turned(logs: Sequence[Log]) -> None:
+    for i in range(logs[0].command.shape[1]):
+        # Where the joint moves most.
+        log = max(logs, key=lambda log: float(np.ptp(log.command[log.on, i])))
+        command, position = log.command[log.on, i], log.position[log.on, i]
+        like = _likeness(command, position)
+        late = like[: max(int(_TURNED_LAG / float(np.median(np.diff(log.time)))), 1)]
+        far = np.std(position) > _TURNED_SHARE * np.std(command)
+        if far and like[0] < -_WELL and float(late.max()) < -like[0] - _MORE:
+            raise InputError(
+                f"{log.name}: q{i + 1} moves against command{i + 1}; multiply one of them by -1, so that both count in "
+                "one direction"
+            )
 
 
 def _refuse_units(names: str, command: Array, position: Array) -> None:

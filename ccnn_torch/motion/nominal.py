@@ -27,13 +27,13 @@ from ccnn_torch.plugins import is_plugin
 from ccnn_torch.spelling import nearest
 
 KEYS: dict[str, str] = {
-    "gain": "proportional gain [N*m/rad]; without it torques are told as angles",
-    "inertia": "of the axis without its load [kg*m^2]",
-    "mass": "of the load at the end of its lever [kg]",
+    "gain": "proportional gain; without it torques are told as angles [N*m/rad]",
+    "inertia": "of the axis about its own axis, without mass * length^2 of its load [kg*m^2]",
+    "mass": "of the load at the end of its lever, which hangs down at 0 [kg]",
     "length": "lever of the load [m]",
     "viscous": "viscous friction, the motor's damping included [N*m*s/rad]",
     "coulomb": "dry friction [N*m]",
-    "load_friction": "dry friction as a share of the motor's torque [1]",
+    "load_friction": "dry friction as a share of |torque of motor + that of load|, which at rest is twice the load [1]",
     "stribeck": "dry friction at rest beyond that in motion [N*m]",
     "stribeck_speed": "speed at which that has fallen to 1/e [rad/s]",
     "gravity_sin": "torque of the weight at 90 degrees beyond that of the load [N*m]",
@@ -44,17 +44,17 @@ KEYS: dict[str, str] = {
     "flexibility": "inertia of the driven side over the stiffness of the joint [s^2]",
     "flexible_damping": "damping ratio of that spring [1]",
     "encoder_at_motor": "1 where the encoder is at the motor, and that spring behind it [1]",
-    "thermal": "change of the dry friction with the temperature [1/K]",
+    "thermal": "change of coulomb for each kelvin above the coldest sample of the logs, as a share of it [1/K]",
     "delay": "from command to motor [s]",
     "offset": "of the position from the command [rad]",
     "backlash": "whole width of the play [rad]",
     "backlash_loaded": "1 where the load presses the play to one side [1]",
-    "speed_limit": "[rad/s]",
-    "torque_limit": "of the motor at the nominal supply [N*m]",
-    "supply": "nominal supply voltage, at which gain and torque_limit hold [V]",
-    "supply_share": "how far the motor's strength follows the supply [1]; 1 where supply is given",
+    "speed_limit": "of the drive, beyond which it follows no command [rad/s]",
+    "torque_limit": "of the motor, at the nominal supply [N*m]",
+    "supply": "nominal voltage, at which gain and torque_limit hold; given, both go with the column supply[V] [V]",
+    "supply_share": "how far they do: 1 where supply is given, 0 not at all [1]",
 }
-"""Keys of the built-in servo; a number for all axes, or a list with one for each."""
+"""Keys of the built-in servo with their units on a turning axis; a number for all axes, or a list with one for each."""
 
 TORQUES = (*("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos"),)
 """Parameters that are torques, which an axis has over the gain."""

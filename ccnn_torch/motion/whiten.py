@@ -33,6 +33,9 @@ def fitted_whitening(residual: Tensor, judged: Tensor) -> Whitening:
     found = torch.zeros(n, high, dtype=residual.dtype)
     count = target.shape[1]
     for i in range(n):
+        # Nothing is left of a joint that never moves.
+        if not bool(target[i].any()):
+            continue
         best = math.inf
         gram, along = past[i].mT @ past[i], past[i].mT @ target[i]
         for order in range(high + 1):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from motion.servo import GAIN, INERTIA, KEYS, LENGTH, LOAD, MASS, VISCOUS, command, moved, moved_on_a_spring, write_log
 
+from ccnn_torch.diagnosis.verdict.findings import findings
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion import (
     Nominal,
@@ -81,17 +82,20 @@ def test_the_command_on_a_real_servo(tmp_path: Path, cli: Cli) -> None:
 def test_a_mechanism_file_gives_joints_that_follow_their_commands(tmp_path: Path) -> None:
     arm = tmp_path / "arm.yaml"
     arm.write_text(
-        "dof: 2\nconvention: standard Denavit-Hartenberg\nunits: {length: m, angle: rad}\na: [0.3, 0.2]\n"
-        "alpha: [0, 0]\nd: [0, 0]\ntheta: [0, 0]\njoint_sign: [1, 1]\nbase_frame: identity\ntool_frame: identity\n"
+        "dof: 3\nconvention: standard Denavit-Hartenberg\nunits: {length: m, angle: rad}\na: [0.3, 0.2, 0.1]\n"
+        "alpha: [0, 0, 0]\nd: [0, 0, 0]\ntheta: [0, 0, 0]\njoint_sign: [1, 1, 1]\n"
+        "base_frame: identity\ntool_frame: identity\n"
     )
     time = np.arange(0, 2.4, 0.01)
-    asked, late = (np.stack([0.5 * np.sin((2 + i) * (time - t)) for i in range(2)], -1) for t in (0.0, 0.03))
+    # The last one is held, and its encoder always gives the same.
+    asked, late = (np.stack([0.5 * np.sin((2 + i) * (time - t) * (i < 2)) for i in range(3)], -1) for t in (0.0, 0.03))
     rows = np.concatenate([time[:, None], asked, late], 1)
-    head = "time[s],command1[rad],command2[rad],q1[rad],q2[rad]"
+    head = "time[s],command1[rad],command2[rad],command3[rad],q1[rad],q2[rad],q3[rad]"
     np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header=head, comments="")
     logs = load_logs([tmp_path / "log.csv"])
     found = diagnose_motion(logs, nominal_of(str(arm), {}, logs[0].units), ["delay"]).content
-    assert found["verdict"]["effects"] == ["delay"] and len(found["where"]["joints"]) == 2
+    assert found["verdict"]["effects"] == ["delay"] and len(found["where"]["joints"]) == 3
+    assert "no log moves q3: of such joints little can be told" in found["notes"]
     values = next(e for e in found["effects"] if e["name"] == "delay")["parameters"]
     assert [v["value"] for v in values.values()] == pytest.approx([0.03, 0.03], rel=0.02)
 
@@ -145,6 +149,7 @@ def test_a_simulator_of_ones_own_is_a_model_whose_parameters_are_causes(tmp_path
     logs, nominal = load_logs([log]), nominal_of(f"{own}:SERVO", {}, ["rad"])
     found = diagnose_motion(logs, nominal, ["offset"])
     assert found.content["verdict"]["effects"] == ["parameter viscous"]
+    assert "viscous 0.0500 → 0.0" in findings(found.content)[0].text
     write_identified(tmp_path, found, nominal, {})
     with pytest.raises(InputError, match="names Python code, "):
         load_identified(tmp_path / "identified_motion.json")
@@ -254,6 +259,8 @@ def test_a_file_that_cannot_be_is_refused_in_one_sentence(tmp_path: Path, cli: C
     back[50] = t[48]
     cases = {
         "time does not increase at line 52 (row 51)": one | {"time[s]": back},
+        "its samples are 10 s apart, which shows no motion; if the times are in ms, write": one | {"time[s]": 1e3 * t},
+        "q1 moves against command1; multiply one": one | {"q1[rad]": -0.98 * u},
         "one of them is in degrees and not in radians": one | {"q1[rad]": np.degrees(u)},
         "the columns of two joints are swapped": swapped,
         "the drive was off throughout": one | {"torque_on[1]": 0 * t},
@@ -291,16 +298,18 @@ def test_a_file_that_cannot_be_is_refused_in_one_sentence(tmp_path: Path, cli: C
         )
 
 
-def test_gaps_wrapped_counters_and_drives_that_are_off_are_left_out(tmp_path: Path) -> None:
+@pytest.mark.parametrize("both", [False, True])
+def test_gaps_wrapped_counters_and_drives_that_are_off_are_left_out(tmp_path: Path, both: bool) -> None:
     t = np.arange(0, 6, 0.01)
     u = 2.5 * np.sin(2 * t) + 2
     q = u - 0.02
     pwm = 100 * (u - q) + np.sin(40 * t)
     q[200:260], pwm[200:260] = q[200] + 1.0, 0.0
     q = (q + np.pi) % (2 * np.pi) - np.pi
-    keep = np.r_[0:400, 450:600]
+    keep = np.r_[0:480, 530:600]
+    sent = (u + np.pi) % (2 * np.pi) - np.pi if both else u
     lines = ["time[s],command1[rad],q1[rad],pwm1[1]"]
-    lines += [f"{t[k]},{u[k]},{q[k]},{pwm[k]}" for k in keep]
+    lines += [f"{t[k]},{sent[k]},{q[k]},{pwm[k]}" for k in keep]
     path = tmp_path / "log.csv"
     path.write_text("\n".join(lines) + "\n")
     log = load_logs([path])[0]
@@ -308,3 +317,26 @@ def test_gaps_wrapped_counters_and_drives_that_are_off_are_left_out(tmp_path: Pa
     assert "1 gap of 0.51 s in all, left out" in said and "the counter of q1 wrapped" in said
     assert "the drive was off for 0.6 s (pwm1" in said and int((~log.on).sum()) == 60
     assert np.allclose((log.position[:, 0] - u[keep])[log.on], -0.02)
+    assert np.allclose(log.command[:, 0], u[keep]) and ("command1 wrapped" in said) == both
+    # A command may jump by a turn, which the axis then follows.
+    step = 2 * np.pi * (t > 3)
+    rows = zip(t, step, step * (1 - np.exp(-5 * np.abs(t - 3))), strict=True)
+    path.write_text("\n".join([lines[0].removesuffix(",pwm1[1]"), *(f"{a},{b},{c}" for a, b, c in rows)]) + "\n")
+    assert np.allclose(load_logs([path])[0].command[:, 0], step)
+
+
+def test_rows_of_a_run_need_not_be_adjacent(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.csv", (0, 1), 1.2)
+    plain, (head, *rows) = load_logs([path]), path.read_text().splitlines()
+    path.write_text("\n".join([head, *sorted(rows, key=lambda row: float(row.split(",")[0]))]) + "\n")
+    mixed = load_logs([path])
+    for one, other in zip(plain, sorted(mixed, key=lambda log: log.name), strict=True):
+        assert one.name == other.name and np.array_equal(one.position, other.position)
+        assert not one.notes and "they were gathered" in other.notes[0]
+
+
+def test_a_gain_is_told_as_a_share_of_that_of_the_model(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.csv", (0,), 2.4)
+    found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS | {"gain": GAIN / 0.8}, ["rad"]), ["servo_gain"])
+    assert found.content["effects"][0]["parameters"]["q1 proportional gain"]["value"] == pytest.approx(-0.2, abs=0.004)
+    assert findings(found.content)[0].text.startswith("wrong servo gain of joint 1: proportional gain -20")

@@ -79,6 +79,13 @@ def test_sizes_are_in_units_of_a_workshop() -> None:
         "11.0 µm/(m·K)",
         "3.60 µrad/h",
     ]
+    # Of a drive: a share of friction, a speed beside its standard deviation, a number whose unit is not known.
+    told = [
+        size_words(*one) for one in ((-0.0139, "1/K"), (3.1e-4, "1/K", 2, 0.01), (4e-5, "m/s", 2, 0.12), (0.302, ""))
+    ]
+    assert told == ["-1.39 %/K", "0.031 %/K", "0.040 mm/s", "0.302"]
+    teeth = {"q1 sin": (0.25, 1e-3, "N*m", "joint 1"), "q1 cogging_order": (12.0, None, "1", "joint 1")}
+    assert findings(_with("cogging", teeth))[0].text == "cogging of joint 1: ±0.250 N·m, 12 times a turn"
 
 
 def test_the_numbers_to_enter_are_nominal_plus_error_with_their_digits() -> None:

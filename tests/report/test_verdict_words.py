@@ -63,6 +63,8 @@ def test_the_verdict_of_each_kind() -> None:
     unsure = one_effect()[0]
     unsure["verdict"]["probability"] = 0.6
     assert "under load is the likeliest explanation (probability 0.60) and would remove" in verdict_text(unsure)
+    unsure["verdict"]["probability"] = 0.004
+    assert "The rows do not determine the cause. Joint compliance under load is the likeliest" in verdict_text(unsure)
 
 
 def test_gaps_that_cannot_be_put_against_a_floor() -> None:
@@ -96,5 +98,8 @@ def test_noise_that_was_estimated_is_no_floor() -> None:
     assert gap_table(results, About()).columns[3] == "noise, estimated"
     assert verdict_text(results).startswith("The noise is not known: the gap of 420 µm is 20 times what the best")
     assert "93 % of its mean square" in verdict_text(results)
+    # What is left of a motion is 1.1 steps of the encoder, or 4.
+    for step, begin in ((1e-4, "The gap of 420 µm is 20 times what"), (3e-5, "The noise is not known: ")):
+        assert verdict_text(results | {"encoder_step": step}).startswith(begin)
     results["noise"] = "repeats"
     assert "20 times the noise (from repeated readings of one target)" in verdict_text(results)

@@ -15,10 +15,12 @@ from ccnn_torch.diagnosis.verdict.findings import findings
 from ccnn_torch.diagnosis.verdict.text import (
     capital,
     follows_words,
+    in_doubt,
     listed,
     no_effect_words,
     probability_words,
     size_text,
+    undetermined,
 )
 from ccnn_torch.effects import OUTLIER
 from ccnn_torch.report.table import markdown_table, print_labelled, print_table, print_text
@@ -79,20 +81,23 @@ def first_screen_markdown(results: Block, about: About) -> list[str]:
 
 
 def _wrong(results: Block) -> str:
-    verdict = results["verdict"]
+    verdict, open_ = results["verdict"], undetermined(results)
     found = [f.text for f in findings(results)]
     if verdict["none"]:
+        if open_:
+            return f"{capital(open_)}; the likeliest: nothing beyond the noise."
         return "Nothing: model and machine differ by no more than the noise."
     if verdict["outside_library"] or not found:
         rest = "a rest" if found else "an error"
         found.append(f"{rest} that {follows_words(verdict)}, which {no_effect_words(results)} describes")
-    return " ".join(f"{capital(text)}." for text in found)
+    likeliest = f"{capital(open_)}; the likeliest: " if open_ else ""
+    return likeliest + " ".join(f"{capital(text)}." for text in found)
 
 
 def _sure(results: Block) -> str:
     verdict = results["verdict"]
     text = f"Probability {probability_words(verdict['probability'])}"
-    if results.get("noise") == "estimated":
+    if in_doubt(results):
         text += "; the noise is not known, and what is taken for it may hold another cause"
     return f"{text}."
 

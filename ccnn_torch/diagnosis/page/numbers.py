@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ccnn_torch.diagnosis.verdict.findings import clear_parameters, frequency_words, size_words
+from ccnn_torch.diagnosis.verdict.findings import clear_parameters, frequency_words, repeats_of, size_words
 from ccnn_torch.display import display_unit, unit_text
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.report.table import Table
@@ -15,6 +15,7 @@ Block = Mapping[str, Any]
 _Z95 = 1.96
 # Numbers of an effect, however many effects there are.
 _FEWEST = 2
+_OWN_UNIT = "A number without unit has that of the simulator."
 
 
 def numbers_table(results: Block, most: int) -> Table | None:
@@ -37,8 +38,9 @@ def numbers_table(results: Block, most: int) -> Table | None:
             enter = "–" if block.get("nominal") is None else _whole(block["nominal"] + value, unit, block["sd"])
             text = f"{_named(name, part)}{_often(name, parameters)}"
             text = text if len(chosen) == 1 else f"{words_of(effect).short}, {text}"
-            rows.append((text, size_words(value, unit, 4), f"± {size_words(error, unit, 2)}", enter))
+            rows.append((text, size_words(value, unit, 4), f"± {size_words(error, unit, 2, value)}", enter))
         left_out += max(len(clear) - each, 0)
+        notes += [_OWN_UNIT] if any(not block["unit"] for block in clear.values()) else []
         notes += [words_of(effect).meaning] if clear and words_of(effect).meaning else []
     if not rows:
         return None
@@ -61,7 +63,7 @@ def _named(name: str, part: str) -> str:
 def _often(name: str, parameters: Block) -> str:
     """How often a wave of a periodic error repeats; empty for other numbers."""
     joint, *rest = name.split(" ")
-    own = parameters.get(f"{joint} frequency")
+    own = repeats_of(parameters, joint)
     if own is None or not rest:
         return ""
     times = int(rest[1]) if len(rest) > 1 and rest[1].isdigit() else 1
@@ -73,7 +75,7 @@ def _whole(value: float, unit: str, sd: float) -> str:
     if unit == "m":
         scale, shown = display_unit("m", 1.0)
         return f"{value / scale:.{_decimals(sd / scale)}f} {shown}"
-    text = f"{value:.{_decimals(sd)}f} {unit_text(unit)}".removesuffix(" 1")
+    text = f"{value:.{_decimals(sd)}f} {unit_text(unit)}".removesuffix(" 1").strip()
     degrees = math.degrees(1.0)
     return f"{text} = {value * degrees:.{_decimals(sd * degrees)}f}°" if unit == "rad" else text
 

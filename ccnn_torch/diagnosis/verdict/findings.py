@@ -24,6 +24,10 @@ _LEAST_SHARE = 0.1
 # Angles at which the largest value of a sum of harmonics is sought.
 _ANGLES = 720
 _A_TURN = " times a turn"
+# Effects whose numbers are waves, and what tells how often these repeat.
+_PERIODIC = {"transmission": "frequency", "cogging": "cogging_order"}
+# From this share for each kelvin on it is none of a length [1/K].
+_NO_GROWTH = 1e-3
 # Speeds below this [m/s or rad/s] are drifts, told by the hour.
 _DRIFT = 1e-3
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
@@ -53,7 +57,7 @@ def findings(results: Block) -> list[Finding]:
     found = []
     for name in results["verdict"]["effects"]:
         words, parameters = words_of(name), by_name.get(name, {}).get("parameters", {})
-        sizes = _waves(parameters) if name == "transmission" else _sizes(parameters)
+        sizes = _waves(parameters) if name in _PERIODIC else _sizes(parameters)
         named = [part for part in sizes if part]
         shown = [part for part in named if sizes[part][0] >= _LEAST_SHARE * max(sizes[p][0] for p in named)]
         most, more = shown[:_MOST_PARTS], len(shown) > _MOST_PARTS
@@ -90,13 +94,25 @@ def places(parts: Sequence[str]) -> str:
     return listed([f"{kind}{'s' if len(n) > 1 else ''} {_numbers(sorted(n, key=_order))}" for kind, n in kinds.items()])
 
 
-def size_words(value: float, unit: str, digits: int = 3) -> str:
-    """A number with a unit that a technician reads: `-7.23 mm`, `2.87 µrad/(N·m)`, `-0.62 %`, `25.6 min`."""
+def size_words(value: float, unit: str, digits: int = 3, beside: float | None = None) -> str:
+    """A number with a unit that a technician reads: `-7.23 mm`, `2.87 µrad/(N·m)`, `-0.62 %`, `25.6 min`.
+
+    Args:
+        value: in SI.
+        unit: its unit; empty where it is not known.
+        digits: significant ones.
+        beside: the number whose standard deviation it is: rates are then told in the unit of that.
+    """
+    size = abs(value if beside is None else beside)
+    if unit == "1/K" and size >= _NO_GROWTH:
+        return f"{number_text(100 * value, digits)} %/K"
+    if not unit:
+        return number_text(value, digits)
     if unit == "1":
         return f"{number_text(100 * value, digits)} %"
     if unit == "s" and abs(value) >= 120:
         return f"{number_text(value / 60, digits)} min"
-    if unit in ("m/s", "rad/s") and abs(value) < _DRIFT:
+    if unit in ("m/s", "rad/s") and size < _DRIFT:
         scale, shown = display_unit(unit[:-2], 3600 * value)
         return f"{number_text(3600 * value / scale, digits)} {shown}/h"
     if unit == "s" and abs(value) < 1:
@@ -105,10 +121,15 @@ def size_words(value: float, unit: str, digits: int = 3) -> str:
         scale, shown = display_unit(unit, value)
         return f"{number_text(value / scale, digits)} {shown}"
     if unit.startswith(("m/", "rad/", "1/K")):
-        scale, prefix = next((p for p in _PREFIXES if abs(value) >= p[0]), _PREFIXES[-1])
+        scale, prefix = next((p for p in _PREFIXES if size >= p[0]), _PREFIXES[-1])
         shown = "m/m/K" if unit == "1/K" else unit
         return f"{number_text(value / scale, digits)} {prefix}{unit_text(shown)}"
     return f"{number_text(value, digits)} {unit_text(unit)}"
+
+
+def repeats_of(parameters: Block, joint: str) -> Block | None:
+    """The number that tells how often a wave of a joint repeats; None where it is no wave."""
+    return next((parameters[name] for n in _PERIODIC.values() if (name := f"{joint} {n}") in parameters), None)
 
 
 def frequency_words(frequency: float, unit: str) -> str:
@@ -132,7 +153,11 @@ def _sizes(parameters: Block) -> dict[str, tuple[float, str]]:
     for part in sorted(chosen, key=lambda p: -sizes[p]):
         name, number = chosen[part], part.partition(" ")[2]
         own = "" if name in (part, f"q{number}") else f"{name.removeprefix(f'q{number} ')} "
-        found[part] = (sizes[part], f"{own}{size_words(parameters[name]['value'], parameters[name]['unit'])}")
+        value, unit = parameters[name]["value"], parameters[name]["unit"]
+        size = size_words(value, unit)
+        if not unit and (before := parameters[name].get("nominal")) is not None:
+            size = f"{size_words(before, unit)} → {size_words(before + value, unit)}"
+        found[part] = (sizes[part], f"{own}{size}")
     return found
 
 
@@ -141,7 +166,7 @@ def _waves(parameters: Block) -> dict[str, tuple[float, str]]:
     clear = clear_parameters(parameters)
     found: dict[str, tuple[float, str]] = {}
     for joint in dict.fromkeys(name.split(" ")[0] for name in clear):
-        own = parameters.get(f"{joint} frequency")
+        own = repeats_of(parameters, joint)
         if own is None:
             continue
         angle = np.linspace(0, 2 * np.pi, _ANGLES, endpoint=False)

@@ -19,6 +19,10 @@ Block = Mapping[str, Any]
 SURE = 0.95
 """From this probability on a verdict is said as a fact, below it as the likeliest explanation."""
 
+# Below this probability the rows determine no verdict: it is but the likeliest of many.
+_OPEN = 0.05
+# What is left beyond so many steps of an encoder is not its noise.
+_STEPS = 3.0
 # Up to so many effects without support are named one by one.
 _FEW_TRIED = 3
 _DRIVERS = {
@@ -84,11 +88,23 @@ def gap_words(results: Block) -> str:
         return f"The gap is {gaps}; how large the noise is, is not known."
     many = " and ".join(times)
     if results.get("noise", "given") == "estimated":
-        return (
-            f"The noise is not known: the gap of {gaps} is {many} times what the best explanation leaves, and that may "
-            "hold another cause."
-        )
+        left = f"the gap of {gaps} is {many} times what the best explanation leaves"
+        doubt = in_doubt(results)
+        return f"The noise is not known: {left}, and that may hold another cause." if doubt else f"{capital(left)}."
     return f"The gap of {gaps} is {many} times the noise{_NOISE_FROM.get(results.get('noise', 'given'), '')}."
+
+
+def in_doubt(results: Block) -> bool:
+    """Whether what is taken for noise may hold another cause; of a motion not where it is the encoder's step."""
+    gap, step = results["gap"], results.get("encoder_step")
+    left = gap["before"] if gap["after"] is None else gap["after"]
+    return results.get("noise") == "estimated" and not (step and left is not None and left <= _STEPS * step)
+
+
+def undetermined(results: Block) -> str:
+    """That the rows do not determine the verdict, without a full stop; empty where they do."""
+    rows = "logs" if results.get("motion") else "rows"
+    return f"the {rows} do not determine the cause" if results["verdict"]["probability"] < _OPEN else ""
 
 
 def verdict_text(results: Block) -> str:
@@ -101,8 +117,11 @@ def verdict_text(results: Block) -> str:
     """
     verdict = results["verdict"]
     said = [gap_words(results)]
+    if open_ := undetermined(results):
+        said.append(f"{capital(open_)}.")
     if verdict["none"]:
-        said.append(f"No cause beyond the noise is to be seen ({_probability(verdict)}).")
+        none = "The likeliest is none beyond the noise" if open_ else "No cause beyond the noise is to be seen"
+        said.append(f"{none} ({_probability(verdict)}).")
     else:
         said.append(_cause(results))
     doubts = (f"{'And' if i else 'But'} {caution}." for i, caution in enumerate(results.get("cautions", ())))

@@ -8,6 +8,6 @@ COULOMB = MotionEffect(
     "coulomb",
     lambda axis: (
         Number("coulomb", "torque", 0.02, (add("coulomb"),)),
-        Number("share of load", "1", 0.2, (add("load_friction"),), 0.05),
+        Number("share of the gear's torque", "1", 0.2, (add("load_friction"),), 0.05),
     ),
 )

@@ -12,5 +12,5 @@ OWN = "own "
 def own_parameter(key: str, value: float) -> MotionEffect:
     """What the simulator gives at another value of one of its parameters, to first order."""
     # Half of it is a plausible error; of one that is 0 nothing is known.
-    number = Number(key, "1", 0.5 * abs(value) or 1.0, (add(f"{OWN}{key}"),), 0.0)
+    number = Number(key, "", 0.5 * abs(value) or 1.0, (add(f"{OWN}{key}"),), 0.0, model=value)
     return MotionEffect(f"{PARAMETER}{key}", lambda axis: (number,))

@@ -66,11 +66,13 @@ class Number:
 
     Attributes:
         name: in `diagnosis.json`.
-        unit: `s`, `1`, `rad`, …; `torque` is a torque of the motor, `joint` the unit of the axis.
+        unit: `s`, `1`, `rad`, …; `torque` is a torque of the motor, `joint` the unit of the axis; empty where it is not
+            known.
         scale: its plausible size.
         acts: on which parameters.
         start: where a fit begins, in plausible sizes.
-        inverse: it is told as 1/number.
+        inverse: it is told as 1/number; one that only multiplies parameters as the change of the first, a share of it.
+        model: what the model has, where it is told beside the difference to it.
     """
 
     name: str
@@ -79,6 +81,7 @@ class Number:
     acts: tuple[Act, ...]
     start: float = 0.3
     inverse: bool = False
+    model: float | None = None
 
 
 @dataclass(frozen=True)

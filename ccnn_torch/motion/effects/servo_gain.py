@@ -13,11 +13,11 @@ def _numbers(axis: Facts) -> tuple[Number, ...]:
     if not axis.driven:
         # The time by which the position lags, 1 over the velocity gain.
         return (Number("lag", "s", 0.03, (add("viscous"),)),)
-    return (Number("log proportional", "1", 0.5, (scaled("gain"),), 0.0),)
+    return (Number("proportional gain", "1", 0.5, (scaled("gain"),), 0.0),)
 
 
 SERVO_GAIN = MotionEffect(
     "servo_gain",
     _numbers,
-    lambda axis: ({"log proportional": 0.3}, {"log proportional": -0.3}) if axis.driven else ({},),
+    lambda axis: ({"proportional gain": 0.3}, {"proportional gain": -0.3}) if axis.driven else ({},),
 )

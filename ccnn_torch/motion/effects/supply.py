@@ -23,7 +23,7 @@ def _missing(axis: Facts) -> str:
     return f"a column supply[V] that changes by {100 * _LEAST:.0f} %, or a model with the motor's limit"
 
 
-_SHARE, _VOLTAGE = "share of its change", "log voltage"
+_SHARE, _VOLTAGE = "share of the voltage's change", "motor's strength"
 
 
 def _numbers(axis: Facts) -> tuple[Number, ...]:
