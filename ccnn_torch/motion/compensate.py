@@ -5,16 +5,25 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ccnn_torch.display import number_text
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion.feed_forward import corrected_command
-from ccnn_torch.motion.identified import load_identified
+from ccnn_torch.motion.feed_forward import Around, corrected_command, moved
+from ccnn_torch.motion.identified import Identified, load_identified
 from ccnn_torch.motion.log import refuse_time, runs_of
-from ccnn_torch.records import read_table, write_table
+from ccnn_torch.records import Table, read_table, write_table
 from ccnn_torch.units import from_si
 
+Array = NDArray[np.float64]
 _FEWEST = 20
+# An error without correction that is so many times the largest one in the logs, and larger than the motion, is none of
+# the machine's.
+_ABSURD = 3.0
+# Share of the error that a correction must take away to be sent.
+_GAINED = 0.1
+# Share of the largest speed above which a motion does not begin at rest.
+_MOVING = 0.1
 
 
 def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool = False) -> list[str]:
@@ -22,28 +31,42 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
 
     Args:
         model: `identified_motion.json`.
-        input: CSV with `time[s]` and `command1[unit]…`, where the machine shall be; `run[1]` where it has several.
+        input: CSV with `time[s]` and `command1[unit]…`, where the machine shall be; `run[1]` where it has several,
+            `supply[V]` and `temperature[degC]` where the model follows them.
         output: CSV.
         allow_code: as of `load_identified`.
 
     Returns:
-        A sentence for each joint: what its error is predicted to be.
+        A sentence for each joint: what its error is predicted to be; and what was assumed.
 
     Raises:
-        InputError: a file is not there or not in this form.
+        InputError: a file is not there or not in this form, or the model errs by more than any machine would.
     """
     found = load_identified(model, allow_code)
     table = read_table(input)
     names = [f"command{i + 1}" for i in range(len(found.units))]
     time = table.column("time", "s")
     wanted = np.stack([table.column(n, unit) for n, unit in zip(names, found.units, strict=True)], -1)
+    around, sentences = _around(found, table)
+    runs = runs_of(table)
     command, position, plain = (np.empty_like(wanted) for _ in range(3))
-    for name, rows in runs_of(table):
+    for name, rows in runs:
         refuse_time(table, rows, time[rows])
         if len(rows) < _FEWEST:
             raise InputError(f"{name}: {len(rows)} rows are no motion; give at least {_FEWEST}")
-        own = corrected_command(found.nominal, found.axes, time[rows], wanted[rows])
+        here = _of_rows(around, rows)
+        own = corrected_command(found.nominal, found.axes, time[rows], wanted[rows], None, here, found.errors)
+        _refuse_absurd(name, found, wanted[rows], own.plain)
         command[rows], position[rows], plain[rows] = own.command, own.position, own.plain
+    # What the model leaves stays, and adds to what the correction does.
+    before, after = (np.hypot(np.sqrt(np.square(wanted - q).mean(0)), found.left) for q in (plain, position))
+    useless = after > (1 - _GAINED) * before
+    if useless.any():
+        command[:, useless] = wanted[:, useless]
+        for _, rows in runs:
+            here = _of_rows(around, rows)
+            position[rows] = moved(found.nominal, found.axes, time[rows], command[rows][None], here)[0]
+        after = np.hypot(np.sqrt(np.square(wanted - position).mean(0)), found.left)
     added = {}
     for what, values in (("corrected", command), ("predicted", position)):
         for i, name in enumerate(names):
@@ -51,12 +74,71 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
             added[f"{what}{i + 1}[{unit}]"] = from_si(values[:, i], found.units[i], unit)
     kept = {table.header(n): table.raw(n) for n in table.names if not n.startswith(("corrected", "predicted"))}
     write_table(output, kept | added)
-    sentences = []
+    said = []
     for i, unit in enumerate(found.units):
-        # What the model leaves stays, and adds to what the correction does.
-        before, after = (
-            float(np.hypot(np.sqrt(np.square(wanted[:, i] - q[:, i]).mean()), found.left[i])) for q in (plain, position)
-        )
-        said = f"{number_text(before, 3)} -> {number_text(after, 3)} {unit} RMS"
-        sentences.append(f"q{i + 1}: predicted {said} ({number_text(found.left[i], 2)} of it the model's own error)")
-    return sentences
+        change = f"predicted {number_text(before[i], 3)}"
+        beside = f"{number_text(found.left[i], 2)} of it the model's own error"
+        if useless[i]:
+            said.append(
+                f"q{i + 1}: {change} {unit} RMS ({beside}), of which a correction would take away less than a "
+                "tenth: the wanted motion is sent as it is"
+            )
+        else:
+            said.append(f"q{i + 1}: {change} -> {number_text(after[i], 3)} {unit} RMS ({beside})")
+    return said + [s for name, rows in runs for s in _begun(name, time[rows], wanted[rows])] + sentences
+
+
+def _around(found: Identified, table: Table) -> tuple[Around, list[str]]:
+    """What surrounds the motion, of all rows, and sentences on what is assumed."""
+    said = []
+    # Column, unit, parameter of an axis that follows it, where that holds, and the unit that it is said in.
+    kinds = (
+        ("supply", "V", "supply", found.nominal.supply, "V"),
+        ("temperature", "K", "thermal", found.temperature, "degC"),
+    )
+    values: dict[str, Array | None] = {}
+    for name, unit, parameter, usual, shown in kinds:
+        needed = any(axis.get(parameter) for axis in found.axes)
+        values[name] = table.column(name, unit) if needed and name in table else None
+        if needed and name not in table:
+            size = (
+                "the usual one"
+                if usual is None
+                else f"{number_text(float(from_si(np.asarray(usual), unit, shown)), 3)} {shown}"
+            )
+            said.append(f"{table.path} has no column {name}[{shown}], which the model follows: {size} is assumed")
+        elif not needed and name in table:
+            said.append(f"{name}[{shown}] changes nothing: the model does not follow it")
+    supply, warm = values["supply"], values["temperature"]
+    if supply is not None:
+        supply = supply / (found.nominal.supply or float(np.median(supply)) or 1.0) - 1
+    if warm is not None:
+        warm = warm - (float(warm[0]) if found.temperature is None else found.temperature)
+    return Around(supply, warm), said
+
+
+def _of_rows(around: Around, rows: NDArray[np.int64]) -> Around:
+    return Around(*(None if own is None else own[rows] for own in around))
+
+
+def _begun(name: str, time: Array, wanted: Array) -> list[str]:
+    """A sentence where a motion does not begin at rest."""
+    speed = np.abs(np.diff(wanted, axis=0) / np.diff(time)[:, None])
+    moving = [f"q{i + 1}" for i in np.flatnonzero(speed[0] > _MOVING * speed.max(0))]
+    if not moving:
+        return []
+    return [
+        f"{name}: {', '.join(moving)} begins with a speed, and the machine at rest at the first position: its first "
+        "moment differs"
+    ]
+
+
+def _refuse_absurd(name: str, found: Identified, wanted: Array, plain: Array) -> None:
+    error, span = np.abs(wanted - plain).max(0), np.ptp(wanted, 0)
+    for i, unit in enumerate(found.units):
+        if error[i] > max(span[i], _ABSURD * found.errors[i]):
+            e, s, logged = (number_text(float(v[i]), 2) for v in (error, span, np.asarray(found.errors)))
+            raise InputError(
+                f"{name}: the identified model would err by {e} {unit} at q{i + 1} in a motion over {s} {unit} (in its "
+                f"logs at most {logged} {unit}): it is not that machine; diagnose it again with more motions"
+            )

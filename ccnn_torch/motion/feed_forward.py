@@ -2,7 +2,8 @@
 
 u <- u + the smoothed (wanted - simulated position), as much earlier as the position comes late: iterative learning
 control (Arimoto 1984) with the simulator in the place of the machine. Of some shares of a step the best is taken, and
-none that takes a command farther from the wanted position than a bound.
+none that takes a command farther from the wanted position, or out of the range of the motion, than a bound. Before the
+motion the machine stands where it begins.
 """
 
 from __future__ import annotations
@@ -25,8 +26,25 @@ _STEPS, _SHARES = 30, (1.0, 0.5, 0.2)
 _GAINED = 0.01
 # Seconds of the rest before the first command, and of the Gaussian that smooths a step.
 _REST, _SMOOTH = 1.0, 0.01
-# The bound, in largest errors of the machine as it is.
-_BOUND = 3.0
+# The bound, in largest errors of the machine as it is, and how far out of the range of the motion, in its spans.
+_BOUND, _BEYOND = 3.0, 0.5
+# Steps to the command at which the machine stands where the motion begins.
+_STANDING = 8
+
+
+class Around(NamedTuple):
+    """What surrounds the axes during a motion, `s` each; None = as usual.
+
+    Attributes:
+        supply: voltage over the nominal one, less 1.
+        warm: temperature less that which the model holds at [K].
+    """
+
+    supply: Array | None = None
+    warm: Array | None = None
+
+
+AS_USUAL = Around()
 
 
 class Corrected(NamedTuple):
@@ -42,7 +60,13 @@ class Corrected(NamedTuple):
     position: Array
 
 
-def moved(nominal: Nominal, axes: Sequence[Mapping[str, float]], time: Array, commands: Array) -> Array:
+def moved(
+    nominal: Nominal,
+    axes: Sequence[Mapping[str, float]],
+    time: Array,
+    commands: Array,
+    around: Around = AS_USUAL,
+) -> Array:
     """Positions of a model whose axes have other parameters, from rest at the first command on.
 
     Args:
@@ -50,6 +74,7 @@ def moved(nominal: Nominal, axes: Sequence[Mapping[str, float]], time: Array, co
         axes: parameters of each axis as in `ABSENT`, in the place of the model's.
         time: `s` [s].
         commands: `p x s x n` [rad or m].
+        around: of the motion.
 
     Returns:
         `p x s x n`.
@@ -70,11 +95,16 @@ def moved(nominal: Nominal, axes: Sequence[Mapping[str, float]], time: Array, co
     def rows(values: Array) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values.transpose(0, 2, 1).reshape(p * n, -1)))
 
+    def course(values: Array | None) -> torch.Tensor | None:
+        return None if values is None else torch.from_numpy(np.r_[np.full(len(before), values[0]), values])[None]
+
     begin = rows(followed if simulated is None else simulated)[:, 0]
     drive = Drive(
         clock.expand(p * n, -1),
         rows(followed),
         torch.stack([begin, torch.zeros_like(begin)], -1),
+        course(around.supply),
+        course(around.warm),
         torque=None if torque is None else rows(torque),
     )
 
@@ -94,6 +124,8 @@ def corrected_command(
     time: Array,
     wanted: Array,
     bound: Sequence[float] | None = None,
+    around: Around = AS_USUAL,
+    errors: Sequence[float] | None = None,
 ) -> Corrected:
     """The commands at which a model goes where it is wanted, as near as the bound allows.
 
@@ -103,20 +135,30 @@ def corrected_command(
         wanted: positions, `s x n` [rad or m].
         bound: largest difference of a command from the wanted position of each joint [rad or m]; None = three times
             the largest error that the machine has without correction.
+        around: of the motion.
+        errors: largest ones in the logs that the machine was identified on [rad or m]; a command leaves the range of
+            the wanted motion by no more than that or half of that range, and the largest error without correction.
     """
     from scipy.ndimage import gaussian_filter1d
 
     step = float(np.median(np.diff(time)))
-    plain = moved(nominal, axes, time, wanted[None])[0]
+    rest = _standing(nominal, axes, time, wanted[0], around)
+    plain = moved(nominal, axes, time, wanted[None], around)[0]
     error = wanted - plain
-    limit = _BOUND * np.abs(error).max(0) if bound is None else np.asarray(bound, dtype=np.float64)
+    largest = np.abs(error).max(0)
+    limit = _BOUND * largest if bound is None else np.asarray(bound, dtype=np.float64)
+    beyond = np.minimum(np.maximum(_BEYOND * np.ptp(wanted, 0), np.inf if errors is None else errors), largest)
+    lowest = np.maximum(wanted - limit, wanted.min(0) - beyond)
+    highest = np.minimum(wanted + limit, wanted.max(0) + beyond)
     late = [lag_of(time, wanted[:, i], plain[:, i]) for i in range(wanted.shape[1])]
     command, position, left = wanted, plain, _rms(error)
     for _ in range(_STEPS):
         ahead = np.stack([np.interp(time + t, time, e) for t, e in zip(late, error.T, strict=True)], -1)
         move = gaussian_filter1d(ahead, _SMOOTH / step, axis=0)
-        trials = np.stack([np.clip(command + share * move, wanted - limit, wanted + limit) for share in _SHARES])
-        found = moved(nominal, axes, time, trials)
+        trials = np.stack([np.clip(command + share * move, lowest, highest) for share in _SHARES])
+        # Whoever waits at the first command stands where the motion begins.
+        trials[:, 0] = np.clip(rest, lowest[0], highest[0])
+        found = moved(nominal, axes, time, trials, around)
         lefts = np.stack([_rms(wanted - q) for q in found])
         best = np.argmin(lefts, 0)
         better = lefts.min(0) < left
@@ -129,6 +171,18 @@ def corrected_command(
         if bool(np.all(left > (1 - _GAINED) * before)):
             break
     return Corrected(command, plain, position)
+
+
+def _standing(
+    nominal: Nominal, axes: Sequence[Mapping[str, float]], time: Array, wanted: Array, around: Around
+) -> Array:
+    """The command at which a machine stands where it is wanted, `n`."""
+    command = wanted.copy()
+    begins = Around(*(None if own is None else own[:2] for own in around))
+    for _ in range(_STANDING):
+        held = np.broadcast_to(command, (1, 2, len(command)))
+        command = command + wanted - moved(nominal, axes, time[:2], held, begins)[0, 0]
+    return command
 
 
 def _rms(values: Array) -> Array:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +40,8 @@ class Identified(NamedTuple):
         left: RMS that it left on runs that were not fitted, of each joint [rad or m].
         effects: names of the verdict.
         units: of the joints.
+        errors: largest differences of command and position in the logs, of each joint [rad or m].
+        temperature: that at which the model's friction holds [K]; None where none was recorded.
     """
 
     nominal: Nominal
@@ -46,6 +49,8 @@ class Identified(NamedTuple):
     left: tuple[float, ...]
     effects: tuple[str, ...]
     units: tuple[str, ...]
+    errors: tuple[float, ...] = ()
+    temperature: float | None = None
 
 
 def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, keys: Mapping[str, Any]) -> list[str]:
@@ -57,7 +62,7 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
         nominal: the model that was diagnosed.
         keys: of the mechanism, as given.
     """
-    library = found.problem.library
+    library, data = found.problem.library, found.problem.data
     values = library.parameters(torch.stack([v.best.spec.theta for v in found.verdicts]), found.problem.axes)
     own = {name.removeprefix(OWN): values.pop(name) for name in [*values] if name.startswith(OWN)}
     count = len(found.verdicts)
@@ -65,11 +70,17 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
     content: dict[str, Any] = {
         "mechanism": nominal.name,
         "mechanism_keys": dict(keys),
-        "units": list(found.problem.data.units),
+        "units": list(data.units),
         "effects": list(found.content["verdict"]["effects"]),
-        "left": [float(own[found.problem.data.judged].square().mean().sqrt()) for own in found.after],
+        "left": [float(own[data.judged].square().mean().sqrt()) for own in found.after],
+        "errors": [float(own[data.judged].abs().max()) for own in data.command - data.position],
         "axes": axes,
     }
+    if "supply" in data.beside:
+        content["supply"] = float((data.beside["supply"] / (1 + found.problem.supply)).nanmedian())
+        nominal = replace(nominal, supply=content["supply"])
+    if "temperature" in data.beside:
+        content["temperature"] = float((data.beside["temperature"] - found.problem.warm).median())
     files = [IDENTIFIED]
     if nominal.name == "servo":
         content["mechanism_keys"] = axis_keys(nominal, axes, _mass(found))
@@ -111,10 +122,16 @@ def load_identified(path: Path, allow_code: bool = False) -> Identified:
         mechanism, keys, units = content["mechanism"], dict(content["mechanism_keys"]), list(content["units"])
         axes = tuple({str(n): float(v) for n, v in axis.items()} for axis in content["axes"])
         left, effects = tuple(map(float, content["left"])), tuple(map(str, content["effects"]))
+        errors = tuple(map(float, content["errors"]))
+        supply, temperature = (float(content[k]) if content.get(k) else None for k in ("supply", "temperature"))
         unknown = next((n for axis in axes for n, v in axis.items() if n not in ABSENT or not math.isfinite(v)), None)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: is no {IDENTIFIED}, which ccnn diagnose --motion writes ({error})") from None
-    if unknown is not None or not len(axes) == len(units) == len(left) or not {*map(str, units)} <= {"rad", "m"}:
+    if (
+        unknown is not None
+        or not len(axes) == len(units) == len(left) == len(errors)
+        or not {*map(str, units)} <= {"rad", "m"}
+    ):
         what = f"an axis has no number '{unknown}'"
         what = what if unknown else f"{len(axes)} axes for {len(units)} joints in rad or m"
         raise InputError(f"{path}: {what}; write it anew with ccnn diagnose --motion")
@@ -124,7 +141,9 @@ def load_identified(path: Path, allow_code: bool = False) -> Identified:
         nominal = nominal_of(name, keys, units)
     if nominal.name != "servo":
         axes = tuple({**axis, **own} for axis, own in zip(axes, nominal.axes, strict=True))
-    return Identified(nominal, nominal.axes if nominal.name == "servo" else axes, left, effects, tuple(units))
+    own = nominal.axes if nominal.name == "servo" else axes
+    nominal = replace(nominal, supply=supply or nominal.supply)
+    return Identified(nominal, own, left, effects, tuple(units), errors, temperature)
 
 
 def _beside(nominal: Nominal, i: int, axis: Axis, mass: float) -> dict[str, float]:

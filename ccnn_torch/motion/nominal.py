@@ -256,7 +256,7 @@ def axis_keys(nominal: Nominal, axes: Sequence[Mapping[str, float]], added: Sequ
         each.append(own)
     usual = {key: ABSENT.get(name, 0.0) for key, name in _SAME.items()}
     found = {key: [own[key] for own in each] for key in each[0] if any(own[key] != usual.get(key, 0.0) for own in each)}
-    return found | ({"supply": nominal.supply} if nominal.supply else {})
+    return found | ({"supply": nominal.supply} if nominal.supply and "supply_share" in found else {})
 
 
 def _numbers(key: str, value: Any, n: int) -> list[float]:
