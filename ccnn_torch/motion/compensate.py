@@ -56,7 +56,7 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
             raise InputError(f"{name}: {len(rows)} rows are no motion; give at least {_FEWEST}")
         here = _of_rows(around, rows)
         own = corrected_command(found.nominal, found.axes, time[rows], wanted[rows], None, here, found.errors)
-        _refuse_absurd(name, found, wanted[rows], own.plain)
+        _refuse_absurd(model, name, found, wanted[rows], own.plain)
         command[rows], position[rows], plain[rows] = own.command, own.position, own.plain
     # What the model leaves stays, and adds to what the correction does.
     before, after = (np.hypot(np.sqrt(np.square(wanted - q).mean(0)), found.left) for q in (plain, position))
@@ -101,12 +101,10 @@ def _around(found: Identified, table: Table) -> tuple[Around, list[str]]:
         needed = any(axis.get(parameter) for axis in found.axes)
         values[name] = table.column(name, unit) if needed and name in table else None
         if needed and name not in table:
-            size = (
-                "the usual one"
-                if usual is None
-                else f"{number_text(float(from_si(np.asarray(usual), unit, shown)), 3)} {shown}"
+            size = "the usual" if usual is None else number_text(float(from_si(usual, unit, shown)), 3)
+            said.append(
+                f"{table.path} has no column {name}[{shown}], which the model follows: {size} {shown} is assumed"
             )
-            said.append(f"{table.path} has no column {name}[{shown}], which the model follows: {size} is assumed")
         elif not needed and name in table:
             said.append(f"{name}[{shown}] changes nothing: the model does not follow it")
     supply, warm = values["supply"], values["temperature"]
@@ -133,12 +131,12 @@ def _begun(name: str, time: Array, wanted: Array) -> list[str]:
     ]
 
 
-def _refuse_absurd(name: str, found: Identified, wanted: Array, plain: Array) -> None:
+def _refuse_absurd(model: Path, name: str, found: Identified, wanted: Array, plain: Array) -> None:
     error, span = np.abs(wanted - plain).max(0), np.ptp(wanted, 0)
     for i, unit in enumerate(found.units):
         if error[i] > max(span[i], _ABSURD * found.errors[i]):
             e, s, logged = (number_text(float(v[i]), 2) for v in (error, span, np.asarray(found.errors)))
             raise InputError(
-                f"{name}: the identified model would err by {e} {unit} at q{i + 1} in a motion over {s} {unit} (in its "
-                f"logs at most {logged} {unit}): it is not that machine; diagnose it again with more motions"
+                f"{model}: on {name}, a motion over {s} {unit}, its q{i + 1} errs by {e} {unit} (the machine in its "
+                f"logs by at most {logged} {unit}): it is not that machine; diagnose it again, with more motions"
             )
