@@ -13,9 +13,10 @@ from torch import Tensor
 from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, Draws, Gap
 from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
 from ccnn_torch.display import number_text
+from ccnn_torch.effects.words import words_of
 from ccnn_torch.motion.effects import Facts, Number
 from ccnn_torch.motion.fit import Fit
-from ccnn_torch.motion.judge import AxisVerdict
+from ccnn_torch.motion.judge import STAMP, AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.phases import PHASES, phases_of
@@ -90,6 +91,17 @@ def effects_of(
             }
         )
     return sorted(rows, key=lambda e: (-e["probability"], e["gap_after"], e["name"]))
+
+
+def hidden_of(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
+    """Cautions where nothing is named although a set leaves clearly less, a sentence each without a full stop."""
+    step, names = 1e3 * STAMP * float(problem.data.time.diff(dim=-1).median()), problem.library.names
+    return [
+        f"q{i + 1} errs by more than the noise, most like {words_of(names[v.hidden]).cause}, and by no more than a "
+        f"shift of the time stamps by {step:.2g} ms would make: record slower motions, or more samples in a second"
+        for i, v in enumerate(verdicts)
+        if v.hidden is not None
+    ]
 
 
 def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, noise: float | None) -> list[str]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.progress import at_step
 from ccnn_torch.diagnosis.shrink.held_out import draws
 from ccnn_torch.diagnosis.verdict.text import verdict_text
-from ccnn_torch.motion.content import effects_of, floor_of, notes_of, where_is
+from ccnn_torch.motion.content import effects_of, floor_of, hidden_of, notes_of, where_is
 from ccnn_torch.motion.effects import motion_effects
 from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
 from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
@@ -138,7 +138,7 @@ def diagnose_motion(
         "not_seen": {n: why for n, why in zip(library.names, library.lacking, strict=True) if why},
         "rows_set_aside": [],
         "why_set_aside": [],
-        "cautions": [],
+        "cautions": hidden_of(problem, verdicts),
         "notes": notes_of(problem, nominal, found, total.floor, noise),
     }
     verdict["text"] = verdict_text(content)

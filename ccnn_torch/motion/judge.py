@@ -25,11 +25,12 @@ from ccnn_torch.motion.search import Search
 # Odds up to which the logs do not distinguish one name from another.
 _LIKE = 20.0
 # Share of a sampling step by which the time stamps of commands and positions may differ.
-_STAMP = 0.1
+STAMP = 0.1
 # Probability from which a member of the most probable set is named, where the set without it is probable, too.
 _NAMED = 0.9
-# Probability of something outside that takes nothing away on runs that no fit saw.
-_UNCONFIRMED = 0.5
+# Probability of something outside that takes nothing away on runs that no fit saw, and of nothing where a set leaves
+# clearly less, in RMS, and only the time stamps may be the reason.
+_UNCONFIRMED, _CLEARLY = 0.5, 3.0
 
 
 class AxisVerdict(NamedTuple):
@@ -41,6 +42,8 @@ class AxisVerdict(NamedTuple):
         marginal: probability of each effect that was fitted, by its number.
         classes: of each member the effects that can stand in its place.
         driver: what the residual follows outside the library; None where nothing is needed.
+        hidden: where nothing is named since a shift of the time stamps would do as much, the effect that explains most;
+            None where what is left is no more than what the best set leaves.
     """
 
     best: Fit
@@ -48,6 +51,7 @@ class AxisVerdict(NamedTuple):
     marginal: dict[int, float]
     classes: dict[int, tuple[int, ...]]
     driver: str | None
+    hidden: int | None = None
 
 
 def judge_axes(found: Search) -> list[AxisVerdict]:
@@ -61,7 +65,7 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     by_members = {f.members: f for f in fits}
     # Mean square of what a shift of the time stamps moves the axis by [rad^2 or m^2]: less is no effect.
     step, speed = float(problem.data.time.diff(dim=-1).median()), problem.data.speed[axis][problem.data.judged]
-    slight = (_STAMP * step) ** 2 * float(speed.square().mean())
+    slight = (STAMP * step) ** 2 * float(speed.square().mean())
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
     sets = [
@@ -94,6 +98,9 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     if inside.get(sure, 0.0) * _LIKE > inside[members]:
         members, classes = sure, _classes(sure, inside)
     same = sum(p for own, p in inside.items() if is_same(frozenset(own), frozenset(members), classes))
+    if not members and left[()] > _CLEARLY**2 * fits[0].left:
+        alone = min((f for f in fits if len(f.members) == 1), key=lambda f: f.left)
+        return AxisVerdict(by_members[()], min(same, _UNCONFIRMED), marginal, classes, None, alone.members[0])
     return AxisVerdict(by_members[members], same, marginal, classes, None)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import jsonschema
 import numpy as np
@@ -23,6 +24,7 @@ from ccnn_torch.motion import (
     write_identified,
 )
 from ccnn_torch.motion.mujoco_write import write_mjcf as write_new_values
+from ccnn_torch.motion.simulators import Simulator
 from ccnn_torch.records import read_table
 from ccnn_torch.report.json_files import load_schema
 
@@ -232,6 +234,47 @@ def test_causes_have_their_values_and_a_corrected_command_is_followed(tmp_path: 
         model.write_text(json.dumps(good | {change: sentence[0]}))
         code, _, error = cli("compensate", model, tmp_path / "in.csv", sent)
         assert code == 2 and str(sentence[1]) in error and error.count("\n") == 1
+
+
+def test_what_time_stamps_may_hide_is_not_said_to_be_noise(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.csv", (0, 1), 2.4, dry=0.0024)
+    nominal = nominal_of("servo", KEYS, ["rad"])
+    found = diagnose_motion(load_logs([log]), nominal, ["delay", "coulomb"]).content
+    assert found["verdict"]["none"] and found["verdict"]["probability"] <= 0.5
+    assert "most like dry friction, and by no more than a shift of the time stamps by 1 ms" in found["cautions"][0]
+
+
+class Stiff:
+    """A servo whose positions are far from linear in its parameters; only their ratios show."""
+
+    parameters: ClassVar[dict[str, float]] = {"gain": 2.0, "damping": 0.09, "inertia": 0.004}
+
+    @staticmethod
+    def simulate(time: np.ndarray, commands: np.ndarray, given: dict[str, float]) -> np.ndarray:
+        step = (time[-1] - time[0]) / (4 * (len(time) - 1))
+        clock = time[0] + step * np.arange(4 * len(time))
+        q, v, found = float(commands[0, 0]), 0.0, np.empty(len(clock))
+        for k, u in enumerate(np.interp(clock, time, commands[:, 0]).tolist()):
+            found[k] = q
+            v += (given["gain"] * (u - q) - given["damping"] * v) / given["inertia"] * step
+            q += v * step
+        return np.interp(time, clock, found)[:, None]
+
+
+def test_a_simulator_is_simulated_where_it_is_not_linear(tmp_path: Path) -> None:
+    time = np.arange(0, 2.4, 0.01)
+    lines = ["time[s],run[1],command1[rad],q1[rad]"]
+    for run in (0, 1):
+        asked = command(run, time)
+        q = Stiff.simulate(time, asked[:, None], Stiff.parameters | {"gain": 1.0})[:, 0]
+        q = np.round(q * 16384 / (2 * np.pi)) * 2 * np.pi / 16384
+        lines += [f"{t:.17g},{run},{u:.17g},{x:.17g}" for t, u, x in zip(time, asked, q, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    simulator = Simulator("stiff", Stiff.simulate, Stiff.parameters)
+    nominal = Nominal("stiff", ({},), (None,), (None,), simulator=simulator)
+    found = diagnose_motion(load_logs([tmp_path / "log.csv"]), nominal, ["delay", "inertia"]).content
+    assert found["verdict"]["effects"] == ["parameter gain"] and found["verdict"]["probability"] > 0.95
+    assert found["effects"][0]["parameters"]["q1 gain"]["value"] == pytest.approx(-1.0, rel=0.02)
 
 
 def test_a_flexible_joint_is_seen_from_the_motor(tmp_path: Path) -> None:

@@ -86,6 +86,8 @@ def _wrong(results: Block) -> str:
     if verdict["none"]:
         if open_:
             return f"{capital(open_)}; the likeliest: nothing beyond the noise."
+        if results.get("motion") and results.get("cautions"):
+            return "Nothing that these logs determine."
         return "Nothing: model and machine differ by no more than the noise."
     if verdict["outside_library"] or not found:
         rest = "a rest" if found else "an error"
