@@ -86,8 +86,10 @@ def _wrong(results: Block) -> str:
     if verdict["none"]:
         if open_:
             return f"{capital(open_)}; the likeliest: nothing beyond the noise."
-        if results.get("motion") and results.get("cautions"):
+        if results.get("motion") and verdict["probability"] <= 0.5:
             return "Nothing that these logs determine."
+        if results.get("motion") and in_doubt(results):
+            return "Nothing beyond what is taken for noise."
         return "Nothing: model and machine differ by no more than the noise."
     if verdict["outside_library"] or not found:
         rest = "a rest" if found else "an error"
