@@ -185,7 +185,7 @@ def pose_block(
             there is no orientation.
         weights: `r x s` [1], or None.
         rotation_weight: η of eq. 5 [m/rad]; adds `energy`, E = position error + η · rotation error, row by row [m].
-        beside: what else is told beside `before` and `after`, under its name; None is left out.
+        beside: what else is reported with `before` and `after`, under its name; None is left out.
 
     Returns:
         `{"position": {"unit": "m", "before": {"rms": S, "max": S}, "after": …}, "rotation": {…} or null}`, and `energy`

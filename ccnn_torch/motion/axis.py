@@ -35,7 +35,7 @@ class Drive(NamedTuple):
         command: `b x s` [rad or m].
         start: position and speed of the first sample, `b x 2`.
         supply: supply voltage over the nominal one, less 1, `b x s`; None = 0.
-        warm: temperature less that of the first sample, `b x s` [K]; None = 0.
+        warm: temperature less that of the coldest sample, `b x s` [K]; None = 0.
         torque: what else resists the motor, over the nominal gain, `b x s` [rad or m]; it comes as late as the command.
     """
 

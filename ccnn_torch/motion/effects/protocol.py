@@ -72,7 +72,7 @@ class Number:
         acts: on which parameters.
         start: where a fit begins, in plausible sizes.
         inverse: it is told as 1/number; one that only multiplies parameters as the change of the first, a share of it.
-        model: what the model has, where it is told beside the difference to it.
+        model: the value in the model, where it is reported with the difference to it.
     """
 
     name: str
