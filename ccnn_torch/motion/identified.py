@@ -15,6 +15,7 @@ import torch
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.motion.effects.own_parameter import OWN
+from ccnn_torch.motion.effects.payload import CARRIED
 from ccnn_torch.motion.engine import MotionDiagnosis
 from ccnn_torch.motion.nominal import TORQUES, Nominal, axis_keys, nominal_of
 from ccnn_torch.motion.stage import ABSENT
@@ -25,7 +26,7 @@ IDENTIFIED, _MODEL = "identified_motion.json", "identified.xml"
 # What an MJCF can hold of an axis.
 _IN_MJCF = ("gain", "inertia", "load", "viscous", "coulomb", "weakness")
 
-# Of what is left of a weight that the MJCF holds.
+# No number is surer.
 _ROUNDING = 1e-12
 
 Axis = Mapping[str, float]
@@ -65,6 +66,7 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
     library, data = found.problem.library, found.problem.data
     values = library.parameters(torch.stack([v.best.spec.theta for v in found.verdicts]), found.problem.axes)
     own = {name.removeprefix(OWN): values.pop(name) for name in [*values] if name.startswith(OWN)}
+    values.pop(CARRIED, None)
     count = len(found.verdicts)
     axes = [{name: float(v[i]) for name, v in values.items() if float(v[i]) != ABSENT[name]} for i in range(count)]
     content: dict[str, Any] = {
@@ -92,11 +94,10 @@ def write_identified(folder: Path, found: MotionDiagnosis, nominal: Nominal, key
     elif nominal.loaded is not None:
         from ccnn_torch.motion.mujoco_write import write_mjcf
 
-        added = _mass(found)
         written = [{name: axis.get(name, ABSENT[name]) for name in _IN_MJCF} for axis in axes]
-        write_mjcf(nominal.name, folder / _MODEL, written, nominal.gains, added, nominal.lengths)
+        write_mjcf(nominal.name, folder / _MODEL, written, nominal.gains, _at_tool(found))
         content["mechanism"] = _MODEL
-        content["axes"] = [_beside(nominal, i, axis, added[i]) for i, axis in enumerate(axes)]
+        content["axes"] = [_beside(axis) for axis in axes]
         files.append(_MODEL)
     write_json(folder / IDENTIFIED, content)
     return files
@@ -146,15 +147,19 @@ def load_identified(path: Path, allow_code: bool = False) -> Identified:
     return Identified(nominal, own, left, effects, tuple(units), errors, temperature)
 
 
-def _beside(nominal: Nominal, i: int, axis: Axis, mass: float) -> dict[str, float]:
+def _beside(axis: Axis) -> dict[str, float]:
     """What an axis has beside its MJCF, over the gain in that."""
     found = {name: value for name, value in axis.items() if name not in _IN_MJCF}
-    weight = nominal.weights[i] if mass and nominal.weights else None
-    for name, own in zip(("gravity_sin", "gravity_cos"), weight or (0.0, 0.0), strict=True):
-        found[name] = found.get(name, 0.0) - mass * own / (nominal.gains[i] or 1.0)
-    gain = axis.get("gain", 1.0)
-    found |= {name: found[name] / gain for name in TORQUES if name in found}
-    return {name: value for name, value in found.items() if abs(value) > _ROUNDING}
+    return found | {name: found[name] / axis.get("gain", 1.0) for name in TORQUES if name in found}
+
+
+def _at_tool(found: MotionDiagnosis) -> float:
+    """Mass at the tool [kg]: the mean of what the joints say, weighted by how sure they are."""
+    payload = next((e for e in found.content["effects"] if e["name"] == "payload"), None)
+    if payload is None or payload["name"] not in found.content["verdict"]["effects"]:
+        return 0.0
+    numbers = [(n["value"], 1 / max(n["sd"], _ROUNDING) ** 2) for n in payload["parameters"].values()]
+    return sum(value * weight for value, weight in numbers) / sum(weight for _, weight in numbers)
 
 
 def _mass(found: MotionDiagnosis) -> list[float]:

@@ -103,6 +103,9 @@ class Library(NamedTuple):
                         nominal = self.facts[i].nominal.get(name, ABSENT[name])
                         low[i, j] = max(float(low[i, j]), -nominal / (factor * number.scale))
                         high[i, j] = min(float(high[i, j]), (_MOST.get(name, math.inf) - nominal) / number.scale)
+                if number.most is not None:
+                    most = number.most / number.scale
+                    low[i, j], high[i, j] = max(float(low[i, j]), -most), min(float(high[i, j]), most)
         # 0 would stand for a shape that is not used.
         for name, place in self.held.items():
             low[:, place], high[:, place] = _LEAST.get(name, _SMALLEST), _MOST.get(name, _WIDEST)

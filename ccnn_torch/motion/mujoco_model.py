@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,43 +57,55 @@ def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> 
         "coulomb": model.dof_frictionloss[dofs] / gain,
         "weakness": model.actuator_forcelimited[position] * gain / np.maximum(limit, _TINY),
     }
-    levers = [_lever(model, j) for j in joints]
     return Nominal(
         path,
         tuple({name: float(v[i]) for name, v in values.items() if v[i]} for i in range(len(joints))),
         tuple(gain.tolist()),
-        tuple(lever and lever[0] for lever in levers),
-        weights=tuple(lever and lever[1] for lever in levers),
+        (None,) * len(joints),
+        heaviest=float(model.body_mass.sum()),
         loaded=lambda time, commands: _moved(model, joints, values, time, commands),
         notes=(f"{Path(path).name}: simulated from rest at each log's first command",),
     )
 
 
-def _lever(model: Any, joint: int) -> tuple[float, tuple[float, float]] | None:
-    """From a hinge to the centre of mass of its body [m], and what 1 kg there weighs, as of `Facts`; None of a joint
-    whose weight follows the positions of others, too."""
+class Tool(NamedTuple):
+    """Where a payload is: a body, and the point in its frame, `3` [m]."""
+
+    body: int
+    place: Array
+
+
+def tools_of(model: Any, joints: Sequence[int]) -> list[Tool]:
+    """Of each joint the tool that it carries: the last site of the last body of its chain, or its centre of mass."""
     import mujoco
 
-    body = int(model.jnt_bodyid[joint])
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    moved = [int(model.jnt_bodyid[j]) for j in joints]
+    tools = []
+    for body in moved:
+        # The first of the bodies beyond it that carry no other joint.
+        last = next(b for b in moved if body in _down(model, b) and not any(o != b and b in _down(model, o) for o in moved))
+        fixed = [b for b in range(model.nbody) if model.body_weldid[b] == model.body_weldid[last]]
+        sites = [s for s in range(model.nsite) if model.site_bodyid[s] in fixed]
+        place = data.site_xpos[sites[-1]] if sites else data.subtree_com[last]
+        tools.append(Tool(last, data.xmat[last].reshape(3, 3).T @ (place - data.xpos[last])))
+    return tools
+
+
+def _down(model: Any, body: int) -> list[int]:
+    """A body and those that carry it."""
     chain = [body]
     while chain[-1]:
         chain.append(int(model.body_parentid[chain[-1]]))
-    if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE or sum(model.body_jntnum[b] for b in chain) != 1:
-        return None
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    axis, arm = data.xaxis[joint], data.xipos[body] - data.xanchor[joint]
-    turned = np.cross(axis, arm)
-    lever = float(np.linalg.norm(turned))
-    cosine, sine = (-float(model.opt.gravity @ v) for v in (turned, np.cross(axis, turned)))
-    return (lever, (sine, cosine)) if lever > _TINY else None
+    return chain
 
 
 def _moved(
     model: Any, joints: Sequence[int], own: Mapping[str, Array], time: Array, commands: Array
-) -> tuple[Array, Array]:
-    """Positions, and what resists each actuator beside its joint's friction and inertia, over its gain, `s x n` each:
-    weights, and the other joints."""
+) -> tuple[Array, Array, Array]:
+    """Positions, what resists each actuator beside its joint's friction and inertia, over its gain (weights, and the
+    other joints), and what 1 kg at its tool adds to that, `s x n` each."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -104,10 +116,15 @@ def _moved(
     clock = np.arange(time[0] - _SETTLING, time[-1] + step, step)
     controls = np.stack([np.interp(clock, time, c) for c in commands.T], -1)
     found, torque = np.empty_like(controls), np.empty_like(controls)
+    tools = tools_of(model, joints)
+    # Of each tool what its point moves by with each joint, and its speed.
+    bent, speed = np.empty((len(controls), len(joints), 3)), np.empty((len(controls), len(joints), 3))
+    jacobian = np.empty((3, model.nv))
     gain = model.actuator_gainprm[: len(joints), 0]
     limit = 1 / np.maximum(own["weakness"], _TINY)
     for k, control in enumerate(controls):
-        q, v = data.qpos[address].copy(), data.qvel[dofs].copy()
+        q, whole = data.qpos[address].copy(), data.qvel.copy()
+        v = whole[dofs]
         found[k] = q
         data.ctrl[:] = control
         mujoco.mj_step(model, data)
@@ -116,5 +133,13 @@ def _moved(
         # What a joint's own friction takes, up to all that holds it.
         dry = np.clip(-data.qfrc_constraint[dofs] / gain, -own["coulomb"], own["coulomb"])
         torque[k] = motor - own["viscous"] * after - dry - own["inertia"] * (after - v) / step
-    at = [np.stack([np.interp(time, clock, x) for x in table.T], -1) for table in (found, torque)]
-    return at[0], at[1]
+        for i, tool in enumerate(tools):
+            if i == 0 or tool.body != tools[i - 1].body:
+                # Of the position before the step, as the kinematics still are.
+                point = data.xpos[tool.body] + data.xmat[tool.body].reshape(3, 3) @ tool.place
+                mujoco.mj_jac(model, data, jacobian, None, point, tool.body)
+            bent[k, i], speed[k, i] = jacobian[:, dofs[i]], jacobian @ whole
+    pulled = np.gradient(speed, step, axis=0) - model.opt.gravity
+    carried = (bent * pulled).sum(-1) / gain
+    made = [np.stack([np.interp(time, clock, x) for x in table.T], -1) for table in (found, torque, carried)]
+    return made[0], made[1], made[2]

@@ -172,6 +172,7 @@ def _problem_of(problem: Problem, axis: int, proposed: Sequence[Motion]) -> Prob
         supply=still,
         warm=still,
         torque=None,
+        carried=None,
         simulated=None,
         own={},
         pool=max(round(step / _STEP), 1),

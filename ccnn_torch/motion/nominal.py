@@ -80,13 +80,14 @@ class Driven(NamedTuple):
         followed: positions that they follow [rad or m].
         torque: what resists their motors, over the gain [rad or m]; None = nothing.
         simulated: positions of the nominal model; None where the nominal axes tell them.
-        own: as of `Problem`.
+        own, carried: as of `Problem`.
     """
 
     followed: Tensor
     torque: Tensor | None = None
     simulated: Tensor | None = None
     own: Mapping[str, Tensor] = {}
+    carried: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -98,11 +99,11 @@ class Nominal:
         axes: parameters of each axis, as in `ABSENT`.
         gains: N m/rad of each axis, None where it is not known.
         lengths: lever of each axis' load [m].
-        weights: of 1 kg there, as of `Facts`.
+        heaviest: as of `Facts`.
         supply: nominal supply voltage; None where the motor's strength is not known to follow it.
         simulator: makes the positions that the axes follow; None where they follow the commands.
-        loaded: `time, commands` -> positions, and what resists the motors beside those of `axes`, over the gains,
-            `s x n` each; None where the axes tell the positions.
+        loaded: `time, commands` -> positions, what resists the motors beside those of `axes`, over the gains, and what
+            1 kg at the tool adds to that, `s x n` each; None where the axes tell the positions.
         notes: sentences without a full stop.
     """
 
@@ -113,8 +114,8 @@ class Nominal:
     supply: float | None = None
     simulator: Simulator | None = None
     notes: tuple[str, ...] = ()
-    weights: tuple[tuple[float, float] | None, ...] = ()
-    loaded: Callable[[Array, Array], tuple[Array, Array]] | None = None
+    heaviest: float | None = None
+    loaded: Callable[[Array, Array], tuple[Array, Array, Array]] | None = None
 
     @property
     def own_effects(self) -> list[MotionEffect]:
@@ -135,9 +136,9 @@ class Nominal:
         """
         simulator = self.simulator
         if self.loaded is not None:
-            pairs = [self.loaded(log.time, log.command) for log in logs]
-            simulated, torque = (_along([pair[k] for pair in pairs], data) for k in range(2))
-            return Driven(data.command, torque, simulated)
+            made_of = [self.loaded(log.time, log.command) for log in logs]
+            simulated, torque, carried = (_along([one[k] for one in made_of], data) for k in range(3))
+            return Driven(data.command, torque, simulated, carried=carried)
         if simulator is not None:
             centre = {name: value + (about or {}).get(name, 0.0) for name, value in simulator.parameters.items()}
 

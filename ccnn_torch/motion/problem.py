@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ccnn_torch.motion.axis import Drive, simulate_axes
 from ccnn_torch.motion.effects.own_parameter import OWN
+from ccnn_torch.motion.effects.payload import CARRIED
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.stretches import Stretches
 
@@ -53,6 +54,7 @@ class Problem:
         torque, simulated: as of `Driven`.
         supply, warm: as of `Drive`, `b x s`.
         own: what a unit of each of a simulator's own parameters changes in its positions, by name, `n x b x s`.
+        carried: what 1 kg at the tool adds to `torque`, `n x b x s` [rad or m per kg].
         pool: so many samples are averaged before they are judged: what is faster than the motion is noise.
     """
 
@@ -65,6 +67,7 @@ class Problem:
     torque: Tensor | None = None
     simulated: Tensor | None = None
     own: Mapping[str, Tensor] = field(default_factory=dict)
+    carried: Tensor | None = None
 
     @property
     def axes(self) -> Tensor:
@@ -131,6 +134,7 @@ class Problem:
             torque=every.reshape(n, m * b, s),
             simulated=None,
             own={name: v.repeat(1, m, 1) for name, v in self.own.items()},
+            carried=None if self.carried is None else self.carried.repeat(1, m, 1),
         )
         moved = wide.positions(theta, self.axes).reshape(n, m, b, s)
         return moved if self.simulated is None else moved + self._beyond[:, None]
@@ -161,16 +165,20 @@ class Problem:
         def of_all(values: Tensor) -> Tensor:
             return values[rows].expand(p, -1, -1).flatten(0, 1)
 
+        parameters = self.library.parameters(theta, axis)
+        own, mass = {name: parameters.pop(f"{OWN}{name}", None) for name in self.own}, parameters.pop(CARRIED, None)
+        torque = None if self.torque is None else of_axis(self.torque)
+        if mass is not None and self.carried is not None:
+            load = mass.repeat_interleave(b)[:, None] * of_axis(self.carried)
+            torque = load if torque is None else torque + load
         drive = Drive(
             of_all(data.time),
             of_axis(self.followed),
             of_axis(start),
             of_all(self.supply),
             of_all(self.warm),
-            None if self.torque is None else of_axis(self.torque),
+            torque,
         )
-        parameters = self.library.parameters(theta, axis)
-        own = {name: parameters.pop(f"{OWN}{name}", None) for name in self.own}
         values = {name: value.repeat_interleave(b)[None] for name, value in parameters.items()}
         moved = simulate_axes(drive, values)[0].reshape(p, b, -1)
         for name, value in own.items():

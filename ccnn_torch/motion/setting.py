@@ -11,7 +11,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.motion.effects import Facts, MotionEffect
 from ccnn_torch.motion.library import library_of
 from ccnn_torch.motion.log import Log
-from ccnn_torch.motion.nominal import Nominal
+from ccnn_torch.motion.nominal import Driven, Nominal
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.stretches import Stretches, cut_stretches
 
@@ -36,16 +36,16 @@ def problem_of(logs: Sequence[Log], nominal: Nominal, effects: Sequence[MotionEf
     warm = torch.zeros_like(data.time)
     if "temperature" in data.beside:
         warm = data.beside["temperature"] - data.beside["temperature"][data.judged].min()
-    facts = [_facts(data, i, nominal, driven.followed, supply, warm) for i in range(len(data.units))]
+    facts = [_facts(data, i, nominal, driven, supply, warm) for i in range(len(data.units))]
     library = library_of(effects, facts)
     if all(library.lacking):
         need = "; ".join(f"{name} needs {why}" for name, why in zip(library.names, library.lacking, strict=True))
         raise InputError(f"effects: these logs can show none of the candidates: {need}")
     pool = max(round(_POOLED / float(data.time.diff(dim=-1).median())), 1)
-    return Problem(data, library, driven.followed, supply, warm, pool, driven.torque, driven.simulated, driven.own)
+    return Problem(data, library, pool=pool, supply=supply, warm=warm, **driven._asdict())
 
 
-def _facts(data: Stretches, i: int, nominal: Nominal, followed: Tensor, supply: Tensor, warm: Tensor) -> Facts:
+def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven, supply: Tensor, warm: Tensor) -> Facts:
     judged = data.judged
 
     def nearly(values: Tensor) -> float:
@@ -60,10 +60,11 @@ def _facts(data: Stretches, i: int, nominal: Nominal, followed: Tensor, supply: 
         nominal=nominal.axes[i],
         gain=nominal.gains[i],
         length=nominal.lengths[i],
-        weight=nominal.weights[i] if nominal.weights else None,
+        carried=0.0 if driven.carried is None else nearly(driven.carried[i][judged]),
+        heaviest=nominal.heaviest,
         span=span or 1.0,
         speed=nearly(data.speed[i][judged]) or 1.0,
-        error=nearly((followed[i] - data.position[i])[judged]) or 1e-6,
+        error=nearly((driven.followed[i] - data.position[i])[judged]) or 1e-6,
         supply=float(supply[judged].abs().max()) if "supply" in data.beside else 0.0,
         temperature=max(float(v.max() - v.min()) for v in runs),
     )

@@ -25,7 +25,7 @@ from ccnn_torch.motion import (
 )
 from ccnn_torch.motion.mujoco_write import write_mjcf as write_new_values
 from ccnn_torch.motion.simulators import Simulator
-from ccnn_torch.records import read_table
+from ccnn_torch.records import read_table, write_table
 from ccnn_torch.report.json_files import load_schema
 
 Cli = Callable[..., tuple[int, str, str]]
@@ -182,15 +182,54 @@ def test_a_mujoco_model_is_a_model_and_gets_the_new_values(tmp_path: Path) -> No
     written = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml"))
     assert written.dof_frictionloss[0] == pytest.approx(0.06, rel=0.1)
     # A tenth of a kilogram more: the body is heavier, and the motor's armature as it was.
-    inertia = (KEYS["inertia"] + 0.1 * 0.1**2) / GAIN
-    axis = {"gain": 1.0, "inertia": inertia, "viscous": KEYS["viscous"] / GAIN, "coulomb": 0.0, "weakness": 0.0}
-    write_new_values(str(model), tmp_path / "identified.xml", [axis], nominal.gains, [0.1], nominal.lengths)
+    axis = {name: KEYS[name] / GAIN for name in ("inertia", "viscous")} | {"gain": 1.0, "coulomb": 0.0, "weakness": 0.0}
+    write_new_values(str(model), tmp_path / "identified.xml", [axis], nominal.gains, 0.1)
     heavier = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml"))
-    assert heavier.body_mass[1] == pytest.approx(0.3) and heavier.dof_M0[0] == pytest.approx(inertia * GAIN)
+    assert heavier.body_mass[1] == pytest.approx(0.3)
+    assert heavier.dof_M0[0] == pytest.approx(KEYS["inertia"] + 0.1 * 0.1**2)
     assert heavier.dof_armature[0] == pytest.approx(KEYS["inertia"] - 0.2 * 0.1**2, abs=1e-6)
     write_mjcf(model, actuator='<motor joint="q"/>')
     with pytest.raises(InputError, match="<position joint=…/> for each command"):
         nominal_of(str(model), {}, ["rad"])
+
+
+def arm(path: Path, payload: float = 0.0) -> Path:
+    """Two links in a vertical plane, with a site at the flange and a payload there [kg]."""
+    link = '<body pos="{x} 0 0"><joint name="{name}" axis="0 1 0" armature="0.05" damping="{damping}"/>'
+    link += '<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="{mass}"/>'
+    load = f'<body pos="0.3 0 0"><geom type="sphere" size="0.01" mass="{payload}"/></body>' if payload else ""
+    inner = link.format(x=0.3, name="q2", damping=6.0, mass=1.0) + f'<site pos="0.3 0 0"/>{load}</body>'
+    path.write_text(
+        '<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/><worldbody>'
+        f"{link.format(x=0, name='q1', damping=20.0, mass=2.0)}{inner}</body></worldbody>"
+        '<actuator><position joint="q1" kp="600"/><position joint="q2" kp="200"/></actuator></mujoco>'
+    )
+    return path
+
+
+def test_a_payload_at_the_tool_of_an_arm_is_named_and_written_into_its_model(tmp_path: Path) -> None:
+    import mujoco
+
+    time = np.arange(0, 4, 0.008)
+    asked = np.stack([command(0, time), command(1, time)], -1)
+    nominal, loaded = (nominal_of(str(arm(tmp_path / f"{m}.xml", m)), {}, ["rad", "rad"]) for m in (0.0, 0.4))
+    assert loaded.loaded is not None
+    table = {"time[s]": time} | {f"command{i + 1}[rad]": asked[:, i] for i in range(2)}
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(asked.shape)
+    measured = loaded.loaded(time, asked)[0] + noise
+    write_table(tmp_path / "log.csv", table | {f"q{i + 1}[rad]": measured[:, i] for i in range(2)})
+    logs = load_logs([tmp_path / "log.csv"])
+    found = diagnose_motion(logs, nominal, ["payload", "gravity", "inertia", "offset"])
+    assert found.content["verdict"]["effects"] == ["payload"] and found.content["verdict"]["shrink"] > 0.95
+    told = next(e for e in found.content["effects"] if e["name"] == "payload")["parameters"]
+    assert {name: v["unit"] for name, v in told.items()} == {"q1 mass": "kg", "q2 mass": "kg"}
+    assert [v["value"] for v in told.values()] == pytest.approx([0.4, 0.4], rel=0.1)
+    write_identified(tmp_path, found, nominal, {})
+    better = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml"))
+    true = mujoco.MjModel.from_xml_path(str(tmp_path / "0.4.xml"))
+    assert better.body_mass.sum() == pytest.approx(true.body_mass.sum(), rel=0.02)
+    # The mass is where it is: the inertia about each joint is that of the loaded arm.
+    assert better.dof_M0 == pytest.approx(true.dof_M0, rel=0.03)
 
 
 def test_causes_have_their_values_and_a_corrected_command_is_followed(tmp_path: Path, cli: Cli) -> None:

@@ -1,4 +1,4 @@
-"""A mass at the end of the axis' lever that the model lacks or has wrong: weight and inertia in one."""
+"""A mass at the tool, or at the end of the axis' lever, that the model lacks or has wrong: weight and inertia in one."""
 
 from __future__ import annotations
 
@@ -6,20 +6,27 @@ from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2."""
+CARRIED = "carried"
+"""The parameter of an axis that is the mass at the tool [kg]."""
+# Share of an axis' error that 100 kg at the tool must make for it to show a mass there.
+_LEAST = 0.01
 
 
 def _missing(axis: Facts) -> str:
     if axis.unit != "rad":
         return "a turning joint"
+    if axis.carried:
+        return "" if 100 * axis.carried >= _LEAST * axis.error else "a joint that the mass loads"
     return "" if axis.length and axis.gain else "the axis' gain and the lever of its load (keys gain and length)"
 
 
 def _numbers(axis: Facts) -> tuple[Number, ...]:
+    if axis.carried:
+        # A mass that would explain the error.
+        return (Number("mass", "kg", axis.error / axis.carried, (add(CARRIED),), most=axis.heaviest),)
     lever, gain = axis.length or 1.0, axis.gain or 1.0
-    sine, cosine = axis.weight or (STANDARD_GRAVITY * lever, 0.0)
     acts = (
-        add("gravity_sin", sine / gain),
-        add("gravity_cos", cosine / gain),
+        add("gravity_sin", STANDARD_GRAVITY * lever / gain),
         add("inertia", lever**2 / gain),
         # The model knows which part of the inertia is behind the gear.
         add("load", lever**2 / gain if axis.nominal.get("load") else 0.0),

@@ -17,8 +17,9 @@ class Facts:
         gain: N m/rad (N/m) of its position control; None where it is not known. Torques are then told as the angle (or
             length) by which the command and the position must differ for them.
         length: lever of a load [m]; None where it is not known.
-        weight: torque of the weight of 1 kg there, times the sine and the cosine of the position [N m]; None: that of a
-            lever that hangs down at 0.
+        carried: nearly the largest torque that 1 kg at the tool loads its motor with, over the gain [rad or m per kg];
+            0 where the model does not tell it.
+        heaviest: no payload is heavier [kg]; None where nothing is known of it.
         span: of the command [rad or m].
         speed: nearly the largest one [per s].
         error: nearly the largest difference of command and position [rad or m].
@@ -29,7 +30,8 @@ class Facts:
     nominal: Mapping[str, float]
     gain: float | None = None
     length: float | None = None
-    weight: tuple[float, float] | None = None
+    carried: float = 0.0
+    heaviest: float | None = None
     span: float = 1.0
     speed: float = 1.0
     error: float = 0.1
@@ -73,6 +75,7 @@ class Number:
         start: where a fit begins, in plausible sizes.
         inverse: it is told as 1/number; one that only multiplies parameters as the change of the first, a share of it.
         model: the value in the model, where it is reported with the difference to it.
+        most: its size is no larger, in its unit; None = any.
     """
 
     name: str
@@ -82,6 +85,7 @@ class Number:
     start: float = 0.3
     inverse: bool = False
     model: float | None = None
+    most: float | None = None
 
 
 @dataclass(frozen=True)
