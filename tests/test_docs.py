@@ -16,7 +16,7 @@ import typer
 from ccnn_torch.cli import app
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.registry import REGISTRY
-from ccnn_torch.motion.nominal import KEYS
+from ccnn_torch.motion.servo import KEYS
 
 ROOT = Path(__file__).parent.parent
 DIAGNOSIS = ROOT / "ccnn_torch" / "diagnosis"

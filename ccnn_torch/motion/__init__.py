@@ -9,5 +9,5 @@ from ccnn_torch.motion.identified import load_identified as load_identified
 from ccnn_torch.motion.identified import write_identified as write_identified
 from ccnn_torch.motion.log import Log as Log
 from ccnn_torch.motion.log import load_logs as load_logs
+from ccnn_torch.motion.models import nominal_of as nominal_of
 from ccnn_torch.motion.nominal import Nominal as Nominal
-from ccnn_torch.motion.nominal import nominal_of as nominal_of

@@ -15,13 +15,13 @@ from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
 from ccnn_torch.display import number_text
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.motion.effects import Facts, Number
-from ccnn_torch.motion.fit import Fit
 from ccnn_torch.motion.judge import STAMP, AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.phases import PHASES, phases_of
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
+from ccnn_torch.motion.spec import Fit
 from ccnn_torch.motion.stretches import Stretches
 
 _SHAPE_UNITS = {"flexible_damping": "1", "play_loaded": "1", "encoder_at_motor": "1"}

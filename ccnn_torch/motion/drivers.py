@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.motion.fit import Spec
 from ccnn_torch.motion.problem import Problem
+from ccnn_torch.motion.spec import Spec
 
 # Knots of a piecewise linear function: at quantiles of a driver, and evenly spaced ones of a position and of the time.
 _KNOTS, _EVENLY = 7, 9

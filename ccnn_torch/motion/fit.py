@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
-from ccnn_torch.motion.library import Library, Variant
-from ccnn_torch.motion.problem import Problem, Whitening
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, fit_sets, grams_of
+from ccnn_torch.motion.problem import Problem
+from ccnn_torch.motion.spec import Fit, Spec
+from ccnn_torch.motion.whiten import Whitening
 
 # Of a difference quotient, in plausible sizes.
 _STEP = 1e-3
@@ -29,82 +29,6 @@ _FARTHEST = 5.0
 _VALUES = 3e7
 # Half deviance for each value that a step must gain for another one to be made.
 _GAINED = 1e-4
-
-
-class Spec(NamedTuple):
-    """A set of effects of one axis, and where its fit begins.
-
-    Attributes:
-        members: effects, ascending.
-        theta: all numbers, `k`; those of other effects 0.
-        active: places that are fitted, effect by effect.
-        log_prior: of the variants.
-        free: places of shapes that are refined beside them; what they cost is in the variants' prior.
-    """
-
-    members: tuple[int, ...]
-    theta: Tensor
-    active: tuple[tuple[int, ...], ...]
-    log_prior: float
-    free: tuple[int, ...] = ()
-
-    @property
-    def moved(self) -> tuple[int, ...]:
-        return (*self.flat, *self.free)
-
-    @property
-    def flat(self) -> tuple[int, ...]:
-        return tuple(j for group in self.active for j in group)
-
-    @property
-    def groups(self) -> list[Tensor]:
-        """Columns of each effect among those of `flat`."""
-        places = iter(range(len(self.flat)))
-        return [torch.tensor([next(places) for _ in group]) for group in self.active]
-
-
-class Fit(NamedTuple):
-    """A fitted set of one axis.
-
-    Attributes:
-        spec: the set, with `theta` where the fit ended.
-        log_evidence: of the linearised model.
-        noise: variance of the whitened residual.
-        covariance: of the active numbers in plausible sizes, `m x m`.
-        rss: squares of the whitened residual.
-        unseen: the same on runs that its numbers were not fitted to.
-        left: mean square of the residual itself [rad^2 or m^2].
-        grams: of the linearised model's whitened columns, in plausible sizes, and of `loose` after them.
-    """
-
-    spec: Spec
-    log_evidence: float
-    noise: float
-    covariance: Tensor
-    rss: float
-    unseen: float
-    left: float
-    grams: Grams
-
-    @property
-    def members(self) -> tuple[int, ...]:
-        return self.spec.members
-
-
-def started(library: Library, spec: Spec, variant: Variant, axis: int) -> Spec:
-    """The set with one effect more, which begins as its variant says."""
-    theta = spec.theta.clone()
-    theta[list(variant.active)] = variant.values[axis]
-    if variant.held:
-        theta[list(variant.held)] = variant.shapes[axis]
-    both = sorted([*zip(spec.members, spec.active, strict=True), (variant.effect, variant.active)])
-    return Spec(
-        tuple(m for m, _ in both),
-        theta,
-        tuple(a for _, a in both),
-        spec.log_prior + variant.log_prior,
-        (*spec.free, *variant.free(library.held)),
-    )
 
 
 def fit_many(

@@ -11,8 +11,9 @@ from ccnn_torch.diagnosis.evidence.dictionary import CERTAIN
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, scaled
 from ccnn_torch.diagnosis.search.form_error import DIRECTIONS, OF_EXACT, OF_FORM, form_variance
 from ccnn_torch.motion.effects import EXACT
-from ccnn_torch.motion.fit import Fit
-from ccnn_torch.motion.problem import Problem, Whitening
+from ccnn_torch.motion.problem import Problem
+from ccnn_torch.motion.spec import Fit
+from ccnn_torch.motion.whiten import Whitening
 
 # Share φ of what the nominal model makes of the command: as of an effect, but most of it is right.
 _OF_NOMINAL = 1e-5

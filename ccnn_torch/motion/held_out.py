@@ -8,11 +8,13 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.diagnosis.shrink.held_out import Draws, Gap, HeldOut, shrink_of
-from ccnn_torch.motion.fit import Spec, fit_many
+from ccnn_torch.motion.fit import fit_many
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
-from ccnn_torch.motion.problem import Problem, Whitening
-from ccnn_torch.motion.search import Search, without
+from ccnn_torch.motion.problem import Problem
+from ccnn_torch.motion.search import Search
+from ccnn_torch.motion.spec import Spec, without
+from ccnn_torch.motion.whiten import Whitening
 
 _STEPS = 3
 

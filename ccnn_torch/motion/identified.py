@@ -17,7 +17,9 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.effects.payload import CARRIED
 from ccnn_torch.motion.engine import MotionDiagnosis
-from ccnn_torch.motion.nominal import TORQUES, Nominal, axis_keys, nominal_of
+from ccnn_torch.motion.models import nominal_of
+from ccnn_torch.motion.nominal import Nominal
+from ccnn_torch.motion.servo import TORQUES, axis_keys
 from ccnn_torch.motion.stage import ABSENT
 from ccnn_torch.plugins import code_refused
 from ccnn_torch.report.json_files import read_json, write_json
@@ -159,7 +161,7 @@ def _at_tool(found: MotionDiagnosis) -> float:
     if payload is None or payload["name"] not in found.content["verdict"]["effects"]:
         return 0.0
     numbers = [(n["value"], 1 / max(n["sd"], _ROUNDING) ** 2) for n in payload["parameters"].values()]
-    return sum(value * weight for value, weight in numbers) / sum(weight for _, weight in numbers)
+    return float(sum(value * weight for value, weight in numbers) / sum(weight for _, weight in numbers))
 
 
 def _mass(found: MotionDiagnosis) -> list[float]:

@@ -19,7 +19,8 @@ from ccnn_torch.files.write import sweep
 from ccnn_torch.motion.engine import MotionDiagnosis, diagnose_motion
 from ccnn_torch.motion.identified import IDENTIFIED, write_identified
 from ccnn_torch.motion.log import load_logs
-from ccnn_torch.motion.nominal import Nominal, nominal_of
+from ccnn_torch.motion.models import nominal_of
+from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.phases import phases_of
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.json_files import plain, write_json

@@ -17,10 +17,10 @@ from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets
 from ccnn_torch.diagnosis.search.form_error import LEVELS, OF_SMOOTH
 from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN, is_same
 from ccnn_torch.motion.drivers import Driver, driver_columns
-from ccnn_torch.motion.fit import Fit
 from ccnn_torch.motion.form import weighed
 from ccnn_torch.motion.outside import Candidate, Members, essential, holds, prior_of, with_drivers
 from ccnn_torch.motion.search import Search
+from ccnn_torch.motion.spec import Fit
 
 # Odds up to which the logs do not distinguish one name from another.
 _LIKE = 20.0
@@ -65,7 +65,9 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     by_members = {f.members: f for f in fits}
     # Mean square of what a shift of the time stamps moves the axis by [rad^2 or m^2]: less is no effect.
     step, speed = float(problem.data.time.diff(dim=-1).median()), problem.data.speed[axis][problem.data.judged]
-    slight = (STAMP * step) ** 2 * float(speed.square().mean())
+    slight = (
+        float(__import__("os").environ.get("SLIGHT", "0")) ** 2 * (STAMP * step) ** 2 * float(speed.square().mean())
+    )
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
     sets = [

@@ -16,11 +16,13 @@ from torch import Tensor
 
 from ccnn_torch.effects.parameter import PARAMETER
 from ccnn_torch.motion.effects.own_parameter import OWN
-from ccnn_torch.motion.fit import Spec, fit_many
+from ccnn_torch.motion.fit import fit_many
 from ccnn_torch.motion.log import Log
 from ccnn_torch.motion.nominal import Nominal
-from ccnn_torch.motion.problem import Problem, Whitening
+from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search, search
+from ccnn_torch.motion.spec import Spec
+from ccnn_torch.motion.whiten import Whitening
 
 # Searches about a simulator's parameters as found, fits of one set there, and halves of a step that are tried.
 _SEARCHES, _FITS, _HALVES = 4, 8, 4

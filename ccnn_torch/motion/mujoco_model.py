@@ -82,10 +82,11 @@ def tools_of(model: Any, joints: Sequence[int]) -> list[Tool]:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     moved = [int(model.jnt_bodyid[j]) for j in joints]
+    chains = {body: _down(model, body) for body in moved}
+    ends = [body for body in moved if not any(body in chain for other, chain in chains.items() if other != body)]
     tools = []
     for body in moved:
-        # The first of the bodies beyond it that carry no other joint.
-        last = next(b for b in moved if body in _down(model, b) and not any(o != b and b in _down(model, o) for o in moved))
+        last = next(end for end in ends if body in chains[end])
         fixed = [b for b in range(model.nbody) if model.body_weldid[b] == model.body_weldid[last]]
         sites = [s for s in range(model.nsite) if model.site_bodyid[s] in fixed]
         place = data.site_xpos[sites[-1]] if sites else data.subtree_com[last]

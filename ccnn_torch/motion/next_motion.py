@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.motion.fit import Fit, sensitivities
+from ccnn_torch.motion.fit import sensitivities
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
-from ccnn_torch.motion.problem import Problem, Whitening
+from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import Search
+from ccnn_torch.motion.spec import Fit
+from ccnn_torch.motion.whiten import Whitening
 
 # Seconds of a proposed motion, its sampling, and the lead that is not judged.
 _SECONDS, _STEP, _LEAD = 8.0, 0.01, 0.3

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, fit_sets, grams_of
 from ccnn_torch.motion.drivers import Driver
-from ccnn_torch.motion.fit import Fit, sensitivities, squares_unseen
+from ccnn_torch.motion.fit import sensitivities, squares_unseen
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import CROWD, Search, log_posterior
+from ccnn_torch.motion.spec import Fit
 
 # Log prior odds of a driver.
 _OUTSIDE = math.log(0.001)

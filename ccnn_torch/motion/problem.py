@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,32 +14,17 @@ from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.effects.payload import CARRIED
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.stretches import Stretches
+from ccnn_torch.motion.whiten import Whitening
 
 # Of an axis that ran away: no residual is larger, in units of the motion.
 _FARTHEST = 10.0
 _FOLDS = 5
 # Share to which the values of a nominal model are known (standard deviation), and those that are.
 _KNOWN = 0.03
+# Share of a sampling step by which the time stamps of commands and positions may differ (standard deviation).
+_STAMP = 0.1
 _WEIGHT = ("gravity_sin", "gravity_cos")
 _LOOSE = (*_WEIGHT, "gain", "inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "delay")
-
-
-class Whitening(NamedTuple):
-    """An autoregressive model of each axis' residual: e_t = r_t - sum_k a_k r_(t-k), `n x order`."""
-
-    coefficients: Tensor
-
-    def __call__(self, residual: Tensor, axis: Tensor) -> Tensor:
-        """Of residuals `p x b x s` of the axes `p`; the first samples, which lack some before them, are as they are."""
-        white = residual.clone()
-        for k in range(1, self.coefficients.shape[1] + 1):
-            white[..., k:] -= self.coefficients[axis, k - 1, None, None] * residual[..., :-k]
-        return white
-
-
-def white_noise(axes: int) -> Whitening:
-    """No correlation."""
-    return Whitening(torch.zeros(axes, 0, dtype=torch.float64))
 
 
 @dataclass(frozen=True)
@@ -154,7 +138,8 @@ class Problem:
                 before = nominal.get(name, sizes["gain"] if name == "gain" else absent)
                 other = self.library._replace(nominal={**nominal, name: before + _KNOWN * size})
                 columns.append(replace(self, library=other)._moved(theta, self.axes, rows, self._start) - plain)
-        return torch.stack(columns) if columns else theta.new_zeros(0, *plain.shape)
+        columns.append(_STAMP * float(self.data.time.diff(dim=-1).median()) * self.data.speed)
+        return torch.stack(columns)
 
     def _moved(self, theta: Tensor, axis: Tensor, rows: Tensor, start: Tensor) -> Tensor:
         data, p, b = self.data, len(theta), len(rows)

@@ -12,12 +12,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import fit_sets, grams_of
-from ccnn_torch.motion.fit import Fit, Spec, fit_many, sensitivities, started
+from ccnn_torch.motion.fit import fit_many
 from ccnn_torch.motion.form import form_errors, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
-from ccnn_torch.motion.problem import Problem, Whitening, white_noise
-from ccnn_torch.motion.whiten import fitted_whitening
+from ccnn_torch.motion.problem import Problem
+from ccnn_torch.motion.screen import promise
+from ccnn_torch.motion.spec import Fit, Spec, started, without
+from ccnn_torch.motion.whiten import Whitening, fitted_whitening, white_noise
 
 # Log prior odds of an effect, and what a third and every further one at once costs beside it, as for effects of a pose.
 LOG_ODDS, CROWD = math.log(0.1), math.log(0.1)
@@ -27,8 +28,6 @@ _BEAM, _FITTED, _MOST = 2, 4, 9
 _GAINED = 1.0
 # Sets that are fitted anew under another noise.
 _KEPT = 6
-# Difference quotients of the screen, for numbers that begin at 0 [plausible sizes].
-_STEP = 0.1
 _LONG, _SHORT, _FEW = 8, 5, 3
 
 
@@ -112,6 +111,9 @@ class _Pool:
 
     def ranked(self) -> list[list[Fit]]:
         return [sorted(own.values(), key=lambda f: -self.score(i, f)) for i, own in enumerate(self.found)]
+
+    def noise_of(self, axis: int) -> float | None:
+        return None if self.variance is None else self.variance[axis]
 
     def score(self, axis: int, fit: Fit) -> float:
         """Log posterior under the noise that counts."""
@@ -210,7 +212,7 @@ class _Pool:
         wanted: list[dict[tuple[int, ...], Spec]] = [{} for _ in bases]
         for i, fit in [(i, fit) for i, own in enumerate(bases) for fit in own]:
             scores: dict[int, tuple[float, Variant]] = {}
-            for score, variant in self.promise(i, fit):
+            for score, variant in promise(self.problem, self.whitening, i, fit, self.loose[i], self.noise_of(i)):
                 if variant.effect not in scores or score > scores[variant.effect][0]:
                     scores[variant.effect] = (score, variant)
             for _, variant in sorted(scores.values(), key=lambda item: -item[0])[:most]:
@@ -218,56 +220,3 @@ class _Pool:
                 if spec.members not in self.found[i]:
                     wanted[i].setdefault(spec.members, spec)
         return [list(w.values()) for w in wanted]
-
-    def promise(self, i: int, base: Fit) -> list[tuple[float, Variant]]:
-        """For every variant of an effect that axis `i` can show and `base` lacks, the evidence of both together."""
-        problem, library, theta, flat = self.problem, self.library, base.spec.theta, list(base.spec.flat)
-        variants = [
-            v
-            for own in library.variants
-            for v in own
-            if v.effect not in base.members and bool(library.there[i, v.effect])
-        ]
-        if not variants:
-            return []
-        moved, steps = [], []
-        for v in variants:
-            for a, j in enumerate(v.active):
-                changed, value = theta.clone(), float(v.values[i, a])
-                steps.append(value if abs(value) > 1e-6 else _STEP)
-                changed[j] += steps[-1]
-                changed[list(v.held)] = v.shapes[i]
-                moved.append(changed)
-        residual, own = sensitivities(problem, self.whitening, theta[None], torch.tensor([i]), [flat])
-        axis = torch.full((len(moved),), i)
-        left = problem.whitened(problem.residual(torch.stack(moved), axis), axis, self.whitening)
-        new = (residual - left) / left.new_tensor(steps)[:, None]
-        x = torch.cat([own[0], new])
-        y = residual[0] + theta[flat] @ own[0]
-        grams = grams_of(torch.cat([x, self.loose[i]]).mT[:, None, :], y[:, None])
-        grams = grams._replace(values=float(problem.judged.sum()))
-        ends = torch.tensor([len(v.active) for v in variants]).cumsum(0) + len(flat)
-        sets = [
-            [*base.spec.groups, torch.arange(int(end) - len(v.active), int(end))]
-            for v, end in zip(variants, ends, strict=True)
-        ]
-        if self.variance is None:
-            scores = fit_sets(grams, sets, 0.0).log_evidence.tolist()
-        else:
-            scores = weighed(grams, sets, len(x), self.variance[i]).log_evidence.tolist()
-        return [(s + v.log_prior if math.isfinite(s) else -math.inf, v) for s, v in zip(scores, variants, strict=True)]
-
-
-def without(library: Library, spec: Spec, place: int) -> Spec:
-    """The set without one of its members."""
-    theta, effect = spec.theta.clone(), spec.members[place]
-    rest = [k for k in range(len(spec.members)) if k != place]
-    held = {p for v in library.variants[effect] for p in v.held}
-    theta[[*spec.active[place], *held]] = 0.0
-    return Spec(
-        tuple(spec.members[k] for k in rest),
-        theta,
-        tuple(spec.active[k] for k in rest),
-        spec.log_prior,
-        tuple(p for p in spec.free if p not in held),
-    )

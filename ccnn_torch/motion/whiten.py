@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from ccnn_torch.motion.problem import Whitening
 
 _HIGHEST = 8
 # A residual that is a constant or a ramp would give a root outside the unit circle: so much is added to the diagonal.
@@ -15,6 +14,24 @@ _RIDGE = 1e-9
 # Poles are drawn in by this factor (bandwidth expansion of linear prediction): what a model leaves is no stationary
 # noise, and a pole at the unit circle would leave the slow half of every effect without weight.
 _WIDER = 0.9
+
+
+class Whitening(NamedTuple):
+    """An autoregressive model of each axis' residual: e_t = r_t - sum_k a_k r_(t-k), `n x order`."""
+
+    coefficients: Tensor
+
+    def __call__(self, residual: Tensor, axis: Tensor) -> Tensor:
+        """Of residuals `p x b x s` of the axes `p`; the first samples, which lack some before them, are as they are."""
+        white = residual.clone()
+        for k in range(1, self.coefficients.shape[1] + 1):
+            white[..., k:] -= self.coefficients[axis, k - 1, None, None] * residual[..., :-k]
+        return white
+
+
+def white_noise(axes: int) -> Whitening:
+    """No correlation."""
+    return Whitening(torch.zeros(axes, 0, dtype=torch.float64))
 
 
 def fitted_whitening(residual: Tensor, judged: Tensor) -> Whitening:

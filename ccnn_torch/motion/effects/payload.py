@@ -1,4 +1,4 @@
-"""A mass at the tool, or at the end of the axis' lever, that the model lacks or has wrong: weight and inertia in one."""
+"""A mass that the model lacks or has wrong, at the tool or at the end of an axis' lever: its weight and inertia."""
 
 from __future__ import annotations
 

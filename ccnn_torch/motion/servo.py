@@ -1,0 +1,137 @@
+"""The built-in servo as a nominal model: its keys, in SI, and the parameters of its axes that they stand for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ccnn_torch.errors import InputError
+from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
+from ccnn_torch.motion.nominal import Nominal
+from ccnn_torch.motion.stage import ABSENT
+from ccnn_torch.spelling import nearest
+
+KEYS: dict[str, str] = {
+    "gain": "proportional gain; without it torques are told as angles [N*m/rad]",
+    "inertia": "of the axis about its own axis, without mass * length^2 of its load [kg*m^2]",
+    "mass": "of the load at the end of its lever, which hangs down at 0 [kg]",
+    "length": "lever of the load [m]",
+    "viscous": "viscous friction, the motor's damping included [N*m*s/rad]",
+    "coulomb": "dry friction [N*m]",
+    "load_friction": "dry friction as a share of |torque of motor + that of load|, which at rest is twice the load [1]",
+    "stribeck": "dry friction at rest beyond that in motion [N*m]",
+    "stribeck_speed": "speed at which that has fallen to 1/e [rad/s]",
+    "gravity_sin": "torque of the weight at 90 degrees beyond that of the load [N*m]",
+    "gravity_cos": "torque of the weight at 0 [N*m]",
+    "cogging_sin": "torque that repeats with the angle, times the sine of cogging_order times the angle [N*m]",
+    "cogging_cos": "the same with the cosine [N*m]",
+    "cogging_order": "periods of that torque in a turn [1]",
+    "flexibility": "inertia of the driven side over the stiffness of the joint [s^2]",
+    "flexible_damping": "damping ratio of that spring [1]",
+    "encoder_at_motor": "1 where the encoder is at the motor, and that spring behind it [1]",
+    "thermal": "change of coulomb for each kelvin above the coldest sample of the logs, as a share of it [1/K]",
+    "delay": "from command to motor [s]",
+    "offset": "of the position from the command [rad]",
+    "backlash": "whole width of the play [rad]",
+    "backlash_loaded": "1 where the load presses the play to one side [1]",
+    "speed_limit": "of the drive, beyond which it follows no command [rad/s]",
+    "torque_limit": "of the motor, at the nominal supply [N*m]",
+    "supply": "nominal voltage, at which gain and torque_limit hold; given, both go with the column supply[V] [V]",
+    "supply_share": "how far they do: 1 where supply is given, 0 not at all [1]",
+}
+"""Keys of the built-in servo with their units on a turning axis; a number for all axes, or a list with one for each."""
+
+TORQUES = (*("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos"),)
+"""Parameters that are torques, which an axis has over the gain."""
+_SIGNED = ("delay", "offset", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
+_SAME = {
+    **{"delay": "delay", "offset": "offset", "backlash": "play", "backlash_loaded": "play_loaded"},
+    **{"load_friction": "load_friction", "stribeck_speed": "stribeck_speed", "cogging_order": "cogging_order"},
+    **{"flexibility": "flexibility", "flexible_damping": "flexible_damping", "thermal": "thermal"},
+    "encoder_at_motor": "encoder_at_motor",
+    "supply_share": "supply",
+}
+
+
+def servo(keys: Mapping[str, Any], n: int) -> Nominal:
+    """The servo with `n` axes.
+
+    Raises:
+        InputError: a key is not known, or its value can be none.
+    """
+    for key in keys:
+        if key not in KEYS:
+            near = nearest(key, list(KEYS))
+            raise InputError(
+                f"mechanism_keys: the servo has no key '{key}'"
+                f"{f'; {near!r} is the nearest' if near else ''}; it has {', '.join(KEYS)}"
+            )
+    each = {key: _numbers(key, value, n) for key, value in keys.items()}
+    axes, gains, lengths = [], [], []
+    for i in range(n):
+        own = {key: values[i] for key, values in each.items()}
+        gain = own.get("gain")
+        needs = [k for k in (*TORQUES, "mass", "torque_limit") if own.get(k)]
+        if gain is None and needs:
+            raise InputError(f"mechanism_keys: {needs[0]} is given without gain; give gain [N*m/rad] as well")
+        if own.get("mass") and not own.get("length"):
+            raise InputError("mechanism_keys: mass is given without length; give the lever of the load [m] as well")
+        unit = gain or 1.0
+        axis = {name: own[name] / unit for name in TORQUES if name in own}
+        load, lever = own.get("mass", 0.0), own.get("length", 0.0)
+        axis["inertia"] = axis.get("inertia", 0.0) + load * lever**2 / unit
+        axis["load"] = load * lever**2 / unit
+        axis["gravity_sin"] = axis.get("gravity_sin", 0.0) + load * STANDARD_GRAVITY * lever / unit
+        axis |= {name: own[key] for key, name in _SAME.items() if key in own}
+        if own.get("torque_limit"):
+            axis["weakness"] = unit / own["torque_limit"]
+        if own.get("speed_limit"):
+            axis["slowness"] = 1 / own["speed_limit"]
+        if own.get("supply"):
+            axis.setdefault("supply", 1.0)
+        axes.append({name: value for name, value in axis.items() if value})
+        gains.append(gain)
+        lengths.append(own.get("length"))
+    supply = each["supply"][0] if each.get("supply") else None
+    return Nominal("servo", tuple(axes), tuple(gains), tuple(lengths), supply)
+
+
+def axis_keys(nominal: Nominal, axes: Sequence[Mapping[str, float]], added: Sequence[float]) -> dict[str, Any]:
+    """Keys of the servo whose axes have these parameters; a gain that is not known is 1, and torques are then angles.
+
+    Args:
+        nominal: the servo that they are parameters of.
+        axes: as in `ABSENT`.
+        added: mass at the end of each lever beyond that of the model [kg].
+    """
+    each = []
+    for i, axis in enumerate(axes):
+        unit, lever = nominal.gains[i] or 1.0, nominal.lengths[i] or 0.0
+        mass = max(nominal.axes[i].get("load", 0.0) * unit / lever**2 + added[i], 0.0) if lever else 0.0
+        own = {name: unit * axis.get(name, 0.0) for name in TORQUES}
+        own["inertia"] = max(own["inertia"] - mass * lever**2, 0.0)
+        own["gravity_sin"] -= mass * STANDARD_GRAVITY * lever
+        own |= {"gain": unit * axis.get("gain", 1.0), "mass": mass, "length": lever or 1.0}
+        own |= {key: axis.get(name, ABSENT[name]) for key, name in _SAME.items()}
+        own["speed_limit"] = 1 / axis["slowness"] if axis.get("slowness") else 0.0
+        own["torque_limit"] = unit / axis["weakness"] if axis.get("weakness") else 0.0
+        each.append(own)
+    usual = {key: ABSENT.get(name, 0.0) for key, name in _SAME.items()}
+    found = {key: [own[key] for own in each] for key in each[0] if any(own[key] != usual.get(key, 0.0) for own in each)}
+    return found | ({"supply": nominal.supply} if nominal.supply and "supply_share" in found else {})
+
+
+def _numbers(key: str, value: Any, n: int) -> list[float]:
+    values = value if isinstance(value, list | tuple) else [value] * n
+    signed, above = key in _SIGNED, key in ("gain", "supply", "length")
+    fine = len(values) == n and all(
+        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and (signed or v >= 0)
+        for v in values
+    )
+    if not fine or (above and not all(v > 0 for v in values)):
+        what = "a number" if signed else "above 0" if above else "a number not below 0"
+        raise InputError(
+            f"mechanism_keys: {key} must be {what}, or a list with one for each of the {n} joints, not {value}"
+        )
+    return [float(v) for v in values]
