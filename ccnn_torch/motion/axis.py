@@ -167,7 +167,7 @@ def _played(q: Array, half: Array) -> Array:
 
 
 def _hung(steps: Array, q: Array, push: Array | None, a: Mapping[str, Array]) -> Array:
-    """The driven side of a play that falls freely between its ends, and does not bounce there."""
+    """The driven side of a play, which is free between its ends but for its friction, and does not bounce there."""
     fall, hang = falling(a)
     inertia, half = load_inertia(a), a["play"] / 2
     light = np.where(inertia > 0, 1 / np.maximum(inertia, TINY), 0.0)
@@ -181,6 +181,8 @@ def _hung(steps: Array, q: Array, push: Array | None, a: Mapping[str, Array]) ->
     for k in range(len(steps)):
         h = steps[k]
         v = v - h * pulled(x, k)
+        # Its bearing brakes it, up to standstill.
+        v = np.sign(v) * np.maximum(np.abs(v) - h * a["play_friction"], 0.0)
         free = x + h * v
         low, high = q[k + 1] - half, q[k + 1] + half
         held = np.minimum(np.maximum(free, low), high)

@@ -25,6 +25,8 @@ from ccnn_torch.motion.spec import Fit
 from ccnn_torch.motion.stretches import Stretches
 
 _SHAPE_UNITS = {"flexible_damping": "1", "play_loaded": "1", "encoder_at_motor": "1"}
+# Of those that are over the unit of the axis.
+_OVER = {"play_friction": "s^2"}
 # A limit that is so far away is none.
 _TINY = 1e-9
 
@@ -183,6 +185,6 @@ def _parameters(library: Library, axis: int, fit: Fit, effect: int) -> dict[str,
         value = float(fit.spec.theta[place])
         if place in own and value:
             order = "1" if facts.unit == "rad" else "rad/m"
-            unit = order if name == "cogging_order" else _SHAPE_UNITS.get(name, f"{facts.unit}/s")
+            unit = order if name == "cogging_order" else _SHAPE_UNITS.get(name, f"{facts.unit}/{_OVER.get(name, 's')}")
             found[f"q{axis + 1} {name}"] = {"value": value, "sd": None, "unit": unit, "part": f"joint {axis + 1}"}
     return found

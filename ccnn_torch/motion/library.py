@@ -32,7 +32,7 @@ _WIDEST = 1e3
 _RARER = {"stribeck": math.log(0.1), "cogging": math.log(0.1)}
 _SMALLEST = 1e-6
 # Shapes that a fit refines from where they begin.
-_REFINED = ("cogging_order", "stribeck_speed", "flexible_damping")
+_REFINED = ("cogging_order", "stribeck_speed", "flexible_damping", "play_friction")
 
 
 class Variant(NamedTuple):

@@ -34,7 +34,8 @@ KEYS: dict[str, str] = {
     "delay": "from command to motor [s]",
     "offset": "of the position from the command [rad]",
     "backlash": "whole width of the play [rad]",
-    "backlash_loaded": "1 where the load presses the play to one side [1]",
+    "backlash_loaded": "1 where the load moves freely within the play, and its weight presses it to one side [1]",
+    "backlash_friction": "what friction of its own then brakes the load by [rad/s^2]",
     "speed_limit": "of the drive, beyond which it follows no command [rad/s]",
     "torque_limit": "of the motor, at the nominal supply [N*m]",
     "supply": "nominal voltage, at which gain and torque_limit hold; given, both go with the column supply[V] [V]",
@@ -47,6 +48,7 @@ TORQUES = (*("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravit
 _SIGNED = ("delay", "offset", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
 _SAME = {
     **{"delay": "delay", "offset": "offset", "backlash": "play", "backlash_loaded": "play_loaded"},
+    "backlash_friction": "play_friction",
     **{"load_friction": "load_friction", "stribeck_speed": "stribeck_speed", "cogging_order": "cogging_order"},
     **{"flexibility": "flexibility", "flexible_damping": "flexible_damping", "thermal": "thermal"},
     "encoder_at_motor": "encoder_at_motor",

@@ -36,6 +36,7 @@ ABSENT: dict[str, float] = {
     "supply": 0.0,
     "play": 0.0,
     "play_loaded": 0.0,
+    "play_friction": 0.0,
     "flexibility": 0.0,
     "flexible_damping": 0.1,
     "encoder_at_motor": 0.0,
