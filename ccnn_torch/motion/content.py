@@ -15,7 +15,7 @@ from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
 from ccnn_torch.display import number_text
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.motion.effects import Facts, Number
-from ccnn_torch.motion.judge import STAMP, AxisVerdict
+from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.phases import PHASES, phases_of
@@ -97,10 +97,10 @@ def effects_of(
 
 def hidden_of(problem: Problem, verdicts: Sequence[AxisVerdict]) -> list[str]:
     """Cautions where nothing is named although a set leaves clearly less, a sentence each without a full stop."""
-    step, names = 1e3 * STAMP * float(problem.data.time.diff(dim=-1).median()), problem.library.names
+    names = problem.library.names
     return [
-        f"q{i + 1} errs by more than the noise, most like {words_of(names[v.hidden]).cause}, and by no more than a "
-        f"shift of the time stamps by {step:.2g} ms would make: record slower motions, or more samples in a second"
+        f"q{i + 1} errs by more than the noise, most like {words_of(names[v.hidden]).cause}, but by less than the form "
+        "of a model and time stamps are known to: record motions that show it more"
         for i, v in enumerate(verdicts)
         if v.hidden is not None
     ]
@@ -114,7 +114,9 @@ def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, no
     library = problem.library
     notes += [unseen_text(n, why) for n, why in zip(library.names, library.lacking, strict=True) if why]
     runs, folds = len(set(data.run.tolist())), int(problem.fold.max()) + 1
-    if runs > 1:
+    if problem.parted and runs > 1:
+        notes.append(f"what is named acts in one run alone: {folds} parts of the runs were held out in turn")
+    elif runs > 1:
         notes.append(f"held out were whole runs, {runs} of them in {folds} folds")
     else:
         notes.append(f"there is one run: its {folds} parts were held out in turn; record a second motion to be surer")

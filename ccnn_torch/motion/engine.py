@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -85,7 +85,9 @@ def diagnose_motion(
     alone, names = singles(found), in_order(problem, verdicts)
     members = [library.names.index(name) for name in names]
     steps = [[only(library, v.best.spec, members[:k]) for v in verdicts] for k in range(len(names) + 1)]
-    residuals = held_out(problem, found.whitening, [*steps, *alone.values()])
+    # Where an effect acts in one run alone the others do not tell its numbers.
+    folded = replace(problem, parted=any(v.best.once for v in verdicts))
+    residuals = held_out(folded, found.whitening, [*steps, *alone.values()])
     # Of the model itself, also where it was linearised elsewhere.
     residuals[0] = nothing
     floor = noise**2 * len(verdicts) if noise else floor_of(problem, found, verdicts)
@@ -139,7 +141,7 @@ def diagnose_motion(
         "rows_set_aside": [],
         "why_set_aside": [],
         "cautions": hidden_of(problem, verdicts),
-        "notes": notes_of(problem, nominal, found, total.floor, noise),
+        "notes": notes_of(folded, nominal, found, total.floor, noise),
     }
     verdict["text"] = verdict_text(content)
     return MotionDiagnosis(content, problem, found, verdicts, nothing, residuals[len(names)], proposed)

@@ -29,6 +29,8 @@ _FARTHEST = 5.0
 _VALUES = 3e7
 # Half deviance for each value that a step must gain for another one to be made.
 _GAINED = 1e-4
+# Share of what an effect does from which it is in one run alone.
+_ONCE = 0.9
 
 
 def fit_many(
@@ -142,13 +144,15 @@ def _fit_lot(
     # Here, since the whitened residual does not tell it.
     plain = problem.pooled(problem.residual(theta, axis, chosen))
     left = (plain.square() * judged).sum((-1, -2)) / values
-    fold = problem.fold if chosen is None else problem.fold[chosen]
-    fold = fold[:, None].expand(judged.shape).flatten()
+    folds = [
+        (own if chosen is None else own[chosen])[:, None].expand(judged.shape).flatten()
+        for own in (problem.fold, problem.part)
+    ]
     found = []
     for k, (i, spec) in enumerate(specs):
         x = columns[k, : len(spec.flat)]
         beside = x[:0] if loose is None else loose[i]
-        found.append(_fit_of(spec._replace(theta=theta[k]), residual[k], x, values, float(left[k]), fold, beside))
+        found.append(_fit_of(spec._replace(theta=theta[k]), residual[k], x, values, float(left[k]), folds, beside))
     return found
 
 
@@ -178,8 +182,14 @@ def _step(x: Tensor, y: Tensor, own: Tensor, real: Tensor, damping: Tensor, valu
     return move.clamp(-_FARTHEST, _FARTHEST)
 
 
-def _fit_of(spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, fold: Tensor, loose: Tensor) -> Fit:
-    """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`, fold of each value `v`."""
+def _fit_of(
+    spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, folds: Sequence[Tensor], loose: Tensor
+) -> Fit:
+    """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`, folds of each value `v`: runs,
+    and parts of them."""
+    once = any(
+        _acts_once(spec.theta[list(own)] @ x[g], folds[0]) for own, g in zip(spec.active, spec.groups, strict=True)
+    )
     y = residual + spec.theta[list(spec.flat)] @ x
     grams = grams_of(torch.cat([x, loose]).mT[:, None, :], y[:, None])._replace(values=values)
     fit = fit_sets(grams, [spec.groups], 0.0)
@@ -190,10 +200,17 @@ def _fit_of(spec: Spec, residual: Tensor, x: Tensor, values: float, left: float,
         float(fit.noise[0]),
         fit.covariance[0, :m, :m],
         float(residual.square().sum()),
-        squares_unseen(x, y, fit, spec.groups, fold),
+        squares_unseen(x, y, fit, spec.groups, folds[once]),
+        once,
         left,
         grams,
     )
+
+
+def _acts_once(does: Tensor, fold: Tensor) -> bool:
+    """Whether what an effect does, `v`, is nearly all in one fold: the others do not tell its numbers."""
+    squares = does.new_zeros(int(fold.max()) + 1).index_add(0, fold, does.square())
+    return len(squares) > 1 and float(squares.max()) > _ONCE * float(squares.sum())
 
 
 def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Tensor], fold: Tensor) -> float:

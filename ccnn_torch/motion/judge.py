@@ -1,8 +1,8 @@
 """From fitted sets to a verdict on each axis.
 
 The forms of effects, and that of the nominal model, are those of the machine only nearly: sets are weighed again under
-a noise with their form errors in it (`diagnosis.search.form_error`). Members that move the axis by less than the time
-stamps of the log can tell are left out of a set before it counts.
+a noise with their form errors in it (`diagnosis.search.form_error`). Members that take nothing away on runs that were
+not fitted are left out of a set before it counts.
 """
 
 from __future__ import annotations
@@ -24,12 +24,10 @@ from ccnn_torch.motion.spec import Fit
 
 # Odds up to which the logs do not distinguish one name from another.
 _LIKE = 20.0
-# Share of a sampling step by which the time stamps of commands and positions may differ.
-STAMP = 0.1
 # Probability from which a member of the most probable set is named, where the set without it is probable, too.
 _NAMED = 0.9
 # Probability of something outside that takes nothing away on runs that no fit saw, and of nothing where a set leaves
-# clearly less, in RMS, and only the time stamps may be the reason.
+# clearly less, in RMS.
 _UNCONFIRMED, _CLEARLY = 0.5, 3.0
 
 
@@ -42,7 +40,7 @@ class AxisVerdict(NamedTuple):
         marginal: probability of each effect that was fitted, by its number.
         classes: of each member the effects that can stand in its place.
         driver: what the residual follows outside the library; None where nothing is needed.
-        hidden: where nothing is named since a shift of the time stamps would do as much, the effect that explains most;
+        hidden: where nothing is named since models and time stamps are known no better, the effect that explains most;
             None where what is left is no more than what the best set leaves.
     """
 
@@ -63,17 +61,10 @@ def judge_axes(found: Search) -> list[AxisVerdict]:
 def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     problem, fits = found.problem, found.found[axis]
     by_members = {f.members: f for f in fits}
-    # Mean square of what a shift of the time stamps moves the axis by [rad^2 or m^2]: less is no effect.
-    step, speed = float(problem.data.time.diff(dim=-1).median()), problem.data.speed[axis][problem.data.judged]
-    slight = (
-        float(__import__("os").environ.get("SLIGHT", "0")) ** 2 * (STAMP * step) ** 2 * float(speed.square().mean())
-    )
     left = {f.members: f.left for f in fits}
     unseen = {f.members: f.unseen for f in fits}
-    sets = [
-        Candidate((essential(f.members, left, slight, unseen), None), f.grams, f.spec.groups, prior_of(f)) for f in fits
-    ]
-    sets += with_drivers(found, axis, drivers, by_members, slight)
+    sets = [Candidate((essential(f.members, left, unseen), None), f.grams, f.spec.groups, prior_of(f)) for f in fits]
+    sets += with_drivers(found, axis, drivers, by_members)
     share: dict[tuple[Members, str | None], float] = {}
     usual: list[float] = []
     for level in LEVELS:
@@ -97,9 +88,13 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     classes = _classes(members, inside)
     like = {m: {m, *classes[m]} for m in members}
     sure = tuple(m for m in members if sum(p for (own, _), p in ranked if like[m] & {*own}) >= _NAMED)
-    if inside.get(sure, 0.0) * _LIKE > inside[members]:
+    likely = {*members}
+    if sure and inside.get(sure, 0.0) * _LIKE > inside[members]:
         members, classes = sure, _classes(sure, inside)
     same = sum(p for own, p in inside.items() if is_same(frozenset(own), frozenset(members), classes))
+    if {*members} < likely:
+        # What was left out for want of a sure name mends the form of what is named, as a rule, and is no cause.
+        same = min(same + sum(p for own, p in inside.items() if {*members} < {*own}), _NAMED)
     if not members and left[()] > _CLEARLY**2 * fits[0].left:
         alone = min((f for f in fits if len(f.members) == 1), key=lambda f: f.left)
         return AxisVerdict(by_members[()], min(same, _UNCONFIRMED), marginal, classes, None, alone.members[0])

@@ -47,31 +47,26 @@ def prior_of(fit: Fit) -> float:
     return log_posterior(fit) - fit.log_evidence
 
 
-def essential(
-    members: Members, left: Mapping[Members, float], slight: float, unseen: Mapping[Members, float]
-) -> Members:
-    """The set without members that do next to nothing, the least first.
+def essential(members: Members, left: Mapping[Members, float], unseen: Mapping[Members, float]) -> Members:
+    """The set without members that take nothing away, the least first.
 
     Args:
         members: of the set.
         left: mean square that each set leaves.
-        slight: of what is next to nothing.
         unseen: squares that each set leaves of runs that it was not fitted to, of which a member has to take something
             away as well; where it is not told it has not.
     """
     most = _NEARLY**2 * unseen.get(members, 0.0)
     while members:
         rest = [r for e in members if (r := tuple(m for m in members if m != e)) in left]
-        rest = [r for r in rest if left[r] - left[members] < slight or unseen.get(r, math.inf) <= most]
+        rest = [r for r in rest if left[r] <= left[members] or unseen.get(r, math.inf) <= most]
         if not rest:
             break
         members = min(rest, key=lambda r: left[r])
     return members
 
 
-def with_drivers(
-    found: Search, axis: int, drivers: Sequence[Driver], fits: Mapping[Members, Fit], slight: float
-) -> list[Candidate]:
+def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapping[Members, Fit]) -> list[Candidate]:
     """Drivers beside the most probable sets, and those that lead from the best one to none."""
     problem, judged = found.problem, found.problem.data.judged
     mine, values = torch.tensor([axis]), float(problem.judged.sum())
@@ -100,12 +95,11 @@ def with_drivers(
             mean = fit_sets(grams, [groups], 0.0).mean[0, len(flat) :]
             rest = (plain - (mean[:, None, None] * driver.columns[axis]).sum(0))[judged].square().mean()
             taken[k][base.members] = float(rest)
-            there = driver.name if float(plain[judged].square().mean() - rest) >= slight else None
+            there = driver.name if float(plain[judged].square().mean() - rest) > 0 else None
             sets.append((k, Candidate((base.members, there), grams, groups, prior, (own, columns, y))))
     # Beside a driver a name has to do what the driver does not do as well.
     return [
-        one._replace(key=(essential(one.key[0], taken[k] if one.key[1] else left, slight, {}), one.key[1]))
-        for k, one in sets
+        one._replace(key=(essential(one.key[0], taken[k] if one.key[1] else left, {}), one.key[1])) for k, one in sets
     ]
 
 

@@ -38,6 +38,7 @@ class Problem:
         torque, simulated: as of `Driven`.
         supply, warm: as of `Drive`, `b x s`.
         own: what a unit of each of a simulator's own parameters changes in its positions, by name, `n x b x s`.
+        parted: whether folds are parts of the runs, where these could be folds.
         carried: what 1 kg at the tool adds to `torque`, `n x b x s` [rad or m per kg].
         pool: so many samples are averaged before they are judged: what is faster than the motion is noise.
     """
@@ -52,6 +53,7 @@ class Problem:
     simulated: Tensor | None = None
     own: Mapping[str, Tensor] = field(default_factory=dict)
     carried: Tensor | None = None
+    parted: bool = False
 
     @property
     def axes(self) -> Tensor:
@@ -186,12 +188,22 @@ class Problem:
 
     @cached_property
     def fold(self) -> Tensor:
-        """Fold of each stretch, `b`: whole runs, dealt out in order; parts of the run where there is one alone."""
-        run, count = self.data.run, len(self.data.run)
+        """Fold of each stretch, `b`: whole runs, dealt out in order; parts of it where there is one alone."""
+        run = self.data.run
         runs = torch.tensor(sorted(set(run.tolist())))
-        if len(runs) < 2:
-            return torch.arange(count) * min(_FOLDS, count) // count
+        if len(runs) < 2 or self.parted:
+            return self.part
         return (torch.arange(len(runs)) % min(_FOLDS, len(runs)))[torch.searchsorted(runs, run)]
+
+    @cached_property
+    def part(self) -> Tensor:
+        """Folds that are a part of every run each, `b`."""
+        run = self.data.run
+        found = torch.zeros_like(run)
+        for one in set(run.tolist()):
+            count = int((run == one).sum())
+            found[run == one] = torch.arange(count) * min(_FOLDS, count) // count
+        return found
 
     @property
     def judged(self) -> Tensor:

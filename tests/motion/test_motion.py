@@ -275,12 +275,12 @@ def test_causes_have_their_values_and_a_corrected_command_is_followed(tmp_path: 
         assert code == 2 and str(sentence[1]) in error and error.count("\n") == 1
 
 
-def test_what_time_stamps_may_hide_is_not_said_to_be_noise(tmp_path: Path) -> None:
+def test_what_is_less_than_models_are_known_to_is_not_said_to_be_noise(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.csv", (0, 1), 2.4, dry=0.0024)
     nominal = nominal_of("servo", KEYS, ["rad"])
     found = diagnose_motion(load_logs([log]), nominal, ["delay", "coulomb"]).content
     assert found["verdict"]["none"] and found["verdict"]["probability"] <= 0.5
-    assert "most like dry friction, and by no more than a shift of the time stamps by 1 ms" in found["cautions"][0]
+    assert "most like dry friction, but by less than the form of a model and time stamps" in found["cautions"][0]
 
 
 class Stiff:
