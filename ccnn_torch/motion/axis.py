@@ -5,8 +5,9 @@ The motor's torque is the gain times (command less position). With everything di
     inertia * q'' = clip(gain * supply * (u - q), 1 / weakness) - viscous * q' - F(q') * sign(q') - weight(q) - teeth(q)
 
 where u is the command after delay, speed limit and offset: torques are then angles (N m per N m/rad), the inertia is
-in s^2, the viscous friction in s. With all of these 0 the position follows the command exactly: that axis is nominal
-where nothing is known. Behind a flexible joint, load and weight hang on a spring that pulls at the motor.
+in s^2, the viscous friction in s; a part of that which the drive makes is within the limit, too. With all of these 0
+the position follows the command exactly: that axis is nominal where nothing is known. Behind a flexible joint, load and
+weight hang on a spring that pulls at the motor.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Drive(NamedTuple):
         start: position and speed of the first sample, `b x 2`.
         supply: supply voltage over the nominal one, less 1, `b x s`; None = 0.
         warm: temperature less that of the coldest sample, `b x s` [K]; None = 0.
-        torque: what else resists the motor, over the nominal gain, `b x s` [rad or m]; it comes as late as the command.
+        torque: what else resists the motor, over the nominal gain, `b x s` [rad or m].
     """
 
     time: Tensor
@@ -83,9 +84,7 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     tensors = {n: parameters.get(n, like.new_full((1, 1), v)).expand(shape) for n, v in ABSENT.items()}
     u, torque = drive.command, drive.torque
     if bool((tensors["delay"] != 0).any()):
-        # Weights and the other joints are late as well, as the motion is.
         u = delayed(drive.time, u, tensors["delay"])
-        torque = None if torque is None else delayed(drive.time, torque, tensors["delay"])
     u = u.expand(*shape, -1) + tensors["offset"][..., None]
     a = {n: v.numpy() for n, v in tensors.items()}
     steps = drive.time.diff(dim=-1).numpy().T

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ccnn_torch.motion.axis import Drive, simulate_axes
+from ccnn_torch.motion.axis import Drive, delayed, simulate_axes
 from ccnn_torch.motion.mistakes import lag_of
 from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.stage import ABSENT
@@ -87,7 +87,7 @@ def moved(
     torque = simulated = None
     followed = asked
     if nominal.loaded is not None:
-        made = [nominal.loaded(clock.numpy(), one) for one in asked]
+        made = [nominal.loaded(clock.numpy(), one, None) for one in asked]
         simulated, torque = (np.stack([m[k] for m in made]) for k in range(2))
     elif nominal.simulator is not None:
         followed = np.stack([nominal.simulator.positions(clock.numpy(), one) for one in asked])
@@ -105,12 +105,17 @@ def moved(
         torch.stack([begin, torch.zeros_like(begin)], -1),
         course(around.supply),
         course(around.warm),
-        torque=None if torque is None else rows(torque),
     )
+    against = None if torque is None else rows(torque)
 
     def simulate(own: Sequence[Mapping[str, float]]) -> torch.Tensor:
-        values = {name: [[axis.get(name, ABSENT[name]) for axis in own] * p] for axis in own for name in axis}
-        return simulate_axes(drive, {name: torch.tensor(v, dtype=torch.float64) for name, v in values.items()})[0]
+        values = {
+            name: torch.tensor([[axis.get(name, ABSENT[name]) for axis in own] * p], dtype=torch.float64)
+            for name in {"delay"}.union(*own)
+        }
+        # Weights and the other joints are as late as the motion is.
+        late = None if against is None else delayed(drive.time, against, values["delay"])[0]
+        return simulate_axes(drive._replace(torque=late), values)[0]
 
     found = simulate(axes)
     if simulated is not None:

@@ -26,7 +26,7 @@ from ccnn_torch.report.json_files import read_json, write_json
 
 IDENTIFIED, _MODEL = "identified_motion.json", "identified.xml"
 # What an MJCF can hold of an axis.
-_IN_MJCF = ("gain", "inertia", "load", "viscous", "coulomb", "weakness")
+_IN_MJCF = ("gain", "inertia", "load", "viscous", "drive_damping", "coulomb", "weakness")
 
 # No number is surer.
 _ROUNDING = 1e-12

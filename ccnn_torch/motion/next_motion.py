@@ -176,6 +176,7 @@ def _problem_of(problem: Problem, axis: int, proposed: Sequence[Motion]) -> Prob
         torque=None,
         carried=None,
         simulated=None,
+        there=None,
         own={},
         pool=max(round(step / _STEP), 1),
     )

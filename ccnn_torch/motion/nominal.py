@@ -27,16 +27,34 @@ class Driven(NamedTuple):
 
     Attributes:
         followed: positions that they follow [rad or m].
-        torque: what resists their motors, over the gain [rad or m]; None = nothing.
+        torque: what resists their motors on the measured motion, over the gain [rad or m]; None = nothing.
         simulated: positions of the nominal model; None where the nominal axes tell them.
+        there: what resists the motors on that motion, as `torque`.
         own, carried: as of `Problem`.
     """
 
     followed: Tensor
     torque: Tensor | None = None
     simulated: Tensor | None = None
+    there: Tensor | None = None
     own: Mapping[str, Tensor] = {}
     carried: Tensor | None = None
+
+
+class Loaded(NamedTuple):
+    """What a simulator of loads makes of commands, `s x n` each.
+
+    Attributes:
+        positions: simulated [rad or m].
+        there: what resists the motors on that motion beside friction and inertia of their own axes, over the gains.
+        torque: the same on the measured motion.
+        carried: what 1 kg at the tool adds to it [per kg].
+    """
+
+    positions: Array
+    there: Array
+    torque: Array
+    carried: Array
 
 
 @dataclass(frozen=True)
@@ -51,8 +69,7 @@ class Nominal:
         heaviest: as of `Facts`.
         supply: nominal supply voltage; None where the motor's strength is not known to follow it.
         simulator: makes the positions that the axes follow; None where they follow the commands.
-        loaded: `time, commands` -> positions, what resists the motors beside those of `axes`, over the gains, and what
-            1 kg at the tool adds to that, `s x n` each; None where the axes tell the positions.
+        loaded: `time, commands, measured` positions -> as of `Loaded`; None where the axes tell the positions.
         notes: sentences without a full stop.
     """
 
@@ -64,7 +81,7 @@ class Nominal:
     simulator: Simulator | None = None
     notes: tuple[str, ...] = ()
     heaviest: float | None = None
-    loaded: Callable[[Array, Array], tuple[Array, Array, Array]] | None = None
+    loaded: Callable[[Array, Array, Array | None], Loaded] | None = None
 
     @property
     def own_effects(self) -> list[MotionEffect]:
@@ -85,9 +102,9 @@ class Nominal:
         """
         simulator = self.simulator
         if self.loaded is not None:
-            made_of = [self.loaded(log.time, log.command) for log in logs]
-            simulated, torque, carried = (_along([one[k] for one in made_of], data) for k in range(3))
-            return Driven(data.command, torque, simulated, carried=carried)
+            made_of = [self.loaded(log.time, log.command, log.position) for log in logs]
+            simulated, there, torque, carried = (_along([one[k] for one in made_of], data) for k in range(4))
+            return Driven(data.command, torque, simulated, there, carried=carried)
         if simulator is not None:
             centre = {name: value + (about or {}).get(name, 0.0) for name, value in simulator.parameters.items()}
 

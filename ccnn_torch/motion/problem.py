@@ -35,7 +35,7 @@ class Problem:
         data: `n` joints, `b` stretches, `s` samples.
         library: effects.
         followed: what the axes follow, `n x b x s`: the commands, or what a simulator makes of them.
-        torque, simulated: as of `Driven`.
+        torque, simulated, there: as of `Driven`.
         supply, warm: as of `Drive`, `b x s`.
         own: what a unit of each of a simulator's own parameters changes in its positions, by name, `n x b x s`.
         parted: whether folds are parts of the runs, where these could be folds.
@@ -51,6 +51,7 @@ class Problem:
     pool: int = 1
     torque: Tensor | None = None
     simulated: Tensor | None = None
+    there: Tensor | None = None
     own: Mapping[str, Tensor] = field(default_factory=dict)
     carried: Tensor | None = None
     parted: bool = False
@@ -86,7 +87,8 @@ class Problem:
         begin, rows = self.simulated[..., :2], torch.arange(len(self.data.time))
         speed = begin.diff(dim=-1) / self.data.time[:, :2].diff(dim=-1)
         theta = torch.zeros(len(begin), self.library.size, dtype=torch.float64)
-        return self.simulated - self._moved(theta, self.axes, rows, torch.cat([begin[..., :1], speed], -1))
+        start = torch.cat([begin[..., :1], speed], -1)
+        return self.simulated - replace(self, torque=self.there)._moved(theta, self.axes, rows, start)
 
     def pushed(self, theta: Tensor, torque: Tensor) -> Tensor:
         """Positions under torques that resist the motors, over the gain, one after the other.

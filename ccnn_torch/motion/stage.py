@@ -19,6 +19,7 @@ ABSENT: dict[str, float] = {
     "inertia": 0.0,
     "load": 0.0,
     "viscous": 0.0,
+    "drive_damping": 0.0,
     "coulomb": 0.0,
     "load_friction": 0.0,
     "stribeck": 0.0,
@@ -144,10 +145,12 @@ class Rule:
             friction = friction + a["stribeck"] * np.exp(-np.square(v / a["stribeck_speed"]))
         speed = self.solved(free, motor, friction, carried, fixed.light, fixed.stiff)
         if self.has["weakness"]:
-            torque = motor - fixed.stiff * speed
+            # The part of the damping that the drive makes is within its limit.
+            torque = motor - (fixed.stiff + a["drive_damping"]) * speed
             held = np.minimum(np.maximum(torque, -limit), limit)
             if not np.array_equal(held, torque):
-                weak = self.solved(free, held, friction, carried, fixed.light, 0 * held)
+                light = np.maximum(fixed.light - a["drive_damping"], TINY)
+                weak = self.solved(free, held, friction, carried, light, 0 * held)
                 speed = np.where(torque == held, speed, weak)
         speed = np.minimum(np.maximum(speed, -_FASTEST), _FASTEST)
         if not self.soft:

@@ -216,7 +216,7 @@ def test_a_payload_at_the_tool_of_an_arm_is_named_and_written_into_its_model(tmp
     assert loaded.loaded is not None
     table = {"time[s]": time} | {f"command{i + 1}[rad]": asked[:, i] for i in range(2)}
     noise = 1e-4 * np.random.default_rng(0).standard_normal(asked.shape)
-    measured = loaded.loaded(time, asked)[0] + noise
+    measured = loaded.loaded(time, asked, None).positions + noise
     write_table(tmp_path / "log.csv", table | {f"q{i + 1}[rad]": measured[:, i] for i in range(2)})
     logs = load_logs([tmp_path / "log.csv"])
     found = diagnose_motion(logs, nominal, ["payload", "gravity", "inertia", "offset"])
