@@ -187,7 +187,8 @@ def _fit_of(
 ) -> Fit:
     """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`, folds of each value `v`: whole
     runs, and parts of them."""
-    once = any(
+    # Runs of one stretch each have no parts.
+    once = int(folds[1].max()) > 0 and any(
         _acts_once(spec.theta[list(own)] @ x[g], folds[0]) for own, g in zip(spec.active, spec.groups, strict=True)
     )
     y = residual + spec.theta[list(spec.flat)] @ x

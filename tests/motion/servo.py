@@ -27,15 +27,22 @@ def command(kind: int, time: Array) -> Array:
 
 
 def moved(
-    time: Array, asked: Array, dry: float = 0.0, delay: float = 0.0, weight: float = 0.0, viscous: float = VISCOUS
+    time: Array,
+    asked: Array,
+    dry: float = 0.0,
+    delay: float = 0.0,
+    weight: float = 0.0,
+    viscous: float = VISCOUS,
+    limit: float = np.inf,
+    drive: float = 0.0,
 ) -> Array:
-    """Position of `INERTIA q'' = GAIN (u - q) - viscous q' - weight sin q - dry tanh(q' / 0.002)`."""
+    """Position of `INERTIA q'' = motor - (viscous - drive) q' - weight sin q - dry tanh(q' / 0.002)`, where the motor
+    makes `GAIN (u - q) - drive q'` within its limit."""
 
     def rate(t: float, state: Array) -> list[float]:
         u = float(np.interp(t - delay, time, asked))
-        torque = (
-            GAIN * (u - state[0]) - viscous * state[1] - weight * np.sin(state[0]) - dry * np.tanh(state[1] / 0.002)
-        )
+        motor = np.clip(GAIN * (u - state[0]) - drive * state[1], -limit, limit)
+        torque = motor - (viscous - drive) * state[1] - weight * np.sin(state[0]) - dry * np.tanh(state[1] / 0.002)
         return [float(state[1]), float(torque / INERTIA)]
 
     found = solve_ivp(rate, (time[0], time[-1]), [asked[0], 0.0], "LSODA", time, rtol=1e-6, atol=1e-8, max_step=0.01)

@@ -27,11 +27,13 @@ TIME = np.sort(np.arange(0, 4, 0.01) + np.random.default_rng(0).uniform(0, 0.003
 OWN = {"inertia": INERTIA / GAIN, "viscous": VISCOUS / GAIN}
 
 
-@pytest.mark.parametrize("real", [{}, {"weight": 0.3}, {"delay": 0.03}, {"dry": 0.1}])
+@pytest.mark.parametrize("real", [{}, {"weight": 0.3}, {"delay": 0.03}, {"dry": 0.1}, {"limit": 0.12, "drive": 0.05}])
 def test_it_moves_as_its_equation_says(real: dict[str, float]) -> None:
     asked = command(0, TIME)
-    torques = {"weight": "gravity_sin", "dry": "coulomb"}
+    torques = {"weight": "gravity_sin", "dry": "coulomb", "drive": "drive_damping"}
     mine = {torques.get(n, n): v / (GAIN if n in torques else 1) for n, v in real.items()}
+    if "limit" in mine:
+        mine["weakness"] = GAIN / mine.pop("limit")
     error = axis(TIME, asked, **OWN, **mine) - moved(TIME, asked, **real)
     assert np.abs(error).max() < 2e-3 * np.ptp(asked)
 
@@ -91,6 +93,12 @@ def test_limits_and_loads_go_on_where_a_stretch_begins() -> None:
     given = {n: torch.tensor([[v]], dtype=torch.float64) for n, v in {"play": 0.1, "play_loaded": 1.0, **OWN}.items()}
     hung = simulate_axes(Drive(time, still, begin, torque=still + 0.2), given)[0, 0]
     assert float(hung[-1]) == pytest.approx(-0.25, abs=1e-3)
+    # Friction of its own brakes it: where that is more than the torque it stays until the other end takes it along.
+    pull = 0.2 / OWN["inertia"]
+    for friction, end in ((1.1 * pull, -0.15), (0.9 * pull, -0.25)):
+        given["play_friction"] = torch.tensor([[friction]], dtype=torch.float64)
+        braked = simulate_axes(Drive(time, still, begin, torque=still + 0.2), given)[0, 0]
+        assert float((braked - hung).max()) > 0.05 and float(braked[-1]) == pytest.approx(end, abs=1e-3)
 
 
 def test_parameters_are_batched_and_never_run_away() -> None:

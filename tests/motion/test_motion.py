@@ -232,6 +232,37 @@ def test_a_payload_at_the_tool_of_an_arm_is_named_and_written_into_its_model(tmp
     assert better.dof_M0 == pytest.approx(true.dof_M0, rel=0.03)
 
 
+def test_a_limit_that_acts_in_one_run_alone_is_named(tmp_path: Path) -> None:
+    # Only the first motion is fast enough; the others do not tell the limit.
+    log = write_log(tmp_path / "log.csv", (0, 1, 1), 2.4, limit=0.25)
+    found = diagnose_motion(
+        load_logs([log]), nominal_of("servo", KEYS, ["rad"]), ["saturation", "speed_limit", "viscous"]
+    )
+    assert found.content["verdict"]["effects"] == ["saturation"] and found.content["verdict"]["probability"] > 0.9
+    assert found.content["verdict"]["shrink"] > 0.9
+    assert any("acts in one run alone: 2 parts of the runs were" in note for note in found.content["notes"])
+
+
+def test_what_one_joint_of_an_arm_does_is_no_finding_at_the_others(tmp_path: Path) -> None:
+    # Behind the friction of the second joint the first one moves otherwise than in the simulation.
+    time = np.arange(0, 4, 0.008)
+    asked = np.stack([command(1, time), command(0, time)], -1)
+    model, real = arm(tmp_path / "model.xml"), arm(tmp_path / "real.xml")
+    real.write_text(real.read_text().replace('damping="6.0"', 'damping="16.0"'))
+    nominal, true = (nominal_of(str(path), {}, ["rad", "rad"]) for path in (model, real))
+    assert true.loaded is not None
+    measured = true.loaded(time, asked, None).positions + 2e-5 * np.random.default_rng(0).standard_normal(asked.shape)
+    table = {"time[s]": time} | {f"command{i + 1}[rad]": asked[:, i] for i in range(2)}
+    write_table(tmp_path / "log.csv", table | {f"q{i + 1}[rad]": measured[:, i] for i in range(2)})
+    found = diagnose_motion(load_logs([tmp_path / "log.csv"]), nominal, ["viscous", "gravity", "inertia", "delay"])
+    first, second = found.verdicts
+    names = found.problem.library.names
+    assert [names[m] for m in second.best.members] == ["viscous"]
+    assert first.best.members == () and first.probability > 0.9
+    told = next(e for e in found.content["effects"] if e["name"] == "viscous")["parameters"]
+    assert {name: v["value"] for name, v in told.items()} == {"q2 viscous": pytest.approx(10.0, rel=0.02)}
+
+
 def test_causes_have_their_values_and_a_corrected_command_is_followed(tmp_path: Path, cli: Cli) -> None:
     real = {"dry": 0.1, "delay": 0.03, "weight": 0.3}
     log, out = write_log(tmp_path / "log.csv", (0, 1), 2.4, **real), tmp_path / "out"
