@@ -185,8 +185,14 @@ def _step(x: Tensor, y: Tensor, own: Tensor, real: Tensor, damping: Tensor, valu
 def _fit_of(
     spec: Spec, residual: Tensor, x: Tensor, values: float, left: float, folds: Sequence[Tensor], loose: Tensor
 ) -> Fit:
-    """The evidence of the model linearised at `spec.theta`; residual `v`, columns `m x v`, folds of each value `v`: whole
-    runs, and parts of them."""
+    """The evidence of the model linearised at `spec.theta`.
+
+    Args:
+        residual, x, loose: whitened, `v`, `m x v` and `k x v`.
+        values: how many count.
+        left: mean square of the residual itself.
+        folds: of each value, `v`: whole runs, and parts of them.
+    """
     # Runs of one stretch each have no parts.
     once = int(folds[1].max()) > 0 and any(
         _acts_once(spec.theta[list(own)] @ x[g], folds[0]) for own, g in zip(spec.active, spec.groups, strict=True)

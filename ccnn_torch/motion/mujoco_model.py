@@ -181,7 +181,7 @@ def _smooth(time: Array, values: Array) -> tuple[Array, Array, Array]:
 def _resisting(
     model: Any, joints: Sequence[int], own: Mapping[str, Array], time: Array, motion: _Motion
 ) -> tuple[Array, Array]:
-    """Torques of weights, springs and the other joints on a motion, and what 1 kg at the tool adds, `s x n` each [N m]."""
+    """Torques of weights, springs and the other joints on a motion, and of 1 kg at the tool, `s x n` each [N m]."""
     import mujoco
 
     data, dofs, tools = mujoco.MjData(model), model.jnt_dofadr[joints], tools_of(model, joints)
