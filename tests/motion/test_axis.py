@@ -93,9 +93,10 @@ def test_limits_and_loads_go_on_where_a_stretch_begins() -> None:
     given = {n: torch.tensor([[v]], dtype=torch.float64) for n, v in {"play": 0.1, "play_loaded": 1.0, **OWN}.items()}
     hung = simulate_axes(Drive(time, still, begin, torque=still + 0.2), given)[0, 0]
     assert float(hung[-1]) == pytest.approx(-0.25, abs=1e-3)
-    # Friction of its own brakes it: where that is more than the torque it stays until the other end takes it along.
-    pull = 0.2 / OWN["inertia"]
-    for friction, end in ((50 * pull, -0.15), (0.9 * pull, -0.25)):
+    # Friction of its own brakes it: where it is strong it stays where the other end has taken it to.
+    motor = simulate_axes(Drive(time, still, begin, torque=still + 0.2), given | {"play": 0 * given["play"]})[0, 0]
+    pull, taken = 0.2 / OWN["inertia"], float(motor.min()) + 0.05
+    for friction, end in ((50 * pull, taken), (0.9 * pull, -0.25)):
         given["play_friction"] = torch.tensor([[friction]], dtype=torch.float64)
         braked = simulate_axes(Drive(time, still, begin, torque=still + 0.2), given)[0, 0]
         assert float((braked - hung).max()) > 0.05 and float(braked[-1]) == pytest.approx(end, abs=1e-3)
