@@ -55,7 +55,11 @@ class AxisVerdict(NamedTuple):
 def judge_axes(found: Search) -> list[AxisVerdict]:
     """The verdict on each axis."""
     drivers = driver_columns(found.problem, [fits[0].spec for fits in found.found])
-    return [_judged(found, i, drivers) for i in range(len(found.found))]
+    verdicts = [_judged(found, i, drivers) for i in range(len(found.found))]
+    named = {m for v in verdicts for m in v.best.members}
+    # What another joint shows clearly is not hidden.
+    verdicts = [v._replace(hidden=None) if v.hidden in named else v for v in verdicts]
+    return [v if v.hidden is None else v._replace(probability=min(v.probability, _UNCONFIRMED)) for v in verdicts]
 
 
 def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
@@ -97,7 +101,7 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
         same = min(same + sum(p for own, p in inside.items() if {*members} < {*own}), _NAMED)
     if not members and left[()] > _CLEARLY**2 * fits[0].left:
         alone = min((f for f in fits if len(f.members) == 1), key=lambda f: f.left)
-        return AxisVerdict(by_members[()], min(same, _UNCONFIRMED), marginal, classes, None, alone.members[0])
+        return AxisVerdict(by_members[()], same, marginal, classes, None, alone.members[0])
     return AxisVerdict(by_members[members], same, marginal, classes, None)
 
 
