@@ -57,8 +57,9 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
     loaded = error.abs().amax((-1, -2))[:, None, None, None] > _LOADED * span
     place, over = _evenly(moved, data.judged), _over_time(problem)
     sign = _direction(speed)[:, None]
+    fast = _hats(speed, data.judged)
     direct = {
-        "speed": _hats(speed, data.judged),
+        "speed": fast,
         "acceleration": _hats(acceleration, data.judged),
         "reversal": _fading(speed, data.time),
         "position": place,
@@ -67,7 +68,7 @@ def driver_columns(problem: Problem, specs: list[Spec]) -> list[Driver]:
         "time": torch.cat([torch.ones_like(over[:, :1]), over], 1),
     }
     # Friction comes and goes with the place, the time and the temperature as well.
-    pushed = [("position", place), ("position", place * sign), ("time", over * sign)]
+    pushed = [("speed", fast), ("position", place), ("position", place * sign), ("time", over * sign)]
     if float(problem.warm.abs().max()) >= _WARMER:
         warm = (problem.warm / problem.warm.abs().max()).expand(len(moved), -1, -1)[:, None]
         pushed.append(("temperature", warm * sign))

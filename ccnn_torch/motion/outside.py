@@ -15,6 +15,7 @@ from ccnn_torch.motion.fit import sensitivities, squares_unseen
 from ccnn_torch.motion.problem import Problem
 from ccnn_torch.motion.search import CROWD, Search, log_posterior
 from ccnn_torch.motion.spec import Fit
+from ccnn_torch.motion.whiten import white_noise
 
 # Log prior odds of a driver.
 _OUTSIDE = math.log(0.001)
@@ -68,12 +69,12 @@ def essential(members: Members, left: Mapping[Members, float], unseen: Mapping[M
 
 def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapping[Members, Fit]) -> list[Candidate]:
     """Drivers beside the most probable sets, and those that lead from the best one to none."""
-    problem, judged = found.problem, found.problem.data.judged
+    problem, plainly = found.problem, white_noise(len(found.problem.axes))
     mine, values = torch.tensor([axis]), float(problem.judged.sum())
-    white = [
-        problem.whitened(driver.columns[axis], mine.expand(len(driver.columns[axis])), found.whitening)
-        for driver in drivers
-    ]
+    white, plain = (
+        [problem.whitened(d.columns[axis], mine.expand(len(d.columns[axis])), whitening) for d in drivers]
+        for whitening in (found.whitening, plainly)
+    )
     chain = [found.found[axis][0]]
     while chain[-1].members:
         less = [tuple(m for m in chain[-1].members if m != e) for e in chain[-1].members]
@@ -84,18 +85,18 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
     for base in {f.members: f for f in [*found.found[axis][:_BASES], *chain]}.values():
         theta, flat = base.spec.theta, list(base.spec.flat)
         residual, columns = sensitivities(problem, found.whitening, theta[None], mine, [flat])
-        own, plain = columns[0], problem.residual(theta[None], mine)[0]
-        y = residual[0] + theta[flat] @ own
+        own, y = columns[0], residual[0] + theta[flat] @ columns[0]
+        # Of the position itself, not of its whitened form.
+        left_plain, own_plain = (part[0] for part in sensitivities(problem, plainly, theta[None], mine, [flat]))
         prior = prior_of(base) + _OUTSIDE + (CROWD if len(base.members) >= 2 else 0.0)
-        for k, (driver, columns) in enumerate(zip(drivers, white, strict=True)):
+        for k, (driver, columns, beside) in enumerate(zip(drivers, white, plain, strict=True)):
             x = torch.cat([own, columns])
             grams = grams_of(torch.cat([x, found.loose[axis]]).mT[:, None, :], y[:, None])._replace(values=values)
             groups = [*base.spec.groups, torch.arange(len(flat), len(x))]
-            # What it takes away of the position itself, not of its whitened form.
-            mean = fit_sets(grams, [groups], 0.0).mean[0, len(flat) :]
-            rest = (plain - (mean[:, None, None] * driver.columns[axis]).sum(0))[judged].square().mean()
-            taken[k][base.members] = float(rest)
-            there = driver.name if float(plain[judged].square().mean() - rest) > 0 else None
+            mean = fit_sets(grams, [groups], 0.0).mean[0]
+            rest = left_plain - (mean[: len(flat)] - theta[flat]) @ own_plain - mean[len(flat) : len(x)] @ beside
+            taken[k][base.members] = float(rest.square().sum())
+            there = driver.name if taken[k][base.members] < float(left_plain.square().sum()) else None
             sets.append((k, Candidate((base.members, there), grams, groups, prior, (own, columns, y))))
     # Beside a driver a name has to do what the driver does not do as well.
     return [
