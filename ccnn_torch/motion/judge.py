@@ -99,10 +99,17 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     if {*members} < likely:
         # What was left out for want of a sure name mends the form of what is named, as a rule, and is no cause.
         same = min(same + sum(p for own, p in inside.items() if {*members} < {*own}), _NAMED)
-    if not members and left[()] > _CLEARLY**2 * fits[0].left:
+    if not members and _after_loose(by_members[()], fits[0].noise) > _CLEARLY**2 * fits[0].rss:
         alone = min((f for f in fits if len(f.members) == 1), key=lambda f: f.left)
         return AxisVerdict(by_members[()], same, marginal, classes, None, alone.members[0])
     return AxisVerdict(by_members[members], same, marginal, classes, None)
+
+
+def _after_loose(nothing: Fit, noise: float) -> float:
+    """Squares that are left of nothing where nominal values and time stamps are off as far as is likely."""
+    xx, xy = nothing.grams.xx, nothing.grams.xy
+    inner = xx + noise * torch.eye(len(xx), dtype=xx.dtype)
+    return float(nothing.grams.yy - xy @ torch.linalg.solve(inner, xy))
 
 
 def _weights(sets: Sequence[Candidate], noise: float, form: float, smooth: float) -> list[float]:
