@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.motion.nominal import Loaded, Nominal
+from ccnn_torch.motion.mujoco_motion import NONE, loaded_motion
+from ccnn_torch.motion.nominal import Nominal
 
 Array = NDArray[np.float64]
-# Seconds at the first command before a log begins: the machine rests there.
-_SETTLING = 1.0
-# Of the Gaussian by which what is measured beside the simulated motion is smoothed [s].
-_SMOOTH = 0.02
-# A limit of 1/this or more is none.
-_TINY = 1e-9
 
 
 def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> Nominal:
@@ -58,7 +53,7 @@ def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> 
         "viscous": (model.dof_damping[dofs] - model.actuator_biasprm[position, 2]) / gain,
         "drive_damping": -model.actuator_biasprm[position, 2] / gain,
         "coulomb": model.dof_frictionloss[dofs] / gain,
-        "weakness": model.actuator_forcelimited[position] * gain / np.maximum(limit, _TINY),
+        "weakness": model.actuator_forcelimited[position] * gain / np.maximum(limit, NONE),
     }
     return Nominal(
         path,
@@ -66,140 +61,6 @@ def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> 
         tuple(gain.tolist()),
         (None,) * len(joints),
         heaviest=float(model.body_mass.sum()),
-        loaded=lambda time, commands, measured: _loaded(model, joints, values, time, commands, measured),
+        loaded=lambda time, commands, measured: loaded_motion(model, joints, values, time, commands, measured),
         notes=(f"{Path(path).name}: simulated from rest at each log's first command",),
     )
-
-
-class Tool(NamedTuple):
-    """Where a payload is: a body, and the point in its frame, `3` [m]."""
-
-    body: int
-    place: Array
-
-
-def tools_of(model: Any, joints: Sequence[int]) -> list[Tool]:
-    """Of each joint the tool that it carries: the last site of the last body of its chain, or its centre of mass."""
-    import mujoco
-
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    moved = [int(model.jnt_bodyid[j]) for j in joints]
-    chains = {body: _down(model, body) for body in moved}
-    ends = [body for body in moved if not any(body in chain for other, chain in chains.items() if other != body)]
-    tools = []
-    for body in moved:
-        last = next(end for end in ends if body in chains[end])
-        fixed = [b for b in range(model.nbody) if model.body_weldid[b] == model.body_weldid[last]]
-        sites = [s for s in range(model.nsite) if model.site_bodyid[s] in fixed]
-        place = data.site_xpos[sites[-1]] if sites else data.subtree_com[last]
-        tools.append(Tool(last, data.xmat[last].reshape(3, 3).T @ (place - data.xpos[last])))
-    return tools
-
-
-def _down(model: Any, body: int) -> list[int]:
-    """A body and those that carry it."""
-    chain = [body]
-    while chain[-1]:
-        chain.append(int(model.body_parentid[chain[-1]]))
-    return chain
-
-
-class _Motion(NamedTuple):
-    """Of all joints of a model, `s x nq` and `s x nv` twice."""
-
-    position: Array
-    speed: Array
-    acceleration: Array
-
-
-def _loaded(
-    model: Any, joints: Sequence[int], own: Mapping[str, Array], time: Array, commands: Array, measured: Array | None
-) -> Loaded:
-    """Simulate commands; own: parameters of the axes; measured: positions, `s x n`; None: those that are simulated."""
-    address, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-    motion, there = _simulated(model, joints, own, time, commands)
-    positions, gain = motion.position[:, address], model.actuator_gainprm[: len(joints), 0]
-    moved = _Motion(*(part.copy() for part in motion))
-    if measured is not None:
-        # What is measured is too rough for an acceleration; what it differs by from the simulated motion is smooth.
-        for part, places, change in zip(moved, (address, dofs, dofs), _smooth(time, measured - positions), strict=True):
-            part[:, places] += change
-    before, (after, carried) = (
-        _resisting(model, joints, own, time, motion)[0],
-        _resisting(model, joints, own, time, moved),
-    )
-    return Loaded(positions, there, there + (after - before) / gain, carried / gain)
-
-
-def _simulated(
-    model: Any, joints: Sequence[int], own: Mapping[str, Array], time: Array, commands: Array
-) -> tuple[_Motion, Array]:
-    """The motion at the log's samples, and what resists each actuator there beside its joint's friction and inertia,
-    over its gain, `s x n`: weights, and the other joints."""
-    import mujoco
-
-    data = mujoco.MjData(model)
-    address, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-    data.qpos[address] = commands[0]
-    mujoco.mj_forward(model, data)
-    step = float(model.opt.timestep)
-    clock = np.arange(time[0] - _SETTLING, time[-1] + step, step)
-    controls = np.stack([np.interp(clock, time, c) for c in commands.T], -1)
-    motion = _Motion(*(np.empty((len(clock), k)) for k in (model.nq, model.nv, model.nv)))
-    torque, gain = np.empty_like(controls), model.actuator_gainprm[: len(joints), 0]
-    limit = 1 / np.maximum(own["weakness"], _TINY)
-    for k, control in enumerate(controls):
-        motion.position[k], motion.speed[k] = data.qpos, data.qvel
-        data.ctrl[:] = control
-        mujoco.mj_step(model, data)
-        motion.acceleration[k] = (data.qvel - motion.speed[k]) / step
-        v = data.qvel[dofs]
-        motor = np.clip(control - motion.position[k, address] - own["drive_damping"] * v, -limit, limit)
-        # What a joint's own friction takes, up to all that holds it.
-        dry = np.clip(-data.qfrc_constraint[dofs] / gain, -own["coulomb"], own["coulomb"])
-        passive = (own["viscous"] - own["drive_damping"]) * v + dry
-        torque[k] = motor - passive - own["inertia"] * motion.acceleration[k, dofs]
-    found = [np.stack([np.interp(time, clock, x) for x in table.T], -1) for table in (*motion, torque)]
-    return _Motion(*found[:3]), found[3]
-
-
-def _smooth(time: Array, values: Array) -> tuple[Array, Array, Array]:
-    """Values without what is fast, and their first two derivatives, `s x n` each."""
-    from scipy.ndimage import gaussian_filter1d
-
-    step = float(np.median(np.diff(time)))
-    clock = np.arange(time[0], time[-1] + step, step)
-    even = gaussian_filter1d(np.stack([np.interp(clock, time, x) for x in values.T], -1), _SMOOTH / step, axis=0)
-    speed = np.gradient(even, step, axis=0)
-    found = [
-        np.stack([np.interp(time, clock, x) for x in v.T], -1) for v in (even, speed, np.gradient(speed, step, axis=0))
-    ]
-    return found[0], found[1], found[2]
-
-
-def _resisting(
-    model: Any, joints: Sequence[int], own: Mapping[str, Array], time: Array, motion: _Motion
-) -> tuple[Array, Array]:
-    """Torques of weights, springs and the other joints on a motion, and of 1 kg at the tool, `s x n` each [N m]."""
-    import mujoco
-
-    data, dofs, tools = mujoco.MjData(model), model.jnt_dofadr[joints], tools_of(model, joints)
-    torque, jacobian, whole = np.empty((len(time), len(joints))), np.empty((3, model.nv)), np.empty(model.nv)
-    # Of each tool what its point moves by with each joint, and its speed.
-    bent, speed = np.empty((len(time), len(joints), 3)), np.empty((len(time), len(joints), 3))
-    for k in range(len(time)):
-        data.qpos, data.qvel, data.qacc = motion.position[k], motion.speed[k], motion.acceleration[k]
-        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel, mujoco.mj_passive):
-            stage(model, data)
-        mujoco.mj_rne(model, data, 1, whole)
-        whole += model.dof_armature * data.qacc - data.qfrc_spring - data.qfrc_gravcomp
-        torque[k] = whole[dofs]
-        for i, tool in enumerate(tools):
-            if i == 0 or tool.body != tools[i - 1].body:
-                point = data.xpos[tool.body] + data.xmat[tool.body].reshape(3, 3) @ tool.place
-                mujoco.mj_jac(model, data, jacobian, None, point, tool.body)
-            bent[k, i], speed[k, i] = jacobian[:, dofs[i]], jacobian @ data.qvel
-    gain = model.actuator_gainprm[: len(joints), 0]
-    pulled = np.gradient(speed, time, axis=0) - model.opt.gravity
-    return torque - own["inertia"] * gain * motion.acceleration[:, dofs], (bent * pulled).sum(-1)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.motion.mujoco_model import Tool, tools_of
+from ccnn_torch.motion.mujoco_motion import Tool, tools_of
 
 # No body is lighter [kg].
 _LEAST = 1e-9

@@ -82,6 +82,8 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
     sets: list[tuple[int, Candidate]] = []
     taken: list[dict[Members, float]] = [{} for _ in drivers]
     left = {members: fit.left for members, fit in fits.items()}
+    # What a driver has to take away: a smooth function can follow what is wrong with the form of a model.
+    slight = float(problem.stamped[axis][problem.data.judged].square().mean()) * values
     for base in {f.members: f for f in [*found.found[axis][:_BASES], *chain]}.values():
         theta, flat = base.spec.theta, list(base.spec.flat)
         residual, columns = sensitivities(problem, found.whitening, theta[None], mine, [flat])
@@ -96,7 +98,8 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
             mean = fit_sets(grams, [groups], 0.0).mean[0]
             rest = left_plain - (mean[: len(flat)] - theta[flat]) @ own_plain - mean[len(flat) : len(x)] @ beside
             taken[k][base.members] = float(rest.square().sum())
-            there = driver.name if taken[k][base.members] < float(left_plain.square().sum()) else None
+            gained = float(left_plain.square().sum()) - taken[k][base.members]
+            there = driver.name if gained >= slight else None
             sets.append((k, Candidate((base.members, there), grams, groups, prior, (own, columns, y))))
     # Beside a driver a name has to do what the driver does not do as well.
     return [

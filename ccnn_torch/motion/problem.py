@@ -142,8 +142,12 @@ class Problem:
                 before = nominal.get(name, sizes["gain"] if name == "gain" else absent)
                 other = self.library._replace(nominal={**nominal, name: before + _KNOWN * size})
                 columns.append(replace(self, library=other)._moved(theta, self.axes, rows, self._start) - plain)
-        columns.append(_STAMP * float(self.data.time.diff(dim=-1).median()) * self.data.speed)
-        return torch.stack(columns)
+        return torch.stack([*columns, self.stamped])
+
+    @property
+    def stamped(self) -> Tensor:
+        """What the positions change by when time stamps are off by what they are known to, `n x b x s`."""
+        return _STAMP * float(self.data.time.diff(dim=-1).median()) * self.data.speed
 
     def _moved(self, theta: Tensor, axis: Tensor, rows: Tensor, start: Tensor) -> Tensor:
         data, p, b = self.data, len(theta), len(rows)

@@ -60,7 +60,7 @@ def _facts(data: Stretches, i: int, nominal: Nominal, driven: Driven, supply: Te
         nominal=nominal.axes[i],
         gain=nominal.gains[i],
         length=nominal.lengths[i],
-        carried=0.0 if driven.carried is None else nearly(driven.carried[i][judged]),
+        carried=None if driven.carried is None else nearly(driven.carried[i][judged]),
         heaviest=nominal.heaviest,
         span=span or 1.0,
         speed=nearly(data.speed[i][judged]) or 1.0,

@@ -10,20 +10,21 @@ CARRIED = "carried"
 """The parameter of an axis that is the mass at the tool [kg]."""
 # Share of an axis' error that 100 kg at the tool must make for it to show a mass there.
 _LEAST = 0.01
+_TINY = 1e-12
 
 
 def _missing(axis: Facts) -> str:
+    if axis.carried is not None:
+        return "" if 100 * axis.carried >= _LEAST * axis.error else "a joint that the mass loads"
     if axis.unit != "rad":
         return "a turning joint"
-    if axis.carried:
-        return "" if 100 * axis.carried >= _LEAST * axis.error else "a joint that the mass loads"
     return "" if axis.length and axis.gain else "the axis' gain and the lever of its load (keys gain and length)"
 
 
 def _numbers(axis: Facts) -> tuple[Number, ...]:
-    if axis.carried:
+    if axis.carried is not None:
         # A mass that would explain the error.
-        return (Number("mass", "kg", axis.error / axis.carried, (add(CARRIED),), most=axis.heaviest),)
+        return (Number("mass", "kg", axis.error / max(axis.carried, _TINY), (add(CARRIED),), most=axis.heaviest),)
     lever, gain = axis.length or 1.0, axis.gain or 1.0
     acts = (
         add("gravity_sin", STANDARD_GRAVITY * lever / gain),

@@ -18,7 +18,7 @@ class Facts:
             length) by which the command and the position must differ for them.
         length: lever of a load [m]; None where it is not known.
         carried: nearly the largest torque that 1 kg at the tool loads its motor with, over the gain [rad or m per kg];
-            0 where the model does not tell it.
+            None where the model does not tell it.
         heaviest: no payload is heavier [kg]; None where nothing is known of it.
         span: of the command [rad or m].
         speed: nearly the largest one [per s].
@@ -30,7 +30,7 @@ class Facts:
     nominal: Mapping[str, float]
     gain: float | None = None
     length: float | None = None
-    carried: float = 0.0
+    carried: float | None = None
     heaviest: float | None = None
     span: float = 1.0
     speed: float = 1.0
