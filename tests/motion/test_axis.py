@@ -135,11 +135,13 @@ def test_every_effect_acts_on_parameters_that_the_axis_has() -> None:
         assert len(effect.shapes(facts)) >= 1
 
 
-def test_a_motor_with_a_limit_may_have_another_voltage_than_the_one_recorded() -> None:
-    facts = Facts("rad", {"inertia": 0.01, "weakness": 1.0}, gain=2.0, supply=0.2)
-    library = library_of(motion_effects(["supply"]), [facts])
+def test_a_motor_near_its_limit_may_have_another_voltage_than_the_one_recorded() -> None:
+    facts = Facts("rad", {"inertia": 0.01, "weakness": 1.0}, gain=2.0, supply=0.2, error=0.6)
+    # An axis that is far from its limit has the same numbers, and the voltage does nothing that its gain does not.
+    library = library_of(motion_effects(["supply"]), [facts, replace(facts, error=0.1)])
     names = [number.name for number in library.numbers[0]]
     # One number or the other, never both: a short log would share what it shows among them.
     assert [[names[j] for j in v.active] for v in library.variants[0]] == [names[:1], names[1:], names[1:]]
-    without = library_of(motion_effects(["supply"]), [replace(facts, nominal={"inertia": 0.01})])
-    assert [v.active for v in without.variants[0]] == [(0,)]
+    found = library.parameters(torch.tensor([[0.0, 1.0]], dtype=torch.float64).expand(2, -1), torch.arange(2))
+    assert found["gain"].tolist() == [pytest.approx(np.exp(0.3)), 1.0] and "supply" not in found
+    assert library_of(motion_effects(["supply"]), [replace(facts, error=0.1, supply=0.0)]).lacking[0]
