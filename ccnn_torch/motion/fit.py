@@ -30,7 +30,7 @@ _VALUES = 3e7
 # Half deviance for each value that a step must gain for another one to be made.
 _GAINED = 1e-4
 # Share of what an effect does from which it is in one run alone.
-_ONCE = 0.9
+_ONCE = 0.99
 
 
 def fit_many(
