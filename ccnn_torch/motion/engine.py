@@ -16,6 +16,7 @@ from ccnn_torch.diagnosis.verdict.text import verdict_text
 from ccnn_torch.motion.content import effects_of, floor_of, hidden_of, notes_of, where_is
 from ccnn_torch.motion.effects import motion_effects
 from ccnn_torch.motion.effects.payload import STANDARD_GRAVITY
+from ccnn_torch.motion.fit import ALONE
 from ccnn_torch.motion.held_out import gap_of, held_out, in_order, only, singles
 from ccnn_torch.motion.judge import AxisVerdict, judge_axes
 from ccnn_torch.motion.linearised import searched
@@ -86,7 +87,7 @@ def diagnose_motion(
     members = [library.names.index(name) for name in names]
     steps = [[only(library, v.best.spec, members[:k]) for v in verdicts] for k in range(len(names) + 1)]
     # Where an effect acts in one run alone the others do not tell its numbers.
-    folded = replace(problem, parted=any(v.best.once for v in verdicts))
+    folded = replace(problem, parted=any(v.best.once > ALONE for v in verdicts))
     residuals = held_out(folded, found.whitening, [*steps, *alone.values()])
     # Of the model itself, also where it was linearised elsewhere.
     residuals[0] = nothing

@@ -29,8 +29,8 @@ _FARTHEST = 5.0
 _VALUES = 3e7
 # Half deviance for each value that a step must gain for another one to be made.
 _GAINED = 1e-4
-# Share of what an effect does from which it is in one run alone.
-_ONCE = 0.99
+# Share of what an effect does in one run from which the others hardly tell its numbers, and from which not at all.
+_ONCE, ALONE = 0.9, 0.99
 
 
 def fit_many(
@@ -193,10 +193,9 @@ def _fit_of(
         left: mean square of the residual itself.
         folds: of each value, `v`: whole runs, and parts of them.
     """
+    shares = (_in_one(spec.theta[list(own)] @ x[g], folds[0]) for own, g in zip(spec.active, spec.groups, strict=True))
     # Runs of one stretch each have no parts.
-    once = int(folds[1].max()) > 0 and any(
-        _acts_once(spec.theta[list(own)] @ x[g], folds[0]) for own, g in zip(spec.active, spec.groups, strict=True)
-    )
+    once = max(shares, default=0.0) if int(folds[1].max()) > 0 else 0.0
     y = residual + spec.theta[list(spec.flat)] @ x
     grams = grams_of(torch.cat([x, loose]).mT[:, None, :], y[:, None])._replace(values=values)
     fit = fit_sets(grams, [spec.groups], 0.0)
@@ -207,17 +206,17 @@ def _fit_of(
         float(fit.noise[0]),
         fit.covariance[0, :m, :m],
         float(residual.square().sum()),
-        squares_unseen(x, y, fit, spec.groups, folds[once]),
+        squares_unseen(x, y, fit, spec.groups, folds[once > _ONCE]),
         once,
         left,
         grams,
     )
 
 
-def _acts_once(does: Tensor, fold: Tensor) -> bool:
-    """Whether what an effect does, `v`, is nearly all in one fold: the others do not tell its numbers."""
+def _in_one(does: Tensor, fold: Tensor) -> float:
+    """Share of what an effect does, `v`, in the fold where it does most; 0 of nothing, and where there is one fold."""
     squares = does.new_zeros(int(fold.max()) + 1).index_add(0, fold, does.square())
-    return len(squares) > 1 and float(squares.max()) > _ONCE * float(squares.sum())
+    return float(squares.max() / squares.sum().clamp_min(1e-300)) if len(squares) > 1 else 0.0
 
 
 def squares_unseen(x: Tensor, y: Tensor, fit: Fits, groups: Sequence[Tensor], fold: Tensor) -> float:

@@ -53,7 +53,7 @@ class Fit(NamedTuple):
         covariance: of the active numbers in plausible sizes, `m x m`.
         rss: squares of the whitened residual.
         unseen: the same on runs that its numbers were not fitted to, or on parts of runs.
-        once: whether these were parts, since a member acts in one run alone, as a limit may.
+        once: largest share of what a member does in one run, which is large of a limit: then these are parts of runs.
         left: mean square of the residual itself [rad^2 or m^2].
         grams: of the linearised model's whitened columns, in plausible sizes, and of `loose` after them.
     """
@@ -64,7 +64,7 @@ class Fit(NamedTuple):
     covariance: Tensor
     rss: float
     unseen: float
-    once: bool
+    once: float
     left: float
     grams: Grams
 
