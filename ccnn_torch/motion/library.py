@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.motion.effects import Facts, MotionEffect, Number
+from ccnn_torch.motion.effects.checked import refuse_wrong_effect
 from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.stage import ABSENT
 
@@ -142,8 +143,18 @@ class Library(NamedTuple):
         return found
 
 
+def _kinds(numbers: Sequence[Number]) -> list[tuple[str, list[tuple[str, str]]]]:
+    return [(number.name, [(act.parameter, act.how) for act in number.acts]) for number in numbers]
+
+
 def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Library:
-    """The library for some axes."""
+    """The library for some axes.
+
+    Raises:
+        InputError: an effect does not keep to `MotionEffect`.
+    """
+    for effect in effects:
+        refuse_wrong_effect(effect, facts)
     lacking = [[effect.missing(axis) for axis in facts] for effect in effects]
     numbers: list[list[Number]] = [[] for _ in facts]
     places: list[tuple[int, ...]] = []
@@ -151,8 +162,8 @@ def library_of(effects: Sequence[MotionEffect], facts: Sequence[Facts]) -> Libra
         own = [tuple(effect.numbers(axis)) for axis in facts]
         begin = len(numbers[0])
         for of_axis, those in zip(numbers, own, strict=True):
-            # An axis that is driven otherwise than the first one has as many numbers, or the first one's.
-            of_axis += those if len(those) == len(own[0]) else own[0]
+            # An axis that is driven otherwise than the first one has its numbers.
+            of_axis += those if _kinds(those) == _kinds(own[0]) else own[0]
         places.append(tuple(range(begin, len(numbers[0]))))
     names = [{numbers[0][j].name for j in own} for own in places]
     shapes = [[effect.shapes(axis) for axis in facts] for effect in effects]
