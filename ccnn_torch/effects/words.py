@@ -130,6 +130,12 @@ _WORDS = {
         "How much higher the proportional gain is than in the model. A lag: 1 over the velocity gain.",
         "Proportional and velocity gain of {where} in the drive and in the model.",
     ),
+    "integral_action": Words(
+        "integral action of the position control",
+        "integral action",
+        "The integral gain over the proportional one, beyond that of the model: 1 over the integral time.",
+        "Integral gain of {where} in the drive and in the model.",
+    ),
     "offset": Words(
         "a constant offset between command and position",
         "offset",

@@ -2,9 +2,10 @@
 
 The motor's torque is the gain times (command less position). With everything divided by the nominal gain, an axis obeys
 
-    inertia * q'' = clip(gain * supply * (u - q), 1 / weakness) - viscous * q' - F(q') * sign(q') - weight(q) - teeth(q)
+    inertia * q'' = clip(gain * supply * (u - q + integral * I), 1 / weakness)
+                    - viscous * q' - F(q') * sign(q') - weight(q) - teeth(q)
 
-where u is the command after delay, speed limit and offset: torques are then angles (N m per N m/rad), the inertia is
+where u is the command after delay, speed limit and offset, and I the integral of u - q over the time: torques are then angles (N m per N m/rad), the inertia is
 in s^2, the viscous friction in s; a part of that which the drive makes is within the limit, too. With all of these 0
 the position follows the command exactly: that axis is nominal where nothing is known. Behind a flexible joint, load and
 weight hang on a spring that pulls at the motor.
@@ -34,7 +35,8 @@ class Drive(NamedTuple):
     Attributes:
         time: `b x s` [s], increasing, also in the padding.
         command: `b x s` [rad or m].
-        start: position and speed of the first sample, `b x 2`.
+        start: position and speed of the first sample, and its acceleration where it does not begin at rest, `b x 2` or
+            `b x 3`.
         supply: supply voltage over the nominal one, less 1, `b x s`; None = 0.
         warm: temperature less that of the coldest sample, `b x s` [K]; None = 0.
         torque: what else resists the motor, over the nominal gain, `b x s` [rad or m].
@@ -92,7 +94,8 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     commands = np.ascontiguousarray(u.permute(2, 0, 1).numpy())
     push = None if torque is None else np.ascontiguousarray(torque.expand(*shape, -1).permute(2, 0, 1).numpy())
     if np.any(a["slowness"] > 0):
-        commands = _limited(steps, commands, 1 / np.maximum(a["slowness"], TINY), _held_at(drive, push, a))
+        begin = np.where(a["slowness"] > 0, _held_at(drive, push, a), commands[0])
+        commands = _limited(steps, commands, 1 / np.maximum(a["slowness"], TINY), begin)
     moved = _moved(drive, steps, commands, push, a)
     if np.any(a["play"] > 0):
         loaded = a["play_loaded"] > 0
@@ -111,8 +114,9 @@ def _moved(drive: Drive, steps: Array, u: Array, push: Array | None, a: Mapping[
     parts = int(min(max(math.ceil(float(np.median(steps)) / max(fast, TINY) / _LONGEST), 1), _MOST_PARTS))
     start = drive.start.numpy()
     q, v = (np.broadcast_to(start[:, k], u.shape[1:]) for k in range(2))
+    faster = start[:, 2] if start.shape[1] > 2 else np.zeros(len(start))
     rule = Rule(a)
-    state = rule.begun(q, v, None if push is None else push[0])
+    state = rule.begun(q, v, faster, u[0], None if push is None else push[0])
     share = None
     if np.any(a["supply"]) and drive.supply is not None and bool((drive.supply != 0).any()):
         share = np.maximum(1 + a["supply"] * drive.supply.numpy().T[:, None], 0)

@@ -24,7 +24,7 @@ _KNOWN = 0.03
 # Share of a sampling step by which the time stamps of commands and positions may differ (standard deviation).
 _STAMP = 0.1
 _WEIGHT = ("gravity_sin", "gravity_cos")
-_LOOSE = (*_WEIGHT, "gain", "inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "delay")
+_LOOSE = (*_WEIGHT, "gain", "integral", "inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "delay")
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class Problem:
 
     @cached_property
     def _start(self) -> Tensor:
-        return torch.stack([self.data.position[:, :, 0], self.data.speed[:, :, 0]], -1)
+        faster = (self.data.speed[:, :, 2] - self.data.speed[:, :, 0]) / (self.data.time[:, 2] - self.data.time[:, 0])
+        return torch.stack([self.data.position[:, :, 0], self.data.speed[:, :, 0], faster], -1)
 
     def positions(self, theta: Tensor, axis: Tensor, chosen: Tensor | None = None) -> Tensor:
         """Simulated positions of models of axes.

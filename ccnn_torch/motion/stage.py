@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 ABSENT: dict[str, float] = {
     "gain": 1.0,
+    "integral": 0.0,
     "inertia": 0.0,
     "load": 0.0,
     "viscous": 0.0,
@@ -52,16 +53,17 @@ _FASTEST = 1e4
 
 
 State = tuple[Array, ...]
-"""Position and speed of the motor, and of the load where it hangs on a spring."""
+"""Position and speed of the motor, of the load where it hangs on a spring, and last the torque of the integral action."""
 
 
 class _Fixed(NamedTuple):
-    """Of one sample: length of a stage, gain, limit and dry friction, inertia and resistance over it, stiffness; of a
-    flexible joint its inertia and its damping over the stage, over its stiffness, and the share of a speed of the motor
+    """Of one sample: length of a stage, gain (with what the integral adds to it within the stage), rate of the integral,
+    limit and dry friction, inertia and resistance over the length, stiffness; of a flexible joint its inertia and its damping over the stage, over its stiffness, and the share of a speed of the motor
     that its load follows with."""
 
     h: Array
     gain: Array
+    rate: Array
     limit: Array
     dry: Array
     mass: Array
@@ -95,8 +97,17 @@ class Rule:
             self.drag = 2 * a["flexible_damping"] * np.sqrt(np.maximum(a["flexibility"], 0))
             self.inertia = np.where(self.hung, np.maximum(self.inertia - load, 0.0), self.inertia)
 
-    def begun(self, q: Array, v: Array, push: Array | None) -> State:
-        """The state of an axis whose encoder shows `q` and `v`: a spring carries the load's weight."""
+    def begun(self, q: Array, v: Array, faster: Array, u: Array, push: Array | None) -> State:
+        """The state of an axis whose encoder shows `q`, `v` and its acceleration: a spring carries the load's weight,
+        and the integral action what the command `u` does not."""
+        state = self._hanging(q, v, push)
+        if not self.has["integral"]:
+            return state
+        friction = self.a["coulomb"] * np.sign(v)
+        load = self.pulling(q, push) + self.a["inertia"] * faster + self.a["viscous"] * v + friction
+        return *state, np.where(self.a["integral"] > 0, load - self.a["gain"] * (u - q), 0.0)
+
+    def _hanging(self, q: Array, v: Array, push: Array | None) -> State:
         if not self.soft:
             return q, v
         sag = self.slack * self.pulling(q, push)
@@ -116,7 +127,9 @@ class Rule:
             over, drag = self.a["flexibility"] / h, h + self.drag
             follows = drag / (over + drag)
             light = light + self.stiffness * drag * (1 - follows)
-        return _Fixed(h, gain, limit, dry, mass, np.maximum(light, TINY), gain * h, over, drag, follows)
+        rate = gain * self.a["integral"]
+        gain = gain + rate * h
+        return _Fixed(h, gain, rate, limit, dry, mass, np.maximum(light, TINY), gain * h, over, drag, follows)
 
     def pulling(self, q: Array, push: Array | None) -> Array | float:
         """Torque of the weight and of the other joints at a position."""
@@ -127,11 +140,13 @@ class Rule:
         """The state at the end of a stage."""
         a, h, limit, q, v = self.a, fixed.h, fixed.limit, *state[:2]
         motor = fixed.gain * (u - q)
+        if self.has["integral"]:
+            motor = motor + state[-1]
         # What the gear carries beside the motor's torque.
         carried = self.pulling(q, push)
         against, loose = carried, q
         if self.soft:
-            x, w = state[2:]
+            x, w = state[2:4]
             apart, pulled = q - x, self.pulling(x, push)
             # The load's speed at the end of the stage is this and `follows` times the motor's.
             loose = (fixed.over * w + apart - self.slack * pulled) / (fixed.over + fixed.drag)
@@ -153,10 +168,15 @@ class Rule:
                 weak = self.solved(free, held, friction, carried, light, 0 * held)
                 speed = np.where(torque == held, speed, weak)
         speed = np.minimum(np.maximum(speed, -_FASTEST), _FASTEST)
-        if not self.soft:
-            return q + h * speed, speed
-        far = np.minimum(np.maximum(loose + fixed.follows * speed, -_FASTEST), _FASTEST)
-        return q + h * speed, speed, state[2] + h * far, far
+        ended: State = q + h * speed, speed
+        if self.soft:
+            far = np.minimum(np.maximum(loose + fixed.follows * speed, -_FASTEST), _FASTEST)
+            ended = *ended, state[2] + h * far, far
+        if self.has["integral"]:
+            # Beyond the limit of the motor it stands still (anti-windup).
+            grown = state[-1] + fixed.rate * h * (u - ended[0])
+            ended = *ended, np.minimum(np.maximum(grown, -limit), limit)
+        return ended
 
     def solved(
         self, free: Array, motor: Array, friction: Array, carried: Array | float, light: Array, stiff: Array

@@ -35,17 +35,19 @@ def moved(
     viscous: float = VISCOUS,
     limit: float = np.inf,
     drive: float = 0.0,
+    integral: float = 0.0,
 ) -> Array:
     """Position of `INERTIA q'' = motor - (viscous - drive) q' - weight sin q - dry tanh(q' / 0.002)`, where the motor
-    makes `GAIN (u - q) - drive q'` within its limit."""
+    makes `GAIN (u - q + integral * integral of u - q) - drive q'` within its limit."""
 
     def rate(t: float, state: Array) -> list[float]:
         u = float(np.interp(t - delay, time, asked))
-        motor = np.clip(GAIN * (u - state[0]) - drive * state[1], -limit, limit)
+        motor = np.clip(GAIN * (u - state[0] + integral * state[2]) - drive * state[1], -limit, limit)
         torque = motor - (viscous - drive) * state[1] - weight * np.sin(state[0]) - dry * np.tanh(state[1] / 0.002)
-        return [float(state[1]), float(torque / INERTIA)]
+        return [float(state[1]), float(torque / INERTIA), float(u - state[0])]
 
-    found = solve_ivp(rate, (time[0], time[-1]), [asked[0], 0.0], "LSODA", time, rtol=1e-6, atol=1e-8, max_step=0.01)
+    begin = [asked[0], 0.0, 0.0]
+    found = solve_ivp(rate, (time[0], time[-1]), begin, "LSODA", time, rtol=1e-6, atol=1e-8, max_step=0.01)
     return np.asarray(found.y[0])
 
 

@@ -27,7 +27,17 @@ TIME = np.sort(np.arange(0, 4, 0.01) + np.random.default_rng(0).uniform(0, 0.003
 OWN = {"inertia": INERTIA / GAIN, "viscous": VISCOUS / GAIN}
 
 
-@pytest.mark.parametrize("real", [{}, {"weight": 0.3}, {"delay": 0.03}, {"dry": 0.1}, {"limit": 0.12, "drive": 0.05}])
+@pytest.mark.parametrize(
+    "real",
+    [
+        {},
+        {"weight": 0.3},
+        {"delay": 0.03},
+        {"dry": 0.1},
+        {"limit": 0.12, "drive": 0.05},
+        {"integral": 3.0, "weight": 0.3},
+    ],
+)
 def test_it_moves_as_its_equation_says(real: dict[str, float]) -> None:
     asked = command(0, TIME)
     torques = {"weight": "gravity_sin", "dry": "coulomb", "drive": "drive_damping"}

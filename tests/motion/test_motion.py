@@ -18,6 +18,7 @@ from ccnn_torch.motion import (
     load_identified,
     load_logs,
     nominal_of,
+    write_identified,
 )
 from ccnn_torch.records import read_table
 from ccnn_torch.report.json_files import load_schema
@@ -264,3 +265,18 @@ def test_a_gain_is_told_as_a_share_of_that_of_the_model(tmp_path: Path) -> None:
     found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS | {"gain": GAIN / 0.8}, ["rad"]), ["servo_gain"])
     assert found.content["effects"][0]["parameters"]["q1 proportional gain"]["value"] == pytest.approx(-0.2, abs=0.004)
     assert findings(found.content)[0].text.startswith("wrong servo gain of joint 1: proportional gain -20")
+
+
+def test_integral_action_is_named_with_its_integral_gain(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.csv", integral=2.0, weight=0.3)
+    nominal = nominal_of("servo", KEYS | {"gravity_sin": 0.3}, ["rad"])
+    found = diagnose_motion(load_logs([log]), nominal, ["integral_action", "servo_gain", "viscous", "gravity", "cogging"])
+    assert found.content["verdict"]["effects"] == ["integral_action"]
+    assert found.content["verdict"]["probability"] > 0.95
+    value = found.content["effects"][0]["parameters"]["q1 integral gain"]
+    assert value["unit"] == "1/s" and value["value"] == pytest.approx(2.0, rel=0.03)
+    # The identified servo has it as a key, and goes where the real one went.
+    write_identified(tmp_path, found, nominal, KEYS | {"gravity_sin": 0.3})
+    keys = json.loads((tmp_path / "identified_motion.json").read_text())["mechanism_keys"]
+    left = diagnose_motion(load_logs([log]), nominal_of("servo", keys, ["rad"]), ["integral_action", "viscous"])
+    assert left.content["verdict"]["none"] and left.content["gap"]["before"] < 0.1 * found.content["gap"]["before"]

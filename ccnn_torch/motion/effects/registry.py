@@ -12,6 +12,7 @@ from ccnn_torch.motion.effects.delay import DELAY
 from ccnn_torch.motion.effects.flexible_joint import FLEXIBLE_JOINT
 from ccnn_torch.motion.effects.gravity import GRAVITY
 from ccnn_torch.motion.effects.inertia import INERTIA
+from ccnn_torch.motion.effects.integral_action import INTEGRAL_ACTION
 from ccnn_torch.motion.effects.offset import OFFSET
 from ccnn_torch.motion.effects.payload import PAYLOAD
 from ccnn_torch.motion.effects.protocol import MotionEffect
@@ -29,7 +30,7 @@ EFFECTS: dict[str, MotionEffect] = {
     effect.name: effect
     for effect in (
         *(DELAY, SERVO_GAIN, OFFSET, GRAVITY, PAYLOAD, INERTIA, VISCOUS, COULOMB, STRIBECK, BACKLASH),
-        *(FLEXIBLE_JOINT, SPEED_LIMIT, SATURATION, SUPPLY, COGGING, THERMAL_FRICTION),
+        *(FLEXIBLE_JOINT, SPEED_LIMIT, SATURATION, SUPPLY, COGGING, THERMAL_FRICTION, INTEGRAL_ACTION),
     )
 }
 

@@ -8,7 +8,7 @@ __all__ = ["CAUSES", "FAMILIES", "OUTSIDE", "PAIRS", "SIX", "truth_of"]
 
 CAUSES = (
     *("delay", "servo_gain", "offset", "gravity", "payload", "inertia", "viscous", "coulomb", "stribeck", "backlash"),
-    *("flexible_joint", "speed_limit", "saturation", "supply", "cogging"),
+    *("flexible_joint", "speed_limit", "saturation", "supply", "cogging", "integral_action"),
 )
 PAIRS = (
     ("delay", "coulomb"),

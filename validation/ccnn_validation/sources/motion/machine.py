@@ -19,6 +19,7 @@ class Axis:
         kp: position gain [N m/rad].
         force: limit of the motor's torque [N m]; 0 = none.
         tilt: of the gravity vector in the plane of the motion [rad].
+        integral: integral gain over the proportional one [1/s]; 0 = none.
         play, spring: width of a play and stiffness of a spring behind the motor; 0 = none.
     """
 
@@ -30,6 +31,7 @@ class Axis:
     kp: float
     force: float = 0.0
     tilt: float = 0.0
+    integral: float = 0.0
     play: float = 0.0
     spring: float = 0.0
     extra: dict[str, float] = field(default_factory=dict)

@@ -140,6 +140,8 @@ def _changed(
         elif cause == "supply":
             low = generator.uniform(0.5, 0.75)
             voltage = _drooping(low)
+        elif cause == "integral_action":
+            real = replace(real, integral=generator.uniform(0.5, 4.0))
         elif cause == "cogging":
             pushes.append(_toothed(0.02 * size * kp, float(generator.integers(6, 20)), generator.uniform(0, 6.28)))
         elif cause == "rubber_stop":
@@ -265,7 +267,7 @@ def _simulated(
     found = np.zeros((len(time), n))
     kp = model.actuator_gainprm[:, 0].copy()
     # One second at the first command, so that it begins at rest.
-    now, k = float(time[0]) - 1.0, 0
+    now, k, memory = float(time[0]) - 1.0, 0, 0.0
     while k < len(time):
         data.ctrl[:] = sent[max(k - 1, 0)] + (
             (sent[k] - sent[k - 1]) * (now - time[k - 1]) / (time[k] - time[k - 1]) if k else 0.0
@@ -273,8 +275,10 @@ def _simulated(
         if volts is not None and axis is not None:
             share = volts[k] / _VOLTS
             model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1] = kp * share, -kp * share
-        if push is not None:
-            data.qfrc_applied[0] = push(now, float(data.qpos[0]), float(data.qvel[0]))
+        if axis is not None and axis.integral:
+            memory += step * axis.kp * axis.integral * float(data.ctrl[0] - data.qpos[0])
+        pushed = 0.0 if push is None else push(now, float(data.qpos[0]), float(data.qvel[0]))
+        data.qfrc_applied[0] = pushed + memory
         mujoco.mj_step(model, data)
         now += step
         while k < len(time) and now >= time[k]:
