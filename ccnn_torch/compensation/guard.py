@@ -53,17 +53,23 @@ class Promise:
         edges = [domain["inputs"][c["name"]] for c in facts["joints"] + facts["covariates"]]
         limits = [facts["limits"][c["name"]] for c in facts["joints"]]
         low, high = (np.array([edge[k] for edge in edges], dtype=float) for k in ("low", "high"))
-        centre, half_range = (np.array(principal[k], dtype=float) for k in ("centre", "half_range"))
+        # As floats at once: of an integer of more than 64 bits numpy makes an object, which has no `hypot`.
+        centre, half_range, least, most = (
+            np.array(principal[k], dtype=float) for k in ("centre", "half_range", "low", "high")
+        )
+        limit, safe, sd = (
+            np.array([entry[k] for entry in limits], dtype=float) for k in ("limit", "safe_correction", "safe_sd")
+        )
         return cls(
-            np.array([entry["limit"] for entry in limits], dtype=float),
-            np.hypot([entry["safe_correction"] for entry in limits], [entry["safe_sd"] for entry in limits]),
+            limit,
+            np.hypot(safe, sd),
             centre,
             low,
             high,
             half_range,
             np.concatenate([np.eye(len(centre)), np.array(principal["directions"], dtype=float)]),
-            np.concatenate([(low - centre) / half_range, principal["low"]]),
-            np.concatenate([(high - centre) / half_range, principal["high"]]),
+            np.concatenate([(low - centre) / half_range, least]),
+            np.concatenate([(high - centre) / half_range, most]),
         )
 
     @classmethod

@@ -361,6 +361,21 @@ def test_tensors_that_do_not_fit(copied: Path, change: Callable[[dict[str, torch
         load_model(path)
 
 
+@pytest.mark.parametrize("number", [-(2**63) - 1, 10**400])
+def test_an_integer_of_many_digits_is_a_number_or_refused(copied: Path, number: int) -> None:
+    for change in (
+        lambda facts: next(iter(facts["limits"].values())).update(safe_correction=number),
+        lambda facts: facts["domain"]["principal"]["low"].__setitem__(0, number),
+    ):
+        facts = facts_of(copied)
+        change(facts)
+        path = forge_master(copied, facts, lambda tensors: None)
+        try:
+            assert np.isfinite(load_model(path)(np.zeros(3))["command"]).all()
+        except ModelFileError as refused:
+            assert str(path) in str(refused)
+
+
 LEAVES = ("domain", "limits", "joints", "network", "lipschitz", "iterations", "covariates", "pose", "mechanism")
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=5),
