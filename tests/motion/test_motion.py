@@ -123,7 +123,7 @@ def test_causes_have_their_values_and_a_corrected_command_is_followed(tmp_path: 
     assert values["delay"]["q1 delay"]["value"] == pytest.approx(0.03, rel=0.05)
     assert values["coulomb"]["q1 coulomb"]["value"] == pytest.approx(0.1, rel=0.1)
     assert values["coulomb"]["q1 coulomb"]["unit"] == "N*m"
-    assert values["gravity"]["q1 sin"]["value"] == pytest.approx(0.3, rel=0.05)
+    assert values["gravity"]["q1 torque at 90 degrees"]["value"] == pytest.approx(0.3, rel=0.05)
     time = np.arange(0, 4, 0.01)
     wanted = command(2, time)
     lines = [f"{t:.12g},{np.degrees(u):.12g}" for t, u in zip(time, wanted, strict=True)]

@@ -93,7 +93,7 @@ def test_a_mujoco_model_is_a_model_and_gets_the_new_values(tmp_path: Path) -> No
     nominal = nominal_of(str(model), {}, ["rad"])
     found = diagnose_motion(load_logs([log]), nominal, ["gravity", "delay", "coulomb"])
     assert sorted(found.content["verdict"]["effects"]) == ["coulomb", "gravity"]
-    sag = next(e for e in found.content["effects"] if e["name"] == "gravity")["parameters"]["q1 sin"]
+    sag = next(e for e in found.content["effects"] if e["name"] == "gravity")["parameters"]["q1 torque at 90 degrees"]
     assert sag["value"] == pytest.approx(0.3 - 0.2 * 9.80665 * 0.1, rel=0.15) and sag["unit"] == "N*m"
     assert write_identified(tmp_path, found, nominal, {}) == ["identified_motion.json", "identified.xml"]
     better = load_identified(tmp_path / "identified_motion.json")

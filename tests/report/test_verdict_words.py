@@ -36,7 +36,7 @@ def test_a_verdict_is_two_sentences_with_its_figures(name: str) -> None:
 def test_the_verdict_of_each_kind() -> None:
     assert verdict_text(one_effect()[0]) == (
         "The gap of 420 µm is 20 times the noise. Joint compliance under load explains it (probability 0.98) and would "
-        "remove 93 % [91, 95] of what is above the noise on rows not used for fitting (420 µm → 113 µm)."
+        "remove 93 % [91, 95] of what is above the noise on data not used for fitting (420 µm → 113 µm)."
     )
     assert "backlash together explain it (probability 0.95) and would remove 99.5 % [98.0" in verdict_text(
         two_effects()[0]

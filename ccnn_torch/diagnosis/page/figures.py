@@ -41,10 +41,10 @@ def gap_plot(results: Block) -> Plot | None:
             dashes = ":" if results.get("noise") == "estimated" else "--"
             axes.axvline(floor / scale, color=FLOOR, linestyle=dashes, label=label)
             axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
-        axes.set_xlabel(f"{name} gap, RMS on rows not used for fitting [{unit}]")
+        axes.set_xlabel(f"{name} gap, RMS on data not used for fitting [{unit}]")
         axes.set_title(f"{name.capitalize()} gap")
     caption = (
-        "How far the model is from the machine on rows not used for fitting: as it is, with one effect alone, and "
+        "How far the model is from the machine on data not used for fitting: as it is, with one effect alone, and "
         "with all effects of the verdict. Whiskers: 95 % intervals. Dashed: the noise as given or as the records show "
         "it. Dotted: an estimate of the noise, which may hold another cause, so that a model can get below it."
     )

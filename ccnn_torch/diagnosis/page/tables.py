@@ -21,7 +21,7 @@ from ccnn_torch.report.table import Table
 Block = Mapping[str, Any]
 _Z95 = 1.96
 _REMOVED = (
-    "Removed: share of the mean square above the noise that goes on rows not used for fitting; it is unknown (–) where "
+    "Removed: share of the mean square above the noise that goes on data not used for fitting; it is unknown (–) where "
     "the gap is not above the noise."
 )
 
@@ -51,12 +51,12 @@ def gap_table(results: Block, about: About) -> Table:
         rows.append((f"{name} [{unit}]", *sizes, number_text(ratio, 3), percent(block["reducible_share"])))
     columns = ("gap", "before", "after", floor_words(results), "before / noise [1]", "above the noise [%]")
     note = (
-        "RMS over the rows not used for fitting of the distance between measured and modelled pose; after: with the "
+        "RMS over the data not used for fitting of the distance between measured and modelled pose; after: with the "
         "effects of the verdict in the model; above the noise: share of the mean square that a better model could "
         "remove."
     )
     if results.get("motion"):
-        note = note.replace("rows not used", "runs not used").replace("pose;", "position;")
+        note = note.replace("pose;", "position;")
     return Table("How large is the gap?", columns, tuple(rows), f"{note} {about.noise}".rstrip())
 
 

@@ -81,7 +81,7 @@ def gap_words(results: Block) -> str:
     """The first sentence: how large the gap is, and how large against the noise."""
     blocks = _blocks(results)
     if not blocks:
-        return "There is no gap between model and machine on the rows not used for fitting."
+        return "There is no gap between model and machine on the data not used for fitting."
     gaps = " and ".join(size_text(block["before"], block) for block in blocks)
     times = [_times(block["before"] / block["noise_floor"]) for block in blocks if block["noise_floor"]]
     if len(times) < len(blocks):
@@ -285,10 +285,10 @@ def _removed(results: Block, joint: str) -> str:
     if results.get("noise", "given") == "estimated":
         whole = 1 - (blocks[0]["after"] / blocks[0]["before"]) ** 2
         return (
-            f"{joint}{100 * max(whole, 0.0):.0f} % of its mean square on rows not used for fitting "
+            f"{joint}{100 * max(whole, 0.0):.0f} % of its mean square on data not used for fitting "
             f"({before} → {after}), or {text.removeprefix(joint)} of it if all that is left is noise"
         )
-    return f"{text} of what is above the noise on rows not used for fitting ({before} → {after})"
+    return f"{text} of what is above the noise on data not used for fitting ({before} → {after})"
 
 
 def _blocks(results: Block) -> list[Block]:

@@ -11,8 +11,8 @@ from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 GRAVITY = MotionEffect(
     "gravity",
     lambda axis: (
-        Number("sin", "torque", 0.1, (add("gravity_sin"),), 0.2),
-        Number("cos", "torque", 0.1, (add("gravity_cos"),), 0.0),
+        Number("torque at 90 degrees", "torque", 0.1, (add("gravity_sin"),), 0.2),
+        Number("torque at 0 degrees", "torque", 0.1, (add("gravity_cos"),), 0.0),
     ),
     missing=lambda axis: (
         "" if axis.unit == "rad" else "a turning joint (the weight on a sliding one looks like an offset)"
