@@ -72,8 +72,8 @@ _WORDS = {
     "gravity": Words(
         "sag under the machine's own weight",
         "sag under the own weight",
-        "Sag for each metre of lever of the weight on a turning joint, or along a sliding one. Of a motion the torque of "
-        "the weight beyond that of the model, where the gain is not given as the angle by which the command must lead.",
+        "Sag for each metre of lever of the weight on a turning joint, or along a sliding one. Of a motion the torque "
+        "of the weight beyond the model's, or where the gain is not given the angle by which the command must lead.",
         "Counterbalance, brake and bearings of {where}, and the payload that the controller knows.",
     ),
     "thermal": Words(

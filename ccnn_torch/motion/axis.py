@@ -2,13 +2,13 @@
 
 The motor's torque is the gain times (command less position). With everything divided by the nominal gain, an axis obeys
 
-    inertia * q'' = clip(gain * supply * (u - q + integral * I), 1 / weakness)
+    inertia * q'' = clip(gain * supply * (u - q + integral * I + derivative * (u' - q')), 1 / weakness)
                     - viscous * q' - F(q') * sign(q') - weight(q) - teeth(q)
 
-where u is the command after delay, speed limit and offset, and I the integral of u - q over the time: torques are then angles (N m per N m/rad), the inertia is
-in s^2, the viscous friction in s; a part of that which the drive makes is within the limit, too. With all of these 0
-the position follows the command exactly: that axis is nominal where nothing is known. Behind a flexible joint, load and
-weight hang on a spring that pulls at the motor.
+where u is the command after delay, speed limit and offset, and I the integral of u - q over the time: torques are then
+angles (N m per N m/rad), the inertia is in s^2, the viscous friction in s; a part of that which the drive makes is
+within the limit, too. With all of these 0 the position follows the command exactly: that axis is nominal where nothing
+is known. Behind a flexible joint, load and weight hang on a spring that pulls at the motor.
 """
 
 from __future__ import annotations
@@ -70,6 +70,13 @@ def delayed(time: Tensor, values: Tensor, delay: Tensor) -> Tensor:
     return (x0 + (x1 - x0) * share).reshape(b, p, s).transpose(0, 1)
 
 
+def _slope(time: Tensor, values: Tensor) -> Tensor:
+    """Central differences, `... x b x s`."""
+    rise, run = values.diff(dim=-1), time.diff(dim=-1)
+    inner = (rise[..., 1:] + rise[..., :-1]) / (run[..., 1:] + run[..., :-1])
+    return torch.cat([rise[..., :1] / run[..., :1], inner, rise[..., -1:] / run[..., -1:]], -1)
+
+
 def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     """Positions of axes.
 
@@ -88,6 +95,11 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     if bool((tensors["delay"] != 0).any()):
         u = delayed(drive.time, u, tensors["delay"])
     u = u.expand(*shape, -1) + tensors["offset"][..., None]
+    if bool((tensors["derivative"] != 0).any()):
+        u = u + tensors["derivative"][..., None] * _slope(drive.time, u)
+        # The other half of it resists the speed, within the limit of the motor.
+        damping = tensors["gain"] * tensors["derivative"]
+        tensors |= {n: tensors[n] + damping for n in ("viscous", "drive_damping")}
     a = {n: v.numpy() for n, v in tensors.items()}
     steps = drive.time.diff(dim=-1).numpy().T
     # Samples first: one sample of all runs lies together in memory.

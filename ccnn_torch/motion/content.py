@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.diagnosis.shrink.held_out import INTERVAL, Draws, Gap
@@ -125,7 +126,7 @@ def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, no
         what = "most of it is no noise of the encoder" if floor > step else "rounding alone leaves 0.29 times the step"
         notes.append(
             f"what the best model leaves is {number_text(floor / step, 2)} times the encoder's step of "
-            f"{number_text(step, 2)} {data.units[0]}: {what}"
+            f"{number_text(step, 2)} {data.units[0]}{' (all joints together)' if len(data.units) > 1 else ''}: {what}"
         )
     order = found.whitening.coefficients.shape[1]
     notes.append(
@@ -136,8 +137,16 @@ def notes_of(problem: Problem, nominal: Nominal, found: Search, floor: float, no
 
 
 def _resolution(data: Stretches) -> float:
-    """The encoder's step: the smallest change, where nearly all are multiples of it; else 0."""
-    steps = np.diff(np.unique(data.position[0][data.judged].numpy()))
+    """Steps of the encoders that move, root of their summed squares, as the floor is of all joints; 0 where one has
+    none."""
+    moving = [position[data.judged].numpy() for position in data.position]
+    steps = [_step_of(position) for position in moving if np.ptp(position) > 0]
+    return math.hypot(*steps) if all(steps) else 0.0
+
+
+def _step_of(position: NDArray[np.float64]) -> float:
+    """The smallest change of a joint, where nearly all are multiples of it; else 0."""
+    steps = np.diff(np.unique(position))
     steps = steps[steps > 1e-9]
     if not len(steps):
         return 0.0

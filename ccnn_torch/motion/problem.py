@@ -24,7 +24,10 @@ _KNOWN = 0.03
 # Share of a sampling step by which the time stamps of commands and positions may differ (standard deviation).
 _STAMP = 0.1
 _WEIGHT = ("gravity_sin", "gravity_cos")
-_LOOSE = (*_WEIGHT, "gain", "integral", "inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "delay")
+_LOOSE = (
+    *(*_WEIGHT, "gain", "integral", "derivative", "inertia", "viscous", "coulomb", "load_friction", "stribeck"),
+    *("weakness", "delay"),
+)
 
 
 @dataclass(frozen=True)

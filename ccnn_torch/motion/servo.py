@@ -15,6 +15,7 @@ from ccnn_torch.spelling import nearest
 KEYS: dict[str, str] = {
     "gain": "proportional gain; without it torques are told as angles [N*m/rad]",
     "integral": "integral gain over the proportional one, 1 over the integral time [1/s]",
+    "derivative": "derivative gain, of command less position, over the proportional one [s]",
     "inertia": "of the axis about its own axis, without mass * length^2 of its load [kg*m^2]",
     "mass": "of the load at the end of its lever, which hangs down at 0 [kg]",
     "length": "lever of the load [m]",
@@ -48,7 +49,8 @@ TORQUES = (*("inertia", "viscous", "coulomb", "stribeck", "gravity_sin", "gravit
 """Parameters that are torques, which an axis has over the gain."""
 _SIGNED = ("delay", "offset", "gravity_sin", "gravity_cos", "cogging_sin", "cogging_cos", "thermal")
 _SAME = {
-    **{"integral": "integral", "delay": "delay", "offset": "offset", "backlash": "play", "backlash_loaded": "play_loaded"},
+    **{"integral": "integral", "derivative": "derivative", "delay": "delay", "offset": "offset"},
+    **{"backlash": "play", "backlash_loaded": "play_loaded"},
     "backlash_friction": "play_friction",
     **{"load_friction": "load_friction", "stribeck_speed": "stribeck_speed", "cogging_order": "cogging_order"},
     **{"flexibility": "flexibility", "flexible_damping": "flexible_damping", "thermal": "thermal"},

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 ABSENT: dict[str, float] = {
     "gain": 1.0,
     "integral": 0.0,
+    "derivative": 0.0,
     "inertia": 0.0,
     "load": 0.0,
     "viscous": 0.0,
@@ -53,13 +54,14 @@ _FASTEST = 1e4
 
 
 State = tuple[Array, ...]
-"""Position and speed of the motor, of the load where it hangs on a spring, and last the torque of the integral action."""
+"""Position and speed of the motor, of the load where it hangs on a spring; last the torque of the integral action."""
 
 
 class _Fixed(NamedTuple):
-    """Of one sample: length of a stage, gain (with what the integral adds to it within the stage), rate of the integral,
-    limit and dry friction, inertia and resistance over the length, stiffness; of a flexible joint its inertia and its damping over the stage, over its stiffness, and the share of a speed of the motor
-    that its load follows with."""
+    """Of one sample: length of a stage, gain (with what the integral adds to it within the stage), rate of the
+    integral, limit and dry friction, inertia and resistance over the length, stiffness; of a flexible joint its inertia
+    and its damping over the stage, over its stiffness, and the share of a speed of the motor that its load follows
+    with."""
 
     h: Array
     gain: Array

@@ -36,6 +36,7 @@ OWN = {"inertia": INERTIA / GAIN, "viscous": VISCOUS / GAIN}
         {"dry": 0.1},
         {"limit": 0.12, "drive": 0.05},
         {"integral": 3.0, "weight": 0.3},
+        {"derivative": 0.02, "limit": 0.2},
     ],
 )
 def test_it_moves_as_its_equation_says(real: dict[str, float]) -> None:

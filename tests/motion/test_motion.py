@@ -263,14 +263,27 @@ def test_rows_of_a_run_need_not_be_adjacent(tmp_path: Path) -> None:
 def test_a_gain_is_told_as_a_share_of_that_of_the_model(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.csv", (0,), 2.4)
     found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS | {"gain": GAIN / 0.8}, ["rad"]), ["servo_gain"])
-    assert found.content["effects"][0]["parameters"]["q1 proportional gain"]["value"] == pytest.approx(-0.2, abs=0.004)
+    parameters = found.content["effects"][0]["parameters"]
+    assert [*parameters] == ["q1 proportional gain"]
+    assert parameters["q1 proportional gain"]["value"] == pytest.approx(-0.2, abs=0.004)
     assert findings(found.content)[0].text.startswith("wrong servo gain of joint 1: proportional gain -20")
+
+
+def test_a_derivative_gain_is_told_in_seconds_over_the_proportional_one(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.csv", derivative=0.02)
+    found = diagnose_motion(load_logs([log]), nominal_of("servo", KEYS, ["rad"]), ["servo_gain", "delay", "viscous"])
+    assert found.content["verdict"]["effects"] == ["servo_gain"]
+    assert found.content["verdict"]["probability"] > 0.95
+    parameters = found.content["effects"][0]["parameters"]
+    assert [*parameters] == ["q1 derivative gain"]
+    assert parameters["q1 derivative gain"]["value"] == pytest.approx(0.02, rel=0.03)
 
 
 def test_integral_action_is_named_with_its_integral_gain(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.csv", integral=2.0, weight=0.3)
     nominal = nominal_of("servo", KEYS | {"gravity_sin": 0.3}, ["rad"])
-    found = diagnose_motion(load_logs([log]), nominal, ["integral_action", "servo_gain", "viscous", "gravity", "cogging"])
+    tried = ["integral_action", "servo_gain", "viscous", "gravity", "cogging"]
+    found = diagnose_motion(load_logs([log]), nominal, tried)
     assert found.content["verdict"]["effects"] == ["integral_action"]
     assert found.content["verdict"]["probability"] > 0.95
     value = found.content["effects"][0]["parameters"]["q1 integral gain"]

@@ -8,16 +8,26 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import Facts, MotionEffect, Number, add, scaled
 
+_PROPORTIONAL, _DERIVATIVE = "proportional gain", "derivative gain"
+
 
 def _numbers(axis: Facts) -> tuple[Number, ...]:
     if not axis.driven:
         # The time by which the position lags, 1 over the velocity gain.
         return (Number("lag", "s", 0.03, (add("viscous"),)),)
-    return (Number("proportional gain", "1", 0.5, (scaled("gain"),), 0.0),)
+    return (
+        Number(_PROPORTIONAL, "1", 0.5, (scaled("gain"),), 0.0),
+        # Of command less position, over the proportional gain; one of the position alone is viscous friction.
+        Number(_DERIVATIVE, "s", 0.03, (add("derivative"),)),
+    )
 
 
-SERVO_GAIN = MotionEffect(
-    "servo_gain",
-    _numbers,
-    lambda axis: ({"proportional gain": 0.3}, {"proportional gain": -0.3}) if axis.driven else ({},),
-)
+def _shapes(axis: Facts) -> list[dict[str, float | None]]:
+    """One gain or the other."""
+    if not axis.driven:
+        return [{}]
+    either = [{_PROPORTIONAL: v, _DERIVATIVE: None} for v in (0.3, -0.3)]
+    return [*either, *({_PROPORTIONAL: None, _DERIVATIVE: v} for v in (0.01, -0.01))]
+
+
+SERVO_GAIN = MotionEffect("servo_gain", _numbers, _shapes)

@@ -9,6 +9,7 @@ __all__ = ["CAUSES", "FAMILIES", "OUTSIDE", "PAIRS", "SIX", "truth_of"]
 CAUSES = (
     *("delay", "servo_gain", "offset", "gravity", "payload", "inertia", "viscous", "coulomb", "stribeck", "backlash"),
     *("flexible_joint", "speed_limit", "saturation", "supply", "cogging", "integral_action"),
+    "derivative_gain",
 )
 PAIRS = (
     ("delay", "coulomb"),
@@ -48,7 +49,7 @@ def truth_of(family: str) -> Truth:
         return Truth("none", (), (frozenset(),))
     if name in OUTSIDE:
         return Truth("outside", (name,), (frozenset(),), True, OUTSIDE[name])
-    causes = tuple(name.split("+"))
+    causes = tuple("servo_gain" if cause == "derivative_gain" else cause for cause in name.split("+"))
     accepted = [frozenset(causes)]
     for cause in causes:
         for other in _ALSO.get(cause, ()):

@@ -140,6 +140,9 @@ def _changed(
         elif cause == "supply":
             low = generator.uniform(0.5, 0.75)
             voltage = _drooping(low)
+        elif cause == "derivative_gain":
+            share = 0.3 * size * nominal.damping / kp
+            real, told = replace(real, damping=real.damping + share * kp), _then(told, _leading(share))
         elif cause == "integral_action":
             real = replace(real, integral=generator.uniform(0.5, 4.0))
         elif cause == "cogging":
@@ -183,6 +186,10 @@ def _late(delay: float) -> Told:
 
 def _shifted(amount: float) -> Told:
     return lambda time, command: command + amount
+
+
+def _leading(seconds: float) -> Told:
+    return lambda time, command: command + seconds * np.gradient(command, time)
 
 
 def _slow(fastest: float) -> Told:
