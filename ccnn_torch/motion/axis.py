@@ -22,7 +22,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ccnn_torch.motion.stage import ABSENT, GAMMA, TINY, Rule, falling, load_inertia, wave_of
+from ccnn_torch.motion.play import hung, played
+from ccnn_torch.motion.stage import ABSENT, GAMMA, TINY, Rule, wave_of
 
 Array = NDArray[np.float64]
 # Steps longer than this, in units of the axis' own time constant, are divided.
@@ -111,9 +112,9 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     moved = _moved(drive, steps, commands, push, a)
     if np.any(a["play"] > 0):
         loaded = a["play_loaded"] > 0
-        driven = _played(moved, a["play"] / 2)
+        driven = played(moved, a["play"] / 2)
         if np.any(loaded):
-            driven = np.where(loaded, _hung(steps, moved, push, a), driven)
+            driven = np.where(loaded, hung(steps, moved, push, a), driven)
         moved = driven
     return torch.from_numpy(moved).permute(1, 2, 0)
 
@@ -170,38 +171,4 @@ def _limited(steps: Array, u: Array, fastest: Array, begin: Array) -> Array:
     for k in range(len(steps)):
         reach = fastest * steps[k]
         found[k + 1] = found[k] + np.minimum(np.maximum(u[k + 1] - found[k], -reach), reach)
-    return found
-
-
-def _played(q: Array, half: Array) -> Array:
-    """The driven side of a play, which rests in the middle at first."""
-    found = q.copy()
-    for k in range(1, len(q)):
-        found[k] = np.maximum(np.minimum(found[k - 1], q[k] + half), q[k] - half)
-    return found
-
-
-def _hung(steps: Array, q: Array, push: Array | None, a: Mapping[str, Array]) -> Array:
-    """The driven side of a play, which is free between its ends but for its friction, and does not bounce there."""
-    fall, hang = falling(a)
-    inertia, half = load_inertia(a), a["play"] / 2
-    light = np.where(inertia > 0, 1 / np.maximum(inertia, TINY), 0.0)
-    found = q.copy()
-
-    def pulled(x: Array, k: int) -> Array:
-        return np.asarray(fall * np.sin(x + hang) + (0.0 if push is None else push[k] * light))
-
-    x, v = q[0] - half * np.sign(pulled(q[0], 0)), np.zeros_like(q[0])
-    found[0] = x
-    for k in range(len(steps)):
-        h = steps[k]
-        v = v - h * pulled(x, k)
-        # Its bearing brakes it, up to standstill.
-        v = np.sign(v) * np.maximum(np.abs(v) - h * a["play_friction"], 0.0)
-        free = x + h * v
-        low, high = q[k + 1] - half, q[k + 1] + half
-        held = np.minimum(np.maximum(free, low), high)
-        v = np.where(held == free, v, (q[k + 1] - q[k]) / h)
-        x = held
-        found[k + 1] = x
     return found

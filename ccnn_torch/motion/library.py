@@ -17,7 +17,7 @@ from ccnn_torch.motion.stage import ABSENT
 # What may not be below 0, and what not above.
 _POSITIVE = (
     *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "play"),
-    *("flexibility", "gain", "integral"),
+    *("flexibility", "gain", "integral", "derivative"),
 )
 # With more damping a spring is no spring.
 _MOST = {"load_friction": 0.9, "flexible_damping": 0.3}

@@ -202,10 +202,3 @@ def wave_of(sine: Array, cosine: Array) -> tuple[Array, Array]:
 def load_inertia(a: Mapping[str, Array]) -> Array:
     """Inertia behind a joint: that of the load, or where it is not known all of the axis'."""
     return np.where(a["load"] > 0, a["load"], a["inertia"])
-
-
-def falling(a: Mapping[str, Array]) -> tuple[Array, Array]:
-    """Size and phase of the acceleration by which the weight turns the far side of a joint back [rad/s^2]."""
-    weight, hang = wave_of(a["gravity_sin"], a["gravity_cos"])
-    inertia = load_inertia(a)
-    return np.where(inertia > 0, weight / np.maximum(inertia, TINY), 0.0), hang

@@ -156,3 +156,13 @@ def test_a_motor_near_its_limit_may_have_another_voltage_than_the_one_recorded()
     found = library.parameters(torch.tensor([[0.0, 1.0]], dtype=torch.float64).expand(2, -1), torch.arange(2))
     assert found["gain"].tolist() == [pytest.approx(np.exp(0.3)), 1.0] and "supply" not in found
     assert library_of(motion_effects(["supply"]), [replace(facts, error=0.1, supply=0.0)]).lacking[0]
+
+
+def test_what_one_model_has_changes_nothing_of_those_beside_it() -> None:
+    asked, moving = command(0, TIME[100:]), [[0.2, 1.5]]
+    drive = Drive(torch.from_numpy(TIME[None, 100:]), torch.from_numpy(asked)[None], torch.tensor(moving).double())
+    shared = {name: torch.tensor([[value]]).double() for name, value in (OWN | {"integral": 3.0}).items()}
+    alone = simulate_axes(drive, shared)[0]
+    for other in ("slowness", "weakness", "flexibility", "play", "derivative", "stribeck"):
+        beside = simulate_axes(drive, shared | {other: torch.tensor([[0.0], [0.05]]).double()})
+        assert (beside[0] - alone).abs().max() < 1e-9, other

@@ -26,8 +26,9 @@ def _shapes(axis: Facts) -> list[dict[str, float | None]]:
     """One gain or the other."""
     if not axis.driven:
         return [{}]
+    derivative = (0.01, -0.01) if axis.nominal.get("derivative") else (0.01,)
     either = [{_PROPORTIONAL: v, _DERIVATIVE: None} for v in (0.3, -0.3)]
-    return [*either, *({_PROPORTIONAL: None, _DERIVATIVE: v} for v in (0.01, -0.01))]
+    return [*either, *({_PROPORTIONAL: None, _DERIVATIVE: v} for v in derivative)]
 
 
 SERVO_GAIN = MotionEffect("servo_gain", _numbers, _shapes)
