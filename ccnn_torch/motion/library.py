@@ -11,20 +11,21 @@ from torch import Tensor
 
 from ccnn_torch.motion.effects import Facts, MotionEffect, Number
 from ccnn_torch.motion.effects.checked import refuse_wrong_effect
+from ccnn_torch.motion.effects.cogging import FEWEST
 from ccnn_torch.motion.effects.own_parameter import OWN
 from ccnn_torch.motion.stage import ABSENT
 
 # What may not be below 0, and what not above.
 _POSITIVE = (
     *("inertia", "viscous", "coulomb", "load_friction", "stribeck", "weakness", "slowness", "play"),
-    *("flexibility", "gain", "integral", "derivative"),
+    *("flexibility", "gain", "integral", "derivative", "supply"),
 )
-# With more damping a spring is no spring.
-_MOST = {"load_friction": 0.9, "flexible_damping": 0.3}
+# With more damping a spring is no spring; a motor is no stronger than its voltage, but for an error of that.
+_MOST = {"load_friction": 0.9, "flexible_damping": 0.3, "supply": 1.5}
 # Share of the largest speed up to which friction may fall with the speed: what falls later is plain dry friction.
 _SLOW = 0.5
-# Fewer periods in a turn are a weight or an offset; a spring without any damping never comes to rest.
-_LEAST = {"cogging_order": 2.0, "flexible_damping": 1e-3}
+# A spring without any damping never comes to rest.
+_LEAST = {"cogging_order": FEWEST, "flexible_damping": 1e-3}
 # Plausible sizes up to which a simulator is linear in its own parameters.
 _REACH = 0.6
 # Plausible sizes: no number is larger.
@@ -100,7 +101,7 @@ class Library(NamedTuple):
                     if name.startswith(OWN):
                         centre = self.about.get(number.name, 0.0) / number.scale
                         low[i, j], high[i, j] = centre - _REACH, centre + _REACH
-                    if how == "add" and name in _POSITIVE:
+                    if how == "add" and name in _POSITIVE and factor:
                         nominal = self.facts[i].nominal.get(name, ABSENT[name])
                         low[i, j] = max(float(low[i, j]), -nominal / (factor * number.scale))
                         high[i, j] = min(float(high[i, j]), (_MOST.get(name, math.inf) - nominal) / number.scale)
