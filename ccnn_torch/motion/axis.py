@@ -71,13 +71,6 @@ def delayed(time: Tensor, values: Tensor, delay: Tensor) -> Tensor:
     return (x0 + (x1 - x0) * share).reshape(b, p, s).transpose(0, 1)
 
 
-def _slope(time: Tensor, values: Tensor) -> Tensor:
-    """Central differences, `... x b x s`."""
-    rise, run = values.diff(dim=-1), time.diff(dim=-1)
-    inner = (rise[..., 1:] + rise[..., :-1]) / (run[..., 1:] + run[..., :-1])
-    return torch.cat([rise[..., :1] / run[..., :1], inner, rise[..., -1:] / run[..., -1:]], -1)
-
-
 def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     """Positions of axes.
 
@@ -96,11 +89,6 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     if bool((tensors["delay"] != 0).any()):
         u = delayed(drive.time, u, tensors["delay"])
     u = u.expand(*shape, -1) + tensors["offset"][..., None]
-    if bool((tensors["derivative"] != 0).any()):
-        u = u + tensors["derivative"][..., None] * _slope(drive.time, u)
-        # The other half of it resists the speed, within the limit of the motor.
-        damping = tensors["gain"] * tensors["derivative"]
-        tensors |= {n: tensors[n] + damping for n in ("viscous", "drive_damping")}
     a = {n: v.numpy() for n, v in tensors.items()}
     steps = drive.time.diff(dim=-1).numpy().T
     # Samples first: one sample of all runs lies together in memory.
@@ -109,6 +97,11 @@ def simulate_axes(drive: Drive, parameters: Mapping[str, Tensor]) -> Tensor:
     if np.any(a["slowness"] > 0):
         begin = np.where(a["slowness"] > 0, _held_at(drive, push, a), commands[0])
         commands = _limited(steps, commands, 1 / np.maximum(a["slowness"], TINY), begin)
+    if np.any(a["derivative"]):
+        commands = commands + _lead(steps, commands, a["derivative"], a["integral"])
+        # The other half of it resists the speed, within the limit of the motor.
+        damping = a["gain"] * a["derivative"]
+        a |= {n: a[n] + damping for n in ("viscous", "drive_damping")}
     moved = _moved(drive, steps, commands, push, a)
     if np.any(a["play"] > 0):
         loaded = a["play_loaded"] > 0
@@ -171,4 +164,18 @@ def _limited(steps: Array, u: Array, fastest: Array, begin: Array) -> Array:
     for k in range(len(steps)):
         reach = fastest * steps[k]
         found[k + 1] = found[k] + np.minimum(np.maximum(u[k + 1] - found[k], -reach), reach)
+    return found
+
+
+def _lead(steps: Array, u: Array, derivative: Array, integral: Array) -> Array:
+    """What a derivative gain adds to commands, `s x p x b`; less what the integral action would make of that, which
+    integrates the commands alone."""
+    step, rise = steps[:, None], np.diff(u, axis=0)
+    inner = (rise[1:] + rise[:-1]) / (step[1:] + step[:-1])
+    found: Array = derivative * np.concatenate([rise[:1] / step[:1], inner, rise[-1:] / step[-1:]])
+    if np.any(integral):
+        change = np.diff(found, axis=0)
+        for k in range(len(steps)):
+            fades = 0.5 * integral * steps[k]
+            found[k + 1] = (found[k] * (1 - fades) + change[k]) / (1 + fades)
     return found

@@ -16,6 +16,7 @@ from ccnn_torch.diagnosis.verdict.text import listed, unseen_text
 from ccnn_torch.display import number_text
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.motion.effects import Facts, Number
+from ccnn_torch.motion.form import deviations
 from ccnn_torch.motion.judge import AxisVerdict
 from ccnn_torch.motion.library import Library
 from ccnn_torch.motion.nominal import Nominal
@@ -79,7 +80,7 @@ def effects_of(
         for i, v in enumerate(verdicts):
             fit = v.best if e in v.best.members else next((f for f in found.found[i] if f.members == (e,)), None)
             if fit is not None and (e in v.best.members or not any(e in w.best.members for w in verdicts)):
-                parameters |= _parameters(library, i, fit, e)
+                parameters |= _parameters(library, i, fit, e, found.found[i][0].noise + found.form[i])
         rows.append(
             {
                 "name": name,
@@ -150,7 +151,7 @@ def _step_of(position: NDArray[np.float64]) -> float:
     steps = steps[steps > 1e-9]
     if not len(steps):
         return 0.0
-    least = float(np.quantile(steps, 0.1))
+    least = float(steps.min())
     whole = np.abs(steps / least - np.round(steps / least)) < 0.1
     return least if whole.mean() > 0.9 else 0.0
 
@@ -169,12 +170,15 @@ def _unit(unit: str, axis: Facts) -> tuple[str, float]:
     return known.get(unit, (unit, 1.0))
 
 
-def _parameters(library: Library, axis: int, fit: Fit, effect: int) -> dict[str, dict[str, Any]]:
-    """The numbers of one effect of a fit, as `parameters` of diagnosis.json; value: the difference to the model."""
+def _parameters(library: Library, axis: int, fit: Fit, effect: int, variance: float) -> dict[str, dict[str, Any]]:
+    """The numbers of one effect of a fit, as `parameters` of diagnosis.json; value: the difference to the model.
+
+    variance: of noise and form errors.
+    """
     facts = library.facts[axis]
     found: dict[str, dict[str, Any]] = {}
     flat = fit.spec.flat
-    deviation = fit.covariance.diagonal().clamp_min(0).sqrt()
+    deviation = deviations(fit, variance)
     for j in (j for j in library.places[effect] if j in flat):
         number: Number = library.numbers[axis][j]
         unit, factor = _unit(number.unit, facts)

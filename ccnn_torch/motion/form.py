@@ -63,6 +63,17 @@ def weighed(grams: Grams, sets: Sequence[Sequence[Tensor]], columns: int, varian
     return fit_sets(left, sets, CERTAIN * grams.values)
 
 
+def deviations(fit: Fit, variance: float) -> Tensor:
+    """Standard deviations of a set's numbers, `m` in plausible sizes, under a noise that holds form errors as well.
+
+    The values of the nominal model are taken for exact here.
+    """
+    m, grams = len(fit.spec.flat), fit.grams
+    own = grams._replace(xx=grams.xx[:m, :m], xy=grams.xy[:m])
+    found = weighed(own, [fit.spec.groups], m, max(variance, fit.noise))
+    return found.covariance[0, :m, :m].diagonal().clamp_min(0).sqrt()
+
+
 def unseen_errors(found: Sequence[Sequence[Fit]]) -> list[float]:
     """Variance in every direction by which the best of each axis' sets is worse on runs that it was not fitted to."""
     return [max(min(f.unseen for f in own) - min(f.rss for f in own), 0.0) / DIRECTIONS for own in found]

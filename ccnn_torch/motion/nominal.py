@@ -66,6 +66,7 @@ class Nominal:
         axes: parameters of each axis, as in `ABSENT`.
         gains: N m/rad of each axis, None where it is not known.
         lengths: lever of each axis' load [m].
+        masses: of each axis' load at the end of its lever [kg]; empty where the model is no servo.
         heaviest: as of `Facts`.
         supply: nominal supply voltage; None where the motor's strength is not known to follow it.
         simulator: makes the positions that the axes follow; None where they follow the commands.
@@ -81,6 +82,7 @@ class Nominal:
     simulator: Simulator | None = None
     notes: tuple[str, ...] = ()
     heaviest: float | None = None
+    masses: tuple[float, ...] = ()
     loaded: Callable[[Array, Array, Array | None], Loaded] | None = None
 
     @property

@@ -151,7 +151,11 @@ class Problem:
     @property
     def stamped(self) -> Tensor:
         """What the positions change by when time stamps are off by what they are known to, `n x b x s`."""
-        return _STAMP * float(self.data.time.diff(dim=-1).median()) * self.data.speed
+        # Of the log itself, of which every so many samples are evaluated.
+        rows = self.data.log
+        there = (rows >= 0)[:, 1:]
+        step = self.data.time.diff(dim=-1)[there] / rows.diff(dim=-1)[there]
+        return _STAMP * float(step.median()) * self.data.speed
 
     def _moved(self, theta: Tensor, axis: Tensor, rows: Tensor, start: Tensor) -> Tensor:
         data, p, b = self.data, len(theta), len(rows)

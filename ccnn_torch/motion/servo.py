@@ -17,6 +17,7 @@ KEYS: dict[str, str] = {
     "integral": "integral gain over the proportional one, 1 over the integral time [1/s]",
     "derivative": "derivative gain, of command less position, over the proportional one [s]",
     "inertia": "of the axis about its own axis, without mass * length^2 of its load [kg*m^2]",
+    "load_inertia": "part of inertia that is behind a play or flexible joint; without it and mass all is [kg*m^2]",
     "mass": "of the load at the end of its lever, which hangs down at 0 [kg]",
     "length": "lever of the load [m]",
     "viscous": "viscous friction, the motor's damping included [N*m*s/rad]",
@@ -59,6 +60,10 @@ _SAME = {
 }
 
 
+# Share of an inertia below which a difference of two is none.
+_ROUNDING = 1e-9
+
+
 def servo(keys: Mapping[str, Any], n: int) -> Nominal:
     """The servo with `n` axes.
 
@@ -73,20 +78,22 @@ def servo(keys: Mapping[str, Any], n: int) -> Nominal:
                 f"{f'; {near!r} is the nearest' if near else ''}; it has {', '.join(KEYS)}"
             )
     each = {key: _numbers(key, value, n) for key, value in keys.items()}
-    axes, gains, lengths = [], [], []
+    axes, gains, lengths, masses = [], [], [], []
     for i in range(n):
         own = {key: values[i] for key, values in each.items()}
         gain = own.get("gain")
-        needs = [k for k in (*TORQUES, "mass", "torque_limit") if own.get(k)]
+        needs = [k for k in (*TORQUES, "load_inertia", "mass", "torque_limit") if own.get(k)]
         if gain is None and needs:
             raise InputError(f"mechanism_keys: {needs[0]} is given without gain; give gain [N*m/rad] as well")
         if own.get("mass") and not own.get("length"):
             raise InputError("mechanism_keys: mass is given without length; give the lever of the load [m] as well")
         unit = gain or 1.0
+        if own.get("load_inertia", 0.0) > own.get("inertia", 0.0):
+            raise InputError("mechanism_keys: load_inertia is a part of inertia, and larger; give inertia as a whole")
         axis = {name: own[name] / unit for name in TORQUES if name in own}
         load, lever = own.get("mass", 0.0), own.get("length", 0.0)
         axis["inertia"] = axis.get("inertia", 0.0) + load * lever**2 / unit
-        axis["load"] = load * lever**2 / unit
+        axis["load"] = (own.get("load_inertia", 0.0) + load * lever**2) / unit
         axis["gravity_sin"] = axis.get("gravity_sin", 0.0) + load * STANDARD_GRAVITY * lever / unit
         axis |= {name: own[key] for key, name in _SAME.items() if key in own}
         if own.get("torque_limit"):
@@ -98,8 +105,9 @@ def servo(keys: Mapping[str, Any], n: int) -> Nominal:
         axes.append({name: value for name, value in axis.items() if value})
         gains.append(gain)
         lengths.append(own.get("length"))
+        masses.append(load)
     supply = each["supply"][0] if each.get("supply") else None
-    return Nominal("servo", tuple(axes), tuple(gains), tuple(lengths), supply)
+    return Nominal("servo", tuple(axes), tuple(gains), tuple(lengths), supply, masses=tuple(masses))
 
 
 def axis_keys(nominal: Nominal, axes: Sequence[Mapping[str, float]], added: Sequence[float]) -> dict[str, Any]:
@@ -113,10 +121,12 @@ def axis_keys(nominal: Nominal, axes: Sequence[Mapping[str, float]], added: Sequ
     each = []
     for i, axis in enumerate(axes):
         unit, lever = nominal.gains[i] or 1.0, nominal.lengths[i] or 0.0
-        mass = max(nominal.axes[i].get("load", 0.0) * unit / lever**2 + added[i], 0.0) if lever else 0.0
+        mass = max(nominal.masses[i] + added[i], 0.0) if lever else 0.0
+        behind = nominal.axes[i].get("load", 0.0) * unit - nominal.masses[i] * lever**2
         own = {name: unit * axis.get(name, 0.0) for name in TORQUES}
         own["inertia"] = max(own["inertia"] - mass * lever**2, 0.0)
         own["gravity_sin"] -= mass * STANDARD_GRAVITY * lever
+        own["load_inertia"] = behind if behind > _ROUNDING * own["inertia"] else 0.0
         own |= {"gain": unit * axis.get("gain", 1.0), "mass": mass, "length": lever or 1.0}
         own |= {key: axis.get(name, ABSENT[name]) for key, name in _SAME.items()}
         own["speed_limit"] = 1 / axis["slowness"] if axis.get("slowness") else 0.0

@@ -82,7 +82,7 @@ def cut_stretches(logs: Sequence[Log]) -> Stretches:
             f"{_LEAD + _SHORTEST:g} s"
         )
     if max(strides) > 1:
-        notes.append(f"of the samples every {max(strides)}. was evaluated, one in {_STEP * 1e3:.0f} ms or so")
+        notes.append(f"one sample in {max(strides)} was evaluated, one in {_STEP * 1e3:.0f} ms or so")
     if len(pieces) > _MOST:
         notes.append(f"{_MOST} of {count_text(len(pieces), 'stretch')}, spread evenly over the logs, were evaluated")
         pieces = [pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, _MOST).round().astype(int))]

@@ -37,6 +37,7 @@ OWN = {"inertia": INERTIA / GAIN, "viscous": VISCOUS / GAIN}
         {"limit": 0.12, "drive": 0.05},
         {"integral": 3.0, "weight": 0.3},
         {"derivative": 0.02, "limit": 0.2},
+        {"derivative": 0.03, "integral": 5.0, "dry": 0.02},
     ],
 )
 def test_it_moves_as_its_equation_says(real: dict[str, float]) -> None:

@@ -116,7 +116,7 @@ def test_pairs_are_told_once_with_their_angle_and_what_separates_them() -> None:
     del results["effects"][0]["signatures"]
     without = confusable_table(results)
     assert without is not None and [row[2:4] for row in without.rows] == [("–", "–")] * 2
-    assert "(these rows do not distinguish them)" in verdict_text(results)
+    assert "(these data do not distinguish them)" in verdict_text(results)
 
 
 def test_what_a_network_would_still_gain_is_one_sentence() -> None:
@@ -203,7 +203,7 @@ def test_a_browser_shows_all_of_the_page(folder: Path, tmp_path: Path) -> None:
         assert 0 < seen["verdict"]["top"] < 200 and seen["verdict"]["height"] > 20
         assert len(seen["figures"]) == 6 and len(seen["tables"]) == 10
         assert all(0.5 * min(width, 600) < f["width"] <= width and f["height"] > 60 for f in seen["figures"])
-        assert "these rows do not distinguish them" in seen["text"] and "&amp;" not in seen["text"]
+        assert "these data do not distinguish them" in seen["text"] and "&amp;" not in seen["text"]
 
 
 def test_a_machine_of_many_joints_and_conditions_has_its_next_measurements_on_the_page(tmp_path: Path) -> None:

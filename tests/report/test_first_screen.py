@@ -132,7 +132,7 @@ def test_what_to_do_now_names_files_columns_and_commands() -> None:
     results["noise"] = "estimated"
     assert "the noise estimated at 21.0 µm" in _told(results)["What it removes"]
     assert "the noise is not known" in _told(results)["How sure"]
-    assert "or geometry error or base frame off: these rows do not distinguish them" in told["What is wrong"].text
+    assert "or geometry error or base frame off: these data do not distinguish them" in told["What is wrong"].text
 
 
 def test_nothing_bad_rows_and_what_is_outside_are_said() -> None:

@@ -14,7 +14,7 @@ from ccnn_torch.diagnosis.search.analysis import analyse
 from ccnn_torch.diagnosis.verdict.text import lacking_text
 from ccnn_torch.effects import Effect, Situation
 
-# Cosine of the angle between what two effects can do beyond which these rows do not distinguish them.
+# Cosine of the angle between what two effects can do beyond which these data do not distinguish them.
 _ALIKE = 0.95
 
 

@@ -134,7 +134,8 @@ def _measure(results: Block, about: About) -> str:
     wanted = results["next_measurements"]
     if wanted:
         rivals = list(dict.fromkeys(name for entry in wanted for name in entry["separates"]))
-        aim = f"to tell {listed(rivals, 'from')} apart" if rivals else "to sharpen the numbers"
+        alone = "to sharpen the numbers" if results["verdict"]["effects"] else "to see smaller effects"
+        aim = f"to tell {listed(rivals, 'from')} apart" if rivals else alone
         aim = f"to see whether {rivals[0]} acts" if len(rivals) == 1 else aim
         path = f"{about.folder}/{NEXT}" if about.folder else NEXT
         motion = wanted[0].get("motion")

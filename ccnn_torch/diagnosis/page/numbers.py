@@ -50,7 +50,7 @@ def numbers_table(results: Block, most: int) -> Table | None:
         columns, cells = columns[:3], [row[:3] for row in rows]
     if left_out:
         notes.append(f"{left_out} more that are clearly not 0 are in diagnosis.json.")
-    notes.append("The intervals hold if nothing else acts.")
+    notes.append("The intervals hold if nothing else acts and the rest of the model is right.")
     return Table("Numbers to enter", columns, tuple(cells), " ".join(notes))
 
 

@@ -157,7 +157,7 @@ def parameter_table(results: Block, most: int = 24) -> Table | None:
 
 
 def confusable_table(results: Block) -> Table | None:
-    """Pairs of effects that these rows do not distinguish, why, and which measurement would."""
+    """Pairs of effects that these data do not distinguish, why, and which measurement would."""
     odds = {e["name"]: e["probability"] for e in results["effects"]}
     rows, listed = [], set()
     for effect in results["effects"]:

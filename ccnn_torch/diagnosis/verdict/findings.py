@@ -74,7 +74,7 @@ def findings(results: Block) -> list[Finding]:
             n for n in by_name.get(name, {}).get("indistinguishable_from", ()) if n not in results["verdict"]["effects"]
         ]
         if like:
-            text += f" (or {listed([words_of(n).short for n in like], 'or')}: these rows do not distinguish them)"
+            text += f" (or {listed([words_of(n).short for n in like], 'or')}: these data do not distinguish them)"
         found.append(Finding(name, text, words.look.format(where=places(most) if most else "the machine")))
     return found
 

@@ -90,7 +90,8 @@ def gap_words(results: Block) -> str:
     if results.get("noise", "given") == "estimated":
         left = f"the gap of {gaps} is {many} times what the best explanation leaves"
         doubt = in_doubt(results)
-        return f"The noise is not known: {left}, and that may hold another cause." if doubt else f"{capital(left)}."
+        known = "; how much of what is left is noise is not known" if doubt else ""
+        return f"{capital(left)}{known}."
     return f"The gap of {gaps} is {many} times the noise{_NOISE_FROM.get(results.get('noise', 'given'), '')}."
 
 
@@ -255,7 +256,7 @@ def _cause(results: Block) -> str:
 
 
 def _with_class(name: str, like: Sequence[str], signatures: Block) -> str:
-    """An effect with those that may replace it, and why these rows do not distinguish them: the angles."""
+    """An effect with those that may replace it, and why these data do not distinguish them: the angles."""
     if not like:
         return effect_words(name)
     angles = [signatures[n]["angle"] for n in like if n in signatures]
@@ -265,7 +266,7 @@ def _with_class(name: str, like: Sequence[str], signatures: Block) -> str:
         size = "less than 0.1°" if widest < 0.1 else f"{'up to ' if len(angles) > 1 else ''}{widest:.1f}°"
         reason = f": on these poses their signatures are {size} apart"
     others = listed([effect_words(n) for n in like], "or")
-    return f"{effect_words(name)}, or {others} (these rows do not distinguish them{reason})"
+    return f"{effect_words(name)}, or {others} (these data do not distinguish them{reason})"
 
 
 def _removed(results: Block, joint: str) -> str:
