@@ -20,6 +20,7 @@ from ccnn_torch.motion import (
     nominal_of,
     write_identified,
 )
+from ccnn_torch.motion.servo import axis_keys
 from ccnn_torch.records import read_table
 from ccnn_torch.report.json_files import load_schema
 
@@ -288,8 +289,21 @@ def test_integral_action_is_named_with_its_integral_gain(tmp_path: Path) -> None
     assert found.content["verdict"]["probability"] > 0.95
     value = found.content["effects"][0]["parameters"]["q1 integral gain"]
     assert value["unit"] == "1/s" and value["value"] == pytest.approx(2.0, rel=0.03)
+    # Form errors are in the standard deviation; the noise of the encoder alone would give a tenth of it.
+    assert abs(value["value"] - 2.0) < 3 * value["sd"] < 0.3
     # The identified servo has it as a key, and goes where the real one went.
     write_identified(tmp_path, found, nominal, KEYS | {"gravity_sin": 0.3})
     keys = json.loads((tmp_path / "identified_motion.json").read_text())["mechanism_keys"]
     left = diagnose_motion(load_logs([log]), nominal_of("servo", keys, ["rad"]), ["integral_action", "viscous"])
     assert left.content["verdict"]["none"] and left.content["gap"]["before"] < 0.1 * found.content["gap"]["before"]
+
+
+def test_the_part_of_an_inertia_that_is_the_load_is_a_key_and_is_kept() -> None:
+    keys = {"gain": 2.0, "inertia": 10.0, "load_inertia": 6.0, "mass": 3.0, "length": 0.5}
+    nominal = nominal_of("servo", keys, ["rad"])
+    assert nominal.axes[0]["load"] == pytest.approx((6.0 + 0.75) / 2) and nominal.axes[0]["inertia"] == 10.75 / 2
+    told = axis_keys(nominal, nominal.axes, [0.5])
+    assert told["load_inertia"] == [pytest.approx(6.0)] and told["mass"] == [3.5]
+    assert told["inertia"] == [pytest.approx(10.0 - 0.5 * 0.25)]
+    with pytest.raises(InputError, match="load_inertia is a part of inertia"):
+        nominal_of("servo", keys | {"inertia": 5.0}, ["rad"])
