@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ccnn_torch.motion.effects.protocol import MotionEffect, Number, add
 
-# 1 over an integral time of a second, as position controllers of servos have it; and how it may begin.
+# Its plausible size is that of an integral time of a second.
 INTEGRAL_ACTION = MotionEffect(
     "integral_action",
     lambda axis: (Number("integral gain", "1/s", 1.0, (add("integral"),)),),
