@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import islice
 from typing import NamedTuple
 
 import torch
@@ -184,7 +185,7 @@ class _Pool:
                 [self.found[i][without(self.library, f.spec, k).members] for k in range(len(f.members))]
                 for i, f in enumerate(before)
             ]
-            self.fit(self.screened(bases, 2), _LONG)
+            self.fit(self.screened(bases), _LONG)
             if all(a.members == b.members for a, b in zip(before, self.best(), strict=True)):
                 return
 
@@ -208,15 +209,16 @@ class _Pool:
             ]
 
     def screened(self, bases: Sequence[Sequence[Fit]], most: int = _FITTED) -> list[list[Spec]]:
-        """For each base the effects that promise most, by what a difference quotient of each explains."""
+        """For each base the new effects that promise most, by what a difference quotient of each explains."""
         wanted: list[dict[tuple[int, ...], Spec]] = [{} for _ in bases]
         for i, fit in [(i, fit) for i, own in enumerate(bases) for fit in own]:
             scores: dict[int, tuple[float, Variant]] = {}
             for score, variant in promise(self.problem, self.whitening, i, fit, self.loose[i], self.noise_of(i)):
                 if variant.effect not in scores or score > scores[variant.effect][0]:
                     scores[variant.effect] = (score, variant)
-            for _, variant in sorted(scores.values(), key=lambda item: -item[0])[:most]:
-                spec = started(self.library, fit.spec, variant, i)
-                if spec.members not in self.found[i]:
-                    wanted[i].setdefault(spec.members, spec)
+            ranked = (variant for _, variant in sorted(scores.values(), key=lambda item: -item[0]))
+            specs = (started(self.library, fit.spec, variant, i) for variant in ranked)
+            new = (spec for spec in specs if spec.members not in self.found[i])
+            for spec in islice(new, most):
+                wanted[i].setdefault(spec.members, spec)
         return [list(w.values()) for w in wanted]
