@@ -126,7 +126,8 @@ def axis_keys(nominal: Nominal, axes: Sequence[Mapping[str, float]], added: Sequ
         own = {name: unit * axis.get(name, 0.0) for name in TORQUES}
         own["inertia"] = max(own["inertia"] - mass * lever**2, 0.0)
         own["gravity_sin"] -= mass * STANDARD_GRAVITY * lever
-        own["load_inertia"] = behind if behind > _ROUNDING * own["inertia"] else 0.0
+        # A part of what was identified, which may be less than the model had.
+        own["load_inertia"] = min(behind, own["inertia"]) if behind > _ROUNDING * own["inertia"] else 0.0
         own |= {"gain": unit * axis.get("gain", 1.0), "mass": mass, "length": lever or 1.0}
         own |= {key: axis.get(name, ABSENT[name]) for key, name in _SAME.items()}
         own["speed_limit"] = 1 / axis["slowness"] if axis.get("slowness") else 0.0

@@ -305,5 +305,9 @@ def test_the_part_of_an_inertia_that_is_the_load_is_a_key_and_is_kept() -> None:
     told = axis_keys(nominal, nominal.axes, [0.5])
     assert told["load_inertia"] == [pytest.approx(6.0)] and told["mass"] == [3.5]
     assert told["inertia"] == [pytest.approx(10.0 - 0.5 * 0.25)]
+    # Less inertia than the model says its load has: what is written is a servo all the same.
+    less = axis_keys(nominal, [{**nominal.axes[0], "inertia": 4.75 / 2}], [0.0])
+    assert less["load_inertia"] == less["inertia"] == [pytest.approx(4.0)]
+    assert nominal_of("servo", less, ["rad"]).axes[0]["load"] == pytest.approx(4.75 / 2)
     with pytest.raises(InputError, match="load_inertia is a part of inertia"):
         nominal_of("servo", keys | {"inertia": 5.0}, ["rad"])
