@@ -8,12 +8,13 @@ from ccnn_torch.compensation.effects.effects import Care as Care
 from ccnn_torch.compensation.effects.effects import PhysicalEffects as PhysicalEffects
 from ccnn_torch.compensation.effects.effects import effect_deviation as effect_deviation
 from ccnn_torch.compensation.effects.effects import expand_effects as expand_effects
-from ccnn_torch.compensation.effects.settled import settled_effects as settled_effects
 from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
 from ccnn_torch.compensation.geometry.identified import Geometry as Geometry
-from ccnn_torch.compensation.geometry.identified import fit_geometry_module as fit_geometry_module
+from ccnn_torch.compensation.geometry.expanded import expand_geometry as expand_geometry
 from ccnn_torch.compensation.geometry.identified import geometric_deviation as geometric_deviation
-from ccnn_torch.compensation.geometry.identified import settled_damping as settled_damping
+from ccnn_torch.compensation.machine.inverse import build_machine as build_machine
+from ccnn_torch.compensation.machine.machine import Machine as Machine
+from ccnn_torch.compensation.machine.machine import Rule as Rule
 from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry as IdentifiedGeometry
 from ccnn_torch.compensation.model_files.identified import load_compensation as load_compensation
 from ccnn_torch.compensation.model_files.identified import sign_model as sign_model

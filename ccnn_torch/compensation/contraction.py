@@ -14,8 +14,6 @@ from ccnn_torch.compensation.domain import Domain
 # A unique command exists below a slope of 1. At this one the fixed point takes 40 steps, and
 # a slope that sampling missed still has room.
 STEEPEST_DEVIATION = 0.5
-# What is left to geometry and known effects of such slopes: the fixed point then takes 17 steps.
-GENTLE = 0.2
 # What is left of the equation q + δ(q) = q*, as a share of the limit.
 TOLERANCE = 1e-12
 
@@ -87,17 +85,6 @@ def steepest(
         best = torch.maximum(best, found)
         step = step * 0.7
     return Steepness(_SAFETY * float(best.max()), min(1.0, float(sizes.max())))
-
-
-def least_step(gentle: Callable[[int], bool], last: int, first: int = 0) -> int:
-    """The first of the steps `first` … `last` that is gentle, by bisection; the last where none is."""
-    if gentle(first):
-        return first
-    low, high = first, last
-    while low + 1 < high:
-        middle = (low + high) // 2
-        low, high = (low, middle) if gentle(middle) else (middle, high)
-    return high
 
 
 def iterations_needed(found: Steepness, tolerance: float = TOLERANCE) -> int:

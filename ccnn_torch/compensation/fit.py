@@ -19,6 +19,7 @@ from ccnn_torch.compensation.contraction import (
 from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.compensation.effects.effects import PhysicalEffects
 from ccnn_torch.compensation.geometry.identified import Geometry
+from ccnn_torch.compensation.machine.machine import ASTRAY, FARTHEST, Machine
 from ccnn_torch.compensation.secant import secant_steps
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
@@ -31,6 +32,12 @@ _LEAST_SHARE = 0.1
 _GENTLE_STEPS = 8
 # Training inputs among the points where its steps are counted.
 _COUNTED = 512
+# A machine's command: the most steps, the share of regular points at which it need not settle, how often the distance
+# from singular poses at which it is damped is doubled, and how far a joint may move while that is found [m or rad].
+_MOST_STEPS, _UNSETTLED, _DOUBLINGS, _FAR = 12, 0.02, 3, 0.5
+_FEW = 1e-3
+# Of the largest deviation in and around the domain: what the whole deviation may be.
+_ROOM = 1.5
 
 
 def fit_compensator(
@@ -46,8 +53,9 @@ def fit_compensator(
     sd_scale: Tensor | None = None,
     geometry: Geometry | None = None,
     effects: PhysicalEffects | None = None,
+    machine: Machine | None = None,
 ) -> Compensator:
-    """Put guard, limit and fixed point around a trained network, and identified geometry and effects beside it.
+    """Put guard, limit and fixed point around a trained network, and the identified machine beside it.
 
     What the network learned is damped about its mean where δ is otherwise too steep for a command to be solved for.
 
@@ -58,13 +66,14 @@ def fit_compensator(
         deviations: training deviations of what the network learned, `s x n` [SI]; with `geometry` or `effects` what
             these leave. The mean of the deviations that fade out is the safe correction outside the domain.
         joints, covariates: coordinates in the order of the inputs.
-        limit: hard limit of |δ|, `n` [SI]; 1.5 times the largest training deviation of each joint, geometry included,
-            when None.
+        limit: hard limit of |δ|, `n` [SI], with a `machine` of what was learned; 1.5 times the largest training
+            deviation of each joint, geometry included, when None.
         margin: how far beyond the training inputs δ is trusted, as a share of their half range.
         transition: width over which it then fades into the safe correction, as a share of the half range.
         sd_scale: what the network's standard deviation is multiplied by, `n` [1]; 1 when None.
         geometry: deviation of the identified geometry, of one repeat.
         effects: deviation of known effects, of one repeat.
+        machine: the identified one, where it has closed forms; in the place of the two.
 
     Raises:
         InputError: shapes do not fit together, or a limit or a scale is out of its range.
@@ -84,8 +93,7 @@ def fit_compensator(
             total = fading = deviations + effects(inputs[:, :n] + deviations, inputs[:, n:])
         if geometry is not None:
             geometry = copy.deepcopy(geometry)
-            total = fading + geometry(inputs[:, :n] + fading)
-            fading = fading if geometry.extrapolates else total
+            total = fading = fading + geometry(inputs[:, :n] + fading)
     limit = default_limit(total) if limit is None else limit.detach()
     if limit.shape != (n,) or not bool((limit >= 0).all() & torch.isfinite(limit).all()):
         raise InputError(f"limit must be one finite number of at least 0 for each of the {n} joints")
@@ -99,21 +107,26 @@ def fit_compensator(
     # A copy: what is compensated with does not change when the learner trains on.
     frozen = copy.deepcopy(network).requires_grad_(False)
     size = {} if geometry is None and effects is None else {"count": 512, "at_once": 1024}
+    machine = copy.deepcopy(machine)
     share = 1.0
     for _ in range(_DAMPINGS):
         scaled = copy.deepcopy(scaling)
         scaled.deviation.mul_(share)
         compensator = Compensator(
             *(frozen, scaled, domain, limit, safe, joints, covariates, 0.0, 1, sd_scale / share, safe_sd),
-            *(geometry, effects),
+            *(geometry, effects, False, machine),
         )
-        found = steepest(compensator.deviation, inputs, domain, limit, **size)
+        slope = compensator.deviation if machine is None else compensator.learned
+        found = steepest(slope, inputs, domain, limit, **size)
         if not math.isfinite(found.lipschitz):
             raise MethodFailedError("the trained network gives values that are not finite within its domain")
         if found.lipschitz <= STEEPEST_DEVIATION:
             compensator.lipschitz, compensator.share = found.lipschitz, share
             compensator.iterations = iterations_needed(found)
-            _accelerate(compensator, inputs)
+            if machine is None:
+                _accelerate(compensator, inputs)
+            else:
+                settle(compensator, inputs)
             return compensator
         share *= 0.9 * STEEPEST_DEVIATION / found.lipschitz
         if share < _LEAST_SHARE:
@@ -137,3 +150,42 @@ def _accelerate(compensator: Compensator, inputs: Tensor) -> None:
     )  # fmt: skip
     compensator.secant = steps < compensator.iterations
     compensator.iterations = steps
+
+
+@torch.no_grad()
+def settle(compensator: Compensator, inputs: Tensor) -> None:
+    """Find how many steps the machine's command takes in and around the domain, and the bound of its deviation.
+
+    Where the command does not settle at regular poses the distance from singular ones at which it is damped is doubled.
+
+    Args:
+        inputs: training inputs, `s x (n + m)` [SI].
+    """
+    machine, n = compensator.machine, len(compensator.joints)
+    assert machine is not None
+    points = spread_points(inputs, compensator.domain, torch.Generator().manual_seed(1), _COUNTED)
+    joints, covariates, strange = compensator._inputs(points[:, :n], points[:, n:])
+    compensator.most.fill_(_FAR)
+    compensator.domain.huge.fill_(FARTHEST)
+    rule = machine.rule
+    for doubling in range(_DOUBLINGS + 1):
+        machine.rule = rule.farther(2.0**doubling)
+        aim = machine.aim(joints)
+        regular = aim[:, -1] <= 0
+        correction = torch.zeros_like(joints)
+        following = compensator.step(joints, covariates, strange, correction, aim)[1]
+        shares = []
+        for _ in range(_MOST_STEPS):
+            correction = following
+            _, following, doubt = compensator.step(joints - correction, covariates, strange, correction, aim)
+            shares.append(float((doubt[regular] > 0).double().mean()) if bool(regular.any()) else 0.0)
+            if shares[-1] == 0:
+                break
+        if shares[-1] <= _UNSETTLED:
+            break
+    # More steps settle few more, and are damped rows' alone.
+    compensator.iterations = next(k for k, share in enumerate(shares, 1) if share <= shares[-1] + _FEW)
+    compensator.unsettled = shares[-1]
+    near = doubt.squeeze(-1) <= ASTRAY
+    largest = correction[near].abs().amax(0) if bool(near.any()) else compensator.limit
+    compensator.most.copy_(torch.maximum(_ROOM * largest, compensator.limit))

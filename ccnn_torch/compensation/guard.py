@@ -27,7 +27,7 @@ class Promise:
     """What holds for every row of a model with n joints and d inputs, the joints first.
 
     Attributes:
-        limit: of |deviation|, `n` [SI]; infinity without one.
+        limit: of |deviation|, `n` [SI]: the card's `most_deviation`; infinity without one.
         sd: standard deviation where the deviation is taken as 0, `n` [SI]; None for a model without one.
         centre, low, high: replacements of an input that is no number, and for an infinite one, `d` [SI].
         half_range: unit of the rows of `directions`, `d` [SI].
@@ -58,7 +58,8 @@ class Promise:
             np.array(principal[k], dtype=float) for k in ("centre", "half_range", "low", "high")
         )
         limit, safe, sd = (
-            np.array([entry[k] for entry in limits], dtype=float) for k in ("limit", "safe_correction", "safe_sd")
+            np.array([entry[k] for entry in limits], dtype=float)
+            for k in ("most_deviation", "safe_correction", "safe_sd")
         )
         return cls(
             limit,
@@ -118,7 +119,8 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
 
     Returns:
         `command`, `deviation`, `ideal`, and `deviation_sd` where the promise has one, `s x n` [SI], all finite;
-        `inside_domain`, `ideal_inside_domain` and `fallback`, `s`, bool.
+        `inside_domain`, `ideal_inside_domain` and `fallback`, `s`, bool; `status` and `ideal_status`, `s`, int64: 0
+        exact, 1 outside what was measured or fallen back, 2 an input is not finite, 3 damped.
     """
     rows, n = joints.shape
     inputs = joints if covariates is None else np.concatenate([joints, covariates], -1)
@@ -133,7 +135,8 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
     # Where an output is no such numbers there are none.
     there = {name: _of_kind(found.get(name), (rows, n), np.float64) for name in floats}
     flags = {name: _of_kind(found.get(name), (rows,), np.bool_) for name in bools}
-    whole = all(value is not None for value in (*there.values(), *flags.values()))
+    states = {name: _of_kind(found.get(name), (rows,), np.int64) for name in ("status", "ideal_status")}
+    whole = all(value is not None for value in (*there.values(), *flags.values(), *states.values()))
     numbers = {name: safe[name] if value is None else value for name, value in there.items()}
 
     command, deviation, ideal = (numbers[name] for name in floats[:3])
@@ -147,11 +150,16 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
 
     checked = {name: np.where(kept_rows[:, None], numbers[name], safe[name]) for name in floats}
     known = kept_rows & ~strange.any(-1)
-    for name, at in (("inside_domain", checked["command"]), ("ideal_inside_domain", given)):
+    inside_of = {"inside_domain": ("status", checked["command"]), "ideal_inside_domain": ("ideal_status", given)}
+    for name, (state, at) in inside_of.items():
         flag = flags[name]
         if flag is None:
             flag = np.zeros(rows, dtype=bool)
         checked[name] = known & flag & promise.inside(np.concatenate([at, inputs[:, n:]], -1))
+        damped = known & (states[state] == 3) if states[state] is not None else np.zeros(rows, dtype=bool)
+        of_row = np.where(damped, 3, np.where(checked[name], 0, 1))
+        lost = strange.any(-1) | (states[state] == 2 if states[state] is not None else False)
+        checked[state] = np.where(lost, 2, of_row)
     return checked | {"fallback": ~kept_rows}
 
 

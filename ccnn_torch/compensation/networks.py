@@ -15,7 +15,8 @@ _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "grnn": "ccnn_torch.learners.grnn_network:GRNNNetwork",
     "gp": "ccnn_torch.learners.gp_posterior:GPNetwork",
     "masked": "ccnn_torch.evolution.masked_network:MaskedNetwork",
-    "serial_geometry": "ccnn_torch.compensation.geometry.serial:SerialGeometry",
+    "forward": "ccnn_torch.compensation.machine.machine:Machine",
+    "inverse": "ccnn_torch.compensation.machine.inverse:InverseMachine",
     "physical_effects": "ccnn_torch.compensation.effects.effects:PhysicalEffects",
     "expanded_geometry": "ccnn_torch.compensation.geometry.expanded:ExpandedGeometry",
 }

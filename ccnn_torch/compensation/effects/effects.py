@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ccnn_torch.compensation.effects.kinematic_fields import Fields, looked_at, make_fields
-from ccnn_torch.compensation.geometry.serial import _inverse
+from ccnn_torch.compensation.geometry.matrices import inverse
 from ccnn_torch.effects import Acting, Situation, make_effect
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 
@@ -90,7 +90,7 @@ class PhysicalEffects(nn.Module):
         covariates: names of the columns that come with the joints.
         acting: effects with their numbers; their own code runs on the fields.
         fields: what the effects see of the nominal machine.
-        care: what is done near singular poses.
+        care: what is done near singular poses; None for an arm, whose command is solved for with the effects in it.
         gravity: `3` [m/s²].
         numbers: of every effect by name and coefficient, for the model's card.
         export_tolerance: share of the limit to which exports agree.
@@ -106,7 +106,7 @@ class PhysicalEffects(nn.Module):
         covariates: Sequence[str],
         acting: Sequence[Acting],
         fields: Fields,
-        care: Care,
+        care: Care | None,
         numbers: Mapping[str, Mapping[str, float]],
     ) -> None:
         super().__init__()
@@ -132,12 +132,31 @@ class PhysicalEffects(nn.Module):
 
     def forward(self, joints: Tensor, covariates: Tensor) -> Tensor:
         """joints: commanded, `... x n` [SI]; covariates: `... x m` [SI]; returns the deviation, `... x n` [SI]."""
+        assert self.care is not None
+        here = self._situation(joints, covariates)
+        return effect_deviation(here, self.acting, self.fields.jacobian, self.care).reshape(joints.shape)
+
+    def changes(self, joints: Tensor, covariates: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """What the effects add to joints `... x n` and to position and rotation vector `... x c` [SI]; None for none.
+
+        Arguments as of a call.
+        """
+        here, found = self._situation(joints, covariates), dict[str, Tensor]()
+        for one in self.acting:
+            change, kind = one.change(here), one.effect.kind
+            found[kind] = found[kind] + change if kind in found else change
+        moved, shift = (found.get(kind) for kind in ("joints", "pose"))
+        lead = joints.shape[:-1]
+        return (
+            None if moved is None else moved.reshape(*lead, -1),
+            None if shift is None else shift.reshape(*lead, -1),
+        )
+
+    def _situation(self, joints: Tensor, covariates: Tensor) -> Situation:
         rows = joints.reshape(-1, joints.shape[-1])
         columns = covariates.reshape(-1, covariates.shape[-1]) if self.covariates else covariates
         given = {name: columns[:, i] for i, name in enumerate(self.covariates) if name != "time"}
-        here = self.fields.fill(Situation(self._mechanism[0], rows, given, self.gravity))
-        found = effect_deviation(here, self.acting, self.fields.jacobian, self.care)
-        return found.reshape(joints.shape)
+        return self.fields.fill(Situation(self._mechanism[0], rows, given, self.gravity))
 
     def describe(self) -> dict[str, Any]:
         """Everything `from_description` needs; the tensors are stored beside it."""
@@ -147,7 +166,7 @@ class PhysicalEffects(nn.Module):
             "covariates": self.covariates,
             "acting": [[one.effect.name, len(one.shape), len(one.coefficients)] for one in self.acting],
             "fields": self.fields.describe(),
-            "care": [None if value == math.inf else value for value in self.care],
+            "care": None if self.care is None else [None if value == math.inf else value for value in self.care],
             "numbers": self.numbers,
         }
 
@@ -156,8 +175,10 @@ class PhysicalEffects(nn.Module):
         """The module as it was described, its tensors 0."""
         # The reader of the file that contains this decides whether code may run.
         mechanism = mechanism_from_description(description["mechanism"], allow_code=True)
-        weight, damping, *most, free = description["care"]
-        gain, inverse_gain = (math.inf if m is None else float(m) for m in most)
+        care = None
+        if description["care"] is not None:
+            weight, damping, *most, free = description["care"]
+            care = Care(weight, damping, *(math.inf if m is None else float(m) for m in most), tuple(free))
         acting = [
             Acting(make_effect(name), *(torch.zeros(size, dtype=torch.float64) for size in sizes))
             for name, *sizes in description["acting"]
@@ -168,7 +189,7 @@ class PhysicalEffects(nn.Module):
             description["covariates"],
             acting,
             Fields.from_description(description["fields"], mechanism),
-            Care(weight, damping, gain, inverse_gain, tuple(free)),
+            care,
             description["numbers"],
         )
 
@@ -178,7 +199,7 @@ def expand_effects(
     acting: Sequence[Acting],
     covariates: Sequence[str],
     margin: float,
-    care: Care,
+    care: Care | None,
 ) -> PhysicalEffects:
     """Effects with their numbers as a module that a model file can hold.
 
@@ -187,7 +208,7 @@ def expand_effects(
         acting: effects of the library, without time.
         covariates: names of the compensator's covariates, in order.
         margin: of the compensator's domain.
-        care: what is done near singular poses; its `free` is found here.
+        care: what is done near singular poses, None for an arm; its `free` is found here.
 
     Raises:
         InputError, MethodFailedError: what the effects see of the machine cannot be expanded over these joints.
@@ -198,22 +219,23 @@ def expand_effects(
     free = []
     for one in acting:
         own = looked_at(Situation(mechanism, situation.joints[few], given, situation.gravity), one.change)
+        names |= own
         if one.effect.kind == "joints" and not own:
             free.append(one.effect.name)
-            continue
-        names |= own | {"jacobian"} | ({"parameter_jacobian"} if one.effect.kind == "parameters" else set())
+        elif care is not None:
+            names |= {"jacobian"} | ({"parameter_jacobian"} if one.effect.kind == "parameters" else set())
     fields = make_fields(mechanism, situation.gravity, names, situation.joints, margin)
     numbers: dict[str, dict[str, float]] = {}
     for one in acting:
         named = [c.name for c in one.effect.coefficients(situation)] + [s.name for s in one.effect.shapes(situation)]
         values = [*one.coefficients.tolist(), *one.shape.tolist()]
         numbers[one.effect.name] = dict(zip(named, values, strict=True))
-    care = care._replace(free=tuple(free))
+    care = None if care is None else care._replace(free=tuple(free))
     module = PhysicalEffects(mechanism, situation.gravity, covariates, acting, fields, care, numbers)
     module.requires_grad_(False)
     # Effects that ask which of their columns the workspace shows keep the answer; a traced graph could not ask.
     columns = [given.get(name, torch.zeros_like(situation.joints[few, 0])) for name in module.covariates]
-    module(situation.joints[few], torch.stack(columns, -1) if columns else situation.joints[few, :0])
+    module.changes(situation.joints[few], torch.stack(columns, -1) if columns else situation.joints[few, :0])
     return module
 
 
@@ -247,4 +269,4 @@ def _held(square: Tensor, most: float) -> Tensor:
 def _lifting(slope: Tensor, damping: float) -> Tensor:
     """Damped inverse of a weighted Jacobian, `... x n x c`."""
     unit = torch.eye(slope.shape[-1], dtype=slope.dtype)
-    return _inverse(slope.mT @ slope + max(damping, _LEAST_DAMPING) ** 2 * unit, unit) @ slope.mT
+    return inverse(slope.mT @ slope + max(damping, _LEAST_DAMPING) ** 2 * unit) @ slope.mT

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import onnx
@@ -12,24 +12,44 @@ from torch import Tensor
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.export.graph import Graph, Value
 from ccnn_torch.compensation.export.to_onnx import Traced, rows_apart_from
+from ccnn_torch.compensation.machine.machine import ASTRAY, Machine
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
 from ccnn_torch.compensation.secant import Step
 
 
 class _Step:
-    """δ at `joints - value`, of finite joints: the compensator's own formula in fewer operations."""
+    """What a step computes at `joints - correction`, of finite joints: the compensator's own formula in fewer
+    operations."""
 
     def __init__(self, compensator: Compensator) -> None:
         self.compensator = compensator
         # Without what is computed at the caged joints themselves, joints may be caged once, with room for a correction:
         # beyond the cage all deviations are the safe one.
-        self.caged_once = compensator.geometry is None and compensator.effects is None
+        parts = (compensator.geometry, compensator.effects, compensator.machine)
+        self.caged_once = all(part is None for part in parts)
 
-    def __call__(self, joints: Tensor, covariates: Tensor, strange: Tensor, value: Tensor) -> tuple[Tensor, ...]:
-        """Returns δ `s x n`, excess and weight `s x 1`, and the network's features."""
+    def __call__(self, joints: Tensor, covariates: Tensor, strange: Tensor, known: Tensor, *at: Tensor) -> tuple[Tensor, ...]:
+        """Returns the next correction `s x n`, excess and weight `s x 1`, the network's features, and doubt `s x 1`.
+
+        Args:
+            joints, covariates: finite, `s x n`, `s x m`.
+            strange, known: how many inputs were not finite, and 1 where none was, else 0, `s x 1`.
+            at: the correction `s x n`, and with a machine its aim.
+        """
+        own, correction = self.compensator, at[0]
+        value, excess, weight, features = self.learned(joints - correction, covariates, strange, known)
+        if own.machine is None:
+            return value, excess, weight, features, torch.zeros_like(strange)
+        moved = joints - correction + value
+        wanted = own.machine.next_correction(moved, own._held(covariates), joints, correction, at[1])
+        following, doubt = own._settled(joints, wanted, correction, at[1])
+        return following, excess, weight, features, doubt
+
+    def learned(self, command: Tensor, covariates: Tensor, strange: Tensor, known: Tensor) -> tuple[Tensor, ...]:
+        """What was learned (without a machine δ) at a command, its excess, weight and features."""
         own, domain = self.compensator, self.compensator.domain
         n = len(own.joints)
-        inputs = torch.cat([joints - value, covariates], -1)
+        inputs = torch.cat([command, covariates], -1)
         caged = inputs if self.caged_once else domain.cage(inputs)
         features = own.scaling.features(caged)
         raw = own.scaling.restore(own.network(features))
@@ -43,14 +63,19 @@ class _Step:
         fade = torch.relu(1 - excess)
         weight = fade * fade
         faded = weight * limited
-        value = faded[..., :n] * own.limit - faded[..., n:] * own.safe + own.safe
+        value = faded[..., :n] * own.limit - faded[..., n:] * own.safe + known * own.safe
         if own.effects is not None:
-            moved = own.effects(caged[..., :n] + value, caged[..., n:])
-            value = own._limited(value + weight * moved)
+            value = own._limited(value + weight * own.effects(caged[..., :n] + value, caged[..., n:]))
         if own.geometry is not None:
-            moved = own.geometry(caged[..., :n] + value)
-            value = own._limited(value + (moved if own.geometry.extrapolates else weight * moved))
+            value = own._limited(value + weight * own.geometry(caged[..., :n] + value))
         return value, excess, weight, features
+
+    def back(self, command: Tensor, covariates: Tensor, strange: Tensor, known: Tensor) -> tuple[Tensor, ...]:
+        """The machine's aim for the way back, and excess and weight of the command."""
+        own = self.compensator
+        assert own.machine is not None
+        value, excess, weight, _ = self.learned(command, covariates, strange, known)
+        return own.machine.aim_back(command + value, own._held(covariates)), excess, weight
 
 
 def _advanced(compensator: Compensator, joints: Tensor, kept: int) -> Traced:
@@ -63,6 +88,56 @@ def _advanced(compensator: Compensator, joints: Tensor, kept: int) -> Traced:
 
     # A tensor of its own for each: the tracer takes equal tensors for one input.
     return Traced(function, *(joints.clone() for _ in range(2 + kept)))
+
+
+def _examples(machine: Machine | None, joints: Tensor) -> list[Tensor]:
+    """Of what a machine's steps take beside the correction."""
+    return [] if machine is None else [machine.aim(joints)]
+
+
+def _chosen(graph: Graph, known: Any, last: list[Any], first: list[Any]) -> list[Any]:
+    """Correction, δ, excess, weight, features and doubt of the last step, or of the first where that went astray."""
+
+    def choose(doubt: Tensor, known: Tensor, *both: Tensor) -> list[Tensor]:
+        half = len(both) // 2
+        found = [torch.where(doubt <= ASTRAY, a, b) for a, b in zip(both[:half], both[half:], strict=True)]
+        return [known * found[0], *found[1:]]
+
+    pairs = [*last[:4], *first[:4]]
+    blank = [torch.zeros(graph.rows, 1, dtype=torch.float64) for _ in range(2)]
+    examples = [torch.ones(graph.rows, v.shape[1], dtype=torch.float64) for v in pairs]
+    correction, excess, weight, features = Traced(choose, *blank, *examples)(graph, last[4], known, *pairs)
+    return [correction, correction, excess, weight, last[4], features]
+
+
+def _back(graph: Graph, step: _Step, at: Any, more: Any, strange: Any, known: Any) -> list[Any]:
+    """The way back of a machine: correction, δ, excess, weight and doubt."""
+    own = step.compensator
+    assert own.machine is not None
+    rows = own.domain.centre.repeat(graph.rows, 1)
+    n = len(own.joints)
+    joints, covariates = rows[:, :n].contiguous(), rows[:, n:].contiguous()
+    blank = torch.zeros(len(rows), 1, dtype=torch.float64)
+    traced = Traced(step.back, joints, covariates, blank, blank.clone())
+    aim, excess, weight = traced(graph, at, more, strange, known)
+    nothing = torch.zeros_like(joints)
+
+    def try_one(command: Tensor, correction: Tensor, aim: Tensor) -> tuple[Tensor, Tensor]:
+        return own.step_back(command - correction, correction, aim)
+
+    one = Traced(try_one, joints, nothing, own.machine.aim_back(joints, covariates))
+    start, doubt = one(graph, at, nothing, aim)
+    correction = found = start
+    for _ in range(own.iterations):
+        correction = graph.solid(found)
+        found, doubt = one(graph, at, correction, aim)
+
+    def choose(doubt: Tensor, known: Tensor, last: Tensor, first: Tensor) -> Tensor:
+        return -known * torch.where(doubt <= ASTRAY, last, first)
+
+    traced = Traced(choose, blank, blank.clone(), joints, nothing.clone())
+    deviation = traced(graph, doubt, known, correction, start)[0]
+    return [deviation, deviation, excess, weight, doubt]
 
 
 def command_graph(
@@ -84,7 +159,6 @@ def command_graph(
     blank = torch.zeros(rows, 1, dtype=torch.float64)
     step = _Step(compensator)
     clean = Traced(lambda given: tuple(domain.clean(given)), points)
-    one = Traced(step, joints, covariates, blank, torch.zeros_like(joints))
 
     batch: str | int = 1 if dtype == "float32" else "batch"
     graph = Graph(rows, opset, dtype)
@@ -106,31 +180,55 @@ def command_graph(
         low, high = domain._cage_low - room, domain._cage_high + room
         (start,) = Traced(lambda v: torch.minimum(torch.maximum(v, low), high), points)(graph, inputs)
     at, more = Traced(parts, points)(graph, start)
-    correction: Any = torch.zeros_like(joints)
-    first = last = one(graph, at, more, strange, correction)
+    (known,) = Traced(lambda v: 1 - torch.clamp(v, 0.0, 1.0), blank)(graph, strange)
+    machine = compensator.machine
+    nothing = torch.zeros_like(joints)
+    aim: list[Value] = []
+    if machine is not None:
+        aim = Traced(machine.aim, joints)(graph, at)
+    one = Traced(step, joints, covariates, blank, blank.clone(), nothing, *_examples(machine, joints))
+    first = last = one(graph, at, more, strange, known, nothing, *aim)
+    correction: Any = nothing
     kept: list[Value] = []
     for _ in range(compensator.iterations):
         if compensator.secant:
             correction, *kept = _advanced(compensator, joints, len(kept))(graph, last[0], correction, *kept)
         else:
-            correction = last[0]
-        last = one(graph, at, more, strange, correction)
+            correction = graph.solid(last[0]) if machine is not None else last[0]
+        last = one(graph, at, more, strange, known, correction, *aim)
+    # Correction, δ, excess, weight and doubt of either way, and the features at the command.
+    there = [correction, last[0], last[1], last[2], last[4], last[3]]
+    back = [first[0], first[0], first[1], first[2], first[4]]
+    if machine is not None:
+        there = _chosen(graph, known, [correction, *last[1:]], [first[0], *first[1:]])
+        back = _back(graph, step, at, more, strange, known)
 
     def inside(excess: Tensor) -> Tensor:
         return (excess <= 0).squeeze(-1)
 
-    found: Mapping[str, Value] = {}
-    found = {"deviation": graph.solid(last[0]), "back_deviation": graph.solid(first[0])}
-    found |= {"guard": last[2], "back_guard": first[2]}
+    def status(excess: Tensor, doubt: Tensor, strange: Tensor) -> Tensor:
+        found = torch.where(doubt <= 0, torch.where(excess > 0, 1.0, 0.0), 3.0)
+        return torch.where(strange > 0, 2.0, found).squeeze(-1)
+
+    found: dict[str, Any] = {"deviation": graph.solid(there[1]), "back_deviation": graph.solid(back[1])}
+    found |= {"guard": there[3], "back_guard": back[3]}
     whole = graph.solid(ideal)
-    for name, sign, by in (("command", "Sub", correction), ("ideal", "Add", first[0])):
+    for name, sign, by in (("command", "Sub", there[0]), ("ideal", "Add", back[0])):
         found[name] = graph.node(sign, [whole.name, graph.solid(by).name], whole.shape, whole.shape)
-    if "inside_domain" in outputs:
-        (found["inside_domain"],) = Traced(inside, blank)(graph, last[1])
-        (found["ideal_inside_domain"],) = Traced(inside, blank)(graph, first[1])
+    for name, way in (("", there), ("ideal_", back)):
+        if f"{name}inside_domain" in outputs:
+            (found[f"{name}inside_domain"],) = Traced(inside, blank)(graph, way[2])
+        if f"{name}status" in outputs:
+            traced = Traced(status, blank, blank.clone(), blank + 0)
+            found[f"{name}status"] = graph.whole(traced(graph, way[2], way[4], strange)[0])
+    if "deviation_sd" in outputs:
         features = compensator.scaling.features(points)
-        sd = Traced(compensator.sd_of, blank, features)
-        (found["deviation_sd"],) = sd(graph, last[2], last[3])
+
+        def spread(weight: Tensor, strange: Tensor, features: Tensor) -> Tensor:
+            return torch.where(strange <= 0, compensator.sd_of(weight, features), compensator.fallback_sd)
+
+        at_command = there[3], strange, there[5]
+        (found["deviation_sd"],) = Traced(spread, blank, blank.clone(), features)(graph, *at_command)
     model = graph.model({name: found[name] for name in outputs}, batch, "compensator")
     model.metadata_props.add(key=METADATA_KEY, value=metadata)
     return model

@@ -53,6 +53,7 @@ class Graph:
         self._known: dict[object, str] = {}
         self._inputs: list[onnx.ValueInfoProto] = []
         self._truths: set[str] = set()
+        self._integers: set[str] = set()
 
     def input(self, name: str, width: int, batch: str | int) -> Value:
         """An input `batch x width`."""
@@ -79,6 +80,8 @@ class Graph:
         if key not in self._known:
             self._known[key] = name = f"v{len(self._known)}"
             self._nodes.append(helper.make_node(op, [*inputs], [name], **attributes))
+            if op == "Cast" or (op in _MOVES and inputs[0] in self._integers):
+                self._integers.add(name)
             if op in _TRUTHS or (op in _MOVES and inputs[0] in self._truths):
                 self._truths.add(name)
         return Value(tuple(shape), self._known[key], tuple(real))
@@ -111,6 +114,11 @@ class Graph:
             inputs += [last] if last else [self.constant(value.offset)] if value.offset.any() else []
             last = self.node("Gemm", inputs, shape, shape).name
         return Value(shape, last, shape)
+
+    def whole(self, value: Value) -> Value:
+        """The same as 64-bit integers."""
+        value = self.solid(value)
+        return self.node("Cast", [value.name], value.shape, value.real, to=TensorProto.INT64)
 
     def full(self, value: Value) -> Value:
         """The same, not broadcast."""
@@ -210,7 +218,8 @@ class Graph:
             if own in fixed or own in renamed:
                 own = self.node("Identity", [own], solid.shape, solid.real, doc_string=key).name
             renamed[own] = key
-            kind = TensorProto.BOOL if own in self._truths else helper.np_dtype_to_tensor_dtype(self._dtype)
+            kind = helper.np_dtype_to_tensor_dtype(self._dtype)
+            kind = TensorProto.BOOL if own in self._truths else TensorProto.INT64 if own in self._integers else kind
             found.append(helper.make_tensor_value_info(key, kind, [batch, *solid.shape[1:]]))
         needed, nodes = set(renamed), []
         for node in reversed(self._nodes):

@@ -321,6 +321,13 @@ def _cast(graph: Graph, value: Value, *_: Any, **__: Any) -> Value:
     return _where(graph, value, 1.0, 0.0)
 
 
+def _length(graph: Graph, value: Value, order: Any = 2, dim: Any = None, keepdim: bool = False) -> Value:
+    """Euclidean length."""
+    assert order == 2
+    dim = [dim] if isinstance(dim, int) else dim
+    return _each(graph, "Sqrt", _reduced(graph, "ReduceSum", _each(graph, "Mul", value, value), dim, keepdim))
+
+
 def _every(graph: Graph, value: Value, dim: Any = None, keepdim: bool = False) -> Value:
     return _each(graph, "Greater", _reduced(graph, "ReduceMin", _cast(graph, value), dim, keepdim), 0.5)
 
@@ -353,6 +360,6 @@ _OTHERS: dict[str, Callable[..., Any]] = {
     "t": _transposed, "select": _selected, "slice": _sliced, "index": _indexed, "index_select": _picked,
     "flip": _flipped, "cat": _joined, "stack": _stacked, "expand": _expanded,
     "expand_as": lambda g, a, b: _expanded(g, a, _shape(b)),
-    "linalg_cross": _cross, "broadcast_tensors": _broadcast, "split": _split, "split_with_sizes": _split,
+    "linalg_cross": _cross, "linalg_vector_norm": _length, "broadcast_tensors": _broadcast, "split": _split, "split_with_sizes": _split,
     "unbind": lambda g, v, dim=0: [_selected(g, v, dim, k) for k in range(v.shape[dim])],
 }  # fmt: skip

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
-from ccnn_torch.compensation.geometry.serial import _inverse
+from ccnn_torch.compensation.geometry.matrices import inverse
 from ccnn_torch.mechanisms import Mechanism
 
 # Of central differences of the fourth order [SI]: machines are about 1 m, and their kinematics are curved by about 1/m.
@@ -17,6 +17,8 @@ _STEP = 5e-4
 _NEWTON_STEPS = 4
 # What is left of the inverse kinematics where a pose was found [SI].
 _FOUND = 1e-9
+# How far a further step may move the pose of one that has settled [m, rad].
+_SETTLED = 1e-13
 # A Jacobian that no machine has [m or rad per joint unit].
 _LOST = 1e9
 
@@ -43,15 +45,15 @@ class ClosedKinematics(nn.Module):
         joints, pose, reachable = self._standing(joints)
         found = {"pose": pose}
         needed = self.start is not None or names & {"frame_slope", "holding", "visible"}
-        seen = _frame_slope(mechanism.frame, pose) if needed else pose
+        seen = frame_slope(mechanism.frame, pose) if needed else pose
         if self.start is None:
-            found["jacobian"] = _frame_slope(lambda q: mechanism.frame(mechanism.forward_kinematics(q)), joints)
+            found["jacobian"] = frame_slope(lambda q: mechanism.frame(mechanism.forward_kinematics(q)), joints)
         else:
             found["jacobian"] = seen @ _pseudo_inverse(_slope(mechanism.solve_inverse, pose))
         if "parameter_jacobian" in names:
             values = mechanism.nominal.expand(joints.shape[0], -1)
             if self.start is None:
-                found["parameter_jacobian"] = _frame_slope(
+                found["parameter_jacobian"] = frame_slope(
                     lambda p: mechanism.frame(mechanism.forward_kinematics(joints, p)), values
                 )
             else:
@@ -67,6 +69,42 @@ class ClosedKinematics(nn.Module):
         if "visible" in names:
             found["visible"] = seen @ _pseudo_inverse(seen)
         return found
+
+    def standing(self, joints: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        """Pose coordinates at joints `... x n`, `... x p` [SI], and whether it is theirs and not the home, `... x 1`.
+
+        By so many steps of Newton's method from the polynomial, all with the derivative there.
+        """
+        mechanism, rows = self._mechanism[0], joints.reshape(-1, joints.shape[-1])
+        found = self._steps(rows, steps)
+        near = torch.relu((mechanism.solve_inverse(found) - rows).abs() - _FOUND).sum(-1, keepdim=True)
+        # A comparison with NaN is false.
+        pose = torch.where(near <= 0, found, mechanism.home_pose)
+        lead = joints.shape[:-1]
+        return pose.reshape(*lead, -1), (near <= 0).reshape(*lead, 1)
+
+    def _steps(self, rows: Tensor, steps: int) -> Tensor:
+        inverse_kinematics = self._mechanism[0].solve_inverse
+        assert self.start is not None
+        pose = self.start(rows)
+        # A derivative that is none counts as large, and the pose stays where it is.
+        lift = _pseudo_inverse(_slope(inverse_kinematics, pose))
+        for _ in range(steps):
+            pose = pose - (lift @ (inverse_kinematics(pose) - rows).unsqueeze(-1)).squeeze(-1)
+        return pose
+
+    def steps_needed(self, joints: Tensor, most: int) -> int:
+        """Steps of `standing` after which the pose of joints `s x n` has settled; `most` where it has not."""
+        for steps in range(1, most):
+            apart = (self._steps(joints, steps) - self._steps(joints, steps + 1)).abs()
+            if bool((apart <= _SETTLED).all()):
+                return steps
+        return most
+
+    def coordinates(self, pose: Tensor, shift: Tensor) -> Tensor:
+        """Pose coordinates `s x p` of a small shift of the frame at a pose, `s x c` [m, rad]."""
+        seen = frame_slope(self._mechanism[0].frame, pose)
+        return (_pseudo_inverse(seen) @ shift.unsqueeze(-1)).squeeze(-1)
 
     def _standing(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Joints and poses that the mechanism can take: those at hand, or its home; and which, `s x 1`."""
@@ -110,7 +148,7 @@ def _difference(values: Tensor) -> Tensor:
     return torch.nan_to_num(slope, nan=_LOST, posinf=_LOST, neginf=-_LOST).permute(1, 2, 0)
 
 
-def _frame_slope(function: Callable[[Tensor], tuple[Tensor, Tensor | None]], point: Tensor) -> Tensor:
+def frame_slope(function: Callable[[Tensor], tuple[Tensor, Tensor | None]], point: Tensor) -> Tensor:
     """Derivative of position and rotation vector (base frame) of a frame, `s x c x k`; see `frame_jacobian`."""
     positions, rotations = function(_neighbours(point))
     if rotations is None:
@@ -126,5 +164,4 @@ def _frame_slope(function: Callable[[Tensor], tuple[Tensor, Tensor | None]], poi
 
 def _pseudo_inverse(matrix: Tensor) -> Tensor:
     """Of `s x o x k` with independent columns, `s x k x o`."""
-    unit = torch.eye(matrix.shape[-1], dtype=matrix.dtype)
-    return _inverse(matrix.mT @ matrix, unit) @ matrix.mT
+    return inverse(matrix.mT @ matrix) @ matrix.mT

@@ -15,11 +15,9 @@ class ExpandedGeometry(ChebyshevExpansion):
     """δ(q), commanded joints `... x n` -> `... x n` [SI], as a polynomial.
 
     Attributes:
-        extrapolates: a polynomial is not valid outside the points it was fitted to.
         export_tolerance: share of the limit to which exports agree; sums of many terms are rounded.
     """
 
-    extrapolates = False
     export_tolerance = 1e-10
 
     def describe(self) -> dict[str, Any]:

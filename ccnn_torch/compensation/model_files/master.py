@@ -71,12 +71,12 @@ def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
     try:
         check_tensors(facts, tensors)
         compensator = _rebuild(facts, tensors)
-        limits = compensator.limit.tolist()
+        limits = [compensator.limit.tolist(), compensator.most.tolist()]
     except RUN_ERRORS as reason:
         raise ModelFileError(
             f"its tensors are not those that its metadata lists ({said(reason)})" + TAKE_AGAIN
         ) from None
-    if limits != [facts["limits"][c["name"]]["limit"] for c in facts["joints"]]:
+    if limits != [[facts["limits"][c["name"]][k] for c in facts["joints"]] for k in ("limit", "most_deviation")]:
         raise ModelFileError("its limits are not those of its metadata" + TAKE_AGAIN)
     return facts, compensator
 
@@ -131,6 +131,8 @@ def _rebuild(facts: Mapping[str, Any], tensors: dict[str, Tensor]) -> Compensato
         made("geometry"),
         made("effects"),
         facts.get("secant", False),
+        made("machine"),
+        tensors["most"],
     )
 
 

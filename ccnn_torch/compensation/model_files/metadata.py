@@ -19,11 +19,9 @@ from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.training import tensor_digest
 from ccnn_torch.version import __version__
 
-# A reader that does not know of a part must refuse such a file, not leave the part out: the newest part counts.
 _FORMATS = "ccnn_torch compensator "
-FORMAT = f"{_FORMATS}2"
-_PARTS = {"secant": f"{_FORMATS}5", "effects": f"{_FORMATS}4", "geometry": f"{_FORMATS}3"}
-_KNOWN = (FORMAT, *reversed(_PARTS.values()))
+FORMAT = f"{_FORMATS}6"
+_LIMITS = ("limit", "most_deviation", "safe_correction", "safe_sd", "sd_scale")
 _REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
 _PACKAGES = ("torch", "onnx", "onnxruntime", "safetensors", "numpy")
 
@@ -39,9 +37,10 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
         raise InputError(f"a model's fields lack {', '.join(missing)}; needed are {', '.join(_REQUIRED)}")
     mechanism = fields["mechanism"]
     pose = mechanism.get("pose", []) if isinstance(mechanism, Mapping) else []
-    limits = (v.tolist() for v in (compensator.limit, compensator.safe, compensator.safe_sd, compensator.sd_scale))
+    about = (compensator.limit, compensator.most, compensator.safe, compensator.safe_sd, compensator.sd_scale)
+    limits = (v.tolist() for v in about)
     facts: dict[str, Any] = {
-        "format": next((form for part, form in _PARTS.items() if getattr(compensator, part)), FORMAT),
+        "format": FORMAT,
         **{key: fields[key] for key in _REQUIRED},
         "joints": [_plain(c) for c in compensator.joints],
         "covariates": [_plain(c) for c in compensator.covariates],
@@ -49,8 +48,8 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
         "network": describe_network(compensator.network),
         "domain": compensator.domain.describe(compensator.joints + compensator.covariates),
         "limits": {
-            c.name: {"unit": c.unit, "limit": limit, "safe_correction": safe, "safe_sd": sd, "sd_scale": scale}
-            for c, limit, safe, sd, scale in zip(compensator.joints, *limits, strict=True)
+            c.name: {"unit": c.unit, **dict(zip(_LIMITS, values, strict=True))}
+            for c, *values in zip(compensator.joints, *limits, strict=True)
         },
         "lipschitz": compensator.lipschitz,
         "iterations": compensator.iterations,
@@ -63,6 +62,8 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
         facts["geometry"] = compensator.geometry.describe()
     if compensator.effects is not None:
         facts["effects"] = compensator.effects.describe()
+    if compensator.machine is not None:
+        facts["machine"] = compensator.machine.describe()
     facts["sha256"] = {"tensors": tensor_digest(dict(compensator.state_dict()))}
     facts["sha256"]["keys"] = _digest(facts)
     return facts
@@ -75,11 +76,11 @@ def check_keys(facts: Any) -> dict[str, Any]:
         ModelFileError: they are not.
     """
     written = str(facts.get("format")) if isinstance(facts, dict) else ""
-    known = written in _KNOWN
+    known = written == FORMAT
     if not known and written.startswith(_FORMATS):
         raise ModelFileError(
-            f"it has the form '{written}' of another version of this package, which reads "
-            f"{', '.join(repr(form) for form in _KNOWN)}; write it again with this version (ccnn run …, or save_model)"
+            f"it has the form '{written}' of another version of this package, which reads {FORMAT!r}; write it again "
+            "with this version (ccnn run …, or save_model)"
         )
     if not isinstance(facts, dict) or not known:
         raise ModelFileError(

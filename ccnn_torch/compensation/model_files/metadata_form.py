@@ -37,6 +37,7 @@ class _Mechanism(_Form):
 
 class _Limit(_Form):
     limit: _Size
+    most_deviation: _Size
     safe_correction: _Number
     safe_sd: _Size
     sd_scale: _Size
@@ -68,6 +69,7 @@ class _Facts(_Form):
     network: dict[str, Any]
     geometry: dict[str, Any] = {}
     effects: dict[str, Any] = {}
+    machine: dict[str, Any] = {}
     domain: _Domain
     limits: dict[str, _Limit]
     lipschitz: _Size

@@ -18,7 +18,10 @@ Array = NDArray[Any]
 TAKE_AGAIN = "; take it again from where it was written"
 
 METADATA_KEY = "ccnn_torch"
-OUTPUTS = ("command", "deviation", "inside_domain", "ideal", "ideal_inside_domain", "deviation_sd")
+OUTPUTS = (
+    *("command", "deviation", "inside_domain", "ideal", "ideal_inside_domain", "deviation_sd"),
+    *("status", "ideal_status"),
+)
 
 # What a graph or a module of another kind than ours may raise. ONNX Runtime's errors have no common class.
 RUN_ERRORS: tuple[type[Exception], ...] = (

@@ -12,13 +12,12 @@ from safetensors.torch import save
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.export.export import export_float32, export_onnx
-from ccnn_torch.compensation.export.pt2 import export_pt2
 from ccnn_torch.compensation.model_files.metadata import facts_of, to_json
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import write_whole
 
-FORMS = ("safetensors", "onnx", "pt2", "float32.onnx")
+FORMS = ("safetensors", "onnx", "float32.onnx")
 
 # Written by this command itself; a field of these names would be lost.
 _OWN = ("files", "date", "notes")
@@ -36,7 +35,7 @@ def save_model(
     method: str = "model",
     forms: Collection[str] = FORMS,
 ) -> dict[str, Path]:
-    """Write METHOD.safetensors, .onnx, .float32.onnx, .pt2 and the card; each whole or not at all, the card last.
+    """Write METHOD.safetensors, .onnx, .float32.onnx and the card; each whole or not at all, the card last.
 
     The master and the exports are byte-identical for one model and one set of fields; what changes from run to run
     is in the card alone.
@@ -50,7 +49,7 @@ def save_model(
         forms: which to write; the master is always written, and the exports take seconds each.
 
     Returns:
-        The files by what they are: `safetensors`, `onnx`, `float32.onnx`, `pt2`, `card`. Where single precision cannot
+        The files by what they are: `safetensors`, `onnx`, `float32.onnx`, `card`. Where single precision cannot
         hold the model, `float32.onnx` is missing and the card's `notes` say so.
 
     Raises:
@@ -64,10 +63,9 @@ def save_model(
         raise InputError(f"a model's field may not be named {taken[0]!r}, which the card holds itself")
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in compensator.state_dict().items()}
     contents = {"safetensors": save(tensors, metadata={METADATA_KEY: text})}
-    notes = []
-    for form, export in (("onnx", export_onnx), ("pt2", export_pt2)):
-        if form in forms:
-            contents[form] = export(compensator, text)
+    notes = settled_notes(compensator)
+    if "onnx" in forms:
+        contents["onnx"] = export_onnx(compensator, text)
     if "float32.onnx" in forms:
         try:
             contents["float32.onnx"] = export_float32(compensator, text)
@@ -87,3 +85,13 @@ def save_model(
     paths["card"] = folder / card_name(method)
     write_whole(paths["card"], to_json(card, indent=2) + "\n")
     return paths
+
+
+def settled_notes(compensator: Compensator) -> list[str]:
+    """A sentence where the machine's command does not settle everywhere in and around the domain."""
+    if not compensator.unsettled:
+        return []
+    return [
+        f"Around the measured region the command does not settle at {compensator.unsettled:.1%} of the poses away from "
+        "singular ones, most of them at the edge of the machine's reach; such rows have status 3."
+    ]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ccnn_torch.compensation.export.export import DAMPED_TOLERANCE
+from ccnn_torch.compensation.machine.machine import ASTRAY
 from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
@@ -120,7 +122,7 @@ def c_compensation(form: Form, static: str = "") -> str:
     texts = [print_program(program, dialect, tables) for program in form.programs]
     functions = "\n\n".join(c_function(program, text) for program, text in zip(form.programs, texts, strict=True))
     numbers = {k: v for text in texts for k, v in text.tables.items()}
-    numbers |= {"ccnn_limit": form.limit * (1 + 1e-9), "ccnn_slack": form.slack}
+    numbers |= {"ccnn_limit": form.limit * (1 + 1e-9)} | ({} if form.machine else {"ccnn_slack": form.slack})
     numbers |= {} if form.spread is None else {"ccnn_fallback_sd": form.fallback_sd}
     return filled(
         "compensation.c.jinja",
@@ -130,6 +132,8 @@ def c_compensation(form: Form, static: str = "") -> str:
         functions=functions,
         covariates=form.covariates,
         secant=form.secant is not None,
+        aims=form.machine.aims if form.machine else 0,
+        astray=dialect.literal(ASTRAY),
         sd=form.spread is not None,
         kept=form.kept,
         steps=form.iterations,
@@ -163,6 +167,8 @@ def _selftest(form: Form, golden: Golden) -> str:
         relative=dialect.literal(golden.relative),
         rounding=dialect.literal(4 * float(np.finfo(form.dtype).eps)),
         zero=dialect.literal(0.0),
+        one=dialect.literal(1.0),
+        damped=dialect.literal(DAMPED_TOLERANCE),
         s=_suffix(form),
     )
 

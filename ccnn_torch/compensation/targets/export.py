@@ -16,7 +16,6 @@ from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.model_files.save import save_model
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
-from ccnn_torch.compensation.targets.from_geometry import compensator_of_geometry
 from ccnn_torch.compensation.targets.from_model import form_of
 from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal
 from ccnn_torch.compensation.targets.linuxcnc import print_linuxcnc
@@ -47,8 +46,7 @@ class _Order:
 
     def compensator(self) -> Compensator:
         if isinstance(self.model, IdentifiedGeometry):
-            made, self.told = compensator_of_geometry(self.model)
-            return made
+            return self.model.compensator
         if self.model.compensator is None:
             raise ModelFileError(f"{self.path}: an export is made of the master; give the .safetensors beside it")
         return self.model.compensator

@@ -140,13 +140,36 @@ class Program:
 
 
 @dataclass
+class MachinePrograms:
+    """Of a machine that inverts its own forward map.
+
+    Attributes:
+        aim: ideal joints -> `aim`.
+        towards: (commanded `joints`, `correction`, `aim`, covariates) -> the next `correction`, `excess`, and `doubt`:
+            above 0 where this one is not the exact one.
+        aim_back: (commanded joints, covariates) -> `aim` of the way back, and `excess`.
+        back: (ideal `joints` tried, `correction`, `aim`) -> the next `correction`, and `doubt`.
+    """
+
+    aim: Program
+    towards: Program
+    aim_back: Program
+    back: Program
+
+    @property
+    def aims(self) -> int:
+        """How many numbers an aim has."""
+        return len(self.aim.outputs["aim"])
+
+
+@dataclass
 class Form:
     """One model: programs and what stands around them.
 
     Attributes:
         joints, covariates: headers `name[unit]` in order.
         iterations: steps from the joints to their command.
-        limit: of |deviation|, `n` [SI].
+        limit: of the whole |deviation|, `n` [SI].
         slack: how far command + deviation may be from the joints before the model is not trusted, `n` [SI].
         fallback_sd: standard deviation where the deviation is taken as 0, `n` [SI].
         dtype: `float64` or `float32`.
@@ -155,6 +178,7 @@ class Form:
         secant: (`found` deviation, `correction`, `steps` before) -> the next `correction` and `steps`; None where that
             correction is the deviation that was found.
         spread: (commanded joints, covariates) -> `sd`; None where it was not asked for.
+        machine: programs in the place of `deviation`; None without a machine.
         facts: lines about the model for a reader: where it came from.
     """
 
@@ -169,12 +193,16 @@ class Form:
     deviation: Program
     secant: Program | None
     spread: Program | None
+    machine: MachinePrograms | None = None
     facts: list[str] = field(default_factory=list)
 
     @property
     def programs(self) -> list[Program]:
         """Those that there are."""
-        return [p for p in (self.clean, self.deviation, self.secant, self.spread) if p is not None]
+        deviation = [self.deviation, self.secant]
+        if self.machine is not None:
+            deviation = [self.machine.aim, self.machine.towards, self.machine.aim_back, self.machine.back]
+        return [p for p in (self.clean, *deviation, self.spread) if p is not None]
 
     @property
     def kept(self) -> int:
@@ -184,7 +212,10 @@ class Form:
     def operations(self) -> Counter[str]:
         """Of one command."""
         count = self.clean.operations()
-        for program, calls in ((self.deviation, self.iterations + 1), (self.secant, self.iterations)):
+        calls_of = [(self.deviation, self.iterations + 1), (self.secant, self.iterations)]
+        if self.machine is not None:
+            calls_of = [(self.machine.aim, 1), (self.machine.towards, self.iterations + 1)]
+        for program, calls in calls_of:
             for op, times in (program.operations() if program else {}).items():
                 count[op] += times * calls
         return count

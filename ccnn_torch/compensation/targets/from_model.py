@@ -13,7 +13,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.contraction import Steepness, iterations_needed
 from ccnn_torch.compensation.secant import Step
-from ccnn_torch.compensation.targets.form import Form, Program
+from ccnn_torch.compensation.targets.form import Form, MachinePrograms, Program
 from ccnn_torch.compensation.targets.from_graph import program_of
 
 # Share of the limit to which single precision is right.
@@ -42,8 +42,59 @@ class _Step(nn.Module):
     def forward(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """δ, excess and standard deviation at finite commanded joints."""
         covariates = joints[..., :0] if covariates is None else covariates
-        found = self.compensator._deviation(joints, covariates, torch.zeros_like(joints[..., :1]))
-        return found.value, found.excess, self.compensator._sd(found)
+        strange = torch.zeros_like(joints[..., :1])
+        own = self.compensator
+        learned = own._learned(joints, covariates, strange)
+        found = learned.value if own.machine is not None else own._deviation(joints, covariates, learned)
+        return found, learned.excess, own.sd_of(learned.weight, learned.features)
+
+
+class _Aim(nn.Module):
+    def __init__(self, compensator: Compensator) -> None:
+        super().__init__()
+        self.compensator = compensator
+
+    def forward(self, joints: Tensor) -> Tensor:
+        """The machine's aim for ideal joints."""
+        assert self.compensator.machine is not None
+        return self.compensator.machine.aim(joints)
+
+
+class _Towards(nn.Module):
+    def __init__(self, compensator: Compensator) -> None:
+        super().__init__()
+        self.compensator = compensator
+
+    def forward(
+        self, joints: Tensor, correction: Tensor, aim: Tensor, covariates: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The machine's next correction at a command, the excess there, and doubt."""
+        covariates = joints[..., :0] if covariates is None else covariates
+        strange = torch.zeros_like(joints[..., :1])
+        learned, found, doubt = self.compensator.step(joints, covariates, strange, correction, aim)
+        return found, learned.excess, doubt
+
+
+class _AimBack(nn.Module):
+    def __init__(self, compensator: Compensator) -> None:
+        super().__init__()
+        self.compensator = compensator
+
+    def forward(self, joints: Tensor, covariates: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The machine's aim for the way back of a command, and the excess there."""
+        covariates = joints[..., :0] if covariates is None else covariates
+        learned, aim = self.compensator.aim_back(joints, covariates, torch.zeros_like(joints[..., :1]))
+        return aim, learned.excess
+
+
+class _Back(nn.Module):
+    def __init__(self, compensator: Compensator) -> None:
+        super().__init__()
+        self.compensator = compensator
+
+    def forward(self, joints: Tensor, correction: Tensor, aim: Tensor) -> tuple[Tensor, Tensor]:
+        """Command less ideal joints to try next, and doubt."""
+        return self.compensator.step_back(joints, correction, aim)
 
 
 class _Next(nn.Module):
@@ -79,7 +130,7 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     example = (point[:, :n].clone(), point[:, n:].clone())[: 2 if compensator.covariates else 1]
     names = ("joints", "covariates")[: len(example)]
 
-    kept: list[list[str | None]] = [["deviation", "excess", None], *([[None, None, "sd"]] if sd else [])]
+    kept: list[list[str | None]] = [["deviation", "excess", None], *([[None, "excess", "sd"]] if sd else [])]
     secant = None
     if compensator.secant:
         # A tensor of its own for each: the tracer takes equal tensors for one input.
@@ -88,21 +139,41 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
         secant = traced_program(_Next(compensator), (*blank,), "secant", given, [*given[1:]])
     (clean,) = _programs(_Clean(compensator), example, "clean", names, [["joints", "covariates", "strange"]])
     deviation, *spread = _programs(_Step(compensator), example, "deviation", names, kept)
+    machine = _machine_programs(compensator, example, names)
     for one in spread:
         one.name = "spread"
-    limit = compensator.limit.numpy()
+    limit = compensator.most.numpy()
     return Form(
         [c.header for c in compensator.joints],
         [c.header for c in compensator.covariates],
         iterations,
         limit,
         _SLACK[dtype] * np.minimum(limit, 1.0),
-        np.hypot(compensator.safe.numpy(), compensator.safe_sd.numpy()),
+        compensator.fallback_sd.numpy(),
         dtype,
         clean,
         deviation,
         secant,
         spread[0] if spread else None,
+        machine,
+    )
+
+
+def _machine_programs(
+    compensator: Compensator, example: tuple[Tensor, ...], names: Sequence[str]
+) -> MachinePrograms | None:
+    """Those of a machine; None without one."""
+    if compensator.machine is None:
+        return None
+    joints, more = example[0], [v.clone() for v in example[1:]]
+    correction, aim = torch.zeros_like(joints), compensator.machine.aim(joints)
+    found = ["correction", "excess", "doubt"]
+    at = ("joints", "correction", "aim")
+    return MachinePrograms(
+        traced_program(_Aim(compensator), (joints,), "aim", ("joints",), ["aim"]),
+        traced_program(_Towards(compensator), (joints, correction, aim, *more), "towards", (*at, *names[1:]), [*found]),
+        traced_program(_AimBack(compensator), example, "aim_back", names, ["aim", "excess"]),
+        traced_program(_Back(compensator), (joints, correction, aim), "back", at, ["correction", "doubt"]),
     )
 
 

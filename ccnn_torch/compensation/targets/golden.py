@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.contraction import TOLERANCE
-from ccnn_torch.compensation.export.export import probe_points
-from ccnn_torch.compensation.geometry.serial import SerialGeometry
+from ccnn_torch.compensation.export.export import DAMPED_TOLERANCE, probe_points
+
 from ccnn_torch.compensation.targets.form import Array, Form
 from ccnn_torch.compensation.targets.from_model import SINGLE_TOLERANCE
 from ccnn_torch.compensation.targets.run import run_form
@@ -54,6 +54,8 @@ class Golden:
                 continue
             extra = {"deviation": 0.0, "sd": self.relative}.get(name, eps) * np.abs(wanted)
             apart = np.abs(found[name].astype(float) - wanted)
+            state = self.outputs["ideal_status" if name == "ideal" else "status"]
+            apart = apart / np.where(state == 3, DAMPED_TOLERANCE, 1.0)[:, None]
             # A number that is none is wrong; a joint without deviations has no tolerance.
             share = np.nan_to_num(apart / (self.tolerance + extra + 1e-300), nan=np.inf)
             worst[name] = float(share.max())
@@ -73,18 +75,11 @@ def golden_vectors(compensator: Compensator, form: Form) -> Golden:
         if form.dtype == "float32":
             given = given.float().double()
         found = compensator.solve(*_split(given, n))
-        clean, _, strange = compensator._inputs(*_split(given, n))
         sd = compensator.sd(*_split(given, n))
-    lost = (strange > 0).numpy()
-    outputs = {
-        "command": np.where(lost, clean, found.command),
-        "deviation": np.where(lost, 0.0, found.deviation),
-        "ideal": np.where(lost, clean, found.ideal),
-        "status": np.where(lost[:, 0], 2, np.where(found.inside_domain, 0, 1)),
-        "ideal_status": np.where(lost[:, 0], 2, np.where(found.ideal_inside_domain, 0, 1)),
-    }
+    names = ("command", "deviation", "ideal", "status", "ideal_status")
+    outputs = {name: getattr(found, name).numpy() for name in names}
     if form.spread is not None:
-        outputs["sd"] = np.where(lost, form.fallback_sd, sd)
+        outputs["sd"] = sd.numpy()
     share = SINGLE_TOLERANCE if form.dtype == "float32" else compensator.export_tolerance
     values = given.numpy()
     return Golden(values[:, :n], values[:, n:], outputs, share * form.limit, 10 * share, _hard(compensator))
@@ -114,8 +109,8 @@ def require_equal(form: Form, golden: Golden) -> dict[str, float]:
 def _hard(compensator: Compensator) -> str:
     """Which part of a model single precision rounds by more than a small share of its limit, most likely."""
     step, limit = float(np.finfo("float32").eps), float(compensator.limit.max())
-    if isinstance(compensator.geometry, SerialGeometry):
-        return f"it computes the arm's links: a length of 1 m is rounded to {step:.1g} m, and the limit is {limit:.1g}"
+    if compensator.machine is not None:
+        return f"it computes the machine's kinematics: a length of 1 m is rounded to {step:.1g} m, and the limit is {limit:.1g}"
     if compensator.effects is not None:
         return "its physical effects are polynomials of many terms, which cancel"
     if getattr(compensator.network, "export_tolerance", TOLERANCE) > TOLERANCE:

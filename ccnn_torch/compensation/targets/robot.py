@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ccnn_torch.compensation.geometry.serial import SerialGeometry
 from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.errors import MethodFailedError
@@ -28,10 +27,12 @@ def _arm(model: LoadedModel | IdentifiedGeometry) -> SerialArm:
         raise MethodFailedError(
             f"a URDF is a tree, and '{model.identified.name}' is no serial arm; its parameters are in identified.yaml"
         )
-    geometry = None if model.compensator is None else model.compensator.geometry
-    if not isinstance(geometry, SerialGeometry):
+    machine = None if model.compensator is None else model.compensator.machine
+    if machine is None or not isinstance(machine.mechanism, SerialArm):
         raise MethodFailedError(
             "this model has no identified links of an arm to write; train with geometry=identify, or give the "
             "identified.yaml of ccnn identify"
         )
-    return geometry.identified_arm()
+    arm = machine.real
+    assert isinstance(arm, SerialArm)
+    return arm

@@ -6,7 +6,17 @@ import math
 
 import numpy as np
 
-from ccnn_torch.compensation.targets.form import OPERATIONS, Array, Expression, Form, Leaf, Let, Program
+from ccnn_torch.compensation.machine.machine import ASTRAY
+from ccnn_torch.compensation.targets.form import (
+    OPERATIONS,
+    Array,
+    Expression,
+    Form,
+    Leaf,
+    Let,
+    MachinePrograms,
+    Program,
+)
 
 # Numbers at a time: a loop over a large table holds all its products of every row.
 _AT_ONCE = 1 << 18
@@ -82,6 +92,9 @@ def run_form(form: Form, joints: Array, covariates: Array | None) -> dict[str, A
     q, strange = cleaned["joints"], cleaned["strange"][:, 0] > 0
     more = {"covariates": cleaned["covariates"]} if m else {}
 
+    if form.machine is not None:
+        return _run_machine(form, form.machine, q, strange, more)
+
     def deviation(at: Array) -> tuple[Array, Array]:
         found = run_program(form.deviation, {"joints": at} | more, form.dtype)
         return found["deviation"], found["excess"][:, 0]
@@ -107,9 +120,49 @@ def run_form(form: Form, joints: Array, covariates: Array | None) -> dict[str, A
         "status": np.where(strange, 2, np.where(good & (excess <= 0), 0, 1)),
         "ideal_status": np.where(strange, 2, np.where(back & (first_excess <= 0), 0, 1)),
     }
-    if form.spread is not None:
-        sd = run_program(form.spread, {"joints": q} | more, form.dtype)["sd"]
-        finite = (np.isfinite(sd) & (sd >= 0)).all(-1) & ~strange
-        out["sd"] = np.where(finite[:, None], sd, form.fallback_sd)
+    out |= _spread(form, q, strange, more)
     assert all(value.shape[-1] == n for name, value in out.items() if "status" not in name)
     return out
+
+
+def _spread(form: Form, q: Array, strange: Array, more: dict[str, Array]) -> dict[str, Array]:
+    """Standard deviation at commanded joints, where it was asked for."""
+    if form.spread is None:
+        return {}
+    sd = run_program(form.spread, {"joints": q} | more, form.dtype)["sd"]
+    finite = (np.isfinite(sd) & (sd >= 0)).all(-1) & ~strange
+    return {"sd": np.where(finite[:, None], sd, form.fallback_sd)}
+
+
+def _run_machine(
+    form: Form, machine: MachinePrograms, q: Array, strange: Array, more: dict[str, Array]
+) -> dict[str, Array]:
+    """As `run_form` for a machine, of finite joints."""
+    aim = run_program(machine.aim, {"joints": q}, form.dtype)["aim"]
+    back = run_program(machine.aim_back, {"joints": q} | more, form.dtype)
+
+    def towards(correction: Array) -> dict[str, Array]:
+        given = {"joints": q - correction, "correction": correction, "aim": aim}
+        return run_program(machine.towards, given | more, form.dtype)
+
+    def tried(correction: Array) -> dict[str, Array]:
+        given = {"joints": q - correction, "correction": correction, "aim": back["aim"]}
+        return run_program(machine.back, given, form.dtype)
+
+    out = {}
+    for names, step in ((("command", "status"), towards), (("ideal", "ideal_status"), tried)):
+        first = last = step(np.zeros_like(q))
+        correction = first["correction"]
+        for _ in range(form.iterations):
+            correction = last["correction"]
+            last = step(correction)
+        good = (last["doubt"] <= ASTRAY) & np.isfinite(correction).all(-1, keepdims=True)
+        correction = np.where(good, correction, first["correction"])
+        excess = np.where(good, last["excess"], first["excess"]) if "excess" in last else back["excess"]
+        correction = np.where(strange[:, None], 0, correction)
+        out[names[0]] = q - correction
+        state = np.where(last["doubt"] <= 0, np.where(excess <= 0, 0, 1), 3)[:, 0]
+        out[names[1]] = np.where(strange, 2, state)
+        if names[0] == "command":
+            out["deviation"] = correction
+    return out | _spread(form, q, strange, more)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ccnn_torch.compensation.machine.machine import ASTRAY
 from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
@@ -32,6 +33,8 @@ def print_structured_text(form: Form, golden: Golden) -> dict[str, str]:
         slack=_table("slack", form.slack, form),
         fallback_sd="" if form.spread is None else _table("fallback_sd", form.fallback_sd, form),
         secant=form.secant is not None,
+        aims=form.machine.aims if form.machine else 0,
+        astray=_literal(ASTRAY, form.dtype),
         kept=form.kept,
         steps=form.iterations,
         rounding=_literal(8 * float(np.finfo(form.dtype).eps), form.dtype),
@@ -109,9 +112,10 @@ def _units(form: Form) -> list[str]:
     return [
         "Inputs and outputs are in SI units, in this order. Joints: " + ", ".join(form.joints) + ".",
         "Covariates: " + (", ".join(form.covariates) or "none; leave the input as it is") + ".",
-        "Status 0: the command is inside the domain of the training rows. 1: outside, where the deviation fades into "
-        "the safe one, or the model broke its limit, and then command = joints. 2: an input is not finite, and then "
-        "command = joints, with the middle of the domain for what is no number and its edge for infinity.",
+        "Status 0: the command is inside the domain of the training rows. 1: outside, where what was learned fades into "
+        "the safe correction, or the model broke its limit, and then command = joints. 2: an input is not finite, and "
+        "then command = joints, with the middle of the domain for what is no number and its edge for infinity. 3: near "
+        "a singular pose or at a limit of the joints, and the command is the nearest safe one.",
     ]
 
 
@@ -154,7 +158,8 @@ def _block(program: Program, text: Text, form: Form) -> str:
 
 def _selftest(form: Form, golden: Golden) -> str:
     """Some golden vectors as a function block: finite ones, half of them at the edges of the domain."""
-    finite = np.flatnonzero((np.abs(np.hstack([golden.joints, golden.covariates])) < 1e30).all(-1))
+    usual = (np.abs(np.hstack([golden.joints, golden.covariates])) < 1e30).all(-1)
+    finite = np.flatnonzero(usual & (golden.outputs["status"] != 3))
     rows = finite[np.linspace(0, len(finite) - 1, _TESTED).astype(int)]
     tables = {name: golden.outputs[name][rows] for name in ("command", "deviation")}
     tables = {"joints": golden.joints[rows], **tables, "tolerance": golden.tolerance}

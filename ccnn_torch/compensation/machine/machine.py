@@ -1,0 +1,217 @@
+"""A machine as it is: nominal and identified kinematics, effects, and the joints that bring it to a nominal pose."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ccnn_torch.compensation.effects.effects import PhysicalEffects
+from ccnn_torch.compensation.geometry.matrices import gauss_jordan, inverse, skew_vector
+from ccnn_torch.compensation.machine.forward import ForwardForm, Placed
+from ccnn_torch.compensation.machine.links import Links
+from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
+
+# Keeps what is inverted regular in the middle of a singular pose: of what shows how near it is, and of a step [m²].
+_NEAR, _REGULAR = 1e-10, 1e-12
+# The way back is damped nearer to a singular pose only, so that it undoes every command that is not damped.
+_BACK = 0.8
+# How far the next step may move a joint that has settled [m or rad].
+SETTLED = 1e-9
+# How far in all, from which on it goes astray: the first step, which is near, is taken in the place of the last.
+ASTRAY = 0.01
+# Joints beyond it are none: what their sines and cosines are differs from library to library [m or rad].
+FARTHEST = 1e3
+
+
+class Rule(NamedTuple):
+    """How commands are found near singular poses (Chiaverini 1997; Nakamura and Hanafusa 1986).
+
+    Attributes:
+        rotation_weight: η of orientation against position [m/rad].
+        nearest: σ0, the smallest singular value below which a command is damped [m per joint unit].
+        damping: λ0, the largest damping of a deviation, in the middle of a singular pose [m per joint unit].
+    """
+
+    rotation_weight: float = 0.04
+    nearest: float = 0.004
+    damping: float = 0.004
+
+    def farther(self, times: float) -> Rule:
+        """Damped from so many times as far from singular poses on, so many times as much."""
+        return self._replace(nearest=times * self.nearest, damping=times * self.damping)
+
+
+class Machine(nn.Module):
+    """f(q, c) = P(F(q + e_joints(q, c); θ), c), and the joints that minimise |W (f(c) - X)|² + λ² |c - q|² for the
+    nominal pose X of ideal joints q; of serial arms and of others whose forward kinematics is a closed form.
+
+    λ is fixed at q: 0 where no singular pose is near, so that the machine reaches X; the deviation is damped, not the
+    step, so that the command does not depend on the number of steps. Every step is Gauss and Newton's with the
+    identified Jacobian.
+
+    Attributes:
+        mechanism: with the nominal parameters, fitted frames included.
+        identified: all parameters as they were identified, `k` [SI].
+        effects: on joints and pose; None without any.
+        rule: of commands near singular poses.
+        low, high: limits of the joints, `n` [SI]; infinite where the machine's file has none.
+        export_tolerance: share of the largest deviation to which exports agree: lengths near 1 m are rounded.
+    """
+
+    kind = "forward"
+    export_tolerance = 1e-9
+    identified: Tensor
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self, mechanism: Mechanism, identified: Tensor, effects: PhysicalEffects | None = None, rule: Rule = Rule()
+    ) -> None:
+        super().__init__()
+        # In a tuple, since the mechanism's own buffers are no part of the model.
+        self._mechanism = (mechanism,)
+        self.rule, self.effects = rule, effects
+        self.register_buffer("identified", identified.detach().clone(), persistent=False)
+        low, high = limits_of(mechanism)
+        self.register_buffer("low", low, persistent=False)
+        self.register_buffer("high", high, persistent=False)
+        self._prepare()
+
+    @property
+    def mechanism(self) -> Mechanism:
+        """The nominal machine."""
+        return self._mechanism[0]
+
+    @property
+    def real(self) -> Mechanism:
+        """The machine with the identified parameters as its nominal ones."""
+        return self.mechanism.with_nominal(self.identified)
+
+    def aim(self, joints: Tensor) -> Tensor:
+        """What a command is to reach, for ideal joints `... x n` [SI]: pose and λ² side by side, `... x a`."""
+        return self._aim(self._nominal.at(joints, slope=False), self._identified.at(joints))
+
+    def aim_back(self, moved: Tensor, covariates: Tensor) -> Tensor:
+        """The same for the way back: the pose that the machine has; moved: command and what was learned there."""
+        return self._aim(self._reached(moved, covariates), self._nominal.at(moved), _BACK)
+
+    def next_correction(self, moved: Tensor, covariates: Tensor, ideal: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
+        """What to subtract from the ideal joints next.
+
+        Args:
+            moved: command and what was learned there, `... x n` [SI].
+            covariates: `... x m` [SI].
+            ideal: joints, `... x n` [SI].
+            correction: ideal joints less command, `... x n` [SI].
+            aim: of the ideal joints.
+        """
+        return self._step(self._reached(moved, covariates), correction, aim)
+
+    def next_back(self, joints: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
+        """The same for the way back: what to subtract from the command; joints: ideal ones, tried."""
+        return self._step(self._nominal.at(joints, slope=not self._nominal.one_slope), correction, aim)
+
+    def within(self, ideal: Tensor, correction: Tensor, most: Tensor) -> Tensor:
+        """A correction of at most `most`, `n`, that takes no joint farther beyond its limits than it is; all [SI]."""
+        zero = torch.zeros_like(ideal)
+        highest = torch.minimum(torch.maximum(ideal - self.low, zero), most)
+        lowest = torch.maximum(torch.minimum(ideal - self.high, zero), -most)
+        return torch.minimum(torch.maximum(correction, lowest), highest)
+
+    def describe(self) -> dict[str, Any]:
+        """Everything `from_description` needs; the tensors are stored beside it."""
+        return {
+            "kind": self.kind,
+            "mechanism": self.mechanism.describe(),
+            "identified": self.identified.tolist(),
+            "effects": None if self.effects is None else self.effects.describe(),
+            "rule": self.rule._asdict(),
+        }
+
+    @classmethod
+    def from_description(cls, description: dict[str, Any]) -> Machine:
+        """The machine as it was described, but for its tensors."""
+        # The reader of the file that contains this decides whether code may run.
+        mechanism = mechanism_from_description(description["mechanism"], allow_code=True)
+        effects = None if description["effects"] is None else PhysicalEffects.from_description(description["effects"])
+        identified = torch.tensor(description["identified"], dtype=torch.float64)
+        more = cls._blank(mechanism, description)
+        return cls(mechanism, identified, effects, Rule(**description["rule"]), **more)
+
+    @classmethod
+    def _blank(cls, mechanism: Mechanism, description: dict[str, Any]) -> dict[str, Any]:
+        """What else it is made of, tensors without meaning."""
+        return {}
+
+    def _prepare(self) -> None:
+        mechanism = self.mechanism
+        make = Links if isinstance(mechanism, SerialArm) else ForwardForm
+        self._nominal, self._identified = make(mechanism, mechanism.nominal), make(mechanism, self.identified)
+
+    def _reached(self, moved: Tensor, covariates: Tensor) -> Placed:
+        slope = not self._identified.one_slope
+        if self.effects is None:
+            return self._identified.at(moved, slope)
+        joints, shift = self.effects.changes(moved, covariates)
+        placed = self._identified.at(moved if joints is None else moved + joints, slope)
+        return placed if shift is None else placed.shifted(shift)
+
+    def _aim(self, wanted: Placed, moving: Placed, share: float = 1.0) -> Tensor:
+        """Pose wanted, λ² of the kinematics that move, and where it serves all steps their weighted Jacobian."""
+        parts = [wanted.position] if wanted.rotation is None else [wanted.position, wanted.rotation.flatten(-2)]
+        slope = self._slope(moving)
+        pull = self._damping(slope, share)
+        lost = [placed.lost for placed in (wanted, moving) if placed.lost is not None]
+        for one in lost:
+            pull = pull + self.rule.damping**2 * one
+        return torch.cat([*parts, *([slope.flatten(-2)] if self._nominal.one_slope else []), pull], -1)
+
+    def _slope(self, placed: Placed) -> Tensor:
+        """Weighted Jacobian, transposed, `... x n x c`."""
+        assert placed.linear is not None and placed.turning is not None
+        if placed.rotation is None:
+            return placed.linear
+        return torch.cat([placed.linear, self.rule.rotation_weight * placed.turning], -1)
+
+    def _damping(self, slope: Tensor, share: float) -> Tensor:
+        """λ² of a weighted Jacobian `... x n x c`, `... x 1` [m² per joint unit²]; it begins at a share of σ0."""
+        square = slope @ slope.mT if slope.shape[-2] <= slope.shape[-1] else slope.mT @ slope
+        unit = torch.eye(square.shape[-1], dtype=square.dtype)
+        # A lower bound of the smallest singular value, squared.
+        near = 1 / (inverse(square + _NEAR * unit) * unit).sum((-2, -1))
+        full = share * self.rule.nearest
+        return self.rule.damping**2 * torch.clamp_min(1 - near / full**2, 0.0).unsqueeze(-1)
+
+    def _step(self, placed: Placed, correction: Tensor, aim: Tensor) -> Tensor:
+        gap = aim[..., :3] - placed.position
+        if placed.rotation is not None:
+            turn = aim[..., 3:12].unflatten(-1, (3, 3)) @ placed.rotation.mT
+            gap = torch.cat([gap, self.rule.rotation_weight * skew_vector(turn)], -1)
+        # Where the machine has no pose, back to the ideal joints.
+        pull = aim[..., -1:] if placed.lost is None else aim[..., -1:] + placed.lost
+        if placed.linear is None:
+            n = correction.shape[-1]
+            slope = aim[..., -1 - n * gap.shape[-1] : -1].unflatten(-1, (n, gap.shape[-1]))
+        else:
+            slope = self._slope(placed)
+        unit = torch.eye(min(slope.shape[-2:]), dtype=slope.dtype)
+        more = (pull.unsqueeze(-1) + _REGULAR) * unit
+        if slope.shape[-2] <= slope.shape[-1]:
+            right = slope @ gap.unsqueeze(-1) + (pull * correction).unsqueeze(-1)
+            return correction - gauss_jordan(slope @ slope.mT + more, right).squeeze(-1)
+        # More joints than coordinates: a step of least norm, so that nothing moves that need not.
+        square = slope.mT @ slope
+        kept = slope.mT @ correction.unsqueeze(-1)
+        damped = slope @ gauss_jordan(square + more, gap.unsqueeze(-1) - kept)
+        return correction - (damped + slope @ gauss_jordan(square + _REGULAR * unit, kept)).squeeze(-1)
+
+
+def limits_of(mechanism: Mechanism) -> tuple[Tensor, Tensor]:
+    """Lowest and highest joints of the machine's file, `n` each [SI]; infinite where there are none."""
+    if isinstance(mechanism, SerialArm) and mechanism.recipe["keys"]["limits"] is not None:
+        return mechanism.limits[:, 0].clone(), mechanism.limits[:, 1].clone()
+    none = torch.full((len(mechanism.joints),), math.inf, dtype=torch.float64)
+    return -none, none
