@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.calibration.config import METHODS, RunConfig, method_names
 from ccnn_torch.calibration.evaluate import Outcome, evaluate, pose_before
-from ccnn_torch.calibration.learning.fitting import fit_method, refit
+from ccnn_torch.calibration.learning.fitting import Fitted, fit_method, refit
 from ccnn_torch.calibration.learning.method_choice import Comparison, compare
 from ccnn_torch.calibration.result import assemble, best_method, plan_of
 from ccnn_torch.calibration.rows.prepare import Prepared, damping_of, prepare
@@ -63,39 +63,18 @@ class Calibration:
         return mechanism if parameters is None else mechanism.with_nominal(parameters)
 
     def compensator(self, method: str | None = None) -> Compensator:
-        """The compensator of a method's exported repeat."""
+        """The compensator of a method's exported repeat.
+
+        Raises:
+            MethodFailedError: there is none; the sentence gives the reason.
+        """
         method = method or self.method
-        repeat, prepared = self.repeat(method), self.prepared
-        rows = prepared.dataset.usable_rows("fit")
-        there = rows.index[repeat][rows.weights[repeat] > 0]
-        fitted = self.outcomes[method].fitted
-        network = fitted.learner.network(repeat).cpu()
-        sd_scale = fitted.sd_scale[repeat]
-        if not isinstance(network, UncertainNetwork):
-            # A learner without a variance of its own has one standard deviation everywhere, here as in the results.
-            sd_scale = fitted.sd(prepared.dataset.inputs[:, :1])[repeat, 0] / fitted.scaling.deviation[repeat]
-        inputs, margin = prepared.dataset.inputs[repeat, there], self.config.compensation.margin
-        limit, geometry, effects = _limit(self.config, len(prepared.mechanism.joints)), None, None
-        if prepared.geometry is not None or prepared.effects is not None:
-            # What these leave at singular poses can be larger than what was there.
-            limit = default_limit(prepared.total[repeat, there]) if limit is None else limit
-        if prepared.effects is not None:
-            effects = prepared.effects.module(repeat, there, margin)
-        if prepared.geometry is not None:
-            geometry = prepared.geometry.module(repeat, inputs[:, : len(prepared.mechanism.joints)], margin)
-        return fit_compensator(
-            network,
-            fitted.scaling.repeat(repeat),
-            inputs,
-            prepared.dataset.deviation[repeat, there],
-            prepared.mechanism.joints,
-            prepared.covariate_coordinates,
-            limit=limit,
-            margin=margin,
-            sd_scale=sd_scale,
-            geometry=geometry,
-            effects=effects,
-        )
+        outcome, repeat = self.outcomes[method], self.repeat(method)
+        if outcome.without:
+            raise MethodFailedError(outcome.without)
+        if outcome.compensators:
+            return outcome.compensators[repeat]
+        return compensator_of(self.config, self.prepared, outcome.fitted, repeat)
 
     def save(
         self,
@@ -197,7 +176,7 @@ def _calibrate(config: RunConfig, folder: RunFolder | None, watch: Watch, prepar
                 fitted = fit_method(name, make, dataset, plan, folder, watched)
             else:
                 fitted = refit(name, make, dataset, plan, comparison.compared[name], folder, watched)
-            outcomes[name] = evaluate(prepared, fitted)
+            outcomes[name] = evaluate(prepared, fitted, partial(compensator_of, config, prepared, fitted))
         except MethodFailedError as problem:
             failed[name] = str(problem)
             continue
@@ -207,6 +186,34 @@ def _calibrate(config: RunConfig, folder: RunFolder | None, watch: Watch, prepar
         raise MethodFailedError("; ".join(f"{name}: {sentence}" for name, sentence in failed.items()))
     results = assemble(config, prepared, before, outcomes, failed, comparison)
     return Calibration(config, prepared, before, outcomes, failed, results)
+
+
+def compensator_of(config: RunConfig, prepared: Prepared, fitted: Fitted, repeat: int) -> Compensator:
+    """The compensator of one repeat of a trained method; raises as `fit_compensator`."""
+    rows = prepared.dataset.usable_rows("fit")
+    there = rows.index[repeat][rows.weights[repeat] > 0]
+    network = fitted.learner.network(repeat).cpu()
+    sd_scale = fitted.sd_scale[repeat]
+    if not isinstance(network, UncertainNetwork):
+        # A learner without a variance of its own has one standard deviation everywhere, here as in the results.
+        sd_scale = fitted.sd(prepared.dataset.inputs[:, :1])[repeat, 0] / fitted.scaling.deviation[repeat]
+    margin, limit = config.compensation.margin, _limit(config, len(prepared.mechanism.joints))
+    physics = {} if prepared.physics is None else prepared.physics.modules(repeat, there, margin)
+    if physics and "machine" not in physics and limit is None:
+        # What geometry and effects leave at singular poses can be larger than what was there.
+        limit = default_limit(prepared.total[repeat, there])
+    return fit_compensator(
+        network,
+        fitted.scaling.repeat(repeat),
+        prepared.dataset.inputs[repeat, there],
+        prepared.dataset.deviation[repeat, there],
+        prepared.mechanism.joints,
+        prepared.covariate_coordinates,
+        limit=limit,
+        margin=margin,
+        sd_scale=sd_scale,
+        **physics,
+    )
 
 
 def makers(config: RunConfig, default: str = "ccnn") -> dict[str, Callable[[], Learner] | None]:

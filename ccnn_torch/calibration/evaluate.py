@@ -1,7 +1,8 @@
-"""Predicted deviations of a trained method, and the pose error before and after."""
+"""Predicted deviations of a trained method, and the pose error before and after its commands."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +10,10 @@ from torch import Tensor
 
 from ccnn_torch.calibration.learning.fitting import Fitted
 from ccnn_torch.calibration.rows.prepare import Prepared
+from ccnn_torch.compensation import Compensator
+from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 # The fixed point q = q* - δ(q) gains a factor of the Lipschitz constant of δ each time, about 1e-3 for real machines.
 _COMMAND_ITERATIONS = 8
@@ -20,16 +24,24 @@ class Outcome:
     """A method's figures on every row of every repeat; which rows are held out is for the reader to choose.
 
     Attributes:
-        deviation: predicted deviation at the commanded joints, `r x s x n` [SI]; of what identified geometry and known
-            effects leave where these are a part of the compensator.
-        after: pose error with the correction, `r x s`.
+        deviation: predicted deviation at the commanded joints, `r x s x n` [SI]; of what the identified machine leaves
+            where that is a part of the compensator.
+        explained: pose error that the model leaves of the poses at the joints as they were commanded, `r x s`.
+        after: pose error under the commands of the compensator, `r x s`; what is explained where there is none.
         after_systematic: the same without the machine's noise, where it is simulated.
+        compensators: of every repeat of measured records; () of a simulated machine, and where `without` says why
+            there is none.
+        damped: share of the rows at which the command is damped near a singular pose or at a limit [1].
     """
 
     fitted: Fitted
     deviation: Tensor
+    explained: PoseError
     after: PoseError
     after_systematic: PoseError | None = None
+    compensators: tuple[Compensator, ...] = ()
+    without: str = ""
+    damped: float = 0.0
 
 
 def pose_before(prepared: Prepared) -> PoseError:
@@ -52,37 +64,95 @@ def pose_with_geometry(prepared: Prepared) -> PoseError | None:
     return prepared.mechanism.pose_error(prepared.pose, reached)
 
 
-def evaluate(prepared: Prepared, fitted: Fitted) -> Outcome:
+def evaluate(prepared: Prepared, fitted: Fitted, make: Callable[[int], Compensator]) -> Outcome:
     """Predict on every row, and find the pose error that is left.
 
     Simulated: the machine is commanded q with q + δ(q) = q*, and the pose that it then reaches is solved.
-    Recorded: FK(q + δ(q)) predicts the measured pose, δ with identified geometry and known effects where there are.
+    Recorded: the commanded joints are taken as ideal ones. Their command c, by the compensator as it is written,
+    brings the model to f(c), and what the model leaves of the measured pose at the joints themselves is added:
+    |f(c) - wanted + (measured - f(q))|.
+
+    Args:
+        make: the compensator of a repeat.
     """
     joints = prepared.joints
-    deviation = _deviation(prepared, fitted, joints)
+    deviation = fitted.predict(torch.cat([joints, prepared.covariates], -1))
     if prepared.simulation is None:
-        return Outcome(fitted, deviation, _pose_left(prepared, deviation))
+        return _of_records(prepared, fitted, deviation, make)
     command = joints
     for _ in range(_COMMAND_ITERATIONS):
-        command = joints - _deviation(prepared, fitted, command)
-    return Outcome(fitted, deviation, *prepared.simulation.pose_errors(command))
+        command = joints - fitted.predict(torch.cat([command, prepared.covariates], -1))
+    after, systematic = prepared.simulation.pose_errors(command)
+    return Outcome(fitted, deviation, after, after, systematic)
+
+
+def _of_records(
+    prepared: Prepared, fitted: Fitted, deviation: Tensor, make: Callable[[int], Compensator]
+) -> Outcome:
+    repeats, found, without = range(len(prepared.joints)), list[Compensator](), ""
+    try:
+        found = [make(repeat) for repeat in repeats]
+    except MethodFailedError as reason:
+        found, without = [], str(reason)
+    left, reached, damped = [], [], 0.0
+    for k in repeats:
+        joints, covariates = prepared.joints[k], prepared.covariates[k]
+        measured = _vectors(prepared, prepared.pose[k])
+        with torch.no_grad():
+            learned = found[k].learned(joints, covariates) if found else deviation[k]
+        rest = _apart(measured, _model(prepared, k, joints + learned))
+        left.append(rest)
+        if not found:
+            reached.append(rest)
+            continue
+        with torch.no_grad():
+            solved = found[k].solve(joints, covariates)
+            moved = solved.command + found[k].learned(solved.command, covariates)
+        wanted = _vectors(prepared, prepared.mechanism.forward_kinematics(joints, _parameters(prepared, k)))
+        reached.append(_apart(_model(prepared, k, moved), wanted) + rest)
+        damped += float((solved.status == 3).double().mean()) / len(prepared.joints)
+    explained, after = _error(torch.stack(left)), _error(torch.stack(reached))
+    return Outcome(fitted, deviation, explained, after, None, tuple(found), without, damped)
 
 
 def pose_with_effects(prepared: Prepared) -> PoseError | None:
     """Pose error that known effects leave by themselves, with the geometry beside them, `r x s`; None without them."""
-    return None if prepared.effects is None else _pose_left(prepared, torch.zeros_like(prepared.joints))
+    if prepared.physics is None or not prepared.physics.source:
+        return None
+    rows = [
+        _apart(_vectors(prepared, prepared.pose[k]), _model(prepared, k, prepared.joints[k]))
+        for k in range(len(prepared.joints))
+    ]
+    return _error(torch.stack(rows))
 
 
-def _pose_left(prepared: Prepared, deviation: Tensor) -> PoseError:
-    """Between measured poses and those predicted with the learned part of the deviation, `r x s x n` [SI]."""
-    joints, total = prepared.joints, deviation
-    if prepared.effects is not None:
-        total = total + prepared.effects.deviation(joints + total)
-    if prepared.geometry is not None:
-        total = total + prepared.geometry.deviation(prepared.pose)(joints + total)
-    reached = prepared.mechanism.forward_kinematics(joints + total, prepared.parameters)
-    return prepared.mechanism.pose_error(prepared.pose, reached)
+def _parameters(prepared: Prepared, repeat: int) -> Tensor | None:
+    """Of the nominal machine in one repeat, frames fitted, `1 x k` or `s x k`."""
+    return None if prepared.parameters is None else prepared.parameters[repeat]
 
 
-def _deviation(prepared: Prepared, fitted: Fitted, joints: Tensor) -> Tensor:
-    return fitted.predict(torch.cat([joints, prepared.covariates], -1))
+def _model(prepared: Prepared, repeat: int, moved: Tensor) -> Tensor:
+    """Frame of the model's pose at command and what was learned there, `s x n`, as `_vectors`."""
+    if prepared.physics is not None:
+        return prepared.physics.frames(repeat, moved)
+    guess = prepared.pose[repeat]
+    return _vectors(prepared, prepared.mechanism.forward_kinematics(moved, _parameters(prepared, repeat), guess))
+
+
+def _vectors(prepared: Prepared, pose: Tensor) -> Tensor:
+    """Position and rotation vector of the frame of poses, `s x c`."""
+    position, rotation = prepared.mechanism.frame(pose)
+    return position if rotation is None else torch.cat([position, matrix_to_rotation_vector(rotation)], -1)
+
+
+def _apart(there: Tensor, here: Tensor) -> Tensor:
+    """From one frame to another, `s x c`: difference of the positions, and the rotation vector between them."""
+    shift = there[..., :3] - here[..., :3]
+    if there.shape[-1] == 3:
+        return shift
+    first, last = (rotation_vector_to_matrix(v[..., 3:]) for v in (here, there))
+    return torch.cat([shift, matrix_to_rotation_vector(last @ first.mT)], -1)
+
+
+def _error(apart: Tensor) -> PoseError:
+    return PoseError(apart[..., :3].norm(dim=-1), apart[..., 3:].norm(dim=-1) if apart.shape[-1] == 6 else None)

@@ -112,7 +112,7 @@ def assemble(
         "constant": {"test": constant, "ratio_to_floor": ratio_to_floor(constant, floor)},
         "floor": floor,
         "auto": None if comparison is None else comparison.block(best),
-        "pose": _pose(config, prepared, before, outcomes[best].after),
+        "pose": _pose(config, prepared, before, outcomes[best]),
         "records": None if prepared.simulated else _records(prepared),
         **_effects(prepared, test),
         "data_sha256": prepared.data_hash,
@@ -155,8 +155,11 @@ def _spread_or_none(values: Tensor | None) -> dict[str, Any] | None:
 def _pose_of(prepared: Prepared, outcome: Outcome) -> dict[str, Any]:
     """The pose error that a method leaves, over all test rows."""
     left, weights = _held_out(prepared, outcome.after)
-    block = pose_block(left, left, weights)
-    return {name: part and {"unit": part["unit"], **part["after"]} for name, part in block.items()}
+    block = pose_block(left, left, weights, explained=_held_out(prepared, outcome.explained)[0])
+    return {
+        name: part and {"unit": part["unit"], **part["after"], "explained": part["explained"]}
+        for name, part in block.items()
+    }
 
 
 def _held_out(prepared: Prepared, error: PoseError) -> tuple[PoseError, Tensor]:
@@ -199,11 +202,12 @@ def row_counts(config: RunConfig, dataset: Dataset) -> dict[str, int]:
     }
 
 
-def _pose(config: RunConfig, prepared: Prepared, before: PoseError, after: PoseError) -> dict[str, Any]:
+def _pose(config: RunConfig, prepared: Prepared, before: PoseError, outcome: Outcome) -> dict[str, Any]:
     place, turn = prepared.pseudoerror.remainder_position, prepared.pseudoerror.remainder_rotation
     errors = {
         "before": before,
-        "after": after,
+        "after": outcome.after,
+        "explained": outcome.explained,
         "geometry": pose_with_geometry(prepared),
         "effects": pose_with_effects(prepared),
         # What no joint deviation can explain.
@@ -218,11 +222,11 @@ def _pose(config: RunConfig, prepared: Prepared, before: PoseError, after: PoseE
 
 def _effects(prepared: Prepared, test: Rows) -> dict[str, Any]:
     """What known effects do by themselves, where they are a part of the compensator."""
-    if prepared.effects is None:
+    if prepared.physics is None or not prepared.physics.source:
         return {}
     left = test.take(prepared.dataset.deviation)
     errors = joint_errors(torch.zeros_like(left), left, test.weights, prepared.mechanism.joints)
-    return {"effects": {"from": prepared.effects.path, "test": errors, "coefficients": prepared.effects.block()}}
+    return {"effects": {"from": prepared.physics.source, "test": errors, "coefficients": prepared.physics.block()}}
 
 
 def _records(prepared: Prepared) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from ccnn_torch.compensation.effects.effects import Care as Care
 from ccnn_torch.compensation.effects.effects import PhysicalEffects as PhysicalEffects
 from ccnn_torch.compensation.effects.effects import effect_deviation as effect_deviation
 from ccnn_torch.compensation.effects.effects import expand_effects as expand_effects
+from ccnn_torch.compensation.effects.effects import gains as gains
 from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
 from ccnn_torch.compensation.geometry.identified import Geometry as Geometry
 from ccnn_torch.compensation.geometry.expanded import expand_geometry as expand_geometry

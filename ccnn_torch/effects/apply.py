@@ -39,14 +39,20 @@ def signature(situation: Situation, effect: Effect, shape: Tensor) -> Tensor:
     return basis
 
 
-def reached(situation: Situation, acting: Sequence[Acting]) -> Tensor:
+def reached(situation: Situation, acting: Sequence[Acting], parameters: Tensor | None = None) -> Tensor:
     """Position `... x s x 3` [m] and rotation matrix, as the frame of the pose measured on a machine with the effects.
+
+    Args:
+        situation: rows.
+        acting: effects with their numbers.
+        parameters: of the machine that moves, `... x k` [SI]; those of the situation when None. What the effects look
+            at is that of the situation.
 
     Returns:
         The frame's position and rotation vector side by side, `... x s x c`: c = 3 without orientation, else 6.
     """
     mechanism = situation.mechanism
-    joints, parameters = situation.joints, mechanism.resolve(situation.parameters)
+    joints, parameters = situation.joints, mechanism.resolve(situation.parameters if parameters is None else parameters)
     for one in acting:
         if one.effect.kind == "joints":
             joints = joints + one.change(situation)
@@ -62,6 +68,28 @@ def reached(situation: Situation, acting: Sequence[Acting]) -> Tensor:
     if rotation is None:
         return position
     return torch.cat([position, matrix_to_rotation_vector(rotation)], -1)
+
+
+def moved_joints(situation: Situation, acting: Sequence[Acting]) -> Tensor:
+    """What the effects on the joints add to them, `... x s x n` [SI]."""
+    changes = [one.change(situation) for one in acting if one.effect.kind == "joints"]
+    return sum(changes, torch.zeros_like(situation.joints))
+
+
+def without_pose_effects(situation: Situation, measured: Tensor, acting: Sequence[Acting]) -> Tensor:
+    """Measured poses `... x s x p` [SI] with the effects on the pose taken away; as measured where that is no pose."""
+    changes = [one.change(situation) for one in acting if one.effect.kind == "pose"]
+    if not changes:
+        return measured
+    position, rotation = situation.mechanism.frame(measured)
+    for change in reversed(changes):
+        position = position - change[..., :3]
+        if rotation is not None and change.shape[-1] == 6:
+            rotation = rotation_vector_to_matrix(change[..., 3:]).mT @ rotation
+    frame = position if rotation is None else torch.cat([position, matrix_to_rotation_vector(rotation)], -1)
+    found = measured_pose(situation, torch.nan_to_num(frame))
+    fine = torch.isfinite(frame).all(-1, keepdim=True) & torch.isfinite(found).all(-1, keepdim=True)
+    return torch.where(fine, found, measured)
 
 
 def measured_pose(situation: Situation, frame: Tensor) -> Tensor:

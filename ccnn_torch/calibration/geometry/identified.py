@@ -2,49 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.rows.dataset import Dataset, pad_rows
-from ccnn_torch.compensation import Geometry, default_limit, fit_geometry_module, geometric_deviation, settled_damping
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm, fit_frames, judge_frames
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
-
-
-@dataclass(frozen=True)
-class Identified:
-    """Identified geometry beside the nominal one, of every repeat.
-
-    Attributes:
-        nominal: fitted frames and the maker's links, `r x 1 x k` [SI].
-        values: identified parameters, `r x 1 x k` [SI].
-        damping: of a serial arm's deviation, see `SerialGeometry`.
-    """
-
-    mechanism: Mechanism
-    nominal: Tensor
-    values: Tensor
-    damping: float
-
-    def deviation(self, guess: Tensor | None = None) -> Callable[[Tensor], Tensor]:
-        """γ of commanded joints `r x s x n`, the same [SI]; guess: poses near by, `r x s x p`."""
-        return geometric_deviation(self.mechanism, self.nominal, self.values, ROTATION_WEIGHT, self.damping, guess)
-
-    def module(self, repeat: int, joints: Tensor, margin: float) -> Geometry:
-        """γ of one repeat for a model file; joints: commanded, of the training rows, `s x n` [SI].
-
-        Raises:
-            InputError, MethodFailedError: see `fit_geometry_module`.
-        """
-        own = (self.nominal[repeat, 0], self.values[repeat, 0])
-        return fit_geometry_module(self.mechanism, *own, joints, margin, ROTATION_WEIGHT, self.damping)
 
 
 @dataclass(frozen=True)
@@ -59,24 +27,6 @@ class Fitted:
     parameters: Tensor | None
     geometry: Tensor | None
     notes: list[str]
-
-    def beside(
-        self, mechanism: Mechanism, joints: Tensor, total: Tensor, splits: list[Split], margin: float
-    ) -> Identified:
-        """The identified geometry as a part of a compensator whose network learns what it leaves.
-
-        Args:
-            joints: commanded, `s x n` [SI].
-            total: deviations of the nominal machine, `[r x] s x n` [SI].
-            splits: one a repeat; the rows that are not held out bound the correction.
-        """
-        assert self.geometry is not None
-        nominal = mechanism.nominal.expand_as(self.geometry) if self.parameters is None else self.parameters
-        each = total.expand(len(splits), *total.shape[-2:])
-        limits = [default_limit(part[Dataset.part(s, "fit")]) for part, s in zip(each, splits, strict=True)]
-        limit = torch.stack(limits).amin(0).clamp_min(1e-12)
-        damping = settled_damping(mechanism, nominal, self.geometry, joints, limit, ROTATION_WEIGHT, margin)
-        return Identified(mechanism, nominal, self.geometry, damping)
 
 
 def fit_machine(mechanism: Mechanism, records: Records, splits: list[Split], identify: bool) -> Fitted:

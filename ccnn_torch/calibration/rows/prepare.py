@@ -14,8 +14,8 @@ from torch import Tensor
 
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.geometry.choice import GeometryChoice, choose_geometry
-from ccnn_torch.calibration.geometry.identified import Fitted, Identified, fit_machine
-from ccnn_torch.calibration.geometry.known_effects import KnownEffects, fit_effects, verdict_of
+from ccnn_torch.calibration.geometry.identified import fit_machine
+from ccnn_torch.calibration.geometry.physics import Physics, fit_effects, identified_alone, verdict_of
 from ccnn_torch.calibration.rows.dataset import Dataset, by_repeat, dataset_of
 from ccnn_torch.calibration.rows.memory import check_memory
 from ccnn_torch.config.held_out import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
@@ -43,13 +43,11 @@ class Prepared:
         joints: commanded joints, `r x s x n` [SI]; the repeats of measured records share their rows.
         covariates: `r x s x m` [SI].
         pose: measured poses, `r x s x p` [SI].
-        pseudoerror: what the poses say about the joints, and what is learned: with `geometry`, that of the identified
-            machine, and with `effects` what they leave of it.
+        pseudoerror: what the poses say about the joints, and what is learned: with `physics` what that leaves.
         total: deviation of the joints of the nominal machine, `r x s x n` [SI]; without these two that is learned.
         identified: geometry with all parameters fitted to the training rows of each repeat, like `parameters`: what a
             geometric calibration would command by, to be compared with; None where it was not fitted.
-        geometry: the same where it is a part of the compensator, so that the network learns what it leaves.
-        effects: known effects that are a part of it, likewise.
+        physics: the identified machine that is a part of the compensator, so that the network learns what it leaves.
         choice: what `geometry` ended as; None for a case.
         simulation: the machine behind simulated rows, or None for measured records.
         notes: sentences for the person who reads the results.
@@ -66,8 +64,7 @@ class Prepared:
     dataset: Dataset
     data_hash: str
     identified: Tensor | None = None
-    geometry: Identified | None = None
-    effects: KnownEffects | None = None
+    physics: Physics | None = None
     choice: GeometryChoice | None = None
     simulation: Simulation | None = None
     notes: list[str] = field(default_factory=list)
@@ -224,22 +221,20 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
         return joint_deviations(mechanism, records.joints, records.pose, parameters=parameters, **settings)
 
     total = deviations = solved(fitted.parameters)
-    learned, identified, effects, margin = fitted.parameters, None, None, config.compensation.margin
-    identify, notes = choice.identify, [*doubts, *records.notes, choice.why, *fitted.notes]
-    beside: Fitted | None = fitted if identify else None
+    learned, physics = fitted.parameters, None
+    notes = [*doubts, *records.notes, choice.why, *fitted.notes]
+    names = [c.name for c in records.covariate_coordinates]
     if verdict is not None:
-        about = (splits, fitted.parameters, total.deviation, total.usable, identify, margin)
-        of_pose = (settings["rotation_weight"], settings["damping"])
-        effects, values, said = fit_effects(verdict, mechanism, records, *about, of_pose)
-        beside = None if values is None else replace(fitted, geometry=values)
+        about = (splits, fitted.parameters, total.usable, choice.identify)
+        physics, said = fit_effects(verdict, mechanism, records, *about)
         notes += said
-    if beside is not None:
-        learned = beside.geometry
-        deviations = solved(learned)
-        identified = beside.beside(mechanism, records.joints, total.deviation, splits, margin)
-    if effects is not None:
-        joints, whole = (by_repeat(rows, seeds) for rows in (records.joints, deviations.deviation))
-        deviations = replace(deviations, deviation=effects.remainder(joints, whole))
+    elif choice.identify:
+        assert fitted.geometry is not None
+        nominal = mechanism.nominal.expand_as(fitted.geometry) if fitted.parameters is None else fitted.parameters
+        physics = identified_alone(mechanism, records, nominal, fitted.geometry, names)
+    if physics is not None:
+        learned = physics.values
+        deviations = physics.targets(records.joints, records.pose, settings)
     jacobian = mechanism.jacobian(records.joints, learned, guess=records.pose)
     return Prepared(
         mechanism=mechanism,
@@ -253,8 +248,7 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
         dataset=dataset_of(mechanism, records.joints, records.covariates, deviations, splits, seeds, jacobian),
         data_hash=records.data_hash,
         identified=fitted.geometry,
-        geometry=identified,
-        effects=effects,
+        physics=physics,
         choice=choice,
         notes=[*held_out_notes(config.split, len(splits[0].test)), *notes, *deviations.notes()],
     )

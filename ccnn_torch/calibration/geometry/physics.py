@@ -1,4 +1,4 @@
-"""`effects: from:FILE`: effects of a diagnosis, fitted to the training rows, as a part of the compensator."""
+"""The identified machine of a run: geometry and effects, fitted to the training rows of each repeat."""
 
 from __future__ import annotations
 
@@ -9,79 +9,113 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.rows.dataset import Dataset
-from ccnn_torch.compensation import Care, PhysicalEffects, effect_deviation, expand_effects, settled_effects
+from ccnn_torch.compensation import Care, build_machine, expand_effects, expand_geometry, gains, geometric_deviation
 from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.diagnosis.from_file import Known, Verdict, one_row_at_a_time, read_verdict
 from ccnn_torch.diagnosis.refit import refit
 from ccnn_torch.display import short_path
-from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, measured_pose, reached
+from ccnn_torch.effects import (
+    Acting,
+    Situation,
+    default_gravity,
+    make_effect,
+    measured_pose,
+    moved_joints,
+    reached,
+    without_pose_effects,
+)
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry
 from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
-from ccnn_torch.mechanisms.frames.fit import fit_frames
+from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, fit_frames
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
 
 _FROM = "from:"
-# Steps of r <- δ - ε(q + r); each gains a factor of ε's slope, at most 0.1.
+# Steps of r <- δ - e(q + r); each gains a factor of e's slope, at most 0.1.
 _STEPS = 6
 # Times geometry and effects are fitted in turn.
 _TURNS = 2
-# Of orientation against position for arms [m/rad], as their frames and links are fitted.
-_ARM_ROTATION = 0.3
+# How much larger than at the training rows what effects take from the kinematics may become.
+_ABOVE = 1.1
 
 
 @dataclass(frozen=True)
-class KnownEffects:
-    """The verdict's effects with the numbers of every repeat.
+class Physics:
+    """The machine of every repeat as it was identified: geometry and effects, without what is learned.
 
     Attributes:
-        path: the diagnosis.
-        situations: all rows on the machine of each repeat, without time.
+        source: where the effects come from, for people; empty without any.
+        situations: all rows on the nominal machine of each repeat, frames fitted, without time.
+        values: all parameters of the real machine, `r x 1 x k` [SI].
         acting: effects on joints and pose, of each repeat.
-        every: all of the verdict's, those on the parameters as well.
+        every: all of the effects, those on the parameters as well, whose change is in `values`.
         covariates: names of the compensator's, in order.
-        care: what is done near singular poses.
     """
 
-    path: str
+    source: str
     situations: list[Situation]
+    values: Tensor
     acting: list[list[Acting]]
     every: list[list[Acting]]
     covariates: list[str]
-    care: Care
 
-    def deviation(self, joints: Tensor) -> Tensor:
-        """ε at commanded joints of all rows, `r x s x n` [SI]."""
-        found = []
-        for situation, acting, at in zip(self.situations, self.acting, joints, strict=True):
-            mechanism, guess = situation.mechanism, situation.guess
+    def frames(self, repeat: int, moved: Tensor) -> Tensor:
+        """Frame of the pose of all rows at command and what was learned there, `s x n` [SI], as `reached` gives it."""
+        here = replace(self.situations[repeat], joints=moved)
+        return reached(here, self.acting[repeat], self.values[repeat, 0])
 
-            def jacobian(q: Tensor, mechanism: Mechanism = mechanism, guess: Tensor | None = guess) -> Tensor:
-                return mechanism.jacobian(q, None, guess).detach()
+    def poses(self, repeat: int, moved: Tensor) -> Tensor:
+        """The same as pose coordinates, `s x p` [SI]."""
+        here = replace(self.situations[repeat], joints=moved)
+        return measured_pose(here, reached(here, self.acting[repeat], self.values[repeat, 0]))
 
-            here = replace(situation, joints=at)
-            found.append(effect_deviation(here, acting, jacobian, self.care) if acting else torch.zeros_like(at))
-        return torch.stack(found)
+    def targets(self, joints: Tensor, pose: Tensor, settings: dict[str, Any]) -> Pseudoerror:
+        """What is left to be learned: the joints at which this machine has the measured pose, less the command.
 
-    def remainder(self, joints: Tensor, deviation: Tensor) -> Tensor:
-        """What is left to be learned of deviations, r + ε(q + r) = δ; all `r x s x n` [SI]."""
-        left = deviation - self.deviation(joints)
-        for _ in range(_STEPS):
-            left = deviation - self.deviation(joints + left)
-        return left
+        Args:
+            joints: commanded, `s x n` [SI].
+            pose: measured, `s x p` [SI].
+            settings: of `joint_deviations`.
+        """
+        mechanism = self.situations[0].mechanism
+        clean = torch.stack(
+            [without_pose_effects(one, pose, own) for one, own in zip(self.situations, self.acting, strict=True)]
+        )
+        each = joints.expand(len(clean), *joints.shape)
+        found = joint_deviations(mechanism, each, clean, parameters=self.values, **settings)
+        parts = []
+        for one, own, whole in zip(self.situations, self.acting, found.deviation, strict=True):
+            left = whole
+            for _ in range(_STEPS if own else 0):
+                left = whole - moved_joints(replace(one, joints=joints + left), own)
+            parts.append(left)
+        return replace(found, deviation=torch.stack(parts))
 
-    def module(self, repeat: int, rows: Tensor, margin: float) -> PhysicalEffects | None:
-        """ε of one repeat for a model file; rows: numbers of the training rows; None where only parameters are off.
+    def modules(self, repeat: int, rows: Tensor, margin: float) -> dict[str, Any]:
+        """The machine of one repeat for a model file, as `fit_compensator` takes it.
+
+        Args:
+            rows: numbers of the training rows.
+            margin: of the compensator's domain.
 
         Raises:
-            InputError, MethodFailedError: see `expand_effects`.
+            InputError, MethodFailedError: see `build_machine`, `expand_effects` and `expand_geometry`.
         """
-        if not self.acting[repeat]:
-            return None
-        there = _rows(self.situations[repeat], rows)
-        return expand_effects(there, self.acting[repeat], self.covariates, margin, self.care)
+        situation, acting, values = self.situations[repeat], self.acting[repeat], self.values[repeat, 0]
+        there, mechanism = _rows(situation, rows), situation.mechanism
+        closed = isinstance(mechanism, SerialArm) or mechanism.closed_form is not None
+        care = None if closed else _care(there)
+        effects = expand_effects(there, acting, self.covariates, margin, care) if acting else None
+        machine = build_machine(mechanism, values, effects, there.joints, margin)
+        if machine is not None:
+            return {"machine": machine}
+        geometry = None
+        if not torch.equal(values, mechanism.nominal):
+            geometry = expand_geometry(geometric_deviation(mechanism, mechanism.nominal, values), there.joints, margin)
+        return {"geometry": geometry, "effects": effects}
 
     def block(self) -> dict[str, Any]:
         """For results.json: each coefficient's value in every repeat, by effect and name."""
@@ -98,6 +132,31 @@ class KnownEffects:
         return found
 
 
+def _care(situation: Situation) -> Care:
+    """Near singular poses effects of a machine without closed forms grow no further than at the training rows."""
+    care = Care(ROTATION_WEIGHT, 0.0)
+    gain, inverse_gain = (_ABOVE * float(sizes.max()) for sizes in gains(situation.jacobian, care))
+    return care._replace(gain=gain, inverse_gain=inverse_gain)
+
+
+def identified_alone(
+    mechanism: Mechanism, records: Records, nominal: Tensor, values: Tensor, covariates: list[str]
+) -> Physics:
+    """The machines of all repeats without any effect.
+
+    Args:
+        nominal, values: all parameters, frames fitted and identified, `r x 1 x k` [SI].
+        covariates: names of the compensator's, in order.
+    """
+    gravity = default_gravity(mechanism)
+    guess = records.pose if records.pose.shape[-1] == len(mechanism.pose) else None
+    situations = [
+        Situation(mechanism.with_nominal(own[0]), records.joints, {}, gravity, None, guess)
+        for own in nominal.expand_as(values)
+    ]
+    return Physics("", situations, values, [[] for _ in situations], [[] for _ in situations], covariates)
+
+
 def verdict_of(key: str, mechanism: Mechanism) -> Verdict:
     """The verdict that the key `effects` names; raises as `read_verdict`."""
     return read_verdict(key.removeprefix(_FROM), mechanism.name, [joint.name for joint in mechanism.joints])
@@ -109,23 +168,18 @@ def fit_effects(
     records: Records,
     splits: list[Split],
     parameters: Tensor | None,
-    total: Tensor,
     usable: Tensor,
     identify: bool,
-    margin: float,
-    settings: tuple[float, float],
-) -> tuple[KnownEffects, Tensor | None, list[str]]:
+) -> tuple[Physics, list[str]]:
     """Fit the verdict's coefficients to the rows of each repeat that are not held out; shapes are the file's.
 
     Args:
         parameters: with fitted frames, `r x 1 x k`; None = nominal.
-        total: deviations of that machine, `[r x] s x n` [SI].
         usable: rows fit to learn from, `[r x] s` bool.
         identify: whether all parameters are to be identified beside the effects.
-        settings: rotation weight and damping of the pseudoerror.
 
     Returns:
-        The effects; the parameters that go with them, `r x 1 x k`, or None where these are nominal; notes.
+        The machines with the effects, and notes.
     """
     if parameters is not None and parameters.shape[1] > 1:
         raise InputError(
@@ -140,8 +194,7 @@ def fit_effects(
     if identify and any(k.effect.kind == "parameters" for k in known):
         known = [k for k in known if k.effect.kind != "parameters"]
         notes.append("The verdict's geometry is left to geometry=identify, which fits all parameters.")
-    arm = isinstance(mechanism, SerialArm)
-    situations, acting, values = [], [], []
+    situations, every, values = [], [], []
     for k, split in enumerate(splits):
         base = mechanism.nominal if parameters is None else parameters[k, 0]
         machine = mechanism if parameters is None else mechanism.with_nominal(base)
@@ -151,26 +204,17 @@ def fit_effects(
         rows &= usable.expand(len(splits), -1)[k]
         fitted, own = _fitted(situation, records, known, rows, identify)
         situations.append(situation)
-        acting.append(fitted)
+        every.append(fitted)
         values.append(own)
-    moving = [[a for a in one if a.effect.kind != "parameters"] for one in acting]
-    changed = torch.stack(values).unsqueeze(1)
-    base_all = mechanism.nominal.expand_as(changed) if parameters is None else parameters
-    weight, damping = (_ARM_ROTATION if arm else settings[0]), settings[1]
-    care = Care(weight, damping)
-    names = [c.name for c in records.covariate_coordinates]
-    if moving[0]:
-        fit = Dataset.part(splits[0], "fit")
-        limit = (1.5 * total.expand(len(splits), *total.shape[-2:])[0, fit].abs().amax(0)).clamp_min(1e-12)
-        there = _rows(situations[0], torch.nonzero(usable.expand(len(splits), -1)[0]).squeeze(-1))
-        care = settled_effects(there, moving[0], names, limit, margin, weight, damping).care
+    acting = [[a for a in one if a.effect.kind != "parameters"] for one in every]
     named = ", ".join(k.effect.name for k in known)
     notes.append(
         f"Effects of {short_path(verdict.path)}: {named}. Their coefficients were fitted anew to the training rows of "
         "each repeat; their periods and other shapes are the file's, which may have seen the held-out rows."
     )
-    found = KnownEffects(short_path(verdict.path), situations, moving, acting, names, care)
-    return found, None if torch.equal(changed, base_all) else changed, notes
+    names = [c.name for c in records.covariate_coordinates]
+    changed = torch.stack(values).unsqueeze(1)
+    return Physics(short_path(verdict.path), situations, changed, acting, every, names), notes
 
 
 def _refuse_lacking(verdict: Verdict, mechanism: Mechanism, records: Records) -> None:
