@@ -24,6 +24,7 @@ from ccnn_torch.config.tree import (
     config_from_options,
     written,
 )
+from ccnn_torch.effects import EFFECTS
 from ccnn_torch.engine import Engine
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.learners.bp_lm import BPLMSettings
@@ -203,11 +204,11 @@ class RunConfig(_Part):
         "learn only what they leave; the model files hold both. none = the network learns everything. auto = what "
         "cross-validation prefers of identified geometry alone, or either with a learner; none for cases and effects",
     )
-    effects: str = Field(
-        default="none",
-        description="from:DIR/diagnosis.json = take the effects that a diagnosis named, fit their coefficients to the "
-        "training rows of records, and let the network learn only what they leave; the model files hold both. none = "
-        "the network learns everything",
+    effects: str | list[str] = Field(
+        default="auto",
+        description="physical causes that are a part of the model, so that the network learns only what they leave: "
+        "auto = those that a diagnosis of the training rows names, where cross-validation finds that they pay (none "
+        "for cases); a list = the same among these; from:DIR/diagnosis.json = those that a diagnosis named; none",
     )
     rotation_weight: float = Field(
         default=0.04, gt=0, description="weight of orientation against position in m per rad (η of eq. 5)"
@@ -264,10 +265,20 @@ class RunConfig(_Part):
 
     @field_validator("effects")
     @classmethod
-    def _none_or_a_file(cls, effects: str) -> str:
-        if effects != "none" and not effects.startswith("from:"):
-            raise ValueError(f"is '{effects}'; write effects=from:{effects} for such a file, or effects=none")
-        return effects
+    def _known_effects(cls, effects: str | list[str]) -> str | list[str]:
+        if isinstance(effects, str):
+            if effects not in ("auto", "none") and not effects.startswith("from:"):
+                raise ValueError(
+                    f"is '{effects}'; write effects=from:{effects} for such a file, [NAME, …] for effects of the "
+                    "library, auto or none"
+                )
+            return effects
+        for name in effects:
+            if name not in EFFECTS:
+                near = nearest(name, tuple(EFFECTS))
+                hint = f"did you mean '{near}'?" if near else f"known are {', '.join(EFFECTS)}"
+                raise ValueError(f"there is no effect '{name}' that a model file can hold; {hint}")
+        return effects or "none"
 
     @model_validator(mode="after")
     def _one_source(self) -> RunConfig:
@@ -296,7 +307,7 @@ class RunConfig(_Part):
             raise ValueError("columns: a case reads no file; remove the key")
         if self.case is not None and self.geometry == "identify":
             raise ValueError("geometry: a case is there to compare learners; write geometry=none, or take records")
-        if self.case is not None and self.effects != "none":
+        if self.case is not None and self.effects not in ("auto", "none"):
             raise ValueError("effects: a case is there to compare learners; write effects=none, or take records")
         folds = self.training.folds > 1 or self.methods == ["auto"]
         if self.training.early_stop and self.split.validation == 0 and not folds:

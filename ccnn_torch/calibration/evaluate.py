@@ -86,9 +86,7 @@ def evaluate(prepared: Prepared, fitted: Fitted, make: Callable[[int], Compensat
     return Outcome(fitted, deviation, after, after, systematic)
 
 
-def _of_records(
-    prepared: Prepared, fitted: Fitted, deviation: Tensor, make: Callable[[int], Compensator]
-) -> Outcome:
+def _of_records(prepared: Prepared, fitted: Fitted, deviation: Tensor, make: Callable[[int], Compensator]) -> Outcome:
     repeats, found, without = range(len(prepared.joints)), list[Compensator](), ""
     try:
         found = [make(repeat) for repeat in repeats]

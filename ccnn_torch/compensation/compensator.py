@@ -344,9 +344,7 @@ class Compensator(nn.Module):
         learned = self._learned(command, covariates, strange)
         return learned, self.machine.aim_back(command + learned.value, self._held(covariates))
 
-    def _settled(
-        self, ideal: Tensor | None, wanted: Tensor, correction: Tensor, aim: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def _settled(self, ideal: Tensor | None, wanted: Tensor, correction: Tensor, aim: Tensor) -> tuple[Tensor, Tensor]:
         """The next correction within its bounds, and whether the one at hand is damped, at a bound or on its way."""
         assert self.machine is not None
         if ideal is None:

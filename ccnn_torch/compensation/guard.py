@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 
@@ -27,8 +28,8 @@ class Promise:
     """What holds for every row of a model with n joints and d inputs, the joints first.
 
     Attributes:
-        limit: of |deviation|, `n` [SI]: the card's `most_deviation`; infinity without one.
-        sd: standard deviation where the deviation is taken as 0, `n` [SI]; None for a model without one.
+        limit: of |deviation|, `n` [SI]: the card's `most_deviation`.
+        sd: standard deviation where the deviation is taken as 0, `n` [SI].
         centre, low, high: replacements of an input that is no number, and for an infinite one, `d` [SI].
         half_range: unit of the rows of `directions`, `d` [SI].
         directions: `k x d` [1], with `least` and `most`, `k` [1]: inside the domain, directions · (x - centre) /
@@ -36,7 +37,7 @@ class Promise:
     """
 
     limit: Array
-    sd: Array | None
+    sd: Array
     centre: Array
     low: Array
     high: Array
@@ -74,11 +75,19 @@ class Promise:
         )
 
     @classmethod
-    def without_card(cls, home: Array) -> Promise:
-        """Of identified geometry, which has no limit and defines its domain itself; home: `n` [SI]."""
-        n = len(home)
-        nothing = np.zeros(0)
-        return cls(np.full(n, np.inf), None, home, home, home, np.ones(n), np.zeros((0, n)), nothing, nothing)
+    def of_compensator(cls, compensator: Compensator) -> Promise:
+        """As the card that would be written for it."""
+        domain, n = compensator.domain, len(compensator.domain.centre)
+        middle, radius = domain.middle.numpy(), domain.radius.numpy()
+        most, sd, *others = (
+            v.numpy()
+            for v in (
+                *(compensator.most, compensator.fallback_sd, domain.centre, domain.low, domain.high),
+                *(domain.half_range, domain.directions),
+            )
+        )
+        assert len(middle) == 2 * n
+        return cls(most, sd, *others, middle - radius, middle + radius)
 
     def cleaned(self, inputs: Array) -> tuple[Array, Array]:
         """Finite inputs `s x d` [SI], as a `Domain` makes them, and which were not, `s x d`, bool."""
@@ -118,7 +127,7 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
         covariates: `s x m` [SI], anything; None without any.
 
     Returns:
-        `command`, `deviation`, `ideal`, and `deviation_sd` where the promise has one, `s x n` [SI], all finite;
+        `command`, `deviation`, `ideal` and `deviation_sd`, `s x n` [SI], all finite;
         `inside_domain`, `ideal_inside_domain` and `fallback`, `s`, bool; `status` and `ideal_status`, `s`, int64: 0
         exact, 1 outside what was measured or fallen back, 2 an input is not finite, 3 damped.
     """
@@ -127,11 +136,9 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
     inputs, strange = promise.cleaned(inputs)
     given = inputs[:, :n]
 
-    floats, bools = ["command", "deviation", "ideal"], ["inside_domain", "ideal_inside_domain"]
+    floats, bools = ["command", "deviation", "ideal", "deviation_sd"], ["inside_domain", "ideal_inside_domain"]
     safe = {"command": given, "deviation": np.zeros_like(given), "ideal": given}
-    if promise.sd is not None:
-        floats.append("deviation_sd")
-        safe["deviation_sd"] = np.broadcast_to(promise.sd, given.shape)
+    safe["deviation_sd"] = np.broadcast_to(promise.sd, given.shape)
     # Where an output is no such numbers there are none.
     there = {name: _of_kind(found.get(name), (rows, n), np.float64) for name in floats}
     flags = {name: _of_kind(found.get(name), (rows,), np.bool_) for name in bools}
@@ -140,12 +147,11 @@ def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, prom
     numbers = {name: safe[name] if value is None else value for name, value in there.items()}
 
     command, deviation, ideal = (numbers[name] for name in floats[:3])
-    rounding = _SLACK * np.minimum(promise.limit, 1.0) + 8 * np.spacing(np.abs(given) + np.abs(deviation))
+    rounding = _SLACK * promise.limit + 8 * np.spacing(np.abs(given) + np.abs(deviation))
     # Written so that a NaN is not good.
     good = np.isfinite(command) & np.isfinite(ideal) & (np.abs(deviation) <= promise.limit * (1 + _EDGE))
     good &= (np.abs(command + deviation - given) <= rounding) & (np.abs(ideal - given) <= promise.limit + rounding)
-    if promise.sd is not None:
-        good &= (numbers["deviation_sd"] >= 0) & (numbers["deviation_sd"] < np.inf)
+    good &= (numbers["deviation_sd"] >= 0) & (numbers["deviation_sd"] < np.inf)
     kept_rows: Array = np.logical_and(good.all(-1), whole)
 
     checked = {name: np.where(kept_rows[:, None], numbers[name], safe[name]) for name in floats}

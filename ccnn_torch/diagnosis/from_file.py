@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +124,37 @@ def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Ver
             no effect that could be compensated.
     """
     content = parse_json(read_text(path, _LARGEST, "give effects=from:DIR/diagnosis.json"), str(path))
+    found = _verdict_of(content, str(path), mechanism, joints)
+    _refuse(str(path), *found)
+    return found[0]
+
+
+def usable_verdict(content: Mapping[str, Any], situation: Situation) -> tuple[Verdict | None, list[str]]:
+    """The effects of a diagnosis that a model file can hold, and notes on those left out; None where there is none.
+
+    Args:
+        content: of a `diagnosis.json`.
+        situation: rows, with their covariates.
+    """
+    mechanism = situation.mechanism
+    names = [joint.name for joint in mechanism.joints]
+    verdict, *_ = _verdict_of(content, "the training rows", mechanism.name, names)
+    notes, kept = not_held_notes([*verdict.parameters]), {}
+    for name, values in verdict.parameters.items():
+        alone = replace(verdict, parameters={name: values}, outside=False)
+        try:
+            if name != OUTLIER and _held(name):
+                alone.on(situation)
+                kept[name] = values
+        except InputError as reason:
+            notes.append(f"{str(reason).removeprefix('the training rows: effects, ')}.")
+    return (replace(verdict, parameters=kept) if kept else None), notes
+
+
+def _verdict_of(
+    content: Any, path: str, mechanism: str, joints: Sequence[str]
+) -> tuple[Verdict, bool, Mapping[str, Any]]:
+    """The verdict as it stands, whether it is that nothing is wrong, and the effects that are listed."""
     try:
         verdict = content["verdict"]
         names, outside, nothing = list(verdict["effects"]), bool(verdict["outside_library"]), bool(verdict["none"])
@@ -142,18 +173,14 @@ def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Ver
             f"{path}: mechanism: was diagnosed on {machine.get('name')} with the joints {', '.join(theirs)}, and this "
             f"run has {mechanism} with {', '.join(joints)}; give the same mechanism"
         )
-    _refuse(str(path), names, outside, nothing, listed)
-    return Verdict(
-        str(path),
-        None if gravity is None else torch.tensor(gravity, dtype=torch.float64),
-        {name: listed[name] for name in names},
-        outside,
-        covariates,
-    )
+    down = None if gravity is None else torch.tensor(gravity, dtype=torch.float64)
+    parameters = {name: listed.get(name, {}) for name in names}
+    return Verdict(path, down, parameters, outside, covariates), nothing, listed
 
 
-def _refuse(path: str, names: list[str], outside: bool, nothing: bool, listed: dict[str, Any]) -> None:
+def _refuse(path: str, verdict: Verdict, nothing: bool, listed: Mapping[str, Any]) -> None:
     """Raise InputError where a verdict has no effects to take."""
+    names, outside = [*verdict.parameters], verdict.outside
     key, remedy = f"{path}: verdict", "write effects=none"
     if nothing:
         raise InputError(f"{key}: none: the gap is no more than the noise, so there is no effect to take; {remedy}")

@@ -1,18 +1,21 @@
-"""`geometry: auto`: nominal or identified geometry, with or without a learner, by cross-validation."""
+"""What a model of measured records is made of, by cross-validation: geometry, effects, a learner."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.geometry.identified import fit_machine
+from ccnn_torch.calibration.geometry.physics import Physics, fit_effects, identified_alone
 from ccnn_torch.calibration.learning.early_stop import Plan
 from ccnn_torch.calibration.learning.fitting import fit_method
 from ccnn_torch.calibration.rows.dataset import dataset_of
+from ccnn_torch.calibration.rows.some_rows import rows_of
+from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import make_learner
 from ccnn_torch.mechanisms import Mechanism, SerialArm
@@ -29,22 +32,43 @@ _LEARNER = "gp"
 # What is trained where nothing was compared.
 _ELSE = "ccnn"
 _QUICK = {"steps": 30, "hyperparameter_rows": 200, "variance_rows": 16}
+# Steps to the command of a learned deviation of the joints, which is steep near the singular poses of an arm.
+_COMMANDS = 8
+
+
+class Candidate(NamedTuple):
+    """What a model may hold: identified geometry, effects, a learner on what these leave."""
+
+    identify: bool
+    effects: bool
+    learner: bool
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        parts = ["identified geometry" if self.identify else "nominal geometry"]
+        parts += ["effects"] * self.effects + ["learner"] * self.learner
+        return " + ".join(parts)
 
 
 @dataclass(frozen=True)
-class GeometryChoice:
-    """What `geometry` ends as.
+class ModelChoice:
+    """What `geometry` and `effects` end as.
 
     Attributes:
         identify: whether identified geometry is a part of the compensator.
+        effects: whether the effects are.
         method: the learner where the config names none: the one that was compared, or the constant where it found
             nothing to learn.
         why: one sentence.
+        by: `folds` where candidates were compared by cross-validation, else `config`.
     """
 
     identify: bool
+    effects: bool
     method: str
     why: str
+    by: str = "config"
 
     @property
     def block(self) -> dict[str, str]:
@@ -52,94 +76,145 @@ class GeometryChoice:
         return {"chosen": "identify" if self.identify else "none", "why": self.why}
 
 
-def choose_geometry(
-    mechanism: Mechanism, records: Records, split: Split, kind: str, seed: int, settings: dict[str, Any]
-) -> GeometryChoice:
-    """Compare identified geometry alone, nominal geometry with a learner, and identified geometry with a learner.
+def choose_model(
+    mechanism: Mechanism,
+    records: Records,
+    split: Split,
+    kind: str,
+    seed: int,
+    settings: dict[str, Any],
+    geometry: str,
+    verdict: Verdict | None,
+) -> ModelChoice:
+    """Compare what the config leaves open by the held-out pose errors under the candidates' own commands.
 
-    By the held-out pose errors of cross-validation in the training rows of one repeat, at most 600 of them; frames,
-    parameters and learner are fitted anew in each fold. The learner is a Gaussian process, for every method that is
-    trained later. A simpler one of the three, in this order, is kept unless a later one is better by more than a
-    standard error of the folds' differences.
+    By cross-validation in the training rows of one repeat, at most 600 of them; frames, parameters, coefficients and
+    learner are fitted anew in each fold. The learner is a Gaussian process, for every method that is trained later. A
+    simpler candidate is kept unless a later one is better by more than a standard error of the folds' differences.
 
     Args:
         split, kind: of the repeat; `kind` says how folds are made.
+        geometry: the key of the config.
+        verdict: effects that were found in the training rows; None without any.
     """
     name = mechanism.name
-    if not mechanism.geometry:
-        return GeometryChoice(False, _ELSE, f"{name} has no geometric parameters to identify.")
-    if isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
-        return GeometryChoice(False, _ELSE, f"{name} has frames per group of rows, and identified geometry has one.")
+    geometry_why = ""
+    if geometry != "none" and not mechanism.geometry:
+        geometry_why = f"{name} has no geometric parameters to identify."
+    elif geometry != "none" and isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
+        geometry_why = f"{name} has frames per group of rows, and identified geometry has one."
+    if geometry_why:
+        geometry = "none"
+    identify = {"auto": (True, False), "identify": (True,), "none": (False,)}[geometry]
+    effects = (False,) if verdict is None else (False, True)
+    candidates = [Candidate(i, e, learner) for learner in (False, True) for e in effects for i in identify]
+    # A machine that is nominal and learns nothing is no model.
+    candidates = [c for c in candidates if any(c)]
+    asked = "" if geometry == "auto" else geometry_why or f"geometry={geometry} was asked for."
+    if len(identify) == len(effects) == 1:
+        return ModelChoice(identify[0], False, _ELSE, asked)
     rows = torch.cat([split.train, split.validation])
     if len(rows) > _MOST_ROWS:
         rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]]
     rows = rows.sort().values
-    few = _rows_of(records, rows)
+    few = rows_of(records, rows)
     none = torch.zeros(0, dtype=torch.int64)
     whole = Split(torch.arange(len(rows)), none, none, None if split.groups is None else split.groups[rows])
     try:
         folds = [replace(f, validation=none, test=f.validation) for f in fold_splits(whole, kind, _FOLDS, seed)]
-        errors = _errors(mechanism, few, folds, seed, settings)
+        errors = _errors(mechanism, few, folds, seed, settings, candidates, verdict)
     except (InputError, MethodFailedError) as problem:
-        return GeometryChoice(False, _ELSE, f"Identified geometry could not be cross-validated: {problem}")
-    return _chosen(errors)
-
-
-def _rows_of(records: Records, rows: Tensor) -> Records:
-    columns = {name: values[rows.numpy()] for name, values in records.columns.items()}
-    parts = {key: getattr(records, key)[rows] for key in ("joints", "pose", "covariates")}
-    return replace(records, **parts, columns=columns, lines=records.lines[rows.numpy()], parts=())
+        return ModelChoice(geometry == "identify", False, _ELSE, f"Candidates could not be cross-validated: {problem}")
+    return _chosen(errors, asked)
 
 
 def _errors(
-    mechanism: Mechanism, records: Records, folds: list[Split], seed: int, settings: dict[str, Any]
-) -> dict[str, Tensor]:
+    mechanism: Mechanism,
+    records: Records,
+    folds: list[Split],
+    seed: int,
+    settings: dict[str, Any],
+    candidates: list[Candidate],
+    verdict: Verdict | None,
+) -> dict[Candidate, Tensor]:
     """Mean squared pose error of the held-out rows of each fold, `k` [m²], by candidate, the simplest first."""
-    fitted = fit_machine(mechanism, records, folds, identify=True)
     joints, pose, weight = records.joints, records.pose, settings["rotation_weight"]
+    fitted = fit_machine(mechanism, records, folds, identify=any(c.identify for c in candidates))
+    names = [c.name for c in records.covariate_coordinates]
     held = torch.zeros(len(folds), len(joints), dtype=torch.float64)
     for k, fold in enumerate(folds):
         held[k, fold.test] = 1.0
 
-    def square(reached: Tensor) -> Tensor:
-        error = mechanism.pose_error(pose, reached)
+    def square(reached: Tensor, wanted: Tensor) -> Tensor:
+        error = mechanism.pose_error(wanted, reached)
         turned = 0.0 if error.rotation is None else weight**2 * error.rotation.square()
         return (error.position.square() + turned).expand(len(folds), -1)
 
-    def learned(parameters: Tensor | None) -> Tensor:
-        found = joint_deviations(mechanism, joints, pose, parameters=parameters, **settings)
-        jacobian = mechanism.jacobian(joints, parameters, guess=pose)
-        seeds = [seed] * len(folds)
-        data = dataset_of(mechanism, joints, records.covariates, found, folds, seeds, jacobian)
-        plan = Plan(early_stop=False, patience=None, checkpoint_every=1000)
-        one = fit_method(_LEARNER, lambda: make_learner(_LEARNER, _QUICK), data, plan, None, lambda *_: [])
-        return square(mechanism.forward_kinematics(joints + one.predict(data.inputs), parameters, guess=pose))
+    nominal = joint_deviations(mechanism, joints, pose, parameters=fitted.parameters, **settings)
+    machines: dict[tuple[bool, bool], Physics] = {}
+    for c in candidates:
+        if c.effects and verdict is not None and c[:2] not in machines:
+            machines[c[:2]] = fit_effects(
+                verdict, mechanism, records, folds, fitted.parameters, nominal.usable, c.identify
+            )[0]
+        elif c.identify and c[:2] not in machines:
+            assert fitted.geometry is not None
+            base = mechanism.nominal.expand_as(fitted.geometry) if fitted.parameters is None else fitted.parameters
+            machines[c[:2]] = identified_alone(mechanism, records, base, fitted.geometry, names)
 
-    assert fitted.geometry is not None
-    rows = {
-        "identified": square(mechanism.forward_kinematics(joints, fitted.geometry, guess=pose)),
-        "nominal + learner": learned(fitted.parameters),
-        "identified + learner": learned(fitted.geometry),
-    }
+    def error(c: Candidate) -> Tensor:
+        physics = machines.get(c[:2])
+        if physics is None:
+            learned = _learned(mechanism, records, nominal, folds, seed, fitted.parameters)
+            # The same joints are wanted, so that what a command misses is added to what the model misses.
+            command = joints.expand(len(folds), -1, -1)
+            for _ in range(_COMMANDS):
+                command = joints - learned(command)
+            moved = joints + learned(joints) + (command + learned(command) - joints)
+            return square(mechanism.forward_kinematics(moved, fitted.parameters, guess=pose), pose)
+        moved = joints.expand(len(folds), -1, -1)
+        if c.learner:
+            targets = physics.targets(joints, pose, settings)
+            moved = joints + _learned(mechanism, records, targets, folds, seed, physics.values)(joints)
+        return square(torch.stack([physics.poses(k, at) for k, at in enumerate(moved)]), pose)
+
+    rows = {c: error(c) for c in candidates}
     # A gross outlier is no evidence for any of them, and would decide alone.
-    length = rows["identified"].sqrt().nan_to_num(math.inf)
+    length = torch.stack([r.nan_to_num(math.inf) for r in rows.values()]).amin(0).sqrt()
     held = held * inlying(length, held > 0, 3, 0)
-    return {name: (values.nan_to_num(0.0) * held).sum(-1) / held.sum(-1) for name, values in rows.items()}
+    return {c: (values.nan_to_num(1e6) * held).sum(-1) / held.sum(-1) for c, values in rows.items()}
 
 
-def _chosen(errors: dict[str, Tensor]) -> GeometryChoice:
+def _learned(
+    mechanism: Mechanism,
+    records: Records,
+    targets: Any,
+    folds: list[Split],
+    seed: int,
+    parameters: Tensor | None,
+) -> Any:
+    """The learner of every fold, trained: commanded joints `[k x] s x n` -> deviations `k x s x n` [SI]."""
+    joints = records.joints
+    jacobian = mechanism.jacobian(joints, parameters, guess=records.pose)
+    data = dataset_of(mechanism, joints, records.covariates, targets, folds, [seed] * len(folds), jacobian)
+    plan = Plan(early_stop=False, patience=None, checkpoint_every=1000)
+    one = fit_method(_LEARNER, lambda: make_learner(_LEARNER, _QUICK), data, plan, None, lambda *_: [])
+
+    def predict(at: Tensor) -> Tensor:
+        each = at.expand(len(folds), *at.shape[-2:])
+        return one.predict(torch.cat([each, records.covariates.expand(len(folds), -1, -1)], -1))
+
+    return predict
+
+
+def _chosen(errors: dict[Candidate, Tensor], asked: str) -> ModelChoice:
     """The simplest that none of the later ones beats by more than a standard error of the folds' differences."""
     chosen, *others = errors
     for other in others:
         gain = errors[chosen] - errors[other]
         if float(gain.mean()) > float(gain.std()) / math.sqrt(len(gain)):
             chosen = other
-    said = ", ".join(f"{name} {1e3 * math.sqrt(float(e.mean())):.3g} mm" for name, e in errors.items())
-    best = {
-        "identified": "Identified geometry alone is taken: no learner is better by more than a standard error",
-        "nominal + learner": "Nominal geometry with a learner is taken, the best in cross-validation",
-        "identified + learner": "Identified geometry with a learner on what it leaves is taken, the best in "
-        "cross-validation",
-    }[chosen]
-    method = "constant" if chosen == "identified" else _LEARNER
-    return GeometryChoice(chosen != "nominal + learner", method, f"{best} (held-out RMS: {said}).")
+    said = ", ".join(f"{c.words} {1e3 * math.sqrt(float(e.mean())):.3g} mm" for c, e in errors.items())
+    why = f"{chosen.words.capitalize()}: the simplest of the best in cross-validation (held-out RMS: {said})."
+    method = _LEARNER if chosen.learner else "constant"
+    return ModelChoice(chosen.identify, chosen.effects, method, f"{asked} {why}".strip(), "folds")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -13,13 +13,15 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.geometry.choice import GeometryChoice, choose_geometry
+from ccnn_torch.calibration.geometry.choice import ModelChoice, choose_model
+from ccnn_torch.calibration.geometry.effects_search import search_effects
 from ccnn_torch.calibration.geometry.identified import fit_machine
 from ccnn_torch.calibration.geometry.physics import Physics, fit_effects, identified_alone, verdict_of
 from ccnn_torch.calibration.rows.dataset import Dataset, by_repeat, dataset_of
 from ccnn_torch.calibration.rows.memory import check_memory
 from ccnn_torch.config.held_out import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
@@ -65,7 +67,7 @@ class Prepared:
     data_hash: str
     identified: Tensor | None = None
     physics: Physics | None = None
-    choice: GeometryChoice | None = None
+    choice: ModelChoice | None = None
     simulation: Simulation | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -204,7 +206,8 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
             "(records: a CSV file; mechanism: tripod, machine_tool, a DH file, a URDF, or file.py:Name)"
         )
     mechanism = load_mechanism(config.mechanism, **config.mechanism_keys)
-    verdict = None if config.effects == "none" else verdict_of(config.effects, mechanism)
+    effects = config.effects
+    verdict = verdict_of(effects, mechanism) if isinstance(effects, str) and effects.startswith("from:") else None
     source = with_test_file(config.records if given is None else given, config.split)
     records = load_records(source, mechanism, config.covariates, columns=config.columns)
     doubts = check_memory(config, len(records), len(mechanism.joints))
@@ -214,7 +217,7 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     held = rows_of_test_file(config.split, records.parts)
     splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds, held)
     settings = _pseudoerror_settings(config, mechanism)
-    choice = _choice(config, mechanism, records, splits[0], settings)
+    choice, verdict, said = _choice(config, mechanism, records, splits[0], settings, verdict)
     fitted = fit_machine(mechanism, records, splits, choice.identify)
 
     def solved(parameters: Tensor | None) -> Pseudoerror:
@@ -222,12 +225,12 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
 
     total = deviations = solved(fitted.parameters)
     learned, physics = fitted.parameters, None
-    notes = [*doubts, *records.notes, choice.why, *fitted.notes]
+    notes = [*doubts, *records.notes, *said, choice.why, *fitted.notes]
     names = [c.name for c in records.covariate_coordinates]
     if verdict is not None:
         about = (splits, fitted.parameters, total.usable, choice.identify)
-        physics, said = fit_effects(verdict, mechanism, records, *about)
-        notes += said
+        physics, more = fit_effects(verdict, mechanism, records, *about)
+        notes += more
     elif choice.identify:
         assert fitted.geometry is not None
         nominal = mechanism.nominal.expand_as(fitted.geometry) if fitted.parameters is None else fitted.parameters
@@ -255,14 +258,30 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
 
 
 def _choice(
-    config: RunConfig, mechanism: Mechanism, records: Records, split: Split, settings: dict[str, Any]
-) -> GeometryChoice:
-    """What `geometry` comes to for these records."""
-    if config.geometry != "auto":
-        return GeometryChoice(config.geometry == "identify", "ccnn", f"geometry={config.geometry} was asked for.")
+    config: RunConfig,
+    mechanism: Mechanism,
+    records: Records,
+    split: Split,
+    settings: dict[str, Any],
+    verdict: Verdict | None,
+) -> tuple[ModelChoice, Verdict | None, list[str]]:
+    """What `geometry` and `effects` come to for these records, the effects, and notes."""
+    if verdict is not None:
+        if config.geometry != "auto":
+            why = f"geometry={config.geometry} was asked for."
+            return ModelChoice(config.geometry == "identify", True, "ccnn", why), verdict, []
+        why = "The effects of a diagnosis are taken in place of identified geometry."
+        return ModelChoice(False, True, "ccnn", why), verdict, []
+    notes: list[str] = []
     if config.effects != "none":
-        return GeometryChoice(False, "ccnn", "The effects of a diagnosis are taken in place of identified geometry.")
-    return choose_geometry(mechanism, records, split, config.split.kind, config.seed, settings)
+        names = None if isinstance(config.effects, str) else config.effects
+        rows = torch.cat([split.train, split.validation])
+        verdict, notes = search_effects(mechanism, records, rows, names, config.seed)
+        if config.repeats > 1 and verdict is not None:
+            notes.append("They were searched in the training rows of the first repeat, for all repeats.")
+    about = (split, config.split.kind, config.seed, settings, config.geometry, verdict)
+    choice = choose_model(mechanism, records, *about)
+    return choice, verdict if choice.effects else None, notes
 
 
 def damping_of(config: RunConfig, mechanism: Mechanism) -> float:

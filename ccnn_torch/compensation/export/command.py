@@ -28,7 +28,9 @@ class _Step:
         parts = (compensator.geometry, compensator.effects, compensator.machine)
         self.caged_once = all(part is None for part in parts)
 
-    def __call__(self, joints: Tensor, covariates: Tensor, strange: Tensor, known: Tensor, *at: Tensor) -> tuple[Tensor, ...]:
+    def __call__(
+        self, joints: Tensor, covariates: Tensor, strange: Tensor, known: Tensor, *at: Tensor
+    ) -> tuple[Tensor, ...]:
         """Returns the next correction `s x n`, excess and weight `s x 1`, the network's features, and doubt `s x 1`.
 
         Args:

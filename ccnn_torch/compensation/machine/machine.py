@@ -98,7 +98,9 @@ class Machine(nn.Module):
         """The same for the way back: the pose that the machine has; moved: command and what was learned there."""
         return self._aim(self._reached(moved, covariates), self._nominal.at(moved), _BACK)
 
-    def next_correction(self, moved: Tensor, covariates: Tensor, ideal: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
+    def next_correction(
+        self, moved: Tensor, covariates: Tensor, ideal: Tensor, correction: Tensor, aim: Tensor
+    ) -> Tensor:
         """What to subtract from the ideal joints next.
 
         Args:

@@ -2,42 +2,39 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
+from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.guard import Promise, as_matrix, kept
+from ccnn_torch.compensation.machine.alone import machine_alone
 from ccnn_torch.compensation.model_files.card import MODEL_FORMS, card_of, read_model
 from ccnn_torch.compensation.model_files.load import LoadedModel, load_model
 from ccnn_torch.compensation.model_files.signature import check_signature, sign_content, signature_path
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.errors import InputError, ModelFileError
+from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism, mechanism_of_file
 from ccnn_torch.mechanisms.files.mechanism_file import MechanismFile, read_mechanism_file
 
 Array = NDArray[Any]
 
-# How near to a pose the joints must bring a machine [m, rad].
-_CLOSE = 1e-8
-# How far joints may be from those that the inverse kinematics give for their pose [SI].
-_SAME = 1e-6
-# No machine has joints as far [SI]; a double has lost what is small there.
-_FARTHEST = 1e6
 _FORMS = (".yaml", ".yml", ".json")
 
 
 class IdentifiedGeometry:
     """What `LoadedModel` is for a network, for identified geometry; the same call, the same names.
 
-    An ideal joint vector means the pose f(q; nominal); the command is g(that pose; identified), on the same branch.
+    An ideal joint vector means the pose f(q; nominal); the command is that of the identified machine at this pose.
 
     Attributes:
         path: the mechanism file.
         nominal, identified: the mechanism with either geometry.
+        compensator: both as a compensator that has learned nothing.
         joints, covariates, pose: coordinates in order; geometry has no covariates.
         facts: `mechanism`: the nominal one's description.
         columns: the map of columns that its records had: header in a file -> ``name[unit]`` or ``ignore``.
@@ -46,13 +43,25 @@ class IdentifiedGeometry:
     def __init__(
         self, path: Path, nominal: Mechanism, identified: Mechanism, columns: dict[str, str] | None = None
     ) -> None:
-        """Take both geometries of one mechanism."""
+        """Take both geometries of one mechanism.
+
+        Raises:
+            ModelFileError: the machine has no closed form, and its geometry is no polynomial of the joints either.
+        """
         self.path, self.nominal, self.identified = path, nominal, identified
         self.joints: tuple[Coordinate, ...] = nominal.joints
         self.pose: tuple[Coordinate, ...] = nominal.pose
         self.columns = columns or {}
         self.covariates: tuple[Coordinate, ...] = ()
         self.facts: dict[str, Any] = {"mechanism": nominal.describe()}
+
+    @cached_property
+    def compensator(self) -> Compensator:
+        """Made when a command is first asked for."""
+        try:
+            return machine_alone(self.nominal, self.identified)
+        except MethodFailedError as reason:
+            raise ModelFileError(f"{self.path}: {reason}") from None
 
     @property
     def middle(self) -> Array:
@@ -68,29 +77,17 @@ class IdentifiedGeometry:
             covariates: none.
 
         Returns:
-            `command`, `deviation` and `ideal`, `... x n` [SI], all finite; `inside_domain` and `ideal_inside_domain`,
-            `...`, bool: False where the machine cannot take the pose, and the joints are returned unchanged (the home
-            joints for what is no number); `fallback`, `...`, bool: where the file gives what is no command, and the
-            joints are returned unchanged as well.
+            As a `LoadedModel`, without `deviation_sd`: there is no learner.
 
         Raises:
             InputError: the last dimension is wrong.
         """
         array = as_matrix(joints, self.joints, "joints")
         rows = array.reshape(-1, array.shape[-1])
-        promise = Promise.without_card(self.middle)
-        given, strange = (torch.from_numpy(v) for v in promise.cleaned(rows))
-        known = ~strange.any(-1)
-        command, inside = _carried(self.nominal, self.identified, given, known)
-        ideal, ideal_inside = _carried(self.identified, self.nominal, given, known)
-        found = {
-            "command": command.numpy(),
-            "deviation": (given - command).numpy(),
-            "inside_domain": inside.numpy(),
-            "ideal": ideal.numpy(),
-            "ideal_inside_domain": ideal_inside.numpy(),
-        }
-        checked = kept(found, rows, None, promise)
+        with torch.no_grad():
+            found = {k: v.numpy() for k, v in self.compensator.solve(torch.tensor(rows))._asdict().items()}
+        checked = kept(found, rows, None, Promise.of_compensator(self.compensator))
+        del checked["deviation_sd"]
         return {name: value.reshape((*array.shape[:-1], *value.shape[1:])) for name, value in checked.items()}
 
 
@@ -177,19 +174,3 @@ def _parsed(path: Path, source: Path, content: bytes) -> MechanismFile:
             "the nominal parameters, too"
         )
     return file
-
-
-@torch.no_grad()
-def _carried(first: Mechanism, second: Mechanism, joints: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-    """Joints of `second` at the poses that `first` takes with `joints`, and where there are any among those `known`."""
-    pose = first.forward_kinematics(joints)
-    found = second.solve_inverse(pose, guess=joints)
-    error = second.pose_error(second.forward_kinematics(found, guess=pose), pose)
-    # A comparison with NaN is false, so a pose without joints is not reached either.
-    reached = error.position < _CLOSE
-    if error.rotation is not None:
-        reached = reached & (error.rotation < _CLOSE)
-    # Joints in another working mode take a pose that our inverse kinematics would take with far-off joints.
-    reached &= first.wrap(first.solve_inverse(pose, guess=joints) - joints).abs().amax(-1) < _SAME
-    reached &= known & (joints.abs().amax(-1) < _FARTHEST)
-    return torch.where(reached[..., None], found, joints), reached

@@ -11,7 +11,6 @@ from torch import Tensor
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.contraction import TOLERANCE
 from ccnn_torch.compensation.export.export import DAMPED_TOLERANCE, probe_points
-
 from ccnn_torch.compensation.targets.form import Array, Form
 from ccnn_torch.compensation.targets.from_model import SINGLE_TOLERANCE
 from ccnn_torch.compensation.targets.run import run_form
