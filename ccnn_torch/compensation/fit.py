@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from ccnn_torch.compensation.compensator import Compensator, default_limit
 from ccnn_torch.compensation.contraction import (
     STEEPEST_DEVIATION,
+    Steepness,
     iterations_needed,
     spread_points,
     steepest,
@@ -117,7 +118,7 @@ def fit_compensator(
             *(geometry, effects, False, machine),
         )
         slope = compensator.deviation if machine is None else compensator.learned
-        found = steepest(slope, inputs, domain, limit, **size)
+        found = steepest(slope, inputs, domain, limit, **size) if bool(limit.any()) else Steepness(0.0, 0.0)
         if not math.isfinite(found.lipschitz):
             raise MethodFailedError("the trained network gives values that are not finite within its domain")
         if found.lipschitz <= STEEPEST_DEVIATION:

@@ -33,7 +33,7 @@ class Promise:
         centre, low, high: replacements of an input that is no number, and for an infinite one, `d` [SI].
         half_range: unit of the rows of `directions`, `d` [SI].
         directions: `k x d` [1], with `least` and `most`, `k` [1]: inside the domain, directions · (x - centre) /
-            half_range is between the two; no rows where the model alone defines the domain.
+            half_range is between the two.
     """
 
     limit: Array
@@ -77,17 +77,12 @@ class Promise:
     @classmethod
     def of_compensator(cls, compensator: Compensator) -> Promise:
         """As the card that would be written for it."""
-        domain, n = compensator.domain, len(compensator.domain.centre)
+        domain = compensator.domain
         middle, radius = domain.middle.numpy(), domain.radius.numpy()
-        most, sd, *others = (
-            v.numpy()
-            for v in (
-                *(compensator.most, compensator.fallback_sd, domain.centre, domain.low, domain.high),
-                *(domain.half_range, domain.directions),
-            )
-        )
-        assert len(middle) == 2 * n
-        return cls(most, sd, *others, middle - radius, middle + radius)
+        centre, low, high = domain.centre.numpy(), domain.low.numpy(), domain.high.numpy()
+        most, sd = compensator.most.numpy(), compensator.fallback_sd.numpy()
+        boxes = domain.half_range.numpy(), domain.directions.numpy(), middle - radius, middle + radius
+        return cls(most, sd, centre, low, high, *boxes)
 
     def cleaned(self, inputs: Array) -> tuple[Array, Array]:
         """Finite inputs `s x d` [SI], as a `Domain` makes them, and which were not, `s x d`, bool."""

@@ -178,7 +178,8 @@ class PhysicalEffects(nn.Module):
         care = None
         if description["care"] is not None:
             weight, damping, *most, free = description["care"]
-            care = Care(weight, damping, *(math.inf if m is None else float(m) for m in most), tuple(free))
+            gain, inverse_gain = (math.inf if m is None else float(m) for m in most)
+            care = Care(weight, damping, gain, inverse_gain, tuple(free))
         acting = [
             Acting(make_effect(name), *(torch.zeros(size, dtype=torch.float64) for size in sizes))
             for name, *sizes in description["acting"]

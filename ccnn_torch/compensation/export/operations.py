@@ -360,6 +360,7 @@ _OTHERS: dict[str, Callable[..., Any]] = {
     "t": _transposed, "select": _selected, "slice": _sliced, "index": _indexed, "index_select": _picked,
     "flip": _flipped, "cat": _joined, "stack": _stacked, "expand": _expanded,
     "expand_as": lambda g, a, b: _expanded(g, a, _shape(b)),
-    "linalg_cross": _cross, "linalg_vector_norm": _length, "broadcast_tensors": _broadcast, "split": _split, "split_with_sizes": _split,
+    "linalg_cross": _cross, "linalg_vector_norm": _length,
+    "broadcast_tensors": _broadcast, "split": _split, "split_with_sizes": _split,
     "unbind": lambda g, v, dim=0: [_selected(g, v, dim, k) for k in range(v.shape[dim])],
 }  # fmt: skip

@@ -42,7 +42,7 @@ class Placed(NamedTuple):
         vector = shift[..., 3:]
         zero = torch.zeros_like(vector[..., 0])
         x, y, z = vector.unbind(-1)
-        skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+        skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*zero.shape, 3, 3)
         square = (vector * vector).sum(-1)[..., None, None]
         sine = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
         cosine = (1 - square / 12 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90)))) / 2

@@ -10,7 +10,7 @@ from torch import Tensor
 from ccnn_torch.compensation.effects.effects import PhysicalEffects
 from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion, expand
 from ccnn_torch.compensation.geometry.closed_form import ClosedKinematics
-from ccnn_torch.compensation.machine.machine import Machine, Rule
+from ccnn_torch.compensation.machine.machine import RULE, Machine, Rule
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
 _MOST_NEWTON = 8
@@ -33,7 +33,7 @@ class InverseMachine(Machine):
         mechanism: Mechanism,
         identified: Tensor,
         effects: PhysicalEffects | None = None,
-        rule: Rule = Rule(),
+        rule: Rule = RULE,
         start: ChebyshevExpansion | None = None,
         newton: int = _MOST_NEWTON,
     ) -> None:
@@ -103,7 +103,7 @@ def build_machine(
     effects: PhysicalEffects | None,
     joints: Tensor,
     margin: float,
-    rule: Rule = Rule(),
+    rule: Rule = RULE,
 ) -> Machine | None:
     """The machine of a compensator; None for one without a closed form in either direction.
 

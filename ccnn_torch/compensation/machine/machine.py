@@ -44,6 +44,10 @@ class Rule(NamedTuple):
         return self._replace(nearest=times * self.nearest, damping=times * self.damping)
 
 
+RULE = Rule()
+"""What suits machines of about 1 m that miss by up to some millimetres."""
+
+
 class Machine(nn.Module):
     """f(q, c) = P(F(q + e_joints(q, c); θ), c), and the joints that minimise |W (f(c) - X)|² + λ² |c - q|² for the
     nominal pose X of ideal joints q; of serial arms and of others whose forward kinematics is a closed form.
@@ -68,7 +72,7 @@ class Machine(nn.Module):
     high: Tensor
 
     def __init__(
-        self, mechanism: Mechanism, identified: Tensor, effects: PhysicalEffects | None = None, rule: Rule = Rule()
+        self, mechanism: Mechanism, identified: Tensor, effects: PhysicalEffects | None = None, rule: Rule = RULE
     ) -> None:
         super().__init__()
         # In a tuple, since the mechanism's own buffers are no part of the model.
@@ -190,13 +194,13 @@ class Machine(nn.Module):
     def _step(self, placed: Placed, correction: Tensor, aim: Tensor) -> Tensor:
         gap = aim[..., :3] - placed.position
         if placed.rotation is not None:
-            turn = aim[..., 3:12].unflatten(-1, (3, 3)) @ placed.rotation.mT
+            turn = aim[..., 3:12].reshape(*aim.shape[:-1], 3, 3) @ placed.rotation.mT
             gap = torch.cat([gap, self.rule.rotation_weight * skew_vector(turn)], -1)
         # Where the machine has no pose, back to the ideal joints.
         pull = aim[..., -1:] if placed.lost is None else aim[..., -1:] + placed.lost
         if placed.linear is None:
             n = correction.shape[-1]
-            slope = aim[..., -1 - n * gap.shape[-1] : -1].unflatten(-1, (n, gap.shape[-1]))
+            slope = aim[..., -1 - n * gap.shape[-1] : -1].reshape(*gap.shape[:-1], n, gap.shape[-1])
         else:
             slope = self._slope(placed)
         unit = torch.eye(min(slope.shape[-2:]), dtype=slope.dtype)
@@ -208,7 +212,8 @@ class Machine(nn.Module):
         square = slope.mT @ slope
         kept = slope.mT @ correction.unsqueeze(-1)
         damped = slope @ gauss_jordan(square + more, gap.unsqueeze(-1) - kept)
-        return correction - (damped + slope @ gauss_jordan(square + _REGULAR * unit, kept)).squeeze(-1)
+        step: Tensor = damped + slope @ gauss_jordan(square + _REGULAR * unit, kept)
+        return correction - step.squeeze(-1)
 
 
 def limits_of(mechanism: Mechanism) -> tuple[Tensor, Tensor]:

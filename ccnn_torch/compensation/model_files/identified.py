@@ -84,9 +84,10 @@ class IdentifiedGeometry:
         """
         array = as_matrix(joints, self.joints, "joints")
         rows = array.reshape(-1, array.shape[-1])
+        compensator = self.compensator
         with torch.no_grad():
-            found = {k: v.numpy() for k, v in self.compensator.solve(torch.tensor(rows))._asdict().items()}
-        checked = kept(found, rows, None, Promise.of_compensator(self.compensator))
+            found = {k: v.numpy() for k, v in compensator.solve(torch.tensor(rows))._asdict().items()}
+        checked = kept(found, rows, None, Promise.of_compensator(compensator))
         del checked["deviation_sd"]
         return {name: value.reshape((*array.shape[:-1], *value.shape[1:])) for name, value in checked.items()}
 

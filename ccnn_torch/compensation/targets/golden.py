@@ -109,7 +109,7 @@ def _hard(compensator: Compensator) -> str:
     """Which part of a model single precision rounds by more than a small share of its limit, most likely."""
     step, limit = float(np.finfo("float32").eps), float(compensator.limit.max())
     if compensator.machine is not None:
-        return f"it computes the machine's kinematics: a length of 1 m is rounded to {step:.1g} m, and the limit is {limit:.1g}"
+        return f"it computes the machine's kinematics: 1 m is rounded to {step:.1g} m, and the limit is {limit:.1g}"
     if compensator.effects is not None:
         return "its physical effects are polynomials of many terms, which cancel"
     if getattr(compensator.network, "export_tolerance", TOLERANCE) > TOLERANCE:
