@@ -33,10 +33,9 @@ _LEAST_SHARE = 0.1
 _GENTLE_STEPS = 8
 # Training inputs among the points where its steps are counted.
 _COUNTED = 512
-# A machine's command: the most steps, the share of regular points at which it need not settle, how often the distance
-# from singular poses at which it is damped is doubled, and how far a joint may move while that is found [m or rad].
-_MOST_STEPS, _UNSETTLED, _DOUBLINGS, _FAR = 12, 0.02, 3, 0.5
-_FEW = 1e-3
+# A machine's command: the most steps, how often the distance from singular poses at which it is damped may be doubled,
+# how far a joint may move while that is found [m or rad], and the share of points for which no further step is taken.
+_MOST_STEPS, _DOUBLINGS, _FAR, _FEW = 12, 3, 0.5, 1e-3
 # Of the largest deviation in and around the domain: what the whole deviation may be.
 _ROOM = 1.5
 
@@ -157,7 +156,7 @@ def _accelerate(compensator: Compensator, inputs: Tensor) -> None:
 def settle(compensator: Compensator, inputs: Tensor) -> None:
     """Find how many steps the machine's command takes in and around the domain, and the bound of its deviation.
 
-    Where the command does not settle at regular poses the distance from singular ones at which it is damped is doubled.
+    The distance from singular poses at which it is damped is doubled as long as fewer points are damped or unsettled.
 
     Args:
         inputs: training inputs, `s x (n + m)` [SI].
@@ -168,25 +167,39 @@ def settle(compensator: Compensator, inputs: Tensor) -> None:
     joints, covariates, strange = compensator._inputs(points[:, :n], points[:, n:])
     compensator.most.fill_(_FAR)
     compensator.domain.huge.fill_(FARTHEST)
-    rule = machine.rule
+    rule, best = machine.rule, math.inf
     for doubling in range(_DOUBLINGS + 1):
         machine.rule = rule.farther(2.0**doubling)
-        aim = machine.aim(joints)
-        regular = aim[:, -1] <= 0
-        correction = torch.zeros_like(joints)
-        following = compensator.step(joints, covariates, strange, correction, aim)[1]
-        shares = []
-        for _ in range(_MOST_STEPS):
-            correction = following
-            _, following, doubt = compensator.step(joints - correction, covariates, strange, correction, aim)
-            shares.append(float((doubt[regular] > 0).double().mean()) if bool(regular.any()) else 0.0)
-            if shares[-1] == 0:
-                break
-        if shares[-1] <= _UNSETTLED:
+        shares, correction, doubt = _settling(compensator, joints, covariates, strange)
+        # Damped, or on its way for ever: the fewer the better.
+        inexact = float((doubt > 0).double().mean())
+        if inexact >= best:
             break
+        best, kept, found = inexact, machine.rule, (shares, correction, doubt)
+        if shares[-1] == 0:
+            break
+    machine.rule, (shares, correction, doubt) = kept, found
     # More steps settle few more, and are damped rows' alone.
     compensator.iterations = next(k for k, share in enumerate(shares, 1) if share <= shares[-1] + _FEW)
     compensator.unsettled = shares[-1]
     near = doubt.squeeze(-1) <= ASTRAY
     largest = correction[near].abs().amax(0) if bool(near.any()) else compensator.limit
     compensator.most.copy_(torch.maximum(_ROOM * largest, compensator.limit))
+
+
+def _settling(
+    compensator: Compensator, joints: Tensor, covariates: Tensor, strange: Tensor
+) -> tuple[list[float], Tensor, Tensor]:
+    """Share of the regular rows that have not settled after each step, and the last correction with its doubt."""
+    assert compensator.machine is not None
+    aim = compensator.machine.aim(joints)
+    regular = aim[:, -1] <= 0
+    correction, shares = torch.zeros_like(joints), list[float]()
+    _, following, doubt = compensator.step(joints, covariates, strange, correction, aim)
+    for _ in range(_MOST_STEPS):
+        correction = following
+        _, following, doubt = compensator.step(joints - correction, covariates, strange, correction, aim)
+        shares.append(float((doubt[regular] > 0).double().mean()) if bool(regular.any()) else 0.0)
+        if shares[-1] == 0:
+            break
+    return shares, correction, doubt

@@ -104,8 +104,8 @@ class ClosedKinematics(nn.Module):
     def coordinates(self, pose: Tensor, shift: Tensor) -> Tensor:
         """Pose coordinates `s x p` of a small shift of the frame at a pose, `s x c` [m, rad]."""
         seen = frame_slope(self._mechanism[0].frame, pose)
-        found: Tensor = _pseudo_inverse(seen) @ shift.unsqueeze(-1)
-        return found.squeeze(-1)
+        found: Tensor = (_pseudo_inverse(seen) @ shift.unsqueeze(-1)).squeeze(-1)
+        return found
 
     def _standing(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Joints and poses that the mechanism can take: those at hand, or its home; and which, `s x 1`."""
