@@ -114,8 +114,8 @@ def _units(form: Form) -> list[str]:
         "Covariates: " + (", ".join(form.covariates) or "none; leave the input as it is") + ".",
         "Status 0: the command is inside the domain of the training rows. 1: outside, where what was learned fades "
         "into the safe correction, or the model broke its limit, and then command = joints. 2: an input is not finite, "
-        "and then command = joints, with the middle of the domain for what is no number and its edge for infinity. 3: near "
-        "a singular pose or at a limit of the joints, and the command is the nearest safe one.",
+        "and then command = joints, with the middle of the domain for what is no number and its edge for infinity. 3: "
+        "near a singular pose or at a limit of the joints, and the command is the nearest safe one.",
     ]
 
 
