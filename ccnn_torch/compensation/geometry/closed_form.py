@@ -86,7 +86,7 @@ class ClosedKinematics(nn.Module):
     def _steps(self, rows: Tensor, steps: int) -> Tensor:
         inverse_kinematics = self._mechanism[0].solve_inverse
         assert self.start is not None
-        pose = self.start(rows)
+        pose: Tensor = self.start(rows)
         # A derivative that is none counts as large, and the pose stays where it is.
         lift = _pseudo_inverse(_slope(inverse_kinematics, pose))
         for _ in range(steps):
