@@ -290,6 +290,6 @@ def test_two_wrong_keys_are_each_named_with_what_set_them(tmp_path: Path) -> Non
     with pytest.raises(InputError, match=r"run.yaml: there is no key 'sede'; did you mean 'seed'\?$"):
         load_diagnose_config(tmp_path / "run.yaml")
     # And one of a diagnosis: all of its keys are read.
-    (tmp_path / "diagnose.yaml").write_text("records: r.csv\nnoise: 1e-5\nmethods: gp\n", encoding="utf-8")
-    with pytest.raises(InputError, match="diagnose.yaml: there is no key 'methods'"):
+    (tmp_path / "diagnose.yaml").write_text("motion: r.csv\nnoise: 1e-5\nmethods: gp\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"diagnose.yaml: there is no key 'methods'"):
         load_diagnose_config(tmp_path / "diagnose.yaml")
