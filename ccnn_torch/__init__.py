@@ -6,11 +6,14 @@ The names below are loaded on first use, so that `ccnn --help` does not wait for
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 from ccnn_torch.version import __version__
 
+# As of `typing`, whose import takes longer than all that is needed here; Ctrl-C in it would be a traceback.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from ccnn_torch.api import calibrate as calibrate
     from ccnn_torch.api import diagnose_motion as diagnose_motion
     from ccnn_torch.api import identify as identify

@@ -47,6 +47,7 @@ class Parameter:
         low, high: bounds [SI]; a simulator is never called beyond them. None = no bound.
         cause: name of its error in a diagnosis; the parameters of one cause are one candidate. None =
             ``geometry``, the lengths and angles of the machine as built.
+        sense: which way it counts, where that is not the usual one (``clockwise``).
     """
 
     name: str
@@ -57,6 +58,7 @@ class Parameter:
     low: float | None = None
     high: float | None = None
     cause: str | None = None
+    sense: str = ""
 
 
 _PLAUSIBLE = {"m": 1e-3, "rad": 2e-3, "1": 2e-3}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -16,8 +17,10 @@ from ccnn_torch.learners.ccnn import CCNN
 from ccnn_torch.learners.constant import Constant
 from ccnn_torch.learners.enn import ENN, ENNSettings
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
+from ccnn_torch.learners.registry import make_learner
 from ccnn_torch.testing import check_learner
 
+EXAMPLE = f"{Path(__file__).parent.parent / 'experiments' / 'my_learner.py'}:Ridge"
 SMALL = {
     "hidden": (3, 2),
     "population": 8,
@@ -44,6 +47,7 @@ FACTORIES: dict[str, Callable[[], Learner]] = {
     ),
     "constant": Constant,
     "descent": lambda: Descent(steps=8),
+    "a user's": lambda: make_learner(EXAMPLE),
 }
 
 

@@ -44,6 +44,14 @@ def test_runs_of_the_same_rows_share_a_letter(tmp_path: Path, cli: Cli) -> None:
     assert table.count("| A |") == 2 and "not comparable" not in table
 
 
+def test_a_name_is_no_formula_of_a_spreadsheet(tmp_path: Path, cli: Cli) -> None:
+    run = tripod(tmp_path / "run", cli, "methods=[constant]", "name==1+1")
+    assert cli("compare", run, "--out", tmp_path / "runs.csv", "--quiet")[0] == 0
+    with (tmp_path / "runs.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["name"] for row in rows} == {"'=1+1"} and all(float(row["before"]) > 0 for row in rows)
+
+
 def test_what_cannot_be_compared(tmp_path: Path, cli: Cli) -> None:
     code, _, err = cli("compare", tmp_path)
     assert code == 2 and "results.json" in err

@@ -19,6 +19,7 @@ from ccnn_torch.calibration.config import (
     make_config,
     method_names,
 )
+from ccnn_torch.diagnosis.config import load_diagnose_config
 from ccnn_torch.errors import InputError
 from ccnn_torch.evolution.settings import CCNNSettings
 from ccnn_torch.files.yaml_file import dump_yaml, parse_yaml
@@ -277,3 +278,18 @@ def test_every_key_is_described() -> None:
     assert ("split.test", "0.3") in {(key, default) for key, default, _ in keys}
     assert "ccnn.hidden" in {key for key, _, _ in keys}
     assert all(f"| `{key}` |" in key_table() for key, _, _ in keys)
+
+
+def test_two_wrong_keys_are_each_named_with_what_set_them(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        config(tmp_path, "case: tripod\n", "ccnn={hiden: 2}", "ccnn.generatons=3")
+    assert "'ccnn={hiden: 2}': there is no key 'ccnn.hiden'; did you mean 'ccnn.hidden'?" in str(caught.value)
+    assert "'ccnn.generatons=3': there is no key 'ccnn.generatons'" in str(caught.value)
+    # A config of `ccnn run` with a mistake: of `methods`, which is right there, nothing is said.
+    (tmp_path / "run.yaml").write_text("records: r.csv\nmechanism: five_bar\nmethods: gp\nsede: 1\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"run.yaml: there is no key 'sede'; did you mean 'seed'\?$"):
+        load_diagnose_config(tmp_path / "run.yaml")
+    # And one of a diagnosis: all of its keys are read.
+    (tmp_path / "diagnose.yaml").write_text("motion: r.csv\nnoise: 1e-5\nmethods: gp\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"diagnose.yaml: there is no key 'methods'"):
+        load_diagnose_config(tmp_path / "diagnose.yaml")

@@ -1,4 +1,4 @@
-"""The worked examples of CONTRIBUTING.md are lines of the files that they name."""
+"""The worked examples of CONTRIBUTING.md are lines of the files that they name, and these are there."""
 
 from __future__ import annotations
 
@@ -15,3 +15,13 @@ def test_the_examples_are_lines_of_the_code() -> None:
         lines = {line.strip() for line in (ROOT / path).read_text().splitlines()}
         shown = [line.strip() for line in code.splitlines() if line.strip() and "…" not in line]
         assert len(shown) > 5 and not [line for line in shown if line not in lines], path
+
+
+def test_every_path_that_is_named_is_there() -> None:
+    prose = re.sub(r"^```.*?^```$", "", (ROOT / "CONTRIBUTING.md").read_text(), flags=re.M | re.S)
+    words = [word for code in re.findall(r"`([^`]+)`", prose) for word in code.split()]
+    words += re.findall(r"\]\(([^)#:]+)\)", prose)
+    # NAME stands for any name, path/to/file.py for a user's file, and a bare job.py for that of any folder.
+    paths = {w for w in words if re.fullmatch(r"[\w.]+/[\w./]*", w) and "NAME" not in w and "path/to" not in w}
+    assert len(paths) > 15
+    assert not [path for path in paths if not any((place / path).exists() for place in (ROOT, ROOT / "ccnn_torch"))]

@@ -50,6 +50,7 @@ def test_a_config_beside_its_records_gives_verdict_and_report(
     # Of an earlier verdict that named a geometry.
     Path("found").mkdir()
     Path("found/corrected.yaml").write_text("mechanism: five_bar\n", encoding="utf-8")
+    Path("found/diagnosis.json").write_text("{}", encoding="utf-8")
     code, shown, told = cli("diagnose", "--config", rows.parent / "config.yaml", "--out", "found", "--details")
     assert code == 0 and told == ""
     results = json.loads(Path("found/diagnosis.json").read_text(encoding="utf-8"))
@@ -70,6 +71,16 @@ def test_a_config_beside_its_records_gives_verdict_and_report(
     for name in ("report.html", "diagnosis.md", "diagnosis.safetensors", "next_measurements.csv"):
         assert Path("found", name).is_file(), name
     assert not Path("found/corrected.yaml").exists()
+
+
+@pytest.mark.parametrize("kind", ["--records", "--motion"])
+def test_a_folder_of_something_else_is_left_as_it_is(cli: Cli, rows: Path, tmp_path: Path, kind: str) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "report.html").write_text("of a run", encoding="utf-8")
+    for folder in (tmp_path / "run", rows, Path("/")):
+        code, _, told = cli("diagnose", kind, rows, "--mechanism", "five_bar", "--out", folder)
+        assert code == 2 and told == f"{folder} holds files already; give a folder of its own with --out DIR\n"
+    assert [file.name for file in (tmp_path / "run").iterdir()] == ["report.html"]
 
 
 def test_without_a_network_the_rest_is_the_same(cli: Cli, rows: Path, tmp_path: Path) -> None:
@@ -118,6 +129,7 @@ def test_rows_set_aside_are_called_by_one_name_everywhere(cli: Cli, tmp_path: Pa
     assert {int(row) for row in rows.split(",")} <= {row + 1 for row in looked["aside"]}
     assert looked["lines_aside"] == [row + 3 for row in looked["aside"]]
     assert f"{len(looked['aside'])} rows set aside. " in " ".join(shown.split())
+    # Beside the check the diagnosis may be written: both say what the same rows show.
     code, shown, _ = cli("diagnose", "--records", path, "--mechanism", "five_bar", "--out", tmp_path, "--no-network")
     assert code == 0 and sentence in " ".join(shown.split())
     results = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from ccnn_torch.cli import app
+from ccnn_torch.cli.application import app
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.registry import REGISTRY
 from ccnn_torch.motion.servo import KEYS

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import make_config
+from ccnn_torch.calibration.job import start_run
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.cli.application import app
 from ccnn_torch.coordinates import Coordinate
@@ -18,6 +19,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification import fit_geometry
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, stack_columns, write_table
+from ccnn_torch.report.arrays import load_arrays
 
 DATA = Path(__file__).parent.parent / "experiments" / "data"
 UR10 = {"records": str(DATA / "ur10_b_500.csv"), "mechanism": str(DATA / "ur10.yaml"), "covariates": []}
@@ -97,6 +99,21 @@ def test_the_remainder_is_what_the_identified_machine_leaves(tmp_path: Path) -> 
     moved = known.geometry.deviation(known.pose)(known.joints + known.dataset.deviation)
     torch.testing.assert_close(known.dataset.deviation + moved, known.total, rtol=0, atol=1e-9)
     assert known.geometry.values.shape == (2, 1, len(truth))
+
+
+def test_before_in_the_figures_is_before_the_geometry_too(tmp_path: Path) -> None:
+    tripod_records(tmp_path / "rows.csv")
+    keys = {"records": str(tmp_path / "rows.csv"), "mechanism": "tripod", "geometry": "identify"}
+    config = make_config(**keys, methods=["constant"], out=str(tmp_path / "r"), save_models=False, save_report=False)
+    start_run(config, quiet=True)
+    arrays = load_arrays(tmp_path / "r")
+    tripod, names = load_mechanism("tripod"), [c.header for c in load_mechanism("tripod").pose]
+    table = read_table(tmp_path / "rows.csv")
+    pose = torch.stack([torch.from_numpy(table.column(n.split("[")[0])) for n in names], -1)
+    nominal = tripod.solve_inverse(pose).numpy() - arrays.commanded
+    np.testing.assert_allclose(arrays.measured, nominal, rtol=0, atol=1e-9)
+    left = arrays.measured - arrays.predicted
+    assert np.sqrt(np.mean(left**2)) < 0.4 * np.sqrt(np.mean(nominal**2))
 
 
 def test_held_out_rows_do_not_change_the_geometry() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 import openpyxl
@@ -97,6 +98,26 @@ def test_a_workbook(tmp_path: Path) -> None:
     (tmp_path / "no.xlsx").write_bytes(b"q1[mm]\n1\n")
     refused(tmp_path / "no.xlsx", "no workbook that openpyxl can read")
     refused(tmp_path / "nowhere.xlsx", "there is no such file")
+
+
+def test_what_is_true_is_no_number(tmp_path: Path) -> None:
+    book = openpyxl.Workbook()
+    columns = slide_columns()
+    book.active.append(list(columns))
+    for row in zip(*columns.values(), strict=True):
+        book.active.append([value.item() for value in row])
+    book.active["A3"] = True
+    book.save(tmp_path / "rows.xlsx")
+    refused(tmp_path / "rows.xlsx", "rows.xlsx (sheet Sheet): column 'y' has 'TRUE' at line 3 (row 2)")
+    frame = pd.DataFrame({name: list(values) for name, values in columns.items()}, dtype=object)
+    frame.iloc[1, 0] = True
+    refused(frame, "DataFrame: column 'y' has 'TRUE' at line 3 (row 2)")
+
+
+def test_a_workbook_that_is_packed_too_densely_is_not_unpacked(tmp_path: Path) -> None:
+    with ZipFile(tmp_path / "rows.xlsx", "w", ZIP_DEFLATED) as book:
+        book.writestr("xl/worksheets/sheet1.xml", b"<row/>" * 5_000_000)
+    refused(tmp_path / "rows.xlsx", "has 30 MB unpacked, mostly of cells that are empty or alike")
 
 
 def test_a_workbook_without_openpyxl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -215,3 +215,13 @@ def test_python_takes_a_mechanism_and_refuses_an_unknown_coordinate() -> None:
     assert len(made.joints) == 5
     with pytest.raises(InputError, match=r"noise\.phi: there is no such name; there are x, y"):
         simulate_records("five_bar", [], 5, {"phi": 1e-5})
+
+
+def test_rows_that_the_changed_machine_does_not_reach_are_drawn_anew() -> None:
+    made = simulate_records("five_bar", ["geometry"], 120, 0.0, seed=0)
+    machine = load_mechanism("five_bar")
+    # In order measured: the direction is the sign of the way from the row before, of those drawn anew as well.
+    way = made.joints.diff(dim=0).sign()
+    found = torch.stack([made.covariates[f"direction{i}"] for i in (1, 2)], -1)
+    assert torch.equal(found[1:], way) and len(made.joints) == 120
+    assert torch.isfinite(made.pose).all() and torch.isfinite(machine.forward_kinematics(made.joints)).all()

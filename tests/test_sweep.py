@@ -87,6 +87,10 @@ def test_a_job_that_fails_is_a_row_too(tmp_path: Path) -> None:
         (["seed=0,0"], "is there twice"),
         (["seed=0,x"], "job seed=x: "),
         (["split.tst=0.1,0.2"], "split.tst"),
+        (
+            [f"{key}={','.join(map(str, range(30)))}" for key in ("seed", "repeats", "order")],
+            r"a sweep of 27,000 jobs \(30 of seed x 30 of repeats x 30 of order\): up to 2,000 are taken",
+        ),
     ],
 )
 def test_what_is_wrong_is_one_sentence(tmp_path: Path, changes: list[str], sentence: str) -> None:

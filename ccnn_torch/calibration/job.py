@@ -8,7 +8,8 @@ from pathlib import Path
 
 from ccnn_torch.calibration.blocks import blocks_of, write_blocks
 from ccnn_torch.calibration.calibrate import Calibration, calibrate, makers
-from ccnn_torch.calibration.config import RunConfig, dump_config, load_config
+from ccnn_torch.calibration.config import RunConfig, dump_config, load_config, method_names
+from ccnn_torch.calibration.learning.fitting import check_storable
 from ccnn_torch.calibration.learning.progress import HeldOut, ProgressBar
 from ccnn_torch.calibration.outputs import write_outputs
 from ccnn_torch.calibration.page.tables import print_tables
@@ -19,6 +20,7 @@ from ccnn_torch.calibration.rows.prepare import Prepared, prepare
 from ccnn_torch.calibration.statistics import share_unit
 from ccnn_torch.engine import Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError, WriteError
+from ccnn_torch.plugins import is_plugin
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.screen import note, say_place, stdout
 from ccnn_torch.run_folder.folder import RunFolder, kept_for
@@ -33,7 +35,7 @@ def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> Ru
         InputError: the config or its data cannot be used, or the folder is taken or in use.
         WriteError: a file cannot be written; what was computed until then is kept.
     """
-    makers(config)
+    _check(config)
     config, prepared = _prepared(config)
     with RunFolder.fresh(config.out, config.name) as folder:
         folder.write("config.yaml", dump_config(config, folder.path))
@@ -55,8 +57,18 @@ def resume_run(path: Path, quiet: bool = False, tables: bool = True) -> RunFolde
     with RunFolder.existing(path) as folder:
         config = load_config(folder.config, [])
         refuse_changes(folder.checkpoints, facts_of(config), folder.config)
+        _check(config)
         _run(*_prepared(config), folder, quiet, tables)
     return folder
+
+
+def _check(config: RunConfig) -> None:
+    """Make the learners, and look whether the networks of a user's own can be stored, before anything is computed."""
+    learners = makers(config)
+    for spec in filter(is_plugin, method_names(config)):
+        make = learners[spec.rpartition(":")[2]]
+        if config.save_models and make is not None:
+            check_storable(spec, make())
 
 
 def _prepared(config: RunConfig) -> tuple[RunConfig, Prepared | None]:

@@ -79,14 +79,17 @@ def _arrays(calibration: Calibration) -> RunArrays:
     def place(poses: Tensor) -> NDArray[np.float64]:
         return _numpy(poses if turns else mechanism.frame(poses)[0])
 
+    # Before compensation is before all of it: what geometry and known effects take away is part of the prediction.
+    learned = prepared.dataset.deviation[k]
+    whole = torch.where(torch.isfinite(prepared.total[k]), prepared.total[k], learned)
     masks, weights = genome(outcome.fitted.learner, k)
     systematic = outcome.after_systematic
     simulation = prepared.simulation
     return RunArrays(
         joints=mechanism.joints,
         commanded=_numpy(prepared.joints[k]),
-        measured=_numpy(prepared.dataset.deviation[k]),
-        predicted=_numpy(outcome.deviation[k]),
+        measured=_numpy(whole),
+        predicted=_numpy(outcome.deviation[k] + (whole - learned)),
         test=test.numpy(),
         place=place(prepared.pose[k]),
         position_before=_numpy(calibration.before.position[k]),

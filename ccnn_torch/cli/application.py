@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import os
 import sys
 from typing import Annotated
@@ -80,10 +81,17 @@ for _command in (
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """Run the command of `sys.argv`, and end the process with its exit code."""
     # Set before torch is loaded. With busy-waiting threads, two runs at once on two cores took tens of times as long;
     # a single run showed no clear difference.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Libraries refuse to load where these are no such thing. Figures need no window, and no file has a date.
+    os.environ["MPLBACKEND"] = "agg"
+    os.environ.pop("SOURCE_DATE_EPOCH", None)
+    for stream in (sys.stdout, sys.stderr):
+        # A code page may lack µ or →.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         # 130: Ctrl-C in a command that has no message of its own for it.
         code = app(standalone_mode=False) or 0

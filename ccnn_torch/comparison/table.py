@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ccnn_torch.display import display_unit, interval_text, number_text
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.csv_text import csv_text
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.table import Table, markdown_table
@@ -66,9 +65,7 @@ def runs_table(runs: Mapping[str, Results]) -> Table:
 
 def runs_csv(runs: Mapping[str, Results]) -> str:
     """Every method of every run as one row, in SI, with 17 significant digits."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_CSV)
+    rows: list[Sequence[object]] = [_CSV]
     for folder, results in runs.items():
         about = [folder, results["name"], results.get("case") or "", results["seed"], results["repeats"]]
         about += [results["rows"][part] for part in ("train", "validation", "test")]
@@ -80,9 +77,8 @@ def runs_csv(runs: Mapping[str, Results]) -> str:
                     continue
                 figures = [pose["before"]["rms"], left["rms"], block.get("ratio_to_floor"), block.get("seconds")]
                 best = int(method == results.get("best_method"))
-                row = [*about, method, best, f"{kind}_rms", pose["unit"], *map(_median, figures)]
-                writer.writerow(f"{v:.17g}" if isinstance(v, float) else v for v in row)
-    return text.getvalue()
+                rows.append([*about, method, best, f"{kind}_rms", pose["unit"], *map(_median, figures)])
+    return csv_text(rows)
 
 
 def write_runs(path: Path, runs: Mapping[str, Results]) -> None:

@@ -44,12 +44,19 @@ class UncertainNetwork(Protocol):
 def register_network(kind: str, network: type[DescribedNetwork]) -> None:
     """Make a kind of network known to model files; call it where the class is defined.
 
+    A file that is loaded once more registers its class anew.
+
     Raises:
         InputError: the kind is taken by another class.
     """
-    if _KINDS.get(kind, network) is not network:
+    before = _KINDS.get(kind, network)
+    if isinstance(before, str) or _place(before) != _place(network):
         raise InputError(f"a network of kind '{kind}' is registered already; give the new one another kind")
     _KINDS[kind] = network
+
+
+def _place(network: type[DescribedNetwork]) -> tuple[str, str]:
+    return network.__module__, network.__qualname__
 
 
 def describe_network(network: nn.Module) -> dict[str, Any]:
@@ -57,11 +64,14 @@ def describe_network(network: nn.Module) -> dict[str, Any]:
     if not callable(getattr(network, "describe", None)):
         raise InputError(
             f"the network {type(network).__name__} cannot be stored: give it describe() and from_description(), "
-            "and register_network(kind, class)"
+            "and ccnn_torch.compensation.register_network(kind, class)"
         )
     description = cast(DescribedNetwork, network).describe()
     if description.get("kind") not in _KINDS:
-        raise InputError(f"networks of kind {description.get('kind')!r} are unknown; call register_network first")
+        raise InputError(
+            f"networks of kind {description.get('kind')!r} are unknown; call "
+            "ccnn_torch.compensation.register_network(kind, class) in the file of the learner"
+        )
     return description
 
 

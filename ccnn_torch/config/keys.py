@@ -94,7 +94,9 @@ def explain(error: ValidationError, model: type[BaseModel], file: str, given: Ma
     parts: dict[str, None] = {}
     for item in error.errors():
         key = ".".join(str(step) for step in item["loc"])
-        override = next((text for name, text in given.items() if f"{key}.".startswith(f"{name}.")), None)
+        # Of `ccnn={…}` and `ccnn.hidden=…` the one that says more of the key.
+        above = max((name for name in given if f"{key}.".startswith(f"{name}.")), key=len, default="")
+        override = given.get(above)
         override = override or next((text for name, text in given.items() if key and name.startswith(f"{key}.")), None)
         source = f"'{override}': " if override else ""
         parts[source + _sentence(key, item["type"], item["msg"], item["input"], keys)] = None

@@ -83,8 +83,10 @@ def config_from_options(
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
     tree = {} if path is None else read_yaml(path)
-    if also and not tree.keys() <= {*model.model_fields} and tree.keys() <= {*config_model(also).model_fields}:
-        tree = {key: value for key, value in tree.items() if key in shared}
+    own, others = {*model.model_fields}, {*config_model(also).model_fields} if also else set()
+    # A key that neither has is a mistake in both, and is told.
+    if tree.keys() & (others - own) and not tree.keys() & (own - others):
+        tree = {key: value for key, value in tree.items() if key in shared or key not in others}
     if path is not None:
         resolve_paths(tree, path.absolute().parent)
     given = apply_overrides(tree, overrides, Path.cwd())

@@ -14,6 +14,7 @@ from ccnn_torch.config.noise import Noise
 from ccnn_torch.config.sizes import size
 from ccnn_torch.config.tree import Columns, Files, Names, Section, config_from_options
 from ccnn_torch.errors import InputError
+from ccnn_torch.run_folder.folder import refuse_foreign
 
 _WRONG_NOISE = (
     "must be a standard deviation of the pose, a size above 0 (10um, or 1e-5 in SI) or one for each coordinate; leave "
@@ -88,6 +89,19 @@ def load_diagnose_config(path: Path | None, overrides: Iterable[str] = ()) -> Di
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
     return config_from_options(DiagnoseConfig, path, overrides, "run", _OF_A_RUN)
+
+
+def folder_of(config: DiagnoseConfig) -> Path:
+    """The folder that a diagnosis writes; of an earlier diagnosis or check it is written over.
+
+    Raises:
+        InputError: none is named, or it holds other files.
+    """
+    if config.out is None:
+        raise InputError("name the folder to write with --out DIR")
+    folder = Path(config.out)
+    refuse_foreign(folder, ("diagnosis.json", "check.json"))
+    return folder
 
 
 def describe_diagnose_keys() -> list[tuple[str, str, str]]:

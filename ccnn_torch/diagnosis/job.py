@@ -10,7 +10,7 @@ from typing import Any
 from ccnn_torch.config.noise import noise_of_pose
 from ccnn_torch.diagnosis import Diagnosis, diagnose, noise_of, situation_of, with_network
 from ccnn_torch.diagnosis.checks.identifiable import Check, check_rows
-from ccnn_torch.diagnosis.config import DiagnoseConfig
+from ccnn_torch.diagnosis.config import DiagnoseConfig, folder_of
 from ccnn_torch.diagnosis.from_records import naming
 from ccnn_torch.diagnosis.outputs import write_diagnosis, write_result
 from ccnn_torch.diagnosis.page.compensate import compensate_lines, typed_path
@@ -40,12 +40,10 @@ def run_diagnosis(config: DiagnoseConfig, quiet: bool = False, details: bool = F
         InputError: something is missing or wrong in the files or keys, the rows carry no verdict, or the folder cannot
             be written. A verdict that cannot be kept is printed.
     """
-    if config.out is None:
-        raise InputError("name the folder to write with --out DIR")
+    folder = folder_of(config)
     stopped = if_stopped("interrupted before there was a verdict; nothing was written")
     with stopped, step_bar(TO_VERDICT, quiet) as tell, watched(tell):
         found = _verdict(config, tell)
-    folder = Path(config.out)
     try:
         with locked(folder):
             sweep(folder)

@@ -38,6 +38,11 @@ class Coupling:
         found += [Coefficient(f"{j.name} zero", j.unit, ZERO[j.unit], joint=j.name, secondary=True) for j in joints]
         return tuple(found)
 
+    def counted_from(self, situation: Situation) -> dict[str, int]:
+        """As of `JointGain`: the joint that moves the other one."""
+        joints = situation.mechanism.joints
+        return {f"{i.name} by {j.name}": k for i in joints for k, j in enumerate(joints) if i.name != j.name}
+
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """None."""
         return ()

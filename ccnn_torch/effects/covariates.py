@@ -55,13 +55,19 @@ def draw_covariates(
         draw = torch.randn(rows, generator=generator, dtype=torch.float64)
         found[f"load_{coordinate.name}"] = sizes[coordinate.unit] * draw
     before = torch.where(torch.rand(1, n, generator=generator, dtype=torch.float64) < 0.5, -1.0, 1.0)
-    way = torch.where(joints.diff(dim=0) < 0, -1.0, 1.0)
-    found |= {f"direction{i + 1}": d for i, d in enumerate(torch.cat([before, way])[:rows].unbind(-1))}
+    found |= directions(joints, before)
     for condition in mechanism.takes:
         if condition.name not in found and condition.spread > 0:
             draw = torch.randn(rows, generator=generator, dtype=torch.float64)
             found[condition.name] = condition.usual + condition.spread * draw
     return found
+
+
+def directions(joints: Tensor, before: Tensor) -> dict[str, Tensor]:
+    """`direction1`…, `s` each: signs of the ways between rows of joints `s x n`, and `before` of the first, `1 x n`."""
+    way = torch.where(joints.diff(dim=0) < 0, -1.0, 1.0)
+    signs = torch.cat([before, way])[: len(joints)]
+    return {f"direction{i + 1}": sign for i, sign in enumerate(signs.unbind(-1))}
 
 
 def covariate_units(mechanism: Mechanism) -> dict[str, str]:

@@ -40,6 +40,13 @@ class JointGain:
             )
         )
 
+    def counted_from(self, situation: Situation) -> dict[str, int]:
+        """Coefficients that multiply a joint's command less the middle of its workspace, and the number of that joint.
+
+        A command of that middle has the joint where the zero says.
+        """
+        return {joint.name: i for i, joint in enumerate(situation.mechanism.joints)}
+
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """None."""
         return ()

@@ -114,10 +114,15 @@ class Situation:
         return self.samples.joints.amin(0), self.samples.joints.amax(0)
 
     @cached_property
+    def middle(self) -> Tensor:
+        """Middle of the workspace of each joint, `n` [joint's unit]."""
+        low, high = self.workspace
+        return (low + high) / 2
+
+    @cached_property
     def from_middle(self) -> Tensor:
         """Commanded joints less the middle of their workspace, `... x s x n` [joint's unit]."""
-        low, high = self.workspace
-        return self.joints - (low + high) / 2
+        return self.joints - self.middle
 
     def once(self, make: Callable[[Situation], Tensor]) -> Tensor:
         """What a function makes of these rows, kept with them from when it is first asked for."""

@@ -41,7 +41,8 @@ _WORDS = {
     "joint_gain": Words(
         "a wrong gain of the joints",
         "wrong gear ratio or lead",
-        "A positive gain: the joint moves this share too far.",
+        "A positive gain: the joint moves this share too far, counted from the command beside it; zero: how far it "
+        "stands off there.",
         "Gear ratio, screw lead or encoder scale of {where} in the controller.",
     ),
     "transmission": Words(
@@ -104,7 +105,8 @@ _WORDS = {
     "coupling": Words(
         "coupling between the joints",
         "coupling",
-        "Motion of the first joint for each unit of motion of the second.",
+        "Motion of the first joint for each unit of motion of the second, counted from the command beside it; zero: "
+        "how far the first stands off there.",
         "Coupling factors in the controller, and gears or belts that run over {where}.",
     ),
     "latency": Words(

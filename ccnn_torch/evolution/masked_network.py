@@ -165,10 +165,21 @@ def _blank_harmonics(shape: Sequence[int] | None, outputs: int) -> Harmonics | N
     return Harmonics(zeros[:, 0], zeros, zeros.new_zeros(*shape), zeros.new_zeros(joints, outputs))
 
 
+class _Sparse(nn.Linear):
+    """A layer whose connections of weight 0 are none, and stay so when the network is trained on."""
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """`... x i` -> `... x o`."""
+        weight = self.weight
+        if weight.requires_grad and torch.is_grad_enabled():
+            weight = weight * (weight != 0)
+        return nn.functional.linear(inputs, weight, self.bias)
+
+
 def _linear(weight: Tensor, width: int) -> nn.Linear:
     # Without its usual start values: those would be drawn from the global random state.
     with torch.device("meta"):
-        linear = nn.Linear(width, len(weight), dtype=torch.float64)
+        linear = _Sparse(width, len(weight), dtype=torch.float64)
     linear.to_empty(device=weight.device)
     linear.requires_grad_(False)
     linear.weight.copy_(weight[:, :width])

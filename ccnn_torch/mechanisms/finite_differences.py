@@ -33,7 +33,7 @@ def central_slope(
         step: of each coordinate, `d`.
         bounds: what they cannot pass, `d` each.
     """
-    ahead = torch.diag(step).reshape(-1, *[1] * (point.dim() - 1), len(step))
+    ahead = torch.diag(step).reshape(len(step), *[1] * (point.dim() - 1), len(step))
     if bounds is not None:
         point = torch.minimum(torch.maximum(point, bounds[0]), bounds[1])
     ends = torch.stack([point + ahead, point - ahead])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from typing import Any, Literal
 
 import torch
@@ -26,7 +27,8 @@ from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, wrap_angle
 
 
 class Mechanism(nn.Module):
-    """Base class of mechanisms. A new one gives `closure` or `solve_inverse`; all else has a numerical default.
+    """Base class of mechanisms. A new one gives `closure`, `solve_inverse` or `forward_kinematics`; all else has a
+    numerical default. Closed forms may leave out the argument `guess`.
 
     Everything is float64 and SI, broadcasts over leading dims, parameters included (`r x 1 x k` parameters and `s x n`
     joints give `r x s x p` poses), and is differentiable in joints, pose and parameters. A row without a solution
@@ -68,9 +70,10 @@ class Mechanism(nn.Module):
     ) -> None:
         """Name the parts; `home_pose` defaults to the middle of the box, `home_joints` to its inverse (from zeros)."""
         super().__init__()
-        if all(getattr(type(self), verb) is getattr(Mechanism, verb) for verb in ("closure", "solve_inverse")):
+        if not any(self._defines(verb) for verb in ("closure", "solve_inverse", "forward_kinematics")):
             raise InputError(
-                f"mechanism '{name}' must define closure(pose, joints, parameters) or solve_inverse(pose, …)"
+                f"mechanism '{name}' must define closure(pose, joints, parameters), solve_inverse(pose, …) or "
+                "forward_kinematics(joints, …)"
             )
         self.name = name
         self.joints = tuple(joints)
@@ -87,7 +90,18 @@ class Mechanism(nn.Module):
         # How to build it again: `spec` and `keys` of `load_mechanism`, which fills this in.
         self.recipe: dict[str, Any] = {}
 
-    # The maths: a mechanism overrides closure or solve_inverse, and what it has in closed form.
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        for verb in ("solve_inverse", "forward_kinematics"):
+            own = vars(cls).get(verb)
+            if own is not None and len(inspect.signature(own).parameters) == 3:
+                setattr(cls, verb, _without_guess(own))
+
+    @classmethod
+    def _defines(cls, verb: str) -> bool:
+        return getattr(cls, verb) is not getattr(Mechanism, verb)
+
+    # The maths: a mechanism overrides one of these three, and what it has in closed form.
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Loop closure, zero where pose and joints fit together.
@@ -100,7 +114,11 @@ class Mechanism(nn.Module):
         Returns:
             `... x c` [SI].
         """
-        return self.wrap(self.solve_inverse(pose, parameters, joints) - joints)
+        if self._defines("solve_inverse"):
+            return self.wrap(self.solve_inverse(pose, parameters, joints) - joints)
+        gap = self.forward_kinematics(joints, parameters, pose) - pose
+        turning = torch.tensor([c.unit == "rad" for c in self.pose], device=gap.device)
+        return torch.where(turning, wrap_angle(gap), gap)
 
     def solve_inverse(self, pose: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
         """Joints of a pose, the plain function behind `inverse_kinematics`; no hook ever acts on it.
@@ -391,6 +409,16 @@ class Mechanism(nn.Module):
             raise InputError(f"mechanism '{self.name}' has the parameters {', '.join(names)}; check {', '.join(wrong)}")
         self.nominal.copy_(_tensor([float(values[n]) for n in names]))
         self._follow_nominal()
+
+
+def _without_guess(verb: Callable[[Any, Tensor, Tensor | None], Tensor]) -> Callable[..., Tensor]:
+    """The same verb, with the argument that a closed form ignores."""
+
+    @wraps(verb)
+    def ignoring(self: Any, given: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None) -> Tensor:
+        return verb(self, given, parameters)
+
+    return ignoring
 
 
 def _tensor(values: Sequence[float]) -> Tensor:

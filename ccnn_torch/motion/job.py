@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ccnn_torch.config.sizes import size
-from ccnn_torch.diagnosis.config import DiagnoseConfig
+from ccnn_torch.diagnosis.config import DiagnoseConfig, folder_of
 from ccnn_torch.diagnosis.page.compensate import typed_path
 from ccnn_torch.diagnosis.page.data import NEXT, RESULT, about_of, load_labels
 from ccnn_torch.diagnosis.page.report import print_diagnosis, write_diagnosis_report
@@ -49,12 +49,11 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
     Raises:
         InputError: something is missing or wrong in the files or keys, or the folder cannot be written.
     """
-    if config.out is None:
-        raise InputError("name the folder to write with --out DIR")
+    folder = folder_of(config)
     stopped = if_stopped("interrupted before there was a verdict; nothing was written")
     with stopped, step_bar(_STEPS, quiet) as tell, watched(tell):
         found, nominal = diagnosed(config)
-    folder, results = Path(config.out), dict(plain(found.to_json()))
+    results = dict(plain(found.to_json()))
     with locked(folder):
         sweep(folder)
         write_json(folder / RESULT, results)

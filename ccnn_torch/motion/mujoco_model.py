@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.simulators.mujoco_file import compiled, mujoco_spec
 from ccnn_torch.motion.mujoco_motion import NONE, loaded_motion
 from ccnn_torch.motion.nominal import Nominal
 
@@ -22,16 +23,10 @@ def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> 
     Raises:
         InputError: MuJoCo is not installed, the model cannot be read, or it has other actuators.
     """
-    try:
-        import mujoco
-    except ImportError:
-        raise InputError(f"{path}: a MuJoCo model needs MuJoCo; pip install 'ccnn-torch[mujoco]'") from None
     if keys:
         raise InputError(f"mechanism_keys: an MJCF takes none, and {', '.join(keys)} was given; write it in {path}")
-    try:
-        model = mujoco.MjModel.from_xml_path(path)
-    except ValueError as error:
-        raise InputError(f"{path}: is no model that MuJoCo reads: {str(error).splitlines()[0]}") from None
+    mujoco, spec = mujoco_spec(path)
+    model = compiled(mujoco, path, spec)
     held = [k for k in range(model.nu) if model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT]
     position = [k for k in held if model.actuator_biasprm[k, 1] < 0 and model.actuator_gainprm[k, 0] > 0]
     if len(position) != model.nu or model.nu != len(units):
@@ -61,6 +56,6 @@ def mujoco_nominal(path: str, keys: Mapping[str, Any], units: Sequence[str]) -> 
         tuple(gain.tolist()),
         (None,) * len(joints),
         heaviest=float(model.body_mass.sum()),
-        loaded=lambda time, commands, measured: loaded_motion(model, joints, values, time, commands, measured),
+        loaded=lambda time, commands, measured: loaded_motion(path, model, joints, values, time, commands, measured),
         notes=(f"{Path(path).name}: simulated from rest at each log's first command",),
     )

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ccnn_torch.errors import InputError
 from ccnn_torch.motion.nominal import Loaded
 
 Array = NDArray[np.float64]
@@ -15,6 +16,8 @@ Array = NDArray[np.float64]
 _SETTLING = 1.0
 # Of the Gaussian by which what is measured beside the simulated motion is smoothed [s].
 _SMOOTH = 0.02
+# Steps of one log, some minutes; numbers that are kept of them, 800 MB.
+_MOST_STEPS, _MOST_CELLS = 2e6, 1e8
 # A limit of 1/this or more is none.
 NONE = 1e-9
 
@@ -62,11 +65,30 @@ class _Motion(NamedTuple):
 
 
 def loaded_motion(
-    model: Any, joints: Sequence[int], own: Mapping[str, Array], time: Array, commands: Array, measured: Array | None
+    path: str,
+    model: Any,
+    joints: Sequence[int],
+    own: Mapping[str, Array],
+    time: Array,
+    commands: Array,
+    measured: Array | None,
 ) -> Loaded:
-    """Simulate commands; own: parameters of the axes; measured: positions, `s x n`; None: those that are simulated."""
+    """Simulate commands.
+
+    Args:
+        path: of the model.
+        model: of MuJoCo.
+        joints: of the actuators, in their order.
+        own: parameters of the axes.
+        time: of the samples, `s` [s].
+        commands: `s x n` [rad or m].
+        measured: positions, `s x n`; None: those that are simulated.
+
+    Raises:
+        InputError: the simulation has too many steps, or is unstable.
+    """
     address, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-    motion, there = _simulated(model, joints, own, time, commands)
+    motion, there = _simulated(path, model, joints, own, time, commands)
     positions, gain = motion.position[:, address], model.actuator_gainprm[: len(joints), 0]
     moved = _Motion(*(part.copy() for part in motion))
     if measured is not None:
@@ -79,7 +101,7 @@ def loaded_motion(
 
 
 def _simulated(
-    model: Any, joints: Sequence[int], own: Mapping[str, Array], time: Array, commands: Array
+    path: str, model: Any, joints: Sequence[int], own: Mapping[str, Array], time: Array, commands: Array
 ) -> tuple[_Motion, Array]:
     """The motion at the log's samples, and what resists each actuator there beside its joint's friction and inertia,
     over its gain, `s x n`: weights, and the other joints."""
@@ -90,6 +112,12 @@ def _simulated(
     data.qpos[address] = commands[0]
     mujoco.mj_forward(model, data)
     step = float(model.opt.timestep)
+    count, most = (time[-1] - time[0] + _SETTLING) / step, min(_MOST_STEPS, _MOST_CELLS / (model.nq + 2 * model.nv))
+    if count > most:
+        raise InputError(
+            f"{path}: the simulation of a log would take {count:,.0f} steps of {step:g} s; write an option timestep "
+            f"of at least {step * count / most:.2g} s, or shorten the log"
+        )
     clock = np.arange(time[0] - _SETTLING, time[-1] + step, step)
     controls = _at(clock, time, commands)
     motion = _Motion(*(np.empty((len(clock), k)) for k in (model.nq, model.nv, model.nv)))
@@ -106,6 +134,12 @@ def _simulated(
         dry = np.clip(-data.qfrc_constraint[dofs] / gain, -own["coulomb"], own["coulomb"])
         passive = (own["viscous"] - own["drive_damping"]) * v + dry
         torque[k] = motor - passive - own["inertia"] * motion.acceleration[k, dofs]
+    bad = mujoco.mjtWarning
+    if any(data.warning[w].number for w in (bad.mjWARN_BADQPOS, bad.mjWARN_BADQVEL, bad.mjWARN_BADQACC)):
+        raise InputError(
+            f"{path}: MuJoCo's simulation of a log is unstable at an option timestep of {step:g} s; write a shorter "
+            "one, or correct the gains and masses"
+        )
     position, speed, acceleration, resisting = (_at(time, clock, table) for table in (*motion, torque))
     return _Motion(position, speed, acceleration), resisting
 

@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ _DAMAGED = (
     *(BadZipFile, EOFError, KeyError, IndexError, ValueError, TypeError, AttributeError, SyntaxError, zlib.error),
     *(RuntimeError, OverflowError),
 )
+# Times the size of its file that a workbook may have unpacked; tables of numbers have 5 to 30.
+_MOST_PACKED = 100
 _WORKBOOKS = (".xlsx", ".xlsm")
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 _DOT_NUMBER = re.compile(r"[+-]?\d*\.\d*([eE][+-]?\d+)?")
@@ -151,6 +153,7 @@ def _sheet_with_header(file: str) -> tuple[str, list[tuple[int, _Cells]]] | None
             warnings.simplefilter("ignore", UserWarning)
             # Formulas count by the values that were last calculated.
             content = io.BytesIO(read_bytes(file, _LARGEST_FILE, "give the path of a CSV file or a workbook"))
+            _check_size(file, content)
             book = openpyxl.load_workbook(content, read_only=True, data_only=True)
             for sheet in book.worksheets:
                 # Some programs write a wrong extent.
@@ -165,6 +168,17 @@ def _sheet_with_header(file: str) -> tuple[str, list[tuple[int, _Cells]]] | None
         return None
     except _DAMAGED:
         raise InputError(f"{file}: this is no workbook that openpyxl can read; save the sheet as CSV") from None
+
+
+def _check_size(file: str, content: io.BytesIO) -> None:
+    """Refuse a workbook that is packed more densely than rows of numbers can be; only the sizes are read."""
+    packed = len(content.getbuffer())
+    unpacked = sum(part.file_size for part in ZipFile(content).infolist())
+    if unpacked > min(_LARGEST_FILE, max(_MOST_PACKED * packed, 10_000_000)):
+        raise InputError(
+            f"{file}: has {unpacked / 1e6:,.0f} MB unpacked, mostly of cells that are empty or alike; save the rows of "
+            "measurements alone, as CSV"
+        )
 
 
 def _fit(row: _Cells, width: int) -> _Cells:
@@ -224,6 +238,9 @@ def _read_cells(
             counts = f"has {len(cells)} cells, but the header names {header.width} columns"
             raise InputError(f"{file}: {name_lines(lines, [row])} {counts}{comma}")
         for column, cell in enumerate(cells):
+            if isinstance(cell, bool):
+                bad[row, column] = str(cell).upper()
+                continue
             try:
                 values[row, column] = float(cell.replace("_", "?") if isinstance(cell, str) else cell)  # type: ignore[arg-type]
             except (TypeError, ValueError, OverflowError):

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
+from ccnn_torch.files.csv_text import csv_text
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import LARGEST, parse_header, split_header, to_si, write_hint
@@ -171,4 +172,4 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
     np.savetxt(buffer, np.stack(arrays, axis=1), fmt="%.17g", delimiter=",")
     if not Path(path).absolute().parent.is_dir():
         raise InputError(f"{path}: cannot be written (its folder is not there); make it, or correct the name")
-    write_whole(path, ",".join(columns) + "\n" + buffer.getvalue().replace("nan", ""))
+    write_whole(path, csv_text([columns]) + buffer.getvalue().replace("nan", ""))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ccnn_torch.files.csv_text import csv_text
 from ccnn_torch.files.write import write_whole
 
 HEADER = ("method", "split", "quantity", "joint", "unit", "median", "low", "high")
@@ -71,8 +70,4 @@ def write_rows(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[
     Raises:
         WriteError: it cannot be written.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows([f"{v:.17g}" if isinstance(v, float | int) else v for v in row] for row in rows)
-    write_whole(path, text.getvalue())
+    write_whole(path, csv_text([header, *rows]))

@@ -29,12 +29,14 @@ def page_text(
     config: str,
     files: Sequence[str],
     best: str | None = None,
+    worse: bool = False,
 ) -> str:
     """A page: verdict, sentences about what failed, tables, figures, notes, files, configuration, versions.
 
     Args:
         template: `report` or `identified`.
         best: first cell of the rows that are set in bold.
+        worse: whether the verdict is no success, and is not marked as one.
     """
     return render(
         template,
@@ -46,6 +48,7 @@ def page_text(
         config=config,
         files=files,
         best=best,
+        worse=worse,
     )
 
 

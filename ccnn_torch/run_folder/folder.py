@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -21,6 +21,21 @@ def kept_for(command: str) -> Iterator[None]:
         yield
     except WriteError as problem:
         raise WriteError(f"{problem}; what was computed is kept, and {command} resumes from it") from None
+
+
+def refuse_foreign(folder: Path, own: Collection[str]) -> None:
+    """Refuse a folder whose files are not those of the command that writes there.
+
+    Args:
+        folder: where a command is going to write, replacing what it wrote there before.
+        own: names of which the command's folder holds one.
+
+    Raises:
+        InputError: the folder is a file, or holds files and none of these names.
+    """
+    held = {LOCK} if not folder.exists() else {file.name for file in folder.iterdir()} if folder.is_dir() else {""}
+    if held - {LOCK} and not held & set(own):
+        raise InputError(f"{folder} holds files already; give a folder of its own with --out DIR")
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.config.noise import Noise, noise_of_pose
 from ccnn_torch.effects import Acting, Situation, default_gravity, measured_pose, reached
+from ccnn_torch.effects.covariates import directions
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
@@ -19,6 +20,9 @@ from ccnn_torch.simulation.config import SimulateConfig
 from ccnn_torch.simulation.limits import refuse_beyond_bounds
 from ccnn_torch.simulation.outliers import bad_rows
 from ccnn_torch.simulation.rows import draw_moves, draw_poses
+
+# Rounds in which rows without a pose are drawn anew.
+_TRIES = 50
 
 
 @dataclass(frozen=True)
@@ -76,18 +80,28 @@ def simulate_records(
     generator = torch.Generator().manual_seed(seed)
     moving = config.rows == "trajectory" or (config.rows == "auto" and any(w.name == "latency" for w in wanted))
     joints, columns = (draw_moves if moving else draw_poses)(machine, rows, config, generator)
-    kept = _kept(columns, config.covariates)
     gravity = default_gravity(machine)
     if config.gravity is not None:
         gravity = torch.tensor(config.gravity, dtype=torch.float64)
-    situation = Situation(machine, joints, kept, gravity)
+    situation = Situation(machine, joints, _kept(columns, config.covariates), gravity)
     acting = [act(w, situation, generator) for w in wanted if not w.outlier]
     refuse_beyond_bounds(situation, acting)
     frame = reached(situation, acting)
-    lost = torch.nonzero(~torch.isfinite(frame).all(-1)).flatten().tolist()
-    if lost:
+    lost = ~torch.isfinite(frame).all(-1)
+    for _ in range(_TRIES if not moving and 2 * int(lost.sum()) <= rows else 0):
+        if not bool(lost.any()):
+            break
+        # At the edge of what the nominal machine reaches: the changed one gets others in the place of these.
+        joints = torch.where(lost[:, None], draw_poses(machine, rows, config, generator)[0], joints)
+        first = torch.stack([columns[f"direction{i + 1}"][:1] for i in range(joints.shape[-1])], -1)
+        columns |= directions(joints, first)
+        situation = replace(situation, joints=joints, covariates=_kept(columns, config.covariates))
+        frame = reached(situation, acting)
+        lost = ~torch.isfinite(frame).all(-1)
+    if bool(lost.any()):
         raise InputError(
-            f"--effect: with these effects the machine has no pose in {len(lost)} of {rows} rows; make them smaller"
+            f"--effect: with these effects the machine has no pose in {int(lost.sum())} of {rows} rows; "
+            "make them smaller"
         )
     nominal = reached(situation, [])
     gap = _rms(frame - nominal)
@@ -104,6 +118,7 @@ def simulate_records(
     pose = measured_pose(situation, frame)
     errors = sigma * torch.randn(pose.shape, generator=generator, dtype=torch.float64)
     pose = _moved(pose, errors) if machine.orientations and pose.shape[-1] == 6 else pose + errors
+    kept = dict(situation.covariates)
     return Simulated(machine, joints, pose, kept, tuple(injected), tuple(sorted(outliers)), gap)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ from ccnn_torch.engine import check_engine
 from ccnn_torch.errors import InputError
 
 _LONGEST = 80
+# Each job is checked before the first one starts, in some milliseconds.
+_MOST = 2000
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,12 @@ def load_sweep(path: str | Path | None, changes: Iterable[str], out: str | Path)
     if not varied:
         raise InputError(
             "name a key that varies, with its values: ccnn sweep CONFIG seed=0,1,2 methods=gp,ccnn --out DIR"
+        )
+    count = math.prod(len(options) for options in varied.values())
+    if count > _MOST:
+        product = " x ".join(f"{len(options)} of {key}" for key, options in varied.items())
+        raise InputError(
+            f"a sweep of {count:,} jobs ({product}): up to {_MOST:,} are taken; give fewer values, or several sweeps"
         )
     values: dict[str, tuple[str, ...]] = {}
     jobs: dict[str, RunConfig] = {}

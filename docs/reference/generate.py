@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from ccnn_torch.cli import app
+from ccnn_torch.cli.application import app
 from ccnn_torch.config.commands import keys_by_section
 from ccnn_torch.report.json_files import load_schema
 

@@ -153,3 +153,19 @@ def test_the_same_rows_give_the_same_diagnosis(tmp_path: Path) -> None:
     first, again = _diagnosed(path), _diagnosed(path)
     assert first.to_json() == again.to_json()
     assert torch.equal(first.analysis.residual, again.analysis.residual)
+
+
+def test_a_simulator_without_parameters_has_effects_of_its_joints(tmp_path: Path) -> None:
+    (tmp_path / "axis.py").write_text(
+        "from ccnn_torch.mechanisms import Joint, Simulator\n"
+        'AXIS = Simulator(name="axis", joints=[Joint("q1", "m", 0.0, 0.6)], pose=("x",),\n'
+        "    simulate=lambda q, c, p: q[:, :1], parameters=[])\n",
+        encoding="utf-8",
+    )
+    g = np.random.default_rng(0)
+    joints = g.uniform(0, 0.6, 60)
+    write_table(tmp_path / "rows.csv", {"q1[m]": joints, "x[m]": 1.002 * joints + NOISE * g.standard_normal(60)})
+    mechanism = load_mechanism(f"{tmp_path / 'axis.py'}:AXIS")
+    records = load_records(tmp_path / "rows.csv", mechanism)
+    assert diagnose(records, mechanism, noise={"x": NOISE}).verdict["effects"] == ["joint_gain"]
+    assert mechanism.parameter_jacobian(records.joints).shape == (60, 3, 0)

@@ -114,3 +114,50 @@ def test_the_slope_of_a_frame_by_name_is_that_of_the_frame(name):
             slides.frame_slope(pose)
     else:
         assert torch.equal(slides.frame_slope(pose), frame_jacobian(slides.frame, pose))
+
+
+class _SliderArm(Mechanism):
+    """A slider along x, tilted, that carries two links; only its forward kinematics is written, without a guess."""
+
+    def __init__(self):
+        super().__init__(
+            name="slider_arm",
+            joints=[Coordinate("q1", "m"), Coordinate("q2", "rad"), Coordinate("q3", "rad")],
+            pose=[Coordinate("x", "m"), Coordinate("y", "m"), Coordinate("phi", "rad")],
+            geometry=[Parameter("length", "m", 0.3), Parameter("hand", "m", 0.1), Parameter("tilt", "rad", 0.0)],
+            low=(0.2, 0.1, 2.9),
+            high=(0.5, 0.25, 3.4),  # across the angle pi
+            home_joints=[0.1, 0.6, 2.5],
+        )
+
+    def forward_kinematics(self, joints, parameters=None):
+        length, hand, tilt = self.values(parameters)
+        q1, q2, q3 = joints.unbind(-1)
+        turn = q2 + q3
+        x = q1 * torch.cos(tilt) + length * torch.cos(q2) + hand * torch.cos(turn)
+        y = q1 * torch.sin(tilt) + length * torch.sin(q2) + hand * torch.sin(turn)
+        return torch.stack([x, y, torch.atan2(torch.sin(turn), torch.cos(turn))], -1)
+
+    def frame(self, pose):
+        x, y, phi = pose.unbind(-1)
+        nought, one = torch.zeros_like(x), torch.ones_like(x)
+        rows = [torch.cos(phi), -torch.sin(phi), nought, torch.sin(phi), torch.cos(phi), nought, nought, nought, one]
+        return torch.stack([x, y, nought], -1), torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def test_forward_kinematics_alone_suffices():
+    mechanism = _SliderArm()
+    joints = mechanism.sample_joints(50, torch.Generator().manual_seed(0))
+    assert torch.isfinite(joints).all()
+    longer = mechanism.nominal + torch.tensor([1e-3, 0.0, 2e-3])
+    pose = mechanism.forward_kinematics(joints, longer)
+    torch.testing.assert_close(mechanism.solve_inverse(pose, longer, joints), joints, rtol=0, atol=1e-9)
+    assert mechanism.closure(pose, joints, longer).abs().max() < 1e-12
+    # The derivative of the root: by the implicit function theorem the inverse of the Jacobian.
+    there = mechanism.forward_kinematics(joints)
+    jacobian = torch.autograd.functional.jacobian
+    step = jacobian(lambda x: mechanism.solve_inverse(x, None, joints).sum(0), there).movedim(0, 1)
+    slope = jacobian(lambda q: mechanism.forward_kinematics(q).sum(0), joints).movedim(0, 1)
+    torch.testing.assert_close(step @ slope, torch.eye(3).double().expand(50, -1, -1), rtol=0, atol=1e-8)
+    with pytest.raises(InputError, match=r"solve_inverse\(pose, …\) or forward_kinematics\(joints, …\)"):
+        type("Nothing", (Mechanism,), {})("nothing", [], [], [], [], [])

@@ -149,7 +149,7 @@ def test_places_are_told_in_words() -> None:
     first, *rest = where_words(results, about_of(labels))
     assert first == "joint 1 55 % and joint 2 45 % of the gap"
     assert rest[0].startswith("40 % of it in 25 % of the rows: x 0 to 100 mm, y 300 to 400 mm, far from the base")
-    assert rest[1] == "85 % of it at load_z 60 N to 120 N"
+    assert rest[1] == "85 % of it in 50 % of the rows: load_z 60 N to 120 N"
     for region in results["where"]["regions"]:
         region["share"] = 0.25
     assert "spread over the whole workspace" in where_words(results, about_of(labels))

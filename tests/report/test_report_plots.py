@@ -170,6 +170,7 @@ def test_convergence_draws_the_median_over_repeats(history: dict[str, np.ndarray
     assert held.get_ylabel() == "mse [m²]" and held.get_yscale() == "log"
     assert set(dots(plot, 1, "noise floor")) == {1e-10} and set(dots(plot, 1, "constant")) == {1.55e-10}
     assert convergence_plot({"step": history["step"]}, "x") is None
+    assert convergence_plot({name: values[:1] for name, values in history.items()}, "constant") is None
     assert population_plot({"step": history["step"]}, "x") is None
 
 

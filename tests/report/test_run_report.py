@@ -98,6 +98,7 @@ def test_a_network_that_makes_it_worse_is_said_with_the_remedy(results: dict[str
     position = results["pose"]["position"]
     after = position["after"]["rms"]["median"]
     assert worse_text(results) == "" and "makes it worse" not in html_text(results)
+    assert '<p class="verdict">' in html_text(results)
     best = results["best_method"]
     for alone, share, said in (("geometry", 0.995, ""), ("geometry", 0.5, "geometry"), ("effects", 0.7, "geometry + ")):
         position[alone] = {"rms": {"median": share * after, "low": 0.0, "high": 1.0, "values": [share * after]}}
@@ -108,6 +109,7 @@ def test_a_network_that_makes_it_worse_is_said_with_the_remedy(results: dict[str
     assert left / right == pytest.approx(0.7, rel=0.01) and "than geometry + effects alone (" in told
     assert told.endswith("methods=constant leaves the network out, methods=auto chooses by cross-validation.")
     assert told in markdown_text(results) and told in html_text(results)
+    assert '<p class="verdict worse">' in html_text(results)
     screen = io.StringIO()
     print_tables(results, Console(file=screen, width=500))
     assert told in screen.getvalue()

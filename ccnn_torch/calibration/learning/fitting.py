@@ -18,7 +18,8 @@ from ccnn_torch.calibration.learning.early_stop import (
     predictive_variance,
 )
 from ccnn_torch.calibration.rows.dataset import Dataset
-from ccnn_torch.errors import MethodFailedError
+from ccnn_torch.compensation.networks import describe_network
+from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner, TrainingData
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Scaling, Training, train, weighted_mse
@@ -81,6 +82,21 @@ class Fitted:
         own = evaluations_until(self.training)
         before = None if self.choice is None else self.choice.evaluations
         return own if own is None or before is None else own + before
+
+
+def check_storable(name: str, learner: Learner) -> None:
+    """Look at the network of a learner that was started on a few random rows.
+
+    Raises:
+        InputError: no model file can hold it.
+    """
+    rows = torch.rand(1, 40, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    weights, seeds = torch.ones(1, 40, dtype=torch.float64), torch.zeros(1, dtype=torch.int64)
+    learner.start(TrainingData(rows, rows.flip(-1), weights, seeds))
+    try:
+        describe_network(learner.network(0))
+    except InputError as problem:
+        raise InputError(f"methods: {name}: {problem}; or write no model files: save_models=false") from None
 
 
 def fit_method(

@@ -34,9 +34,11 @@ def convergence_plot(
         unit: the joints' SI unit.
 
     Returns:
-        None when the history has none of these metrics.
+        None when the history has none of these metrics, or a single step, which converges to nothing.
     """
     step = history["step"]
+    if len(step) < 2:
+        return None
     panels = [
         ("Fitness", "fitness [1]", [n for n in ("fitness_best", "fitness_mean") if n in history], False),
         ("Training error", "error, standardised [1]", [n for n in history if n.startswith("error_")], True),

@@ -9,7 +9,7 @@ from typing import Any
 from ccnn_torch.calibration.page.figure_learning import convergence_plot, population_plot
 from ccnn_torch.calibration.page.figure_network import network_plot
 from ccnn_torch.calibration.page.figure_progress import progress_plot
-from ccnn_torch.calibration.page.tables import cautions, result_tables, verdict, write_tables
+from ccnn_torch.calibration.page.tables import cautions, result_tables, verdict, worse_text, write_tables
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_arrays, load_history
@@ -37,6 +37,7 @@ def html_text(
         config,
         files,
         results.get("best_method"),
+        worse=bool(worse_text(results)),
     )
 
 

@@ -67,17 +67,24 @@ def regime_words(name: str, regime: Block, unit: str) -> str:
     return f"{name} {low} to {high}"
 
 
+def row_parts(regimes: Sequence[Block]) -> list[float]:
+    """Of each regime of a covariate its share of the rows; alike where a file of an earlier version does not tell."""
+    rows = [regime.get("rows", 1) for regime in regimes]
+    return [count / max(sum(rows), 1) for count in rows]
+
+
 def where_table(results: Block, about: About, *, telling: bool = False) -> Table | None:
     """Shares of the gap by output, joint, leg, covariate regime and phase of a motion.
 
     Args:
-        telling: leave covariates out none of whose regimes differs from an even share.
+        telling: leave covariates out none of whose regimes differs from the share of its rows.
     """
     found = list(shares(results, about))
     hidden = []
     for name, regimes in results["where"]["covariates"].items():
         intervals = [interval for group, _, _, interval in found if group == name]
-        even = all(i is not None and i[0] <= 1 / len(regimes) <= i[1] for i in intervals)
+        parts = zip(intervals, row_parts(regimes), strict=True)
+        even = all(i is not None and i[0] <= part <= i[1] for i, part in parts)
         hidden += [name] if telling and even else []
     rows = [
         (part, percent(share), percent_interval(interval))

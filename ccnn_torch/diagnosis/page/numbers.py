@@ -7,14 +7,18 @@ from collections.abc import Mapping
 from typing import Any
 
 from ccnn_torch.diagnosis.verdict.findings import clear_parameters, frequency_words, repeats_of, size_words
-from ccnn_torch.display import display_unit, unit_text
+from ccnn_torch.display import display_unit, number_text, unit_text
 from ccnn_torch.effects.words import words_of
 from ccnn_torch.report.table import Table
 
 Block = Mapping[str, Any]
 _Z95 = 1.96
+# Of the middle from which a gain counts: a gain of some thousandths times the rest is no error.
+_MIDDLE_DIGITS = 6
 # Numbers of an effect, however many effects there are.
 _FEWEST = 2
+# A wave of forty periods over the travel, ten travels from where the joint counts from, is in step to a thousandth.
+_PERIOD_DIGITS = 7
 _OWN_UNIT = "A number without unit has that of the simulator."
 
 
@@ -36,7 +40,7 @@ def numbers_table(results: Block, most: int) -> Table | None:
             value, unit, error = block["value"], block["unit"], _Z95 * block["sd"]
             part = block.get("part") or ""
             enter = "–" if block.get("nominal") is None else _whole(block["nominal"] + value, unit, block["sd"])
-            text = f"{_named(name, part)}{_often(name, parameters)}"
+            text = f"{_named(name, part)}{_often(name, parameters)}{_counted(block)}"
             text = text if len(chosen) == 1 else f"{words_of(effect).short}, {text}"
             rows.append((text, size_words(value, unit, 4), f"± {size_words(error, unit, 2, value)}", enter))
         left_out += max(len(clear) - each, 0)
@@ -67,7 +71,18 @@ def _often(name: str, parameters: Block) -> str:
     if own is None or not rest:
         return ""
     times = int(rest[1]) if len(rest) > 1 and rest[1].isdigit() else 1
-    return f", {frequency_words(times * own['value'], own['unit'])}"
+    return f", {frequency_words(times * own['value'], own['unit'], _PERIOD_DIGITS)}"
+
+
+def _counted(block: Block) -> str:
+    """From where a gain counts, and which way a number does, where that is not the usual one."""
+    if "sense" in block:
+        return f", {block['sense']}"
+    if "about" not in block:
+        return ""
+    about = block["about"]
+    scale, unit = (1e-3, "mm") if about["unit"] == "m" else (1.0, unit_text(about["unit"]))
+    return f", about {about['joint']} = {number_text(about['value'] / scale, _MIDDLE_DIGITS)} {unit}"
 
 
 def _whole(value: float, unit: str, sd: float) -> str:

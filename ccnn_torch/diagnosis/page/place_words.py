@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ccnn_torch.diagnosis.page.data import About
-from ccnn_torch.diagnosis.page.localisation import regime_words
+from ccnn_torch.diagnosis.page.localisation import regime_words, row_parts
 from ccnn_torch.diagnosis.verdict.findings import places
 from ccnn_torch.diagnosis.verdict.text import listed
 from ccnn_torch.effects import OUTLIER
@@ -23,7 +23,7 @@ _MORE = 1.5
 # Of the distances of all regions from the base: a region among the nearest or farthest third is called so, where the
 # distances differ by this share.
 _APART = 0.1
-# Beyond an even share at 95 %: from there on a condition matters.
+# Beyond the share of its rows at 95 %: from there on a condition matters.
 _BEYOND = 0.1
 # Ranges below this many metres are told in mm.
 _SMALL = 0.5
@@ -106,11 +106,12 @@ def _regime(results: Block, about: About) -> str:
     found = []
     for name, regimes in results["where"]["covariates"].items():
         intervals = results.get("where_ci95", {}).get("covariates", {}).get(name) or []
-        for regime, interval in zip(regimes, intervals, strict=False):
-            found.append((interval[0] - 1 / len(regimes), regime, name))
+        for regime, part, interval in zip(regimes, row_parts(regimes), intervals, strict=False):
+            found.append((interval[0] - part, part, regime, name))
     if not found:
         return ""
-    beyond, regime, name = max(found, key=lambda item: item[0])
+    beyond, part, regime, name = max(found, key=lambda item: item[0])
     if beyond < _BEYOND:
         return ""
-    return f"{100 * regime['share']:.0f} % of it at {regime_words(name, regime, about.unit(name))}"
+    where = regime_words(name, regime, about.unit(name))
+    return f"{100 * regime['share']:.0f} % of it in {100 * part:.0f} % of the rows: {where}"

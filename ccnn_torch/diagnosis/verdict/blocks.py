@@ -138,6 +138,13 @@ def _parameters(made: Blocks, name: str) -> dict[str, dict[str, Any]]:
         | ({"nominal": nominal[c.name]} if atom.effect.kind == "parameters" and c.name in nominal else {})
         for c, v, d in zip(coefficients, own.mean[place], deviation, strict=True)
     }
+    for parameter in mechanism.geometry:
+        if parameter.sense and parameter.name in found:
+            found[parameter.name]["sense"] = parameter.sense
+    for coefficient, i in getattr(atom.effect, "counted_from", lambda _: {})(analysis.situation).items():
+        if coefficient in found:
+            joint, middle = mechanism.joints[i], float(analysis.situation.middle[i])
+            found[coefficient]["about"] = {"joint": joint.name, "value": middle, "unit": joint.unit}
     used = None if atom.used is None else set(atom.used)
     for shape, value in zip(atom.effect.shapes(analysis.situation), atom.shape.tolist(), strict=True):
         if used is None or shape.columns is None or used & set(shape.columns):

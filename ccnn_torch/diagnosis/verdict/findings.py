@@ -132,18 +132,19 @@ def repeats_of(parameters: Block, joint: str) -> Block | None:
     return next((parameters[name] for n in _PERIODIC.values() if (name := f"{joint} {n}") in parameters), None)
 
 
-def frequency_words(frequency: float, unit: str) -> str:
-    """`5 times a turn` of a turning joint, `every 5.2 mm` of a sliding one."""
+def frequency_words(frequency: float, unit: str, digits: int = 3) -> str:
+    """`5 times a turn` of a turning joint, `every 5.2 mm` of a sliding one, to so many significant digits."""
     if unit == "1":
-        return f"{frequency:.3g}{_A_TURN}"
+        return f"{frequency:.{digits}g}{_A_TURN}"
     scale, shown = display_unit("m", 2 * math.pi / frequency)
-    return f"every {number_text(2 * math.pi / frequency / scale, 3)} {shown}"
+    return f"every {number_text(2 * math.pi / frequency / scale, digits)} {shown}"
 
 
 def _sizes(parameters: Block) -> dict[str, tuple[float, str]]:
     """Of each part its clearest number: how large it is against those of the others, and in words."""
     chosen: dict[str, str] = {}
-    for name, block in clear_parameters(parameters).items():
+    # A gain before the zero that it has where it counts from.
+    for name, block in sorted(clear_parameters(parameters).items(), key=lambda item: "about" not in item[1]):
         chosen.setdefault(block.get("part") or "", name)
     if len({parameters[name]["unit"] for name in chosen.values()}) == 1:
         sizes = {part: abs(parameters[name]["value"]) for part, name in chosen.items()}

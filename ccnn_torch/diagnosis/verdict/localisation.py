@@ -87,8 +87,10 @@ def localise(analysis: Analysis, residual: Tensor, seed: int = 0) -> tuple[dict[
         ],
         "covariates": {
             name: [
-                {"from": low, "to": high, "share": share}
-                for (low, high), share in zip(edges[name][0], found.plain, strict=True)
+                {"from": low, "to": high, "share": share, "rows": int(rows_there)}
+                for (low, high), share, rows_there in zip(
+                    edges[name][0], found.plain, edges[name][1].sum(0), strict=True
+                )
             ]
             for name, found in covariates.items()
         },

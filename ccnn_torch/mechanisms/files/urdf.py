@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
-from ccnn_torch.files.read import read_bytes
+from ccnn_torch.files.xml_file import read_xml
 from ccnn_torch.mechanisms.machines.link_frames import compose
 from ccnn_torch.mechanisms.machines.serial import MOST_JOINTS, SerialArm
 from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_euler_zyx, matrix_to_rotation_vector
@@ -42,7 +41,7 @@ def read_urdf(
         InputError: one sentence that names the file and the joint or link: a branch without `tip`, an unknown link, a
             mimic, floating or planar joint in the chain, a number that is none.
     """
-    root = _parsed(path)
+    root = read_xml(path, _LARGEST, "give the path of a URDF")
     chain = _chain(path, root, base, tip)
     if len(chain) > 2 * MOST_JOINTS:
         raise InputError(f"{path}: the chain has {len(chain)} joints; up to {MOST_JOINTS} that move can be handled")
@@ -79,28 +78,6 @@ def read_urdf(
         unknown_frames=["base", "tool"],
         orientation=orientation,
     )
-
-
-class _WithoutDoctype(ElementTree.TreeBuilder):
-    """Entities are declared in a document type, which no URDF has and which can unfold to gigabytes or name a file."""
-
-    def doctype(self, name: str, pubid: str, system: str) -> None:
-        """Called before anything of it is unfolded."""
-        raise InputError("has a document type (<!DOCTYPE …>), which is not read; remove it")
-
-
-def _parsed(path: str) -> Element:
-    content = read_bytes(path, _LARGEST, "give the path of a URDF")
-    parser = ElementTree.XMLParser(target=_WithoutDoctype())
-    try:
-        parser.feed(content)
-        root: Element = parser.close()
-    except InputError as reason:
-        raise InputError(f"{path}: {reason}") from None
-    # An encoding that is unknown or has several bytes a character is no error of the parser's own.
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
-        raise InputError(f"{path}: is no valid XML in UTF-8: {error}") from None
-    return root
 
 
 _Transform = tuple[Tensor, Tensor]

@@ -23,7 +23,8 @@ class FiveBar(Mechanism):
     Leg i has the parameters of eq. 10: crank l, coupler L, foot Ax, Ay [m], and of the drive the gain k [1] and the
     offset gamma [rad]. The joints are the commanded angles ψ of eq. 9: θ1 = k1 ψ1 + γ1 and θ2 = k2 (π - ψ2) + γ2, with
     θ1 the angle of crank 1 from +x, counter-clockwise, and θ2 that of crank 2 from -x, clockwise: with gain 1 and
-    offset 0 both joints are the angle of their crank from +x, counter-clockwise. Eq. 12 prints l_1 for l_2 in its
+    offset 0 both joints are the angle of their crank from +x, counter-clockwise. So a positive γ1 turns crank 1
+    counter-clockwise and a positive γ2 turns crank 2 clockwise. Eq. 12 prints l_1 for l_2 in its
     second line. Elbows point outward (working mode) and the tool is above the line from elbow 1 to elbow 2 (assembly
     mode). Joint angles are continuous over all poses that are not straight below their crank's foot.
 
@@ -43,7 +44,9 @@ class FiveBar(Mechanism):
         for leg, x in ((1, -a), (2, a)):
             lengths = [(f"l{leg}", l), (f"L{leg}", L), (f"A{leg}x", x), (f"A{leg}y", 0.0)]
             geometry += [Parameter(name, "m", value, leg, _SCALE) for name, value in lengths]
-            geometry += [Parameter(f"k{leg}", "1", 1.0, leg, _SCALE), Parameter(f"gamma{leg}", "rad", 0.0, leg, _SCALE)]
+            way = "clockwise" if leg == 2 else ""
+            geometry.append(Parameter(f"k{leg}", "1", 1.0, leg, _SCALE))
+            geometry.append(Parameter(f"gamma{leg}", "rad", 0.0, leg, _SCALE, sense=way))
         nominal = torch.tensor([g.nominal for g in geometry], dtype=torch.float64)
         centre, radius = inscribed_circle(*_geometry(nominal)[:3])
         super().__init__(

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms.simulators.mujoco_file import compiled, mujoco_spec
 from ccnn_torch.mechanisms.simulators.mujoco_parameters import Array, ModelNumbers, ModelParameter
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 
@@ -38,7 +39,10 @@ class MujocoMachine:
         threads: int | None,
     ) -> None:
         """See `mujoco_simulator`."""
-        self.mujoco, self.rollout = _imported(path)
+        self.mujoco, spec = mujoco_spec(path)
+        from mujoco import rollout
+
+        self.rollout = rollout
         self.path, self.pose = path, pose
         self.planar = "".join(axis for axis in _AXES if axis not in pose) if "phi" in pose else ""
         strange = [c for c in pose if c not in _WRENCH and (c != "phi" or len(self.planar) != 1)]
@@ -48,7 +52,7 @@ class MujocoMachine:
             )
         wrench = [_WRENCH["r" + self.planar if c == "phi" else c] for c in pose]
         self.loads = [f"load_{c}" for c in pose]
-        self.model = self._compiled(measured, wrench)
+        self.model = self._compiled(spec, measured, wrench)
         self.numbers = ModelNumbers(self.mujoco, path, self.model, parameters)
         self.site = self.numbers.element("site", measured)
         self.actuators = [self.numbers.element("actuator", a) for a in actuators]
@@ -65,22 +69,17 @@ class MujocoMachine:
         self.data = [self.mujoco.MjData(self.model) for _ in range(count)]
         self.width = self.mujoco.mjtState.mjSTATE_FULLPHYSICS
 
-    def _compiled(self, measured: str, wrench: list[int]) -> Any:
+    def _compiled(self, spec: Any, measured: str, wrench: list[int]) -> Any:
         """The model with a motor more for each load, which pushes the measured site along an axis of the world."""
-        try:
-            spec = self.mujoco.MjSpec.from_file(str(self.path))
-            if not any(site.name == measured for site in spec.sites):
-                names = ", ".join(site.name for site in spec.sites if site.name) or "none with a name"
-                raise InputError(f"{self.path}: has no site '{measured}'; it has {names}")
-            ground = spec.worldbody.add_site(name="ccnn_torch ground")
-            for axis in wrench:
-                gear = np.eye(6)[axis].tolist()
-                site = self.mujoco.mjtTrn.mjTRN_SITE
-                spec.add_actuator(trntype=site, target=measured, refsite=ground.name, gear=gear)
-            return spec.compile()
-        except ValueError as reason:
-            said = " ".join(str(reason).split())
-            raise InputError(f"{self.path}: MuJoCo does not take it: {said}") from None
+        if not any(site.name == measured for site in spec.sites):
+            names = ", ".join(site.name for site in spec.sites if site.name) or "none with a name"
+            raise InputError(f"{self.path}: has no site '{measured}'; it has {names}")
+        ground = spec.worldbody.add_site(name="ccnn_torch ground")
+        for axis in wrench:
+            gear = np.eye(6)[axis].tolist()
+            site = self.mujoco.mjtTrn.mjTRN_SITE
+            spec.add_actuator(trntype=site, target=measured, refsite=ground.name, gear=gear)
+        return compiled(self.mujoco, self.path, spec)
 
     def __call__(self, commands: Array, covariates: Mapping[str, Array], parameters: Array) -> Array:
         """As `Simulator.simulate`."""
@@ -168,14 +167,3 @@ class MujocoMachine:
             i, j = ((k + _AXES.index(self.planar)) % 3 for k in (1, 2))
             columns["phi"] = np.arctan2(turn[:, j, i], turn[:, i, i])
         return np.stack([columns[c] for c in self.pose], -1)
-
-
-def _imported(path: Path) -> tuple[Any, Any]:
-    try:
-        import mujoco
-        from mujoco import rollout
-    except ImportError:
-        raise InputError(f"{path}: is simulated by MuJoCo: pip install 'ccnn-torch[mujoco]'") from None
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file")
-    return mujoco, rollout
