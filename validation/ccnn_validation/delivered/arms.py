@@ -68,7 +68,7 @@ def arm(
 def _joint_errors(
     torques: _Torques, turning: Array, values: Mapping[str, Array], joints: Array, covariates: Covariates
 ) -> Array:
-    """How far the joints are from their command, `s x n`; a sliding joint's four gear numbers are lead, then nothing."""
+    """How far the joints are from their command, `s x n`; the first gear number of a sliding joint is its lead."""
     gears = values["gears"]
     waves = sum(gears[:, 2 * k - 2] * np.sin(k * joints) + gears[:, 2 * k - 1] * np.cos(k * joints) for k in (1, 2))
     errors = values["zeros"] + np.where(turning, waves, gears[:, 0] * joints)
@@ -83,7 +83,7 @@ def _joint_errors(
 
 
 class _Torques:
-    """Torques about the joints of a chain, kept for the joints that were asked last: a fit asks for the same ones again."""
+    """Torques about the joints of a chain, kept for the joints that were asked last: a fit asks for them again."""
 
     def __init__(self, chain: Chain) -> None:
         self._chain, self._kept, self._asked = chain, (np.zeros(0), np.zeros(0)), b""

@@ -17,7 +17,7 @@ __all__ = ["ROTATION_WEIGHT", "Fit", "apart", "commands", "expected", "fitted", 
 ROTATION_WEIGHT = 0.3
 """Weight of orientation against position [m/rad], in frames and commands."""
 _STEP = 1e-4
-"""Step of a derivative, in standard deviations of the prior (at most 1e-7 m or rad for links)."""
+"""Step of a derivative, in standard deviations of the prior, and never more than 1e-6 m or rad."""
 _OPEN = 1e-2
 """Weight of a frame that the rows leave open, beside errors in m."""
 _NEWTON = 12
@@ -92,14 +92,14 @@ def fitted(machine: Machine, rows: Rows, measured: Pose) -> Fit:
     def jacobian(scaled: Array) -> Array:
         return slopes(misfit, scaled, step)
 
-    found = least_squares(misfit, np.zeros(len(centre)), jac=jacobian, method="lm", xtol=1e-6, ftol=1e-6)
+    found = least_squares(misfit, np.zeros(len(centre)), jac=jacobian, method="trf", ftol=1e-6)
     last = jacobian(found.x)
     return Fit(centre + prior * found.x, last.T @ last)
 
 
 def _steps(prior: Array) -> Array:
-    """Steps in units of the prior: 1e-7 m or rad for wide priors, a ten-thousandth of narrow ones."""
-    return np.asarray(np.minimum(_STEP, 1e-7 / prior))
+    """Steps in units of the prior: 1e-6 m or rad for wide priors, a ten-thousandth of narrow ones."""
+    return np.asarray(np.minimum(_STEP, 1e-6 / prior))
 
 
 def expected(machine: Machine, fit: Fit, rows: Rows, share: float = 1.0) -> tuple[float, float]:
@@ -124,10 +124,10 @@ def expected(machine: Machine, fit: Fit, rows: Rows, share: float = 1.0) -> tupl
 
 
 def fitted_frames(machine: Machine, joints: Array, poses: Pose, span: Array | None = None) -> Array:
-    """Base and tool frame (12 numbers) in which the nominal machine is nearest to poses; none of machines without frames.
+    """Base and tool frame in which the nominal machine is nearest to poses: 12 numbers, none of machines without frames.
 
-    The rule of the whole package: least squares of the position and of 0.3 m/rad times the orientation. With a span (see
-    `reachable`) only what lies in it counts, and what that leaves open stays near the true frames.
+    The rule of the whole package: least squares of the position and of 0.3 m/rad times the orientation. With a span
+    (see `reachable`) only what lies in it counts, and what that leaves open stays near the true frames.
     """
     start = machine.vector("true")[: machine.frames]
     if not machine.frames:
