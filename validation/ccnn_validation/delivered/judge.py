@@ -74,7 +74,7 @@ def judged(
             row[f"{column}_{unit}"] = None if value is None else scale * value
     for form in forms:
         found = delivered(contestant, form, machine, sets)
-        if found is not None:
+        if found:
             row |= reached(machine, sets, found, frames, form)
     row["said"] = " | ".join(contestant.said)
     (out / "row.json").write_text(json.dumps(row, indent=1) + "\n")

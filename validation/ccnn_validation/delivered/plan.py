@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ccnn_validation.delivered.machine import Covariates, Machine, Pose, finite, resting
 from ccnn_validation.delivered.rotation import Array
 
-__all__ = ["SETS", "Rows", "measured_pose", "measured_rows", "test_rows"]
+__all__ = ["SETS", "Rows", "joined", "measured_pose", "measured_rows", "test_rows"]
 
 SETS = ("inside", "edge", "outside", "wrist")
 _BEYOND = 0.3
@@ -26,6 +27,13 @@ class Rows:
     joints: Array
     covariates: Covariates
     columns: tuple[str, ...]
+
+
+def joined(sets: Mapping[str, Rows]) -> Rows:
+    """The rows of all sets, one set after the other."""
+    rows = list(sets.values())
+    covariates = {name: np.concatenate([r.covariates[name] for r in rows]) for name in rows[0].covariates}
+    return Rows(np.concatenate([r.joints for r in rows]), covariates, rows[0].columns)
 
 
 def measured_rows(machine: Machine, count: int) -> Rows:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ccnn_validation.delivered.machine import Machine, Pose
-from ccnn_validation.delivered.plan import Rows
+from ccnn_validation.delivered.plan import Rows, joined
 from ccnn_validation.delivered.rotation import Array
 from ccnn_validation.delivered.tables import Commands, read_commands, write_records, write_targets
 
@@ -47,14 +47,12 @@ class Contestant:
         command: which of `COMMANDS` made the model.
         model: its file; None where the program refused.
         said: sentences of calls that failed, and tracebacks.
-        seconds: how long the calibration took.
     """
 
     folder: Path
     command: str
     model: Path | None = None
     said: list[str] = field(default_factory=list)
-    seconds: float = 0.0
 
     def call(self, *arguments: str) -> bool:
         """Run the program in the folder; keep what it says, and return whether it ended with 0."""
@@ -80,8 +78,10 @@ def calibrated(
         keys: overrides `key=value` of the calibration.
         out: folder for the files.
     """
+    out = out.resolve()
     contestant = Contestant(out, command)
     out.mkdir(parents=True, exist_ok=True)
+    (out / "said.txt").unlink(missing_ok=True)
     write_records(out / "measured.csv", machine, rows, measured)
     if machine.files.text is not None:
         (out / machine.files.mechanism).write_text(machine.files.text)
@@ -101,6 +101,8 @@ def calibrated(
         effects = ["effects=from:diagnosis/diagnosis.json"]
     if contestant.call("run", "config.yaml", "out=model", "save_report=false", *effects, *keys):
         contestant.model = out / "model" / "model.safetensors"
+        if not contestant.model.is_file():
+            contestant.said.append("run: exit 0 without a model file")
     return contestant
 
 
@@ -129,14 +131,21 @@ def _figure(block: Mapping[str, Any] | None, name: str) -> float | None:
     return None if value is None else float(value)
 
 
-def delivered(
-    contestant: Contestant, form: str, machine: Machine, sets: Mapping[str, Rows]
-) -> dict[str, Commands] | None:
-    """Commands of each set of rows by one of `FORMS`; None where the program did not give them."""
+def delivered(contestant: Contestant, form: str, machine: Machine, sets: Mapping[str, Rows]) -> dict[str, Commands]:
+    """Commands of each set of rows by one of `FORMS`; nothing where the program did not give them."""
     if contestant.model is None or not contestant.model.is_file():
-        return None
-    if form == "c":
-        return _by_c(contestant, machine, sets)
+        return {}
+    rows = joined(sets)
+    found = _by_c(contestant, machine, rows) if form == "c" else _by_file(contestant, form, machine, rows)
+    if found is None:
+        return {}
+    ends = np.cumsum([len(part.joints) for part in sets.values()])[:-1]
+    parts = zip(np.split(found.joints, ends), np.split(found.status, ends), strict=True)
+    return {name: Commands(*part) for name, part in zip(sets, parts, strict=True)}
+
+
+def _by_file(contestant: Contestant, form: str, machine: Machine, rows: Rows) -> Commands | None:
+    assert contestant.model is not None
     model = contestant.model
     if form == "onnx":
         model = model.parent / "model.onnx"
@@ -144,19 +153,14 @@ def delivered(
             if not contestant.call("export", str(contestant.model), "--to", "onnx", "--out", "onnx"):
                 return None
             model = contestant.folder / "onnx" / "model.onnx"
-    found = {}
-    for name, rows in sets.items():
-        path, out = contestant.folder / f"{name}.csv", contestant.folder / f"{name}_{form}.csv"
-        write_targets(path, machine, rows)
-        contestant.call("compensate", str(model), path.name, out.name)
-        # A row that falls back ends with 2 and is written all the same.
-        if not out.is_file():
-            return None
-        found[name] = read_commands(out, len(machine.units))
-    return found
+    out = contestant.folder / f"commands_{form}.csv"
+    write_targets(contestant.folder / "targets.csv", machine, rows)
+    contestant.call("compensate", str(model), "targets.csv", out.name)
+    # A row that falls back ends with 2 and is written all the same.
+    return read_commands(out, len(machine.units)) if out.is_file() else None
 
 
-def _by_c(contestant: Contestant, machine: Machine, sets: Mapping[str, Rows]) -> dict[str, Commands] | None:
+def _by_c(contestant: Contestant, machine: Machine, rows: Rows) -> Commands | None:
     assert contestant.model is not None
     if not contestant.call("export", str(contestant.model), "--to", "c99", "--out", "c"):
         return None
@@ -172,14 +176,11 @@ def _by_c(contestant: Contestant, machine: Machine, sets: Mapping[str, Rows]) ->
     if built.returncode:
         contestant.said.append(f"gcc: {built.stderr.strip()[:300]}")
         return None
-    found = {}
-    for name, rows in sets.items():
-        columns = [rows.joints] + [_in_si(covariate, rows.covariates[covariate])[:, None] for covariate in names]
-        text = "\n".join(" ".join(f"{v:.17g}" for v in line) for line in np.concatenate(columns, -1))
-        answer = subprocess.run([str(program.resolve())], input=text, capture_output=True, text=True, check=True).stdout
-        table = np.array([line.split() for line in answer.splitlines()], float)
-        found[name] = Commands(table[:, :count], table[:, count])
-    return found
+    columns = [rows.joints] + [_in_si(name, rows.covariates[name])[:, None] for name in names]
+    text = "\n".join(" ".join(f"{v:.17g}" for v in line) for line in np.concatenate(columns, -1))
+    answer = subprocess.run([str(program.resolve())], input=text, capture_output=True, text=True, check=True).stdout
+    table = np.array([line.split() for line in answer.splitlines()], float)
+    return Commands(table[:, :count], table[:, count])
 
 
 def _name(covariate: Any) -> str:

@@ -26,10 +26,10 @@ _DAMPING = 2e-3
 
 @dataclass(frozen=True)
 class Fit:
-    """Unknowns `k` as fitted, and what rows and prior say of them in units of the prior, `k x k`."""
+    """Unknowns `k` as fitted, and the slopes of whitened rows by unknowns in units of the prior, `rows x k`."""
 
     unknowns: Array
-    information: Array
+    slopes: Array
 
 
 def apart(first: Pose, second: Pose, position: float = 1.0, rotation: float = ROTATION_WEIGHT) -> Array:
@@ -93,8 +93,7 @@ def fitted(machine: Machine, rows: Rows, measured: Pose) -> Fit:
         return slopes(misfit, scaled, step)
 
     found = least_squares(misfit, np.zeros(len(centre)), jac=jacobian, method="trf", ftol=1e-6)
-    last = jacobian(found.x)
-    return Fit(centre + prior * found.x, last.T @ last)
+    return Fit(centre + prior * found.x, jacobian(found.x)[: -len(centre)])
 
 
 def _steps(prior: Array) -> Array:
@@ -111,7 +110,7 @@ def expected(machine: Machine, fit: Fit, rows: Rows, share: float = 1.0) -> tupl
         share: share of the measured rows that are fitted (the information of the rows, not of the prior, is less).
     """
     prior, one = machine.vector("prior"), np.eye(len(fit.unknowns))
-    root = np.linalg.cholesky(share * (fit.information - one) + one)
+    root = np.linalg.qr(np.concatenate([np.sqrt(share) * fit.slopes, one]), "r").T
     model = machine.pose(fit.unknowns, rows.joints, rows.covariates)
 
     def moved(unknowns: Array) -> Array:
@@ -124,7 +123,7 @@ def expected(machine: Machine, fit: Fit, rows: Rows, share: float = 1.0) -> tupl
 
 
 def fitted_frames(machine: Machine, joints: Array, poses: Pose, span: Array | None = None) -> Array:
-    """Base and tool frame in which the nominal machine is nearest to poses: 12 numbers, none of machines without frames.
+    """Base and tool frame (12 numbers) in which the nominal machine is nearest to poses; none without frames.
 
     The rule of the whole package: least squares of the position and of 0.3 m/rad times the orientation. With a span
     (see `reachable`) only what lies in it counts, and what that leaves open stays near the true frames.

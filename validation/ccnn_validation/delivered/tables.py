@@ -22,7 +22,7 @@ Columns = list[tuple[str, Array]]
 
 
 def degrees(machine: Machine) -> bool:
-    """Whether this machine's files are in degrees and millimetres with a quaternion; every second one's are."""
+    """Whether a machine's files are in degrees and millimetres, an arm's with quaternions; every second one's are."""
     return machine.seed % 2 == 1
 
 
@@ -40,7 +40,7 @@ class Commands:
 
 def write_records(path: Path, machine: Machine, rows: Rows, measured: Pose) -> None:
     """Measured rows: joints, pose and covariates."""
-    _write(path, [*_joints(machine, rows), *_pose(measured, degrees(machine)), *_covariates(rows)])
+    _write(path, [*_joints(machine, rows), *_pose(measured, degrees(machine), machine.frames > 0), *_covariates(rows)])
 
 
 def write_targets(path: Path, machine: Machine, rows: Rows) -> None:
@@ -74,13 +74,13 @@ def _joints(machine: Machine, rows: Rows) -> Columns:
     return found
 
 
-def _pose(measured: Pose, quaternion: bool) -> Columns:
-    unit = "mm" if quaternion else "m"
+def _pose(measured: Pose, shown: bool, arm: bool) -> Columns:
+    unit = "mm" if shown else "m"
     found = [(f"{axis}[{unit}]", v / _SI[unit]) for axis, v in zip("xyz", measured.position.T, strict=False)]
     if measured.rotation is None:
         return found
     turn = Rotation.from_matrix(measured.rotation)
-    if quaternion and len(found) == 3:
+    if shown and arm:
         x, y, z, w = turn.as_quat().T
         return [*found, ("qw[1]", w), ("qx[1]", x), ("qy[1]", y), ("qz[1]", z)]
     return found + [(f"r{axis}[rad]", v) for axis, v in zip("xyz", turn.as_rotvec().T, strict=True)]
