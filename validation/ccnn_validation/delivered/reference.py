@@ -110,14 +110,14 @@ def expected(machine: Machine, fit: Fit, rows: Rows, share: float = 1.0) -> tupl
         share: share of the measured rows that are fitted (the information of the rows, not of the prior, is less).
     """
     prior, one = machine.vector("prior"), np.eye(len(fit.unknowns))
-    root = np.linalg.qr(np.concatenate([np.sqrt(share) * fit.slopes, one]), "r").T
+    _, upper = np.linalg.qr(np.concatenate([np.sqrt(share) * fit.slopes, one]))
     model = machine.pose(fit.unknowns, rows.joints, rows.covariates)
 
     def moved(unknowns: Array) -> Array:
         return apart(model, machine.pose(unknowns, rows.joints, rows.covariates), 1.0, 1.0)
 
     slope = slopes(moved, fit.unknowns, _steps(prior) * prior) * prior
-    variance = (np.linalg.solve(root, slope.reshape(-1, len(prior)).T) ** 2).sum(0).reshape(slope.shape[:-1])
+    variance = (np.linalg.solve(upper.T, slope.reshape(-1, len(prior)).T) ** 2).sum(0).reshape(slope.shape[:-1])
     split = model.position.shape[1]
     return float(np.sqrt(variance[:, :split].sum(-1).mean())), float(np.sqrt(variance[:, split:].sum(-1).mean()))
 
