@@ -10,8 +10,6 @@ from scipy.spatial.transform import Rotation
 from ccnn_validation.delivered.chain import Chain, Place
 from ccnn_validation.delivered.rotation import Array
 
-__all__ = ["dh_chain", "dh_text", "urdf_text"]
-
 
 def dh_chain(a: Sequence[float], alpha: Sequence[float], d: Sequence[float]) -> Chain:
     """A chain of turning joints from a standard Denavit-Hartenberg table [m, rad]: Rz(q) Tz(d) Tx(a) Rx(alpha)."""

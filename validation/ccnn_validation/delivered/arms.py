@@ -10,8 +10,6 @@ from ccnn_validation.delivered.chain import Chain, chain_pose, joint_places
 from ccnn_validation.delivered.machine import Block, Covariates, Files, Machine, Pose
 from ccnn_validation.delivered.rotation import Array
 
-__all__ = ["arm"]
-
 _SHIFT, _TURN, _ZERO = 4e-4, 5e-4, 6e-4
 """Standard deviations of a link's errors [m], [rad], and of a turning joint's zero [rad]."""
 _GEAR = (50e-6, 300e-6)

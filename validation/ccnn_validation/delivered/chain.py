@@ -9,8 +9,6 @@ import numpy as np
 
 from ccnn_validation.delivered.rotation import Array, about, matrix
 
-__all__ = ["Chain", "Place", "chain_pose", "joint_places", "place"]
-
 Place = tuple[Array, Array]
 """Position `3` [m] and rotation matrix `3 x 3`."""
 

@@ -27,8 +27,6 @@ from ccnn_validation.delivered.reference import apart, commands, expected, fitte
 from ccnn_validation.delivered.rotation import Array
 from ccnn_validation.delivered.tables import Commands
 
-__all__ = ["RELIABLE", "Figures", "judged", "jump", "reached", "reference_row"]
-
 Figures = dict[str, float | str | None]
 RELIABLE = 1.2
 """The reference counts where its model error is at most so many times what its Cramér-Rao bound says."""

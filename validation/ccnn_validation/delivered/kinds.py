@@ -12,11 +12,9 @@ import numpy as np
 from ccnn_validation.delivered.arm_files import dh_chain, dh_text, urdf_text
 from ccnn_validation.delivered.arms import arm
 from ccnn_validation.delivered.chain import Chain, place
-from ccnn_validation.delivered.machine import Block, Files, Machine
+from ccnn_validation.delivered.machine import Block, Files, Machine, Model
 from ccnn_validation.delivered.parallel import delta_pose, five_bar_pose, hexagon, leg_lengths, stewart_pose
 from ccnn_validation.delivered.rotation import Array
-
-__all__ = ["KINDS", "draw"]
 
 _LIMITS = 1.8
 """A URDF's limits: so many half ranges of the measured box from its middle."""
@@ -133,7 +131,7 @@ def _parallel(
     unit: str,
     box: tuple[Array, Array],
     sizes: Mapping[str, tuple[Array, float]],
-    pose: Callable[..., object],
+    pose: Model,
     files: Files,
 ) -> Machine:
     """A parallel machine, measured in its own base: sizes are nominal value and standard deviation of its error."""
@@ -143,7 +141,7 @@ def _parallel(
         true = nominal + rng.normal(0, spread, nominal.shape)
         blocks.append(Block(name, nominal, true, np.full(nominal.shape, 2 * spread), nominal))
     units = (unit,) * len(box[0])
-    return Machine(kind, seed, (), units, *box, None, tuple(blocks), pose, _noise(rng), files)  # type: ignore[arg-type]
+    return Machine(kind, seed, (), units, *box, None, tuple(blocks), pose, _noise(rng), files)
 
 
 def _delta(what: _Draw) -> Machine:

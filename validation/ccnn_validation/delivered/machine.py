@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from ccnn_validation.delivered.rotation import Array
 
-__all__ = ["Block", "Covariates", "Files", "Machine", "Pose", "finite"]
-
 Covariates = Mapping[str, Array]
 """Columns of `s` rows in SI (temperature in °C): `temperature`, `load_z`, `direction1` …"""
 
@@ -48,6 +46,10 @@ class Block:
     centre: Array
 
 
+Model = Callable[[Mapping[str, Array], Array, Covariates], "Pose"]
+"""Pose of joints `s x n` and covariates under the unknowns by block."""
+
+
 @dataclass(frozen=True)
 class Files:
     """How the machine is told to the program: a mechanism's name or file, its keys, and what the file holds."""
@@ -81,7 +83,7 @@ class Machine:
     high: Array
     wrist: int | None
     blocks: tuple[Block, ...]
-    model: Callable[[Mapping[str, Array], Array, Covariates], Pose]
+    model: Model
     noise: tuple[float, float]
     files: Files
 

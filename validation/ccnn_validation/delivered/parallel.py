@@ -9,8 +9,6 @@ import numpy as np
 from ccnn_validation.delivered.machine import Covariates, Pose
 from ccnn_validation.delivered.rotation import Array
 
-__all__ = ["delta_pose", "five_bar_pose", "hexagon", "leg_lengths", "stewart_pose"]
-
 _STEPS = 30
 """Newton's steps at most; a step from home to a pose in the box takes five."""
 

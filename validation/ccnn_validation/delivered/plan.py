@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from ccnn_validation.delivered.machine import Covariates, Machine, Pose, finite, resting
 from ccnn_validation.delivered.rotation import Array
-
-__all__ = ["SETS", "Rows", "joined", "measured_pose", "measured_rows", "test_rows"]
 
 SETS = ("inside", "edge", "outside", "wrist")
 _BEYOND = 0.3
@@ -87,8 +85,7 @@ def _line(machine: Machine, count: int) -> Rows:
     raise ValueError(f"{machine.kind} {machine.seed}: no line in its box is reached all along")
 
 
-def _rows(machine: Machine, count: int, stream: int, make: object) -> Rows:
-    assert callable(make)
+def _rows(machine: Machine, count: int, stream: int, make: Callable[[np.random.Generator, int], Array]) -> Rows:
     rng = np.random.default_rng([machine.seed, stream])
     joints = np.zeros((0, len(machine.low)))
     for _ in range(_TRIES):

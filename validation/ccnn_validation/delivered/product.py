@@ -17,8 +17,6 @@ from ccnn_validation.delivered.plan import Rows, joined
 from ccnn_validation.delivered.rotation import Array
 from ccnn_validation.delivered.tables import Commands, read_commands, write_records, write_targets
 
-__all__ = ["COMMANDS", "FORMS", "Contestant", "calibrated", "delivered", "promised"]
-
 COMMANDS = ("run", "diagnose", "identify")
 FORMS = ("safetensors", "onnx", "c")
 _KELVIN = 273.15

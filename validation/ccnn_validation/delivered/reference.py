@@ -12,8 +12,6 @@ from ccnn_validation.delivered.machine import Machine, Pose
 from ccnn_validation.delivered.plan import Rows
 from ccnn_validation.delivered.rotation import Array, difference
 
-__all__ = ["ROTATION_WEIGHT", "Fit", "apart", "commands", "expected", "fitted", "fitted_frames", "reachable", "rms"]
-
 ROTATION_WEIGHT = 0.3
 """Weight of orientation against position [m/rad], in frames and commands."""
 _STEP = 1e-4

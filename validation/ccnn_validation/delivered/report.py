@@ -11,8 +11,6 @@ import numpy as np
 
 from ccnn_validation.delivered.judge import Figures
 
-__all__ = ["LIMITS", "figures_of", "kept", "line", "summary", "write_csv"]
-
 LIMITS = (1.1, 1.15)
 """Reached over reference, and what is measured after the correction over the promise."""
 

@@ -6,8 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-__all__ = ["Array", "about", "difference", "matrix"]
-
 Array = NDArray[np.float64]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,6 @@ from scipy.spatial.transform import Rotation
 from ccnn_validation.delivered.machine import Machine, Pose
 from ccnn_validation.delivered.plan import Rows
 from ccnn_validation.delivered.rotation import Array
-
-__all__ = ["Commands", "degrees", "read_commands", "write_records", "write_targets"]
 
 _SI = {"rad": 1.0, "deg": math.pi / 180, "m": 1.0, "mm": 1e-3, "1": 1.0, "N": 1.0, "degC": 1.0}
 _UNITS = {"temperature": "degC", "load_z": "N"}
@@ -26,6 +25,7 @@ def degrees(machine: Machine) -> bool:
     return machine.seed % 2 == 1
 
 
+@dataclass(frozen=True)
 class Commands:
     """Commands of a file in its row order, SI.
 
@@ -34,8 +34,8 @@ class Commands:
         status: 0 exact, 1 outside, 2 not finite, 3 damped, `s`; without that column 1 where outside the domain.
     """
 
-    def __init__(self, joints: Array, status: Array) -> None:
-        self.joints, self.status = joints, status
+    joints: Array
+    status: Array
 
 
 def write_records(path: Path, machine: Machine, rows: Rows, measured: Pose) -> None:
