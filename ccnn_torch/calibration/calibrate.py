@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from ccnn_torch.calibration.evaluate import Outcome, evaluate, pose_before
 from ccnn_torch.calibration.learning.fitting import Fitted, fit_method, refit
 from ccnn_torch.calibration.learning.method_choice import Comparison, compare
 from ccnn_torch.calibration.result import assemble, best_method, plan_of
-from ccnn_torch.calibration.rows.prepare import Prepared, damping_of, prepare
+from ccnn_torch.calibration.rows.prepare import Prepared, damping_of, over_all_rows, prepare
 from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import LEARNERS, Learner, make_learner
@@ -46,6 +46,7 @@ class Calibration:
     outcomes: dict[str, Outcome]
     failed: dict[str, str]
     results: dict[str, Any]
+    frames: Prepared | None = field(default=None, repr=False)
 
     @property
     def method(self) -> str:
@@ -57,24 +58,58 @@ class Calibration:
         return int(self.outcomes[method or self.method].fitted.score.argmin())
 
     def mechanism(self, method: str | None = None) -> Mechanism:
-        """The nominal machine, with the frames fitted in the exported repeat."""
-        parameters = self.prepared.repeat_parameters(self.repeat(method))
-        mechanism = self.prepared.mechanism
+        """The nominal machine, with the frames that belong to `compensator`."""
+        method = method or self.method
+        if method == self.method and self._final is not None and self.frames is not None:
+            return self._framed(self.frames, 0)
+        return self._framed(self.prepared, self.repeat(method))
+
+    @staticmethod
+    def _framed(prepared: Prepared, repeat: int) -> Mechanism:
+        parameters = prepared.repeat_parameters(repeat)
+        mechanism = prepared.mechanism
         return mechanism if parameters is None else mechanism.with_nominal(parameters)
 
     def compensator(self, method: str | None = None) -> Compensator:
-        """The compensator of a method's exported repeat.
+        """The compensator that is saved: of the best method fitted to all rows, of another as it was judged.
 
         Raises:
             MethodFailedError: there is none; the sentence gives the reason.
         """
         method = method or self.method
+        return self._judged(method) if self._final is None or method != self.method else self._final
+
+    def _judged(self, method: str) -> Compensator:
+        """The compensator of a method's exported repeat, made without the rows held out."""
         outcome, repeat = self.outcomes[method], self.repeat(method)
         if outcome.without:
             raise MethodFailedError(outcome.without)
         if outcome.compensators:
             return outcome.compensators[repeat]
         return compensator_of(self.config, self.prepared, outcome.fitted, repeat)
+
+    @cached_property
+    def _final(self) -> Compensator | None:
+        """Of the best method, fitted to all rows of measured records; None where that is not asked for or fails."""
+        prepared, outcome = self.prepared, self.outcomes[self.method]
+        held_by_file = self.config.split.test_file is not None
+        if prepared.source is None or not self.config.refit or self.config.repeats > 1 or held_by_file:
+            return None
+        if outcome.without:
+            return None
+        whole = over_all_rows(prepared)
+        make = makers(self.config, prepared.default_method)[self.method]
+        assert make is not None
+        try:
+            fitted = refit(
+                self.method, make, whole.dataset, plan_of(self.config), outcome.fitted.choice, None, lambda *_: []
+            )
+            fitted.sd_scale = outcome.fitted.sd_scale
+            found = compensator_of(self.config, whole, fitted, 0)
+        except MethodFailedError:
+            return None
+        self.frames = whole
+        return found
 
     def save(
         self,
@@ -101,7 +136,7 @@ class Calibration:
         # Seconds differ from run to run, and the model file of one config and seed may not.
         del metrics["seconds"]
         compensator = self.compensator(method)
-        metrics["promise"] = self._promise(method, compensator)
+        metrics["promise"] = self._promise(method)
         about = {
             "mechanism": self.mechanism(method).describe(),
             "method": method,
@@ -115,23 +150,19 @@ class Calibration:
         save_model(Path(folder), compensator, about, method=name, forms=forms)
         return compensator.share
 
-    def _promise(self, method: str, compensator: Compensator) -> dict[str, Any] | None:
-        """What the held-out rows promise for new ones, with the compensator as it is in the file.
+    def _promise(self, method: str) -> dict[str, Any] | None:
+        """What the held-out rows promise for new ones, by the model that did not see them.
 
         With frames per group of rows the card has no frames to judge new rows by, and of a simulated machine the
         commanded one is judged: both by the figures of the results.
         """
         prepared, repeat = self.prepared, self.repeat(method)
         test = prepared.dataset.splits[repeat].test
-        found = (self.before, self.outcomes[method].after)
-        before, after = (_rows_of(error, len(prepared.joints), repeat, test) for error in found)
-        joints, covariates = prepared.joints[repeat, test], prepared.covariates[repeat, test]
-        if not prepared.simulated and (prepared.parameters is None or prepared.parameters.shape[1] == 1):
-            mechanism = self.mechanism(method)
-            with torch.no_grad():
-                ideal = compensator.back(joints, covariates)
-            after = mechanism.pose_error(prepared.pose[repeat, test], mechanism.forward_kinematics(ideal))
-        return promise_block(before, after, configurations(joints, prepared.mechanism.joints))
+        found = (self.before, self.outcomes[method].explained)
+        before, explained = (_rows_of(error, len(prepared.joints), repeat, test) for error in found)
+        return promise_block(
+            before, explained, configurations(prepared.joints[repeat, test], prepared.mechanism.joints)
+        )
 
 
 def calibrate(
@@ -198,17 +229,28 @@ def compensator_of(config: RunConfig, prepared: Prepared, fitted: Fitted, repeat
         # A learner without a variance of its own has one standard deviation everywhere, here as in the results.
         sd_scale = fitted.sd(prepared.dataset.inputs[:, :1])[repeat, 0] / fitted.scaling.deviation[repeat]
     margin, limit = config.compensation.margin, _limit(config, len(prepared.mechanism.joints))
-    physics = {} if prepared.physics is None else prepared.physics.modules(repeat, there, margin)
+    inputs, covariates = prepared.dataset.inputs[repeat, there], prepared.covariate_coordinates
+    scaling = fitted.scaling.repeat(repeat)
+    if fitted.name == "constant":
+        # It looks at nothing, and a model asks only for what something in it uses.
+        used = [] if prepared.physics is None else prepared.physics.uses(repeat)
+        kept = [k for k, c in enumerate(covariates) if c.name in used]
+        n = len(prepared.mechanism.joints)
+        inputs = inputs[:, [*range(n), *(n + k for k in kept)]]
+        covariates = tuple(covariates[k] for k in kept)
+        scaling = scaling.of_inputs(inputs)
+    names = [c.name for c in covariates]
+    physics = {} if prepared.physics is None else prepared.physics.modules(repeat, there, margin, names)
     if physics and "machine" not in physics and limit is None:
         # What geometry and effects leave at singular poses can be larger than what was there.
         limit = default_limit(prepared.total[repeat, there])
     return fit_compensator(
         network,
-        fitted.scaling.repeat(repeat),
-        prepared.dataset.inputs[repeat, there],
+        scaling,
+        inputs,
         prepared.dataset.deviation[repeat, there],
         prepared.mechanism.joints,
-        prepared.covariate_coordinates,
+        covariates,
         limit=limit,
         margin=margin,
         sd_scale=sd_scale,

@@ -231,6 +231,11 @@ class RunConfig(_Part):
     training: TrainingConfig = Field(default_factory=TrainingConfig)
     auto: AutoConfig = Field(default_factory=AutoConfig)
     compensation: CompensationConfig = Field(default_factory=CompensationConfig)
+    refit: bool = Field(
+        default=True,
+        description="fit the model that is saved again to all rows of measured records, when it was chosen and judged "
+        "without those held out; not with repeats, nor where split.test names a file",
+    )
     save_models: bool = Field(default=True, description="write model files and their card")
     save_report: bool = Field(
         default=True, description="draw plots/ and write report.html; results.json, .csv and .md are always written"

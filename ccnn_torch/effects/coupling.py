@@ -50,8 +50,8 @@ class Coupling:
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x n²`."""
         n = situation.joints.shape[-1]
-        others = ~torch.eye(n, dtype=torch.bool)
+        others = torch.nonzero(~torch.eye(n, dtype=torch.bool).flatten()).squeeze(-1)
         eye = torch.eye(n, dtype=situation.joints.dtype, device=situation.joints.device)
         # moved joint, pair (i, j): 1 where the moved joint is i, times the position of joint j.
         moved = eye[:, :, None] * situation.from_middle[..., None, None, :]
-        return torch.cat([moved[..., others], eye.expand(*moved.shape[:-2], n)], -1)
+        return torch.cat([moved.flatten(-2)[..., others], eye.expand(*moved.shape[:-2], n)], -1)

@@ -99,6 +99,13 @@ class Scaling(nn.Module):
             *(b[index].clone() for b in (self.centre, self.half_range, self.mean, self.deviation)),
         )
 
+    def of_inputs(self, inputs: Tensor) -> Scaling:
+        """The scaling of one repeat with other inputs, `s x i` [SI], all of them linear; outputs as they are."""
+        blank = torch.zeros(inputs.shape[-1], dtype=torch.bool)
+        new = Scaling.fit(inputs, torch.zeros_like(inputs[:, :1]), torch.ones_like(inputs[:, 0]), blank)
+        about = (new.linear, new.periodic, new.centre, new.half_range)
+        return Scaling(*about, self.mean.clone(), self.deviation.clone())
+
     def features(self, inputs: Tensor) -> Tensor:
         """inputs: `[r x] ... x i` [SI]; returns `[r x] ... x feature_count` [1]."""
         # Without a periodic input nothing is picked: exported graphs stay free of gather.

@@ -85,6 +85,7 @@ def choose_model(
     settings: dict[str, Any],
     geometry: str,
     verdict: Verdict | None,
+    asked_effects: bool,
 ) -> ModelChoice:
     """Compare what the config leaves open by the held-out pose errors under the candidates' own commands.
 
@@ -95,7 +96,8 @@ def choose_model(
     Args:
         split, kind: of the repeat; `kind` says how folds are made.
         geometry: the key of the config.
-        verdict: effects that were found in the training rows; None without any.
+        verdict: effects that were found in the training rows, or that a file names; None without any.
+        asked_effects: whether the effects are a part of every candidate.
     """
     name = mechanism.name
     geometry_why = ""
@@ -106,13 +108,13 @@ def choose_model(
     if geometry_why:
         geometry = "none"
     identify = {"auto": (True, False), "identify": (True,), "none": (False,)}[geometry]
-    effects = (False,) if verdict is None else (False, True)
+    effects = (False,) if verdict is None else (True,) if asked_effects else (False, True)
     candidates = [Candidate(i, e, learner) for learner in (False, True) for e in effects for i in identify]
     # A machine that is nominal and learns nothing is no model.
     candidates = [c for c in candidates if any(c)]
     asked = "" if geometry == "auto" else geometry_why or f"geometry={geometry} was asked for."
     if len(identify) == len(effects) == 1:
-        return ModelChoice(identify[0], False, _ELSE, asked)
+        return ModelChoice(identify[0], effects[0], _ELSE, asked)
     rows = torch.cat([split.train, split.validation])
     if len(rows) > _MOST_ROWS:
         rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]]
@@ -124,7 +126,8 @@ def choose_model(
         folds = [replace(f, validation=none, test=f.validation) for f in fold_splits(whole, kind, _FOLDS, seed)]
         errors = _errors(mechanism, few, folds, seed, settings, candidates, verdict)
     except (InputError, MethodFailedError) as problem:
-        return ModelChoice(geometry == "identify", False, _ELSE, f"Candidates could not be cross-validated: {problem}")
+        why = f"Candidates could not be cross-validated: {problem}"
+        return ModelChoice(geometry == "identify", effects[0], _ELSE, why)
     return _chosen(errors, asked)
 
 

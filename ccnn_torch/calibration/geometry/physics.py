@@ -94,12 +94,31 @@ class Physics:
             parts.append(left)
         return replace(found, deviation=torch.stack(parts))
 
-    def modules(self, repeat: int, rows: Tensor, margin: float) -> dict[str, Any]:
+    def uses(self, repeat: int) -> list[str]:
+        """Names of the covariates without which the effects change."""
+        here, kept = self.situations[repeat], list[str]()
+        before = self._acted(here, repeat)
+        for name in here.covariates:
+            fewer = {n: v for n, v in here.covariates.items() if n != name}
+            if not torch.equal(self._acted(replace(here, covariates=fewer), repeat), before):
+                kept.append(name)
+        return kept
+
+    def _acted(self, situation: Situation, repeat: int) -> Tensor:
+        """What the effects change, side by side, `s x d`; NaN where one cannot act without what is missing."""
+        parts = [torch.zeros_like(situation.joints[:, :1])]
+        for one in self.acting[repeat]:
+            lacking = one.effect.missing(situation.mechanism, [*situation.covariates])
+            parts.append(torch.full_like(parts[0], torch.nan) if lacking else one.change(situation).nan_to_num())
+        return torch.cat(parts, -1)
+
+    def modules(self, repeat: int, rows: Tensor, margin: float, covariates: list[str]) -> dict[str, Any]:
         """The machine of one repeat for a model file, as `fit_compensator` takes it.
 
         Args:
             rows: numbers of the training rows.
             margin: of the compensator's domain.
+            covariates: names of the compensator's, in order.
 
         Raises:
             InputError, MethodFailedError: see `build_machine`, `expand_effects` and `expand_geometry`.
@@ -108,7 +127,7 @@ class Physics:
         there, mechanism = _rows(situation, rows), situation.mechanism
         closed = isinstance(mechanism, SerialArm) or mechanism.closed_form is not None
         care = None if closed else _care(there)
-        effects = expand_effects(there, acting, self.covariates, margin, care) if acting else None
+        effects = expand_effects(there, acting, covariates, margin, care) if acting else None
         machine = build_machine(mechanism, values, effects, there.joints, margin)
         if machine is not None:
             return {"machine": machine}

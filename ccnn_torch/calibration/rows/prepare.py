@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -35,6 +35,16 @@ from ccnn_torch.simulation.machines.realistic import build_machine
 _MOST_JOINTS = 6
 
 
+class Source(NamedTuple):
+    """Measured records and what was chosen for them, with which a model is fitted to any of their rows."""
+
+    mechanism: Mechanism
+    records: Records
+    settings: dict[str, Any]
+    choice: ModelChoice
+    verdict: Verdict | None
+
+
 @dataclass(frozen=True)
 class Prepared:
     """Everything that is fixed before the first training step.
@@ -51,6 +61,7 @@ class Prepared:
             geometric calibration would command by, to be compared with; None where it was not fitted.
         physics: the identified machine that is a part of the compensator, so that the network learns what it leaves.
         choice: what `geometry` ended as; None for a case.
+        source: the measured records; None for a case.
         simulation: the machine behind simulated rows, or None for measured records.
         notes: sentences for the person who reads the results.
     """
@@ -68,6 +79,7 @@ class Prepared:
     identified: Tensor | None = None
     physics: Physics | None = None
     choice: ModelChoice | None = None
+    source: Source | None = None
     simulation: Simulation | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -218,14 +230,27 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds, held)
     settings = _pseudoerror_settings(config, mechanism)
     choice, verdict, said = _choice(config, mechanism, records, splits[0], settings, verdict)
+    notes = [*doubts, *records.notes, *said, choice.why]
+    prepared = _fitted_to(Source(mechanism, records, settings, choice, verdict), splits, seeds)
+    notes = [*held_out_notes(config.split, len(splits[0].test)), *notes, *prepared.notes]
+    return replace(prepared, notes=notes)
+
+
+def over_all_rows(prepared: Prepared) -> Prepared:
+    """The rows of the only repeat with none held out: what was chosen stays, what was fitted is fitted again."""
+    assert prepared.source is not None
+    rows, none = torch.arange(len(prepared.source.records)), torch.zeros(0, dtype=torch.int64)
+    return _fitted_to(prepared.source, [Split(rows, none, none)], prepared.dataset.seeds)
+
+
+def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepared:
+    """Frames, geometry and effects fitted to the rows that are not held out, and what is left to be learned."""
+    mechanism, records, settings, choice, verdict = source
     fitted = fit_machine(mechanism, records, splits, choice.identify)
-
-    def solved(parameters: Tensor | None) -> Pseudoerror:
-        return joint_deviations(mechanism, records.joints, records.pose, parameters=parameters, **settings)
-
-    total = deviations = solved(fitted.parameters)
-    learned, physics = fitted.parameters, None
-    notes = [*doubts, *records.notes, *said, choice.why, *fitted.notes]
+    total = deviations = joint_deviations(
+        mechanism, records.joints, records.pose, parameters=fitted.parameters, **settings
+    )
+    learned, physics, notes = fitted.parameters, None, [*fitted.notes]
     names = [c.name for c in records.covariate_coordinates]
     if verdict is not None:
         about = (splits, fitted.parameters, total.usable, choice.identify)
@@ -253,7 +278,8 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
         identified=fitted.geometry,
         physics=physics,
         choice=choice,
-        notes=[*held_out_notes(config.split, len(splits[0].test)), *notes, *deviations.notes()],
+        source=source,
+        notes=[*notes, *deviations.notes()],
     )
 
 
@@ -266,20 +292,15 @@ def _choice(
     verdict: Verdict | None,
 ) -> tuple[ModelChoice, Verdict | None, list[str]]:
     """What `geometry` and `effects` come to for these records, the effects, and notes."""
-    if verdict is not None:
-        if config.geometry != "auto":
-            why = f"geometry={config.geometry} was asked for."
-            return ModelChoice(config.geometry == "identify", True, "ccnn", why), verdict, []
-        why = "The effects of a diagnosis are taken in place of identified geometry."
-        return ModelChoice(False, True, "ccnn", why), verdict, []
     notes: list[str] = []
-    if config.effects != "none":
+    asked = verdict is not None
+    if config.effects != "none" and not asked:
         names = None if isinstance(config.effects, str) else config.effects
         rows = torch.cat([split.train, split.validation])
         verdict, notes = search_effects(mechanism, records, rows, names, config.seed)
         if config.repeats > 1 and verdict is not None:
             notes.append("They were searched in the training rows of the first repeat, for all repeats.")
-    about = (split, config.split.kind, config.seed, settings, config.geometry, verdict)
+    about = (split, config.split.kind, config.seed, settings, config.geometry, verdict, asked)
     choice = choose_model(mechanism, records, *about)
     return choice, verdict if choice.effects else None, notes
 
