@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,12 +33,10 @@ def _deviation(value: Any) -> Any:
     return value
 
 
-# What means the same in a config for `ccnn run`.
-_OF_A_RUN = ("records", "columns", "mechanism", "mechanism_keys", "covariates", "seed")
-
-
 class DiagnoseConfig(Section):
     """Options of `ccnn diagnose` and `ccnn check`."""
+
+    of_a_run = ("records", "columns", "mechanism", "mechanism_keys", "covariates", "seed")
 
     records: Files | None = Field(
         default=None,
@@ -79,15 +77,18 @@ class DiagnoseConfig(Section):
     seed: int = Field(default=0, ge=0, lt=2**63, description="seed of folds and resampling")
 
 
-def load_diagnose_config(path: Path | None, overrides: Iterable[str] = ()) -> DiagnoseConfig:
+def load_diagnose_config(
+    path: Path | None, overrides: Iterable[str] = (), note: Callable[[str], None] | None = None
+) -> DiagnoseConfig:
     """Read a config file (defaults where there is none) and put overrides ``key.sub=value`` over it.
 
-    A config for `ccnn run`, as `ccnn new` writes it, gives its records, mechanism, columns and seed.
+    A config for `ccnn run`, as `ccnn new` writes it, gives its records, mechanism, columns and seed; `note` is called
+    with a sentence on the others.
 
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
-    return config_from_options(DiagnoseConfig, path, overrides, "run", _OF_A_RUN)
+    return config_from_options(DiagnoseConfig, path, overrides, note)
 
 
 def describe_diagnose_keys() -> list[tuple[str, str, str]]:

@@ -5,7 +5,7 @@ Relative paths in a config file start from the file's folder, those on the comma
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -137,6 +137,8 @@ class SimulateConfig(Section):
 
 class IdentifyConfig(Section):
     """An identification: mechanism, data, parameters, methods."""
+
+    of_a_run = ("name", "seed", "records", "columns", "mechanism", "mechanism_keys", "split")
 
     name: str = Field(
         default="identification", min_length=1, description="name of the run; default: the config file's name"
@@ -287,15 +289,20 @@ def base_method(method: str) -> str:
     return method.removesuffix(PER_LEG)
 
 
-def load_identify_config(path: str | Path | None, overrides: Iterable[str] = ()) -> IdentifyConfig:
+def load_identify_config(
+    path: str | Path | None, overrides: Iterable[str] = (), note: Callable[[str], None] | None = None
+) -> IdentifyConfig:
     """Read a config file and put overrides ``key.sub=value`` over it; without a file these are all.
+
+    A config for `ccnn run`, as `ccnn new` writes it, gives its records, machine and split; `note` is called with a
+    sentence on the others.
 
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
     if path is None:
         return config_from_options(IdentifyConfig, None, overrides)
-    return config_from_file(IdentifyConfig, path, overrides)
+    return config_from_file(IdentifyConfig, path, overrides, note)
 
 
 def make_identify_config(**keys: Any) -> IdentifyConfig:

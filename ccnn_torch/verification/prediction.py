@@ -38,7 +38,9 @@ class Rows:
     predicted: Tensor
 
 
-def nominal_mechanism(model: LoadedModel | IdentifiedGeometry, spec: str | None, allow_code: bool) -> Mechanism:
+def nominal_mechanism(
+    model: LoadedModel | IdentifiedGeometry, spec: str | None, allow_code: bool, keys: Mapping[str, Any] | None = None
+) -> Mechanism:
     """The nominal machine that the model was made for, its frames as they were fitted then."""
     about = model.facts["mechanism"]
     if spec is None:
@@ -46,7 +48,7 @@ def nominal_mechanism(model: LoadedModel | IdentifiedGeometry, spec: str | None,
             return model.nominal
         with code_refused(f"{model.path}: its mechanism", allow_code):
             return mechanism_from_description(about, allow_code=True)
-    given = load_mechanism(spec)
+    given = load_mechanism(spec, **(keys or {}))
     if isinstance(given, SerialArm) and len(about["pose"]) == 3:
         given = given.with_orientation("none")
     for key in ("name", "joints", "pose"):
