@@ -35,10 +35,10 @@ def plan(
     """Choose the poses that best identify a machine's geometric parameters, and recommend how many to measure.
 
     OUT.csv has a row for each pose: the joints to command, q1[unit]…, and the pose at which they bring the nominal
-    machine, the most informative ones first. The page beside it gives the gain of each further pose. Keys:
-    mechanism, mechanism_keys, parameters.free, .fixed, .tied, .prior, residual, noise, joint_noise, index, candidates,
-    limits, max_condition, rotation_weight, per_leg, repeat, least_gain, margin, seed. Sizes are in SI, or texts with a
-    unit.
+    machine, the most informative ones first. The page beside it gives the gain of each further pose. Keys: mechanism,
+    mechanism_keys, columns, joint_map, parameters.free, .fixed, .tied, .prior, residual, noise, joint_noise, index,
+    candidates, limits, max_condition, rotation_weight, per_leg, repeat, least_gain, margin, seed. Sizes are in SI, or
+    texts with a unit.
 
     Examples:
 
@@ -74,6 +74,6 @@ def plan(
             if sentence := left_out_sentence(part):
                 say(sentence)
             say(plan_sentence(part, wanted.least_gain))
-    files = write_plan(out, machine, plans, wanted.least_gain)
+    files = write_plan(out, machine, plans, wanted.least_gain, wanted)
     if not quiet:
         say_place(f"Written: {', '.join(str(file) for file in files)}")

@@ -67,7 +67,7 @@ def verify(
         if wanted.records is None:
             raise InputError("records: are missing; give RECORDS.csv, --records, or the key in a config")
         loaded = load_compensation(model, allow_code=allow_code)
-        read = {"columns": wanted.columns, "mechanism_keys": wanted.mechanism_keys}
+        read = {"columns": wanted.columns, "joint_map": wanted.joint_map, "mechanism_keys": wanted.mechanism_keys}
         found = verify_model(loaded, wanted.records, wanted.mechanism, compensated, refit_frames, allow_code, **read)
         write_verify_report(out, found.results, found.arrays)
     results = found.results

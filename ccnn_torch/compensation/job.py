@@ -16,6 +16,7 @@ from ccnn_torch.compensation.wanted_poses import WantedPoses
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import FallbackWarning, InputError
 from ccnn_torch.records.headers import columns_there
+from ccnn_torch.records.joint_map import JointMap, read_joint_map
 from ccnn_torch.records.load import JOINT_LIMIT
 from ccnn_torch.records.pose_columns import stack_columns
 from ccnn_torch.records.read_table import mapped, read_parts
@@ -99,11 +100,15 @@ def write_compensated(
 ) -> Compensated:
     """The table of `compensate_table`, read, computed and written in parts of so many rows."""
     result = Compensated()
+    counted = read_joint_map(loaded.joint_map, loaded.joints, loaded.columns)
     with writing_table(output) as write:
         for original in read_parts(input, rows):
             # Headers that the model's run mapped are mapped alike; OUT repeats them as they are.
             table = mapped(original, columns_there(original.units, loaded.columns))
-            joints, units = poses.joints(table) if poses is not None else _joints(loaded, table, back)
+            # A file of poses or commands alone is of the controller as well; one with the mechanism's joints is not.
+            own = poses is None and all(c.name in original for c in loaded.joints)
+            shown = counted if counted is not None and (counted.is_in(original.names, table) or not own) else None
+            joints, units = poses.joints(table, shown) if poses is not None else _joints(loaded, table, back, shown)
             covariates = stack_columns(table, loaded.covariates) if loaded.covariates else None
             with warnings.catch_warnings():
                 # Reported at the end, with the line of the table.
@@ -113,21 +118,24 @@ def write_compensated(
                 raise InputError(
                     f"--sd: {loaded.path} is identified geometry, which has no standard deviation of a command"
                 )
-            added = _added(loaded, found, units, back, sd)
+            added = _added(loaded, found, units, back, sd, shown)
             names = {header.partition("[")[0] for header in added}
             write({original.header(n): original.cells(n) for n in original.names if n not in names} | added)
             _count(result, table, found, back)
     return result
 
 
-def _joints(loaded: Model, table: Table, back: bool) -> tuple[Array, dict[str, str]]:
+def _joints(loaded: Model, table: Table, back: bool, shown: JointMap | None) -> tuple[Array, dict[str, str]]:
     """Joints `rows x n` [SI], and the unit of each as written."""
-    names = {c.name: c.name for c in loaded.joints}
+    own = [c.name for c in loaded.joints] if shown is None else shown.columns
+    names = {c.name: column for c, column in zip(loaded.joints, own, strict=True)}
     if back and all(f"command_{name}" in table for name in names):
         names = {name: f"command_{name}" for name in names}
     _refuse_other_machine(loaded, table)
     columns = tuple(Coordinate(names[c.name], c.unit) for c in loaded.joints)
-    return stack_columns(table, columns, JOINT_LIMIT), {c.name: table.units[names[c.name]] for c in loaded.joints}
+    values = stack_columns(table, columns, JOINT_LIMIT)
+    units = {c.name: table.units[names[c.name]] for c in loaded.joints}
+    return values if shown is None else shown.of_shown(values), units
 
 
 def _refuse_other_machine(loaded: Model, table: Table) -> None:
@@ -142,8 +150,10 @@ def _refuse_other_machine(loaded: Model, table: Table) -> None:
         )
 
 
-def _added(loaded: Model, found: dict[str, Array], units: dict[str, str], back: bool, sd: bool) -> dict[str, ArrayLike]:
-    """The columns that OUT gets, in the units that the joints were written in."""
+def _added(
+    loaded: Model, found: dict[str, Array], units: dict[str, str], back: bool, sd: bool, shown: JointMap | None
+) -> dict[str, ArrayLike]:
+    """The columns that OUT gets, in the units and in the count that the joints were written in."""
 
     def named(what: str, values: Array) -> dict[str, ArrayLike]:
         return {
@@ -151,6 +161,11 @@ def _added(loaded: Model, found: dict[str, Array], units: dict[str, str], back: 
             for k, c in enumerate(loaded.joints)
         }
 
+    if shown is not None:
+        found = found | {name: shown.shown(found[name]) for name in ("command", "ideal")}
+        found["deviation"] = shown.change_shown(found["deviation"])
+        if sd:
+            found["deviation_sd"] = shown.spread_shown(found["deviation_sd"])
     if back:
         return named("ideal", found["ideal"]) | {"inside_domain[1]": found["ideal_inside_domain"]}
     added = named("command", found["command"]) | named("deviation", found["deviation"])

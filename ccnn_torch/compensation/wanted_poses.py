@@ -15,6 +15,7 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 from ccnn_torch.plugins import code_refused
+from ccnn_torch.records.joint_map import JointMap
 from ccnn_torch.records.load import JOINT_LIMIT
 from ccnn_torch.records.pose_columns import read_pose, stack_columns
 from ccnn_torch.records.table import Table
@@ -51,8 +52,8 @@ class WantedPoses:
             f"guess_{last.header} near the joints wanted."
         )
 
-    def joints(self, table: Table) -> tuple[NDArray[np.float64], dict[str, str]]:
-        """Ideal joints of wanted poses, `rows x n` [SI], and the unit to write each in.
+    def joints(self, table: Table, shown: JointMap | None = None) -> tuple[NDArray[np.float64], dict[str, str]]:
+        """Ideal joints of wanted poses, `rows x n` [SI], and the unit to write each in; guesses are as `shown`.
 
         Raises:
             InputError: a column is missing, or poses cannot be reached (named by line).
@@ -67,7 +68,8 @@ class WantedPoses:
         guesses = tuple(Coordinate(f"guess_{c.name}", c.unit) for c in mechanism.joints)
         guided = any(c.name in table for c in guesses)
         if guided:
-            guess = torch.from_numpy(stack_columns(table, guesses, JOINT_LIMIT))
+            near = stack_columns(table, guesses, JOINT_LIMIT)
+            guess = torch.from_numpy(near if shown is None else shown.of_shown(near))
         self.chooses = bool(mechanism.orientations) and not guided
         if self.chooses:
             joints = _follow(mechanism, poses, self._before)

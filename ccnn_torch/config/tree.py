@@ -47,6 +47,16 @@ Columns = Annotated[
 ]
 """Headers of records -> names and units."""
 
+JointMap = Annotated[
+    dict[str, str],
+    Field(
+        default={},
+        description="joints as sums of the file's columns, where the controller counts otherwise, e.g. "
+        '{q3: "J3 - J2"}; commands are written back in its count',
+    ),
+]
+"""Joints -> linear functions of columns."""
+
 
 class Section(BaseModel):
     """A section of a config: unknown keys are refused, values are finite and immutable."""

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field
 from ccnn_torch.config.keys import list_keys
 from ccnn_torch.config.noise import Noise
 from ccnn_torch.config.sizes import size
-from ccnn_torch.config.tree import Columns, Files, Names, Section, config_from_options
+from ccnn_torch.config.tree import Columns, Files, JointMap, Names, Section, config_from_options
 from ccnn_torch.errors import InputError
 
 _WRONG_NOISE = (
@@ -36,7 +36,7 @@ def _deviation(value: Any) -> Any:
 class DiagnoseConfig(Section):
     """Options of `ccnn diagnose` and `ccnn check`."""
 
-    of_a_run = ("records", "columns", "mechanism", "mechanism_keys", "covariates", "seed")
+    of_a_run = ("records", "columns", "joint_map", "mechanism", "mechanism_keys", "covariates", "seed")
 
     records: Files | None = Field(
         default=None,
@@ -47,6 +47,7 @@ class DiagnoseConfig(Section):
         description="CSV of the logs of a machine in motion, each a run; the same as --motion; in the place of records",
     )
     columns: Columns
+    joint_map: JointMap
     mechanism: str | None = Field(default=None, description="the nominal machine; the same as --mechanism")
     out: str | None = Field(default=None, description="folder to write; the same as --out")
     mechanism_keys: dict[str, Any] = Field(

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from ccnn_torch.config.keys import list_keys
-from ccnn_torch.config.tree import Names, Section, config_from_options
+from ccnn_torch.config.tree import Columns, JointMap, Names, Section, config_from_options
 
 Size = float | str
 """A number in SI, or a text of number and unit, such as `0.1 mm` or `0.03 deg`."""
@@ -30,10 +30,12 @@ class PlannedParameters(Section):
 class PlanConfig(Section):
     """What `ccnn plan` accepts."""
 
-    of_a_run = ("mechanism", "mechanism_keys", "seed")
+    of_a_run = ("columns", "joint_map", "mechanism", "mechanism_keys", "seed")
 
     mechanism: str | None = Field(default=None, description="the nominal machine; the same as --mechanism")
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    columns: Columns
+    joint_map: JointMap
     parameters: PlannedParameters = Field(default_factory=PlannedParameters)
     residual: Literal["auto", "inverse", "forward"] = Field(
         default="auto",

@@ -8,16 +8,17 @@ from typing import Any
 
 from pydantic import Field
 
-from ccnn_torch.config.tree import Columns, Files, Section, config_from_options
+from ccnn_torch.config.tree import Columns, Files, JointMap, Section, config_from_options
 
 
 class VerifyConfig(Section):
     """Keys of `ccnn verify`, which mean the same in a config for `ccnn run`."""
 
-    of_a_run = ("records", "columns", "mechanism", "mechanism_keys")
+    of_a_run = ("records", "columns", "joint_map", "mechanism", "mechanism_keys")
 
     records: Files | None = Field(default=None, description="new rows; the same as RECORDS.csv and --records")
     columns: Columns
+    joint_map: JointMap
     mechanism: str | None = Field(
         default=None, description="the nominal machine; the same as --mechanism; null = the model's"
     )

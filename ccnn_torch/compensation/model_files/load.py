@@ -102,6 +102,11 @@ class LoadedModel:
         return dict(self.card.get("columns") or {})
 
     @property
+    def joint_map(self) -> dict[str, str]:
+        """Joint -> sum of columns, where the controller of its run counts otherwise."""
+        return dict(self.card.get("joint_map") or {})
+
+    @property
     def middle(self) -> Array:
         """Middle of the domain's joints, `n` [SI]; where a search for joints begins."""
         edges = [self.facts["domain"]["inputs"][c.name] for c in self.joints]
