@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Annotated
@@ -19,6 +20,20 @@ def compensate(
     pose: Annotated[bool, typer.Option("--pose", help="IN has wanted poses instead of joints.")] = False,
     back: Annotated[bool, typer.Option("--back", help="IN has commands; OUT gets the ideal joints.")] = False,
     sd: Annotated[bool, typer.Option("--sd", help="OUT gets the deviations' standard deviations, too.")] = False,
+    tool: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z,RX,RY,RZ",
+            help="With --pose, of an arm: another tool than the measured one, from the end of the last link.",
+        ),
+    ] = None,
+    base: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z,RX,RY,RZ",
+            help="With --pose, of an arm: the frame that poses are given in, in the measured one.",
+        ),
+    ] = None,
     public_key: Annotated[
         Path | None, typer.Option("--public-key", metavar="PUBLIC.pem", help="Take only a model signed by this key.")
     ] = None,
@@ -51,6 +66,8 @@ def compensate(
 
     ccnn compensate runs/ur10/model.safetensors poses.csv commands.csv --pose
 
+    ccnn compensate runs/ur10/model.safetensors poses.csv commands.csv --pose --tool "10mm,0,120mm,0,90deg,0"
+
     ccnn compensate checkpoints/tripod/model.onnx commands.csv ideal.csv --back
 
     ccnn compensate checkpoints/tripod/model.onnx joints.csv commands.csv --sd
@@ -67,6 +84,9 @@ def compensate(
         raise InputError(
             "--sd and --back exclude each other: --sd gives the standard deviation of a command, --back takes commands"
         )
+    for option, frame in (("--tool", tool), ("--base", base)):
+        if frame is not None and not pose:
+            raise InputError(f"{option}: needs --pose; joints are the same with every tool and in every frame")
     for file, what in ((input, "IN.csv"), (model, "the model")):
         if os.path.realpath(output) == os.path.realpath(file):
             raise InputError(f"{output}: OUT.csv is {what} itself, which would be overwritten; name another file")
@@ -83,7 +103,10 @@ def compensate(
         else:
             from ccnn_torch.compensation.job import compensate_table
 
-            said, refused = compensate_table(model, input, output, pose, back, sd, public_key, allow_code)
+            frames = [
+                None if text is None else _numbers(text, f"--{o}") for o, text in (("tool", tool), ("base", base))
+            ]
+            said, refused = compensate_table(model, input, output, pose, back, sd, public_key, allow_code, *frames)
     if not quiet:
         from ccnn_torch.report.screen import say
 
@@ -91,3 +114,16 @@ def compensate(
             say(sentence)
     if refused:
         raise InputError(refused)
+
+
+def _numbers(text: str, option: str) -> list[float]:
+    """x, y, z and a rotation vector [m, rad]."""
+    from ccnn_torch.config.sizes import size
+
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) != 6:
+        raise InputError(f'{option} {text}: give x,y,z,rx,ry,rz with units, e.g. "10mm,0,120mm,0,90deg,0"')
+    found = [size(part, unit, option) for part, unit in zip(parts, ("m", "m", "m", "rad", "rad", "rad"), strict=True)]
+    if not all(map(math.isfinite, found)):
+        raise InputError(f"{option} {text}: has a number that is not finite; write lengths and angles")
+    return found

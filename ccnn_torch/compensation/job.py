@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -60,6 +61,8 @@ def compensate_table(
     sd: bool = False,
     public_key: Path | None = None,
     allow_code: bool = False,
+    tool: Sequence[float] | None = None,
+    base: Sequence[float] | None = None,
 ) -> tuple[list[str], str]:
     """Write the input's columns with commands, deviations and flags; see `ccnn compensate --help` for the columns.
 
@@ -68,6 +71,7 @@ def compensate_table(
         input, output: CSV files (`input` also .xlsx).
         pose, back, sd: as the options of `ccnn compensate`.
         public_key, allow_code: as of `load_model`.
+        tool, base: as of `WantedPoses`.
 
     Returns:
         Sentences on what was written; and one on rows in which the model violates the limits in its card, else empty.
@@ -76,7 +80,7 @@ def compensate_table(
         InputError: a file cannot be read or is not in this form; nothing is written then.
     """
     loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
-    poses = WantedPoses(loaded, allow_code) if pose else None
+    poses = WantedPoses(loaded, allow_code, tool, base) if pose else None
     found = write_compensated(loaded, input, output, poses, back, sd)
     said = sentences(output, found, trained=isinstance(loaded, LoadedModel))
     if poses is not None and poses.chooses:

@@ -13,7 +13,8 @@ from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
+from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
+from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.plugins import code_refused
 from ccnn_torch.records.joint_map import JointMap
 from ccnn_torch.records.load import JOINT_LIMIT
@@ -34,10 +35,38 @@ class WantedPoses:
         chooses: whether joints were found without a given branch, where there are several.
     """
 
-    def __init__(self, loaded: LoadedModel | IdentifiedGeometry, allow_code: bool = False) -> None:
-        """Take the mechanism that the model was made for."""
+    def __init__(
+        self,
+        loaded: LoadedModel | IdentifiedGeometry,
+        allow_code: bool = False,
+        tool: Sequence[float] | None = None,
+        base: Sequence[float] | None = None,
+    ) -> None:
+        """Take the mechanism that the model was made for.
+
+        Args:
+            loaded: the model.
+            allow_code: run the Python file that the model names as its mechanism.
+            tool: of an arm, x, y, z and rotation vector of the tool's frame from the end of the last link [m, rad]; the
+                measured one when None.
+            base: of an arm, the same of the frame in which poses are given, in the measured one; that itself when None.
+
+        Raises:
+            InputError: `tool` or `base` of a machine that is no arm with orientation.
+        """
         with code_refused(f"{loaded.path}: its mechanism", allow_code):
             self._mechanism = mechanism_from_description(loaded.facts["mechanism"], allow_code=True)
+        self._same = tool is None and base is None
+        machine = self._mechanism
+        if not (self._same or (isinstance(machine, SerialArm) and len(machine.pose) == 6)):
+            raise InputError(
+                f"{'--tool' if base is None else '--base'}: {loaded.path} was made for {machine.name}; only an arm whose "
+                "orientation was measured takes another tool or workpiece frame; leave it out"
+            )
+        self._before_pose = torch.eye(4, dtype=torch.float64) if base is None else _frame(base)
+        self._behind_pose = torch.eye(4, dtype=torch.float64)
+        if tool is not None:
+            self._behind_pose = torch.linalg.inv(_frame(tool)) @ _frame(_measured_tool(loaded, self._mechanism))
         self._first = _first_guess(loaded)
         self._before = self._first
         self.chooses = False
@@ -63,7 +92,7 @@ class WantedPoses:
         if len(coordinates) != len(mechanism.pose):
             missing = [c.header for c in mechanism.pose if c.name not in {k.name for k in coordinates}]
             raise InputError(f"{table.path}: the poses of {mechanism.name} need the columns {', '.join(missing)}, too")
-        poses = torch.from_numpy(values)
+        poses = self._of_the_measured_tool(torch.from_numpy(values))
         guess = self._first
         guesses = tuple(Coordinate(f"guess_{c.name}", c.unit) for c in mechanism.joints)
         guided = any(c.name in table for c in guesses)
@@ -90,6 +119,34 @@ class WantedPoses:
         return joints.detach().numpy(), {
             c.name: units.get(key, c.unit) for c, key in zip(mechanism.joints, keys, strict=True)
         }
+
+    def _of_the_measured_tool(self, poses: Tensor) -> Tensor:
+        """Poses of the tool and in the frame with which the model was made, `s x p`."""
+        if self._same:
+            return poses
+        found = self._before_pose @ _frames(poses) @ self._behind_pose
+        return torch.cat([found[:, :3, 3], matrix_to_rotation_vector(found[:, :3, :3])], -1)
+
+
+def _measured_tool(loaded: LoadedModel | IdentifiedGeometry, mechanism: Mechanism) -> Sequence[float]:
+    """The tool's frame with which the model was made, x, y, z and rotation vector from the end of the last link."""
+    machine = loaded.identified if isinstance(loaded, IdentifiedGeometry) else mechanism
+    tool: list[float] = machine.nominal[-6:].tolist()
+    return tool
+
+
+def _frame(numbers: Sequence[float]) -> Tensor:
+    """`4 x 4` of x, y, z and a rotation vector [m, rad]."""
+    values = torch.tensor(list(numbers), dtype=torch.float64)
+    return _frames(values[None])[0]
+
+
+def _frames(poses: Tensor) -> Tensor:
+    """`s x 4 x 4` of poses `s x 6`."""
+    found = torch.eye(4, dtype=torch.float64).repeat(len(poses), 1, 1)
+    found[:, :3, :3] = rotation_vector_to_matrix(poses[:, 3:])
+    found[:, :3, 3] = poses[:, :3]
+    return found
 
 
 def _units(table: Table, read: Sequence[str]) -> dict[str, str]:

@@ -13,6 +13,7 @@ import openpyxl
 import pytest
 import torch
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 from stand_ins import Sigmoids, fields, tripod_joints
 from torch import Tensor
 
@@ -20,7 +21,7 @@ from ccnn_torch.compensation import Compensator, IdentifiedGeometry, load_compen
 from ccnn_torch.compensation.job import sentences, write_compensated
 from ccnn_torch.compensation.wanted_poses import WantedPoses
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms import SerialArm, load_mechanism
 from ccnn_torch.mechanisms.files.write_machine import write_machine
 from ccnn_torch.records import read_table, write_table
 from ccnn_torch.records.read_table import read_parts
@@ -228,3 +229,58 @@ def test_joints_of_poses_are_in_the_units_of_the_file(tmp_path: Path, guided: bo
     assert {out.units[f"command_q{k}"] for k in range(1, 7)} == {"deg"}
     command = [out.column(f"command_q{k}")[0] for k in range(1, 7)]
     np.testing.assert_allclose(command, arm.home_joints, atol=1e-7)
+
+
+@pytest.fixture
+def identified(tmp_path: Path) -> Path:
+    """An arm whose links and tool differ from the nominal ones."""
+    (tmp_path / "arm.yaml").write_text(ARM)
+    arm = load_mechanism(str(tmp_path / "arm.yaml"))
+    nominal = arm.describe()["parameters"]
+    draw = torch.Generator().manual_seed(0)
+    real = arm.with_nominal(arm.nominal + 1e-3 * torch.randn(len(arm.nominal), generator=draw, dtype=torch.float64))
+    write_machine(real, nominal, tmp_path, "identified", {})
+    return tmp_path / "identified.yaml"
+
+
+def test_another_tool_in_another_frame_reaches_the_pose(identified: Path, tmp_path: Path, cli: Cli) -> None:
+    loaded = load_compensation(identified)
+    assert isinstance(loaded, IdentifiedGeometry)
+    real = loaded.identified
+    assert isinstance(real, SerialArm)
+    tool, base = [0.01, 0.0, 0.12, 0.0, np.pi / 2, 0.0], [1.0, -0.5, 0.2, 0.0, 0.0, 0.3]
+    joints = real.home_joints + 0.3 * torch.rand(9, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    joints[:, 4] += 0.6
+    with_tool = real.with_nominal(torch.cat([real.nominal[:-6], torch.tensor(tool, dtype=torch.float64)]))
+    # Poses of the tool in the workpiece's frame.
+    there = Rotation.from_rotvec(base[3:]).inv()
+    pose = with_tool.forward_kinematics(joints).numpy()
+    wanted = np.concatenate(
+        [there.apply(pose[:, :3] - base[:3]), (there * Rotation.from_rotvec(pose[:, 3:])).as_rotvec()], -1
+    )
+    guess = {f"guess_{c.header}": joints[:, k].numpy() for k, c in enumerate(real.joints)}
+    write_table(tmp_path / "in.csv", dict(zip([c.header for c in real.pose], wanted.T, strict=True)) | guess)
+    options = ("--pose", "--tool", "10mm,0,120mm,0,90deg,0", "--base", "1,-50cm,0.2,0,0,0.3")
+    code, _, said = cli("compensate", identified, tmp_path / "in.csv", tmp_path / "out.csv", *options)
+    assert code == 0, said
+    out = read_table(tmp_path / "out.csv")
+    command = np.stack([out.column(f"command_q{k}") for k in range(1, 7)], -1)
+    reached = with_tool.forward_kinematics(torch.from_numpy(command)).numpy()
+    np.testing.assert_allclose(reached, pose, atol=1e-7)
+
+
+def test_a_tool_or_a_frame_that_cannot_be_taken(identified: Path, folder: Path, tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "in.csv").write_text("y[m],z[m],phi[rad]\n0,1,0\n")
+    for model, words, sentence in (
+        (identified, ("--tool", "0,0,0,0,0,0"), "--tool: needs --pose"),
+        (identified, ("--pose", "--tool", "0,0,0"), 'give x,y,z,rx,ry,rz with units, e.g. "10mm,0,120mm,0,90deg,0"'),
+        (identified, ("--pose", "--base", "10deg,0,0,0,0,0"), "--base"),
+        (identified, ("--pose", "--base", "inf,0,0,0,0,0"), "has a number that is not finite"),
+        (
+            folder / "model.onnx",
+            ("--pose", "--base", "0,0,0,0,0,0"),
+            "only an arm whose orientation was measured takes another",
+        ),
+    ):
+        code, _, said = cli("compensate", model, tmp_path / "in.csv", tmp_path / "out.csv", *words)
+        assert code == 2 and sentence in said and said.count("\n") == 1
