@@ -60,8 +60,8 @@ class WantedPoses:
         machine = self._mechanism
         if not (self._same or (isinstance(machine, SerialArm) and len(machine.pose) == 6)):
             raise InputError(
-                f"{'--tool' if base is None else '--base'}: {loaded.path} was made for {machine.name}; only an arm whose "
-                "orientation was measured takes another tool or workpiece frame; leave it out"
+                f"{'--tool' if base is None else '--base'}: {loaded.path} was made for {machine.name}; only an arm "
+                "whose orientation was measured takes another tool or workpiece frame; leave it out"
             )
         self._before_pose = torch.eye(4, dtype=torch.float64) if base is None else _frame(base)
         self._behind_pose = torch.eye(4, dtype=torch.float64)
