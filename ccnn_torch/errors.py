@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+_NO_MEMORY = ("can't allocate memory", "Failed to allocate memory", "bad_alloc", "not enough memory", "out of memory")
+
 
 class CcnnError(Exception):
     """Anything this package raises on purpose."""
@@ -30,6 +32,11 @@ class MethodFailedError(CcnnError):
 
 class FallbackWarning(UserWarning):
     """A model file gave a command outside the limits in its card; the joints are then commanded without correction."""
+
+
+def out_of_memory(problem: Exception) -> bool:
+    """Whether an error says that memory could not be had, in the words of Python, torch or ONNX Runtime."""
+    return isinstance(problem, MemoryError) or any(words in str(problem) for words in _NO_MEMORY)
 
 
 class OutsideDomainWarning(UserWarning):

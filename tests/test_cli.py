@@ -253,7 +253,7 @@ def test_all_methods_name_those_that_failed(cli: Cli, tmp_path: Path, monkeypatc
     ("command", "text", "other"),
     [
         ("run", "mechanism: five_bar\nrecords: rows.csv\nnoise: 1e-4\n", "identify"),
-        ("identify", "mechanism: five_bar\nrecords: rows.csv\ntraining: {folds: 3}\n", "run"),
+        ("identify", "case: tripod\ntraining: {folds: 3}\n", "run"),
         ("suite", "mechanism: five_bar\nsimulate: {poses: 20}\n", "identify"),
         ("identify", "base: {case: tripod}\ncases: [{name: a}]\n", "suite"),
         ("run", "candidates: 200\nlimits: {x: [0, 1]}\n", "plan --config"),

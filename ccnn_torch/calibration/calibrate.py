@@ -146,6 +146,7 @@ class Calibration:
             "rotation_weight": self.config.rotation_weight,
             "damping": damping_of(self.config, self.prepared.mechanism),
             "columns": self.config.columns,
+            "joint_map": self.config.joint_map,
         }
         save_model(Path(folder), compensator, about, method=name, forms=forms)
         return compensator.share

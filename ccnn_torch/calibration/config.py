@@ -17,6 +17,7 @@ from ccnn_torch.config.split import SplitConfig
 from ccnn_torch.config.tree import (
     Columns,
     Files,
+    JointMap,
     Names,
     Section,
     config_from_file,
@@ -193,6 +194,7 @@ class RunConfig(_Part):
         description="measured records, a CSV file (or .xlsx) with headers name[unit], or a list of such files",
     )
     columns: Columns
+    joint_map: JointMap
     mechanism: str | None = Field(
         default=None,
         description="mechanism of the records: tripod, machine_tool, a DH file (.yaml), a URDF, or file.py:Name",
@@ -308,8 +310,8 @@ class RunConfig(_Part):
             raise ValueError("order: records have the order in which they were measured; remove the key")
         if self.case is not None and self.split.test_file is not None:
             raise ValueError("split.test: a case makes its own rows and takes no file; write a share, e.g. 0.3")
-        if self.case is not None and self.columns:
-            raise ValueError("columns: a case reads no file; remove the key")
+        if self.case is not None and (self.columns or self.joint_map):
+            raise ValueError("columns, joint_map: a case reads no file; remove the key")
         if self.case is not None and self.geometry == "identify":
             raise ValueError("geometry: a case is there to compare learners; write geometry=none, or take records")
         if self.case is not None and self.effects not in ("auto", "none"):

@@ -28,7 +28,7 @@ from ccnn_torch.cli.suite import suite
 from ccnn_torch.cli.sweep import sweep
 from ccnn_torch.cli.verify import verify
 from ccnn_torch.display import visible
-from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.errors import InputError, MethodFailedError, out_of_memory
 from ccnn_torch.run_folder.interrupt import Stopped
 from ccnn_torch.version import __version__
 
@@ -107,6 +107,10 @@ def main() -> None:
         sys.exit(130)
     except typer.Abort:
         code = 130
+    except (MemoryError, RuntimeError) as problem:
+        if not out_of_memory(problem):
+            raise
+        code = _say("there is not enough memory for this: end other programs, or give less at once")
     if code == 130:
         _say("interrupted; what was written so far is kept")
     # The interpreter looks for garbage once more before it ends: a fifth of a second over torch's objects.

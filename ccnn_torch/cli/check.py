@@ -14,7 +14,10 @@ from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
 
 
 def check(
-    overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[CONFIG] [KEY=VALUE]...", help="A config, and key=value or key.sub=value over it."),
+    ] = None,
     records: Annotated[Path | None, typer.Option(help="CSV of joints, measured poses and covariates.")] = None,
     mechanism: Annotated[
         str | None,
@@ -53,7 +56,7 @@ def check(
         from ccnn_torch.report.table import print_table
 
     with if_stopped(NOTHING_WRITTEN):
-        wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out)
+        wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out, quiet=quiet)
         found = with_status("checking what the rows can identify …", lambda _: run_check(wanted), quiet)
     if not quiet:
         for line in check_text(found):

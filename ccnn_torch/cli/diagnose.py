@@ -13,7 +13,10 @@ from ccnn_torch.cli.loading import loading
 
 
 def diagnose(
-    overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[CONFIG] [KEY=VALUE]...", help="A config, and key=value or key.sub=value over it."),
+    ] = None,
     records: Annotated[Path | None, typer.Option(help="CSV of joints, measured poses and covariates.")] = None,
     mechanism: Annotated[
         str | None,
@@ -66,5 +69,5 @@ def diagnose(
         from ccnn_torch.diagnosis.job import run_diagnosis
         from ccnn_torch.motion.job import run_motion
 
-    wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out, network, motion)
+    wanted = configured(overrides, records, mechanism, noise, effects, config, seed, out, network, motion, quiet)
     (run_motion if wanted.motion else run_diagnosis)(wanted, quiet, details)

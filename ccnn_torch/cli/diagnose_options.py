@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ccnn_torch.cli.words import config_and_changes, noted
+
 if TYPE_CHECKING:
     from ccnn_torch.diagnosis.config import DiagnoseConfig
 
@@ -21,14 +23,16 @@ def configured(
     out: Path | None = None,
     network: bool | None = None,
     motion: list[Path] | None = None,
+    quiet: bool = False,
 ) -> DiagnoseConfig:
-    """The config file, overridden by the options of the command line."""
+    """The config file, overridden by the options of the command line; `overrides` may begin with the config."""
     from ccnn_torch.config.noise import read_noise
     from ccnn_torch.config.overrides import listed_files
     from ccnn_torch.diagnosis.config import load_diagnose_config
 
     noise_key = [] if noise is None else [f"noise={json.dumps(read_noise(noise))}"]
-    wanted = load_diagnose_config(config, [*(overrides or []), *noise_key])
+    file, changes = config_and_changes(overrides or [], config)
+    wanted = load_diagnose_config(file, [*changes, *noise_key], noted(quiet))
     names = None if effects is None else [e.strip() for e in effects.split(",") if e.strip()]
     given = {
         "records": None if records is None else listed_files(str(records), Path()),

@@ -7,12 +7,19 @@ from typing import Annotated
 
 import typer
 
+from ccnn_torch.cli.completion import complete_mechanism
+from ccnn_torch.cli.words import config_and_changes, noted
 from ccnn_torch.errors import InputError
 
 
 def identify(
     config: Annotated[Path | None, typer.Argument(help="A YAML config, e.g. experiments/five_bar.yaml.")] = None,
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
+    config_option: Annotated[Path | None, typer.Option("--config", help="The same as CONFIG.")] = None,
+    records: Annotated[str | None, typer.Option(help="The same as records=….")] = None,
+    mechanism: Annotated[
+        str | None, typer.Option(help="The same as mechanism=….", autocompletion=complete_mechanism)
+    ] = None,
     resume: Annotated[Path | None, typer.Option(help="Resume the identification in this folder.")] = None,
     out: Annotated[str | None, typer.Option(help="Folder to write; the same as out=….")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
@@ -46,16 +53,14 @@ def identify(
         for key, default, description in describe_identify_keys():
             typer.echo(f"{key}={default}\n    {description}")
         return
+    file, changes = config_and_changes(
+        [config, *(overrides or [])], config_option, records=records, mechanism=mechanism, out=out, seed=seed
+    )
     if resume is not None:
-        if config is not None or overrides or out is not None or seed is not None:
-            raise InputError("--resume takes the folder alone, without CONFIG, overrides, --out and --seed")
+        if changes or file is not None:
+            raise InputError("--resume takes the folder alone, without CONFIG, overrides and other options")
         resume_identification(resume, quiet=quiet)
         return
-    if config is None:
+    if file is None and not changes:
         raise InputError("name a config, for example: ccnn identify experiments/five_bar.yaml (or --resume DIR)")
-    changes = list(overrides or [])
-    if "=" in str(config) and not config.is_file():
-        changes, config = [str(config), *changes], None
-    changes += [f"out={out}"] if out is not None else []
-    changes += [f"seed={seed}"] if seed is not None else []
-    start_identification(load_identify_config(config, changes), quiet=quiet)
+    start_identification(load_identify_config(file, changes, noted(quiet)), quiet=quiet)

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from ccnn_torch.cli.completion import complete_mechanism
+from ccnn_torch.cli.words import config_and_changes
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import read_yaml
 
@@ -17,6 +19,11 @@ def run(
         typer.Argument(help="A YAML config, for example experiments/tripod.yaml; defaults where there is none."),
     ] = None,
     overrides: Annotated[list[str] | None, typer.Argument(help="key=value or key.sub=value, over the config.")] = None,
+    config_option: Annotated[Path | None, typer.Option("--config", help="The same as CONFIG.")] = None,
+    records: Annotated[str | None, typer.Option(help="The same as records=….")] = None,
+    mechanism: Annotated[
+        str | None, typer.Option(help="The same as mechanism=….", autocompletion=complete_mechanism)
+    ] = None,
     resume: Annotated[Path | None, typer.Option(help="Resume the run in this folder.")] = None,
     out: Annotated[str | None, typer.Option(help="Folder to write; the same as out=….")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as seed=….")] = None,
@@ -38,22 +45,20 @@ def run(
 
     ccnn run --resume runs/tripod30
     """
-    if config is not None and "=" not in str(config):
+    file, changes = config_and_changes(
+        [config, *(overrides or [])], config_option, records=records, mechanism=mechanism, out=out, seed=seed
+    )
+    if file is not None:
         # Before torch is loaded: a file that is not there need not wait for it.
-        read_yaml(config)
+        read_yaml(file)
     from ccnn_torch.calibration.config import load_config
     from ccnn_torch.calibration.job import resume_run, start_run
 
     if resume is not None:
-        if config is not None or overrides or out is not None or seed is not None:
-            raise InputError("--resume takes the run's folder alone, without CONFIG, overrides, --out and --seed")
+        if changes or file is not None:
+            raise InputError("--resume takes the run's folder alone, without CONFIG, overrides and other options")
         resume_run(resume, quiet=quiet)
         return
-    if config is None:
+    if file is None and not changes:
         raise InputError("name a config, for example: ccnn run experiments/tripod.yaml (or --resume RUN_DIR)")
-    changes = list(overrides or [])
-    if "=" in str(config) and not config.is_file():
-        changes, config = [str(config), *changes], None
-    changes += [f"out={out}"] if out is not None else []
-    changes += [f"seed={seed}"] if seed is not None else []
-    start_run(load_config(config, changes), quiet=quiet)
+    start_run(load_config(file, changes), quiet=quiet)

@@ -8,13 +8,21 @@ from typing import Annotated
 import typer
 
 from ccnn_torch.cli.completion import complete_mechanism
+from ccnn_torch.cli.words import config_and_changes, noted
+from ccnn_torch.errors import InputError
 from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
 
 
 def verify(
     model: Annotated[Path, typer.Argument(help="A .safetensors or .onnx file, or identified.yaml.")],
-    records: Annotated[str, typer.Argument(metavar="RECORDS.csv", help="New rows: joints and measured poses.")],
     out: Annotated[Path, typer.Option(help="Folder to write verify.json and verify.html to.")],
+    records: Annotated[
+        str | None, typer.Argument(metavar="RECORDS.csv", help="New rows: joints and measured poses.")
+    ] = None,
+    records_option: Annotated[str | None, typer.Option("--records", help="The same as RECORDS.csv.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="A config for ccnn run: how the records are read, and the machine.")
+    ] = None,
     mechanism: Annotated[
         str | None,
         typer.Option(
@@ -50,11 +58,17 @@ def verify(
     """
     with if_stopped(NOTHING_WRITTEN):
         from ccnn_torch.compensation import load_compensation
+        from ccnn_torch.verification.config import load_verify_config
         from ccnn_torch.verification.job import verify_model
         from ccnn_torch.verification.page import write_verify_report
 
+        file, changes = config_and_changes([], config, records=records or records_option, mechanism=mechanism)
+        wanted = load_verify_config(file, changes, noted(quiet))
+        if wanted.records is None:
+            raise InputError("records: are missing; give RECORDS.csv, --records, or the key in a config")
         loaded = load_compensation(model, allow_code=allow_code)
-        found = verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code)
+        read = {"columns": wanted.columns, "joint_map": wanted.joint_map, "mechanism_keys": wanted.mechanism_keys}
+        found = verify_model(loaded, wanted.records, wanted.mechanism, compensated, refit_frames, allow_code, **read)
         write_verify_report(out, found.results, found.arrays)
     results = found.results
     if not quiet:

@@ -6,7 +6,7 @@ import dataclasses
 import inspect
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
@@ -91,6 +91,7 @@ def explain(error: ValidationError, model: type[BaseModel], file: str, given: Ma
         given: key -> override, for keys that were set on the command line.
     """
     keys = {key: description for key, _, description in list_keys(model)}
+    also = config_model("run").model_fields if getattr(model, "of_a_run", ()) else ()
     parts: dict[str, None] = {}
     for item in error.errors():
         key = ".".join(str(step) for step in item["loc"])
@@ -99,7 +100,7 @@ def explain(error: ValidationError, model: type[BaseModel], file: str, given: Ma
         override = given.get(above)
         override = override or next((text for name, text in given.items() if key and name.startswith(f"{key}.")), None)
         source = f"'{override}': " if override else ""
-        parts[source + _sentence(key, item["type"], item["msg"], item["input"], keys)] = None
+        parts[source + _sentence(key, item["type"], item["msg"], item["input"], keys, also)] = None
     other = _other_command(file, model)
     if other:
         return f"{file}: this looks like {other}"
@@ -117,16 +118,20 @@ def _other_command(file: str, model: type[BaseModel]) -> str:
     there = set(read_yaml(Path(file)))
     if there >= {"convention", "alpha"}:
         return f"the file of an arm, no config; write mechanism={file}"
+    known = set(model.model_fields)
+    # A command that takes the config of a run, of records, does not fail for that.
+    if getattr(model, "of_a_run", ()) and not there.isdisjoint(("records", "mechanism")):
+        known |= set(config_model("run").model_fields)
     # A single unknown key is more likely a typing error than another command's file.
-    if len(there) < 2 or there <= set(model.model_fields):
+    if len(there) < 2 or there <= known:
         return ""
     names = (name for name in _COMMANDS if there <= set(config_model(name).model_fields))
     return next((f"a config for `ccnn {name}{_OPTION.get(name, '')}`" for name in names), "")
 
 
-def _sentence(key: str, kind: str, message: str, value: Any, keys: Mapping[str, str]) -> str:
+def _sentence(key: str, kind: str, message: str, value: Any, keys: Mapping[str, str], also: Iterable[str]) -> str:
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"there is no key '{key}'; {_hint(key, keys)}"
+        return f"there is no key '{key}'; {_hint(key, keys, also)}"
     if kind in ("model_type", "dataclass_type", "dict_type"):
         return f"{key}: must hold the keys {', '.join(_below(key, keys))}, not {_short(value)}"
     if kind == "value_error":
@@ -141,12 +146,15 @@ def _sentence(key: str, kind: str, message: str, value: Any, keys: Mapping[str, 
     return f"{key}: {text}, not {_short(value)}"
 
 
-def _hint(key: str, keys: Mapping[str, str]) -> str:
+def _hint(key: str, keys: Mapping[str, str], also: Iterable[str]) -> str:
     section, _, last = key.rpartition(".")
     beside = _below(section, keys)
     near = nearest(last, beside, 0.65)
     if near is not None:
         return f"did you mean '{section + '.' if section else ''}{near}'?"
+    shared = nearest(key, [*also], 0.65)
+    if shared is not None:
+        return f"did you mean '{shared}'?"
     # The right word in the wrong section, such as generations for ccnn.generations.
     ends = {other.rpartition(".")[2]: other for other in reversed(list(keys))}
     elsewhere = nearest(last, list(ends), 0.8)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
@@ -15,6 +15,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import dump_yaml, read_yaml
 
 Config = TypeVar("Config", bound=BaseModel)
+Note = Callable[[str], None]
 
 
 def _listed(value: Any) -> Any:
@@ -46,21 +47,45 @@ Columns = Annotated[
 ]
 """Headers of records -> names and units."""
 
+JointMap = Annotated[
+    dict[str, str],
+    Field(
+        default={},
+        description="joints as sums of the file's columns, where the controller counts otherwise, e.g. "
+        '{q3: "J3 - J2"}; commands are written back in its count',
+    ),
+]
+"""Joints -> linear functions of columns."""
+
 
 class Section(BaseModel):
     """A section of a config: unknown keys are refused, values are finite and immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    of_a_run: ClassVar[tuple[str, ...]] = ()
+    """Keys that mean the same in a config for `ccnn run`, where a command takes one and leaves its other keys out."""
 
-def config_from_file(model: type[Config], path: str | Path, overrides: Iterable[str]) -> Config:
+
+def config_from_file(
+    model: type[Config],
+    path: str | Path,
+    overrides: Iterable[str],
+    note: Note | None = None,
+) -> Config:
     """Read a config file and put overrides ``key.sub=value`` over it; its name is the file's unless it has one.
+
+    Args:
+        model: class of the config.
+        path: the file.
+        overrides: ``key.sub=value``.
+        note: called with a sentence that names the keys of `ccnn run` that were left out.
 
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
     path = Path(path)
-    tree = read_yaml(path)
+    tree = _used(read_yaml(path), model, path, note)
     tree.setdefault("name", path.stem)
     # Links are resolved, as the system does for `..` and as `written` does.
     resolve_paths(tree, Path(os.path.realpath(path.parent)))
@@ -69,7 +94,10 @@ def config_from_file(model: type[Config], path: str | Path, overrides: Iterable[
 
 
 def config_from_options(
-    model: type[Config], path: Path | None, overrides: Iterable[str], also: str = "", shared: Sequence[str] = ()
+    model: type[Config],
+    path: Path | None,
+    overrides: Iterable[str],
+    note: Note | None = None,
 ) -> Config:
     """As `config_from_file` for commands that need no file: defaults where there is none, and for empty keys.
 
@@ -77,21 +105,50 @@ def config_from_options(
         model: class of the config.
         path: the file.
         overrides: ``key.sub=value``.
-        also: another command, of whose configs the `shared` keys are read.
+        note: called with a sentence that names the keys of `ccnn run` that were left out.
 
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
-    tree = {} if path is None else read_yaml(path)
-    own, others = {*model.model_fields}, {*config_model(also).model_fields} if also else set()
-    # A key that neither has is a mistake in both, and is told.
-    if tree.keys() & (others - own) and not tree.keys() & (own - others):
-        tree = {key: value for key, value in tree.items() if key in shared or key not in others}
+    tree = {} if path is None else _used(read_yaml(path), model, path, note)
     if path is not None:
         resolve_paths(tree, path.absolute().parent)
     given = apply_overrides(tree, overrides, Path.cwd())
     filled = {key: value for key, value in tree.items() if value is not None}
     return validated(model, filled, str(path or "command line"), given)
+
+
+def _used(tree: dict[str, Any], model: type[BaseModel], path: Path, note: Note | None) -> dict[str, Any]:
+    """A file's keys without those that `ccnn run` alone has; of a config for `ccnn run` the shared ones."""
+    run, shared = config_model("run"), getattr(model, "of_a_run", ())
+    names = {".".join(key) for key in _foreign(tree, model, run)} if shared else set()
+    # A case study has no records to share.
+    if not names or not {"records", "mechanism"} & tree.keys():
+        return tree
+    if tree.keys() <= {*run.model_fields}:
+        names |= tree.keys() - {*shared}
+    kept = {
+        key: {k: v for k, v in value.items() if f"{key}.{k}" not in names} if isinstance(value, dict) else value
+        for key, value in tree.items()
+        if key not in names
+    }
+    if note is not None:
+        left = [name for name in sorted(names) if name.partition(".")[0] == name or name.partition(".")[0] in kept]
+        are = "is a key of ccnn run and is" if len(left) == 1 else "are keys of ccnn run and are"
+        note(f"{path}: {', '.join(left)} {are} not used here.")
+    return kept
+
+
+def _foreign(tree: Mapping[str, Any], model: type[BaseModel], run: type[BaseModel]) -> Iterator[tuple[str, ...]]:
+    """Keys of a tree, with those of their sections, that `run` has and `model` has not."""
+    for key, value in tree.items():
+        mine, theirs = model.model_fields.get(key), run.model_fields.get(key)
+        if theirs is not None and mine is None:
+            yield (key,)
+        elif theirs is not None and mine is not None and isinstance(value, dict):
+            ours, its = mine.annotation, theirs.annotation
+            if isinstance(ours, type) and issubclass(ours, BaseModel) and isinstance(its, type):
+                yield from ((key, *below) for below in _foreign(value, ours, its))
 
 
 def config_from_keys(model: type[Config], keys: Mapping[str, Any]) -> Config:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field
 from ccnn_torch.config.keys import list_keys
 from ccnn_torch.config.noise import Noise
 from ccnn_torch.config.sizes import size
-from ccnn_torch.config.tree import Columns, Files, Names, Section, config_from_options
+from ccnn_torch.config.tree import Columns, Files, JointMap, Names, Section, config_from_options
 from ccnn_torch.errors import InputError
 from ccnn_torch.run_folder.folder import refuse_foreign
 
@@ -34,12 +34,10 @@ def _deviation(value: Any) -> Any:
     return value
 
 
-# What means the same in a config for `ccnn run`.
-_OF_A_RUN = ("records", "columns", "mechanism", "mechanism_keys", "covariates", "seed")
-
-
 class DiagnoseConfig(Section):
     """Options of `ccnn diagnose` and `ccnn check`."""
+
+    of_a_run = ("records", "columns", "joint_map", "mechanism", "mechanism_keys", "covariates", "seed")
 
     records: Files | None = Field(
         default=None,
@@ -50,6 +48,7 @@ class DiagnoseConfig(Section):
         description="CSV of the logs of a machine in motion, each a run; the same as --motion; in the place of records",
     )
     columns: Columns
+    joint_map: JointMap
     mechanism: str | None = Field(default=None, description="the nominal machine; the same as --mechanism")
     out: str | None = Field(default=None, description="folder to write; the same as --out")
     mechanism_keys: dict[str, Any] = Field(
@@ -80,15 +79,18 @@ class DiagnoseConfig(Section):
     seed: int = Field(default=0, ge=0, lt=2**63, description="seed of folds and resampling")
 
 
-def load_diagnose_config(path: Path | None, overrides: Iterable[str] = ()) -> DiagnoseConfig:
+def load_diagnose_config(
+    path: Path | None, overrides: Iterable[str] = (), note: Callable[[str], None] | None = None
+) -> DiagnoseConfig:
     """Read a config file (defaults where there is none) and put overrides ``key.sub=value`` over it.
 
-    A config for `ccnn run`, as `ccnn new` writes it, gives its records, mechanism, columns and seed.
+    A config for `ccnn run`, as `ccnn new` writes it, gives its records, mechanism, columns and seed; `note` is called
+    with a sentence on the others.
 
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
-    return config_from_options(DiagnoseConfig, path, overrides, "run", _OF_A_RUN)
+    return config_from_options(DiagnoseConfig, path, overrides, note)
 
 
 def folder_of(config: DiagnoseConfig) -> Path:

@@ -103,5 +103,7 @@ def _loaded(config: DiagnoseConfig) -> tuple[Records, Mechanism, Sequence[str] |
             raise InputError(f"{key}: is missing; give --{key}, or the key in a config")
     mechanism = load_mechanism(str(config.mechanism), **config.mechanism_keys)
     assert config.records is not None
-    records = load_records(config.records, mechanism, config.covariates, learns=False, columns=config.columns)
+    records = load_records(
+        config.records, mechanism, config.covariates, learns=False, columns=config.columns, joint_map=config.joint_map
+    )
     return records, mechanism, config.effects

@@ -9,6 +9,8 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
+from typing import BinaryIO
 from uuid import uuid4
 
 from ccnn_torch.errors import WriteError
@@ -25,14 +27,27 @@ def write_whole(path: str | Path, content: bytes | str) -> None:
     Raises:
         WriteError: it cannot be written (disk full, no permission, a folder of that name …); an old file is as it was.
     """
+    with writing_whole(path) as stream:
+        stream.write(content.encode() if isinstance(content, str) else content)
+
+
+@contextmanager
+def writing_whole(path: str | Path) -> Iterator[BinaryIO]:
+    """As `write_whole`, bit by bit: gives a stream. What was written to it is at the path once all of it is written.
+
+    Raises as `write_whole`; any other error leaves the old content.
+    """
     path = Path(path)
-    data = content.encode() if isinstance(content, str) else content
     with _as_write_error(path):
         kind = _kind(path)
         if kind is not None and stat.S_ISDIR(kind):
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         if kind is not None and not stat.S_ISREG(kind):
-            path.write_bytes(data)
+            with TemporaryFile() as stream:
+                yield stream
+                stream.seek(0)
+                with path.open("wb") as there:
+                    shutil.copyfileobj(stream, there)
             return
         if kind is not None and not os.access(path, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
@@ -42,7 +57,7 @@ def write_whole(path: str | Path, content: bytes | str) -> None:
         temporary = target.with_name(f"{_PREFIX}{uuid4().hex}{_SUFFIX}")
         try:
             with temporary.open("xb") as stream:
-                stream.write(data)
+                yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
             if kind is not None:

@@ -5,7 +5,7 @@ Relative paths in a config file start from the file's folder, those on the comma
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +16,7 @@ from ccnn_torch.config.split import HeldOutConfig
 from ccnn_torch.config.tree import (
     Columns,
     Files,
+    JointMap,
     Names,
     Section,
     config_from_file,
@@ -138,6 +139,8 @@ class SimulateConfig(Section):
 class IdentifyConfig(Section):
     """An identification: mechanism, data, parameters, methods."""
 
+    of_a_run = ("name", "seed", "records", "columns", "joint_map", "mechanism", "mechanism_keys", "split")
+
     name: str = Field(
         default="identification", min_length=1, description="name of the run; default: the config file's name"
     )
@@ -159,6 +162,7 @@ class IdentifyConfig(Section):
         description="measured records, a CSV file (or .xlsx) with headers name[unit], or a list of such files",
     )
     columns: Columns
+    joint_map: JointMap
     simulate: SimulateConfig | None = Field(default=None, description="simulated machines instead of records")
     constraint: ConstraintConfig | None = Field(
         default=None, description="what holds the tool in the records, which then have no measured pose"
@@ -245,8 +249,10 @@ class IdentifyConfig(Section):
             raise ValueError(
                 "transfer: its rows are split as the records are, and split.test names a file; write a share"
             )
-        if self.simulate is not None and (self.columns or self.split.test_file is not None):
-            raise ValueError("columns and a file in split.test: simulated machines read no file; remove the key")
+        if self.simulate is not None and (self.columns or self.joint_map or self.split.test_file):
+            raise ValueError(
+                "columns, joint_map and a file in split.test: simulated machines read no file; remove the key"
+            )
         if self.simulate is not None and (self.noise is not None or self.joint_noise is not None):
             raise ValueError("noise: simulated data has simulate.noise and simulate.joint_noise; remove the key")
         if self.simulate is not None and self.simulate.points and self.residual == "forward":
@@ -287,15 +293,20 @@ def base_method(method: str) -> str:
     return method.removesuffix(PER_LEG)
 
 
-def load_identify_config(path: str | Path | None, overrides: Iterable[str] = ()) -> IdentifyConfig:
+def load_identify_config(
+    path: str | Path | None, overrides: Iterable[str] = (), note: Callable[[str], None] | None = None
+) -> IdentifyConfig:
     """Read a config file and put overrides ``key.sub=value`` over it; without a file these are all.
+
+    A config for `ccnn run`, as `ccnn new` writes it, gives its records, machine and split; `note` is called with a
+    sentence on the others.
 
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
     if path is None:
         return config_from_options(IdentifyConfig, None, overrides)
-    return config_from_file(IdentifyConfig, path, overrides)
+    return config_from_file(IdentifyConfig, path, overrides, note)
 
 
 def make_identify_config(**keys: Any) -> IdentifyConfig:

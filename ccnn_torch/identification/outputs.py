@@ -21,7 +21,8 @@ def write_outputs(found: Identification, folder: Path) -> None:
     write_whole(folder / "identified.md", identified_markdown(results))
     save_identified_arrays(folder, found.arrays)
     # Of several machines the first.
-    write_machine(found.mechanism(), found.nominal(), folder, "identified", found.config.columns)
+    config = found.config
+    write_machine(found.mechanism(), found.nominal(), folder, "identified", config.columns, config.joint_map)
     if found.config.save_report:
         write_identified_report(folder, results)
     write_json(folder / RESULTS, results)

@@ -67,12 +67,14 @@ def compensate_motion(model: Path, input: Path, output: Path, allow_code: bool =
             here = _of_rows(around, rows)
             position[rows] = moved(found.nominal, found.axes, time[rows], command[rows][None], here)[0]
         after = np.hypot(np.sqrt(np.square(wanted - position).mean(0)), found.left)
-    added = {}
+    added: dict[str, Array | list[str]] = {}
     for what, values in (("corrected", command), ("predicted", position)):
         for i, name in enumerate(names):
             unit = table.units[name]
             added[f"{what}{i + 1}[{unit}]"] = from_si(values[:, i], found.units[i], unit)
-    kept = {table.header(n): table.raw(n) for n in table.names if not n.startswith(("corrected", "predicted"))}
+    kept: dict[str, Array | list[str]] = {
+        table.header(n): table.cells(n) for n in table.names if not n.startswith(("corrected", "predicted"))
+    }
     write_table(output, kept | added)
     said = []
     for i, unit in enumerate(found.units):

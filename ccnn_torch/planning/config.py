@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
 
 from ccnn_torch.config.keys import list_keys
-from ccnn_torch.config.tree import Names, Section, config_from_options
+from ccnn_torch.config.tree import Columns, JointMap, Names, Section, config_from_options
 
 Size = float | str
 """A number in SI, or a text of number and unit, such as `0.1 mm` or `0.03 deg`."""
@@ -30,7 +30,12 @@ class PlannedParameters(Section):
 class PlanConfig(Section):
     """What `ccnn plan` accepts."""
 
+    of_a_run = ("columns", "joint_map", "mechanism", "mechanism_keys", "seed")
+
+    mechanism: str | None = Field(default=None, description="the nominal machine; the same as --mechanism")
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
+    columns: Columns
+    joint_map: JointMap
     parameters: PlannedParameters = Field(default_factory=PlannedParameters)
     residual: Literal["auto", "inverse", "forward"] = Field(
         default="auto",
@@ -71,13 +76,17 @@ class PlanConfig(Section):
     seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the candidates")
 
 
-def load_plan_config(path: Path | None, overrides: Iterable[str] = ()) -> PlanConfig:
+def load_plan_config(
+    path: Path | None, overrides: Iterable[str] = (), note: Callable[[str], None] | None = None
+) -> PlanConfig:
     """Read a config file (defaults where there is none) and put overrides ``key.sub=value`` over it.
+
+    A config for `ccnn run`, as `ccnn new` writes it, gives its machine; `note` is called with a sentence on the others.
 
     Raises:
         InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
     """
-    return config_from_options(PlanConfig, path, overrides)
+    return config_from_options(PlanConfig, path, overrides, note)
 
 
 def describe_plan_keys() -> list[tuple[str, str, str]]:

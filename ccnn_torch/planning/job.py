@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.config.prior_sizes import prior_sizes
@@ -15,11 +18,15 @@ from ccnn_torch.identification import ParameterChoice
 from ccnn_torch.identification.problems.problem import Progress
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.planning import Plan, plan_poses
-from ccnn_torch.planning.config import PlanConfig
+from ccnn_torch.planning.config import PlanConfig, load_plan_config
 from ccnn_torch.planning.figure import plan_plot
 from ccnn_torch.planning.page import plan_markdown
 from ccnn_torch.records import write_table
+from ccnn_torch.records.joint_map import read_joint_map
 from ccnn_torch.report.figures.style import save_figure
+from ccnn_torch.units import from_si, split_header
+
+Array = NDArray[np.float64]
 
 
 def make_plan(
@@ -36,7 +43,7 @@ def make_plan(
     Raises:
         InputError: as `load_mechanism` and `plan_poses`; a size that is invalid, or of an unknown name.
     """
-    config = config or PlanConfig()
+    config = config or load_plan_config(None)
     if poses < 1:
         raise InputError(f"--poses: plan at least 1 pose, not {poses}")
     machine = load_mechanism(mechanism, **config.mechanism_keys) if isinstance(mechanism, str) else mechanism
@@ -70,11 +77,14 @@ def check_plan_file(path: Path) -> None:
         raise InputError(f"--out: '{path}' must end in .csv; the page and the picture are written beside it")
 
 
-def write_plan(path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: float) -> list[Path]:
+def write_plan(
+    path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: float, config: PlanConfig | None = None
+) -> list[Path]:
     """Write the poses as CSV, and beside it a page (.md) with its picture (.png, .svg).
 
     The CSV has a row for each pose: `leg[1]` where each leg has its own, the joints to command, and the pose at which
-    they bring the nominal machine; the most informative rows come first.
+    they bring the nominal machine; the most informative rows come first. With a `joint_map` of the config the joints
+    stand there as the controller counts them, too, as `command_q1[unit]` ….
 
     Returns:
         The files.
@@ -89,6 +99,7 @@ def write_plan(path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: 
     for coordinates, part in ((mechanism.joints, "joints"), (mechanism.pose, "pose")):
         values = torch.cat([getattr(plan, part) for plan in plans])
         columns |= {c.header: values[:, i].numpy() for i, c in enumerate(coordinates)}
+    columns |= _commands(columns, mechanism, config or load_plan_config(None))
     make_folder(path.parent)
     write_table(path, columns)
     plot = plan_plot(mechanism.pose, plans, least_gain)
@@ -96,6 +107,20 @@ def write_plan(path: Path, mechanism: Mechanism, plans: list[Plan], least_gain: 
     page = path.with_suffix(".md")
     write_whole(page, plan_markdown(mechanism.name, plans, least_gain, pictures[0].name, plot.caption))
     return [path, page, *pictures]
+
+
+def _commands(columns: Mapping[str, Array], mechanism: Mechanism, config: PlanConfig) -> dict[str, Array]:
+    """The joints as the controller counts them, in the units of its columns; nothing where it counts no other way."""
+    counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
+    if counted is None:
+        return {}
+    shown = counted.shown(np.stack([columns[joint.header] for joint in mechanism.joints], -1))
+    units = dict(split_header(target) for target in config.columns.values())
+    found = {}
+    for k, (joint, column) in enumerate(zip(mechanism.joints, counted.columns, strict=True)):
+        unit = units.get(column) or joint.unit
+        found[f"command_{joint.name}[{unit}]"] = from_si(shown[:, k], joint.unit, unit)
+    return found
 
 
 def _limits(config: PlanConfig, machine: Mechanism) -> dict[str, tuple[float, float]]:

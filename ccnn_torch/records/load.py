@@ -14,6 +14,7 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.records.covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES
 from ccnn_torch.records.covariates import choose_covariates
+from ccnn_torch.records.joint_map import read_joint_map, with_joints
 from ccnn_torch.records.pose_columns import HasCoordinates, check_joints, refuse_lost_orientation, unused_joints
 from ccnn_torch.records.pose_columns import read_pose as read_pose
 from ccnn_torch.records.pose_columns import stack_columns as stack_columns
@@ -97,6 +98,7 @@ def load_records(
     covariates: Sequence[str] | None = None,
     learns: bool = True,
     columns: Mapping[str, str] | None = None,
+    joint_map: Mapping[str, str] | None = None,
 ) -> Records:
     """Load records for a mechanism.
 
@@ -114,6 +116,7 @@ def load_records(
         learns: whether a learner is trained on the rows: fewer than twice the unknowns of a linear fit are then
             refused. An identification checks their number by its parameters.
         columns: header in the file -> ``name[unit]``, or ``ignore``.
+        joint_map: joint -> sum of columns, where the controller counts otherwise: ``{"q3": "J3 - J2"}``.
 
     Raises:
         InputError: a column is missing, is repeated, or has no unit or one of a wrong dimension; a cell is not a
@@ -121,8 +124,8 @@ def load_records(
             differ in their columns; too few rows; no input varies.
     """
     if isinstance(source, Records):
-        return _loaded(source, mechanism, covariates, columns)
-    table = read_source(source, columns)
+        return _loaded(source, mechanism, covariates, columns or joint_map)
+    table = with_joints(read_source(source, columns), read_joint_map(joint_map or {}, mechanism.joints, columns))
     check_joints(table, mechanism.joints)
     joints = stack_columns(table, mechanism.joints, JOINT_LIMIT)
     pose, coordinates, orientation, read = read_pose(table, mechanism)

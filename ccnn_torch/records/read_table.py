@@ -8,9 +8,10 @@ import io
 import re
 import warnings
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
@@ -36,6 +37,9 @@ _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (code
 _DOT_NUMBER = re.compile(r"[+-]?\d*\.\d*([eE][+-]?\d+)?")
 # A row of a spreadsheet.
 _Cells = Sequence[object]
+_Row = TypeVar("_Row")
+# Rows, their lines, and how many stand before them -> values, and the text of cells that are no number.
+_Numbers = Callable[[list[_Row], NDArray[np.int64], int], tuple[NDArray[np.float64], dict[tuple[int, int], str]]]
 
 
 class Frame(Protocol):
@@ -62,38 +66,74 @@ def read_table(path: str | Path, columns: Mapping[str, str] | None = None) -> Ta
         InputError: the file cannot be read or is empty, a header is repeated, `columns` does not fit it, a title
             stands above it, or a row has another number of cells than the header.
     """
+    return next(read_parts(path, None, columns))
+
+
+def read_parts(path: str | Path, rows: int | None, columns: Mapping[str, str] | None = None) -> Iterator[Table]:
+    """The table of `read_table` in parts of so many rows, so that no more of it is in memory; None = in one part.
+
+    Raises as `read_table`, when the part with the error is reached.
+    """
     file = str(path)
     if Path(file).suffix.lower() in _WORKBOOKS:
-        return _read_workbook(file, columns)
-    text, notes = _read_text(file)
-    text_lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    filled = [number for number, line in enumerate(text_lines) if line.strip(" \t,;")]
+        return _workbook_parts(file, rows, columns)
+    return _csv_parts(file, rows, columns)
+
+
+def _csv_parts(file: str, rows: int | None, columns: Mapping[str, str] | None) -> Iterator[Table]:
+    text = _Text(file)
+    filled = text.filled()
+    # Comments, the header, and twenty lines below it.
+    head: list[tuple[int, str]] = []
+    below = -1
+    while below < 20 and (line := next(filled, None)) is not None:
+        head.append(line)
+        below += below >= 0 or not is_comment(line[1])
     # Excel's own first line, which names the separator.
-    if filled and re.fullmatch(r"sep=[,;\t]", text_lines[filled[0]].strip(" ")):
-        filled = filled[1:]
-    if not filled:
+    if head and re.fullmatch(r"sep=[,;\t]", head[0][1].strip(" ")):
+        head = head[1:]
+    if not head:
         raise InputError(f"{file}: the file is empty; line 1 must be the header, e.g. q1[rad],x[mm]")
-    filled = filled[header_row([text_lines[number] for number in filled]) :]
-    first = bare_header(text_lines[filled[0]])
+    head = head[header_row([line for _, line in head]) :]
+    number, first = head[0][0], bare_header(head[0][1])
     separator = max(SEPARATORS, key=first.count)
-    near = [first, *(text_lines[number] for number in filled[1:20])]
-    refuse_title(file, [row.split(max(SEPARATORS, key=row.count)) for row in near], [n + 1 for n in filled])
-    header = read_header(next(_split([first], separator, file, [filled[0] + 1])), file, columns, filled[0] + 1)
-    rows = [text_lines[number] for number in filled[1:]]
-    if not rows:
+    near = [first, *(line for _, line in head[1:20])]
+    refuse_title(file, [row.split(max(SEPARATORS, key=row.count)) for row in near], [n for n, _ in head])
+    header = read_header(next(_split([first], separator, file, [number])), file, columns, number)
+    comma = separator != "," and _has_decimal_commas(text, number, separator)
+
+    def numbers(
+        lines_of_text: list[str], lines: NDArray[np.int64], start: int
+    ) -> tuple[NDArray[np.float64], dict[tuple[int, int], str]]:
+        plain = [row.replace(",", ".") for row in lines_of_text] if comma else lines_of_text
+        try:
+            values = np.loadtxt(plain, delimiter=separator, comments=None, quotechar='"', ndmin=2)
+            if values.shape == (len(plain), header.width):
+                return values, {}
+        except ValueError:
+            pass
+        return _read_cells(_split(lines_of_text, separator, file, lines), header, file, lines, separator, comma, start)
+
+    yield from _parts(file, header, chain(head[1:], filled), numbers, rows, text.notes)
+
+
+def _parts(
+    file: str,
+    header: Header,
+    numbered: Iterator[tuple[int, _Row]],
+    numbers: _Numbers[_Row],
+    rows: int | None,
+    notes: Sequence[str] = (),
+) -> Iterator[Table]:
+    """Tables of so many rows each, in order; numbered: line of the file and what stands in it, below the header."""
+    start = 0
+    while batch := list(islice(numbered, rows)):
+        lines = np.array([number for number, _ in batch], dtype=np.int64)
+        values, bad = numbers([row for _, row in batch], lines, start)
+        yield _kept(file, header, values, lines, bad, notes, start)
+        start += len(batch)
+    if not start:
         raise InputError(f"{file}: there is a header but no row below it")
-    if separator != "," and _has_decimal_commas(rows, separator):
-        rows = [row.replace(",", ".") for row in rows]
-    lines = np.array(filled[1:], dtype=np.int64) + 1
-    bad: dict[tuple[int, int], str] = {}
-    try:
-        values = np.loadtxt(rows, delimiter=separator, comments=None, quotechar='"', ndmin=2)
-        uniform = values.shape == (len(rows), header.width)
-    except ValueError:
-        uniform = False
-    if not uniform:
-        values, bad = _read_cells(_split(rows, separator, file, lines), header, file, lines, separator)
-    return _kept(file, header, values, lines, bad, notes)
 
 
 def _split(
@@ -122,7 +162,7 @@ def read_frame(frame: Frame, columns: Mapping[str, str] | None = None) -> Table:
     return _kept(file, header, values, lines, bad)
 
 
-def _read_workbook(file: str, columns: Mapping[str, str] | None) -> Table:
+def _workbook_parts(file: str, rows: int | None, columns: Mapping[str, str] | None) -> Iterator[Table]:
     found = _sheet_with_header(file)
     if found is None:
         raise InputError(f"{file}: no sheet begins with a header, a row of texts such as q1[rad] and x[mm]")
@@ -131,11 +171,13 @@ def _read_workbook(file: str, columns: Mapping[str, str] | None) -> Table:
     width = max(k + 1 for _, row in filled for k, cell in enumerate(row) if _filled(cell))
     where = f"{file} (sheet {title})"
     header = read_header([str(cell or "") for cell in _fit(filled[0][1], width)], where, columns)
-    if len(filled) == 1:
-        raise InputError(f"{where}: there is a header but no row below it")
-    lines = np.array([number for number, _ in filled[1:]], dtype=np.int64)
-    values, bad = _read_cells((_fit(row, width) for _, row in filled[1:]), header, where, lines)
-    return _kept(where, header, values, lines, bad)
+
+    def numbers(
+        cells: list[_Cells], lines: NDArray[np.int64], start: int
+    ) -> tuple[NDArray[np.float64], dict[tuple[int, int], str]]:
+        return _read_cells((_fit(row, width) for row in cells), header, where, lines, start=start)
+
+    yield from _parts(where, header, iter(filled[1:]), numbers, rows)
 
 
 def _sheet_with_header(file: str) -> tuple[str, list[tuple[int, _Cells]]] | None:
@@ -189,6 +231,18 @@ def _filled(cell: object) -> bool:
     return cell is not None and str(cell).strip() != ""
 
 
+def mapped(table: Table, columns: Mapping[str, str]) -> Table:
+    """A table that was read without a map of columns, with its names and units as the map has them.
+
+    Raises:
+        InputError: as `read_table`, where the map does not fit.
+    """
+    if not columns:
+        return table
+    header = read_header([table.header(name) for name in table.names], table.path, columns)
+    return _kept(table.path, header, table.values, table.lines, table.bad_cells, table.notes, table.start)
+
+
 def _kept(
     file: str,
     header: Header,
@@ -196,38 +250,57 @@ def _kept(
     lines: NDArray[np.int64],
     bad: Mapping[tuple[int, int], str],
     notes: Sequence[str] = (),
+    start: int = 0,
 ) -> Table:
     """The table of the columns that the header keeps."""
     place = {column: k for k, column in enumerate(header.kept)}
     cells = {(row, place[column]): text for (row, column), text in bad.items() if column in place}
-    return Table(file, header.units, values[:, header.kept], lines, cells, notes=tuple(notes))
+    return Table(file, header.units, values[:, header.kept], lines, cells, notes=tuple(notes), start=start)
 
 
-def _read_text(file: str) -> tuple[str, list[str]]:
-    """The text of a file, and a note where its code page had to be guessed."""
-    data = read_bytes(file, _LARGEST_FILE, "give the path of a CSV file")
-    code = next((name for mark, name in _MARKS if data.startswith(mark)), None)
-    if code is None and b"\0" in data:
-        raise InputError(f"{file}: this is no text file; save it as CSV, or as a workbook with the ending .xlsx")
-    for name in (code,) if code else ("utf-8", "cp1252"):
-        try:
-            text = data.decode(name)
-        except UnicodeDecodeError:
-            continue
-        guessed = f"{Path(file).name} is not UTF-8 and was read as Windows code page 1252; check units such as ° and µm"
-        return text, [guessed] if name == "cp1252" else []
-    raise InputError(f"{file}: the file is neither UTF-8 nor UTF-16 nor Windows-1252 text; save it as 'CSV UTF-8'")
+class _Text:
+    """The lines of a file, of which only the bytes are held; `notes` says where its code page had to be guessed."""
+
+    def __init__(self, file: str) -> None:
+        self._data = read_bytes(file, _LARGEST_FILE, "give the path of a CSV file")
+        self.notes: list[str] = []
+        code = next((name for mark, name in _MARKS if self._data.startswith(mark)), None)
+        if code is None and b"\0" in self._data:
+            raise InputError(f"{file}: this is no text file; save it as CSV, or as a workbook with the ending .xlsx")
+        for self._code in (code,) if code else ("utf-8", "cp1252"):
+            try:
+                self._data.decode(self._code)
+            except UnicodeDecodeError:
+                continue
+            if self._code == "cp1252":
+                read_as = "is not UTF-8 and was read as Windows code page 1252; check units such as ° and µm"
+                self.notes.append(f"{Path(file).name} {read_as}")
+            return
+        raise InputError(f"{file}: the file is neither UTF-8 nor UTF-16 nor Windows-1252 text; save it as 'CSV UTF-8'")
+
+    def filled(self) -> Iterator[tuple[int, str]]:
+        """Number and text of each line that has more than separators."""
+        for number, line in enumerate(io.TextIOWrapper(io.BytesIO(self._data), encoding=self._code), 1):
+            if line.strip(" \t,;\n"):
+                yield number, line.removesuffix("\n")
 
 
-def _has_decimal_commas(rows: Sequence[str], separator: str) -> bool:
-    """Whether commas are decimal separators: there are some, and no cell is a number with a point."""
-    if not any("," in row for row in rows):
+def _has_decimal_commas(text: _Text, header: int, separator: str) -> bool:
+    """Whether commas are decimal separators below a header: there are some, and no cell is a number with a point."""
+    if not any("," in row for number, row in text.filled() if number > header):
         return False
+    rows = (row for number, row in text.filled() if number > header)
     return not any(_DOT_NUMBER.fullmatch(cell.strip(' "')) for row in rows for cell in row.split(separator))
 
 
 def _read_cells(
-    rows: Iterable[_Cells], header: Header, file: str, lines: NDArray[np.int64], separator: str = ""
+    rows: Iterable[_Cells],
+    header: Header,
+    file: str,
+    lines: NDArray[np.int64],
+    separator: str = "",
+    decimal_comma: bool = False,
+    start: int = 0,
 ) -> tuple[NDArray[np.float64], dict[tuple[int, int], str]]:
     """The cells as numbers, and the text of cells that are none."""
     values = np.full((len(lines), header.width), np.nan)
@@ -236,14 +309,19 @@ def _read_cells(
         if len(cells) != header.width:
             comma = "; with a decimal comma, separate the cells by semicolons" if separator == "," else ""
             counts = f"has {len(cells)} cells, but the header names {header.width} columns"
-            raise InputError(f"{file}: {name_lines(lines, [row])} {counts}{comma}")
+            raise InputError(f"{file}: {name_lines(lines, [row], start=start)} {counts}{comma}")
         for column, cell in enumerate(cells):
             if isinstance(cell, bool):
                 bad[row, column] = str(cell).upper()
                 continue
             try:
-                values[row, column] = float(cell.replace("_", "?") if isinstance(cell, str) else cell)  # type: ignore[arg-type]
+                values[row, column] = float(_plain(cell, decimal_comma) if isinstance(cell, str) else cell)  # type: ignore[arg-type]
             except (TypeError, ValueError, OverflowError):
                 text = str(cell).strip()
                 bad[row, column] = "" if text in ("None", "<NA>", "NaT") else text
     return values, bad
+
+
+def _plain(cell: str, decimal_comma: bool) -> str:
+    """A number as Python writes it, without the underscores that only Python knows."""
+    return (cell.replace(",", ".") if decimal_comma else cell).replace("_", "?")

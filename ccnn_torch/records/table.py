@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
-from ccnn_torch.files.csv_text import csv_text
-from ccnn_torch.files.write import write_whole
+from ccnn_torch.files.csv_text import csv_cell
+from ccnn_torch.files.write import writing_whole
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import LARGEST, parse_header, split_header, to_si, write_hint
+
 
 FILE = "file"
 """The column that numbers the files where there are several: 0, 1, …"""
@@ -35,6 +36,7 @@ class Table:
         bad_cells: (row, column) -> text of the cells that are empty or no number.
         parts: where rows are from, in order: file and number of its rows; empty for a single file.
         notes: remarks on how the file was read, one sentence each.
+        start: how many rows of the file stand before these, where this is a part of it.
     """
 
     path: str
@@ -44,6 +46,7 @@ class Table:
     bad_cells: dict[tuple[int, int], str] = field(default_factory=dict)
     parts: tuple[tuple[str, int], ...] = ()
     notes: tuple[str, ...] = ()
+    start: int = 0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -69,11 +72,19 @@ class Table:
 
     def name_rows(self, rows: Sequence[int] | NDArray[np.int64]) -> str:
         """Rows (0-based) by their lines in the file: "line 17 (row 16)", with the file where there are several."""
-        return name_lines(self.lines, rows, parts=self.parts)
+        return name_lines(self.lines, rows, parts=self.parts, start=self.start)
 
     def raw(self, name: str) -> NDArray[np.float64]:
         """The column in its own unit, `rows`, NaN where a cell is empty or no number."""
         return self.values[:, self.names.index(name)]
+
+    def cells(self, name: str) -> NDArray[np.float64] | list[str]:
+        """The column in its own unit as `write_table` takes it, `rows`: numbers, or texts where a cell is a text."""
+        number = self.names.index(name)
+        texts = {row: text for (row, column), text in self.bad_cells.items() if column == number and text}
+        if not texts:
+            return self.raw(name)
+        return [texts.get(row, cell) for row, cell in enumerate(_numbers(self.raw(name)))]
 
     def cell(self, name: str, row: int) -> str:
         """A number of the column as written, with its unit."""
@@ -130,11 +141,13 @@ def name_lines(
     rows: Sequence[int] | NDArray[np.int64],
     most: int = 5,
     parts: Sequence[tuple[str, int]] = (),
+    start: int = 0,
 ) -> str:
     """Text that names rows (given 0-based) by their lines, at most `most` of them: "line 17 (row 16)".
 
     The line is that of the file, whose first line is the header; the row counts the rows below it from 1. With `parts`
     (files and the numbers of their rows) the file is named and the row counts in it: "line 17 (row 16) of day2.csv".
+    `start` rows stand before these.
     """
     more = f" and {len(rows) - most} more" if len(rows) > most else ""
     ends = np.cumsum([count for _, count in parts])
@@ -145,31 +158,61 @@ def name_lines(
         first = 0 if owner == 0 else int(ends[owner - 1])
         plural = "s" if len(there) > 1 else ""
         shown_lines = ", ".join(str(int(lines[row])) for row in there)
-        shown_rows = ", ".join(str(row - first + 1) for row in there)
+        shown_rows = ", ".join(str(start + row - first + 1) for row in there)
         file = f" of {parts[owner][0]}" if parts else ""
         named.append(f"line{plural} {shown_lines} (row{plural} {shown_rows}){file}")
     return " and ".join(named) + more
 
 
-def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
+def write_table(path: str | Path, columns: Mapping[str, ArrayLike | list[str]]) -> None:
     """Write a CSV file with 17 significant digits, so that `read_table` gives back the same floats bit by bit.
 
     Args:
         path: the file; an existing one is replaced.
-        columns: header ``name[unit]``, or a bare name -> values `rows`; NaN is written as an empty cell.
+        columns: header ``name[unit]``, or a bare name -> values `rows`; NaN is written as an empty cell. A list of
+            texts is written so that a spreadsheet takes none of them for a formula.
 
     Raises:
         InputError: columns have one name or differ in length, or the file cannot be written.
     """
-    names = [split_header(header)[0] for header in columns]
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise InputError(f"{path}: column '{twice[0]}' would occur twice in the header")
-    arrays = [np.asarray(values, dtype=np.float64) for values in columns.values()]
-    if len({array.shape for array in arrays}) != 1 or arrays[0].ndim != 1:
-        raise InputError(f"{path}: the columns to write must be one-dimensional and of one length")
-    buffer = io.StringIO()
-    np.savetxt(buffer, np.stack(arrays, axis=1), fmt="%.17g", delimiter=",")
+    with writing_table(path) as write:
+        write(columns)
+
+
+@contextmanager
+def writing_table(path: str | Path) -> Iterator[Callable[[Mapping[str, ArrayLike | list[str]]], None]]:
+    """As `write_table`, part by part: gives what writes the next rows. The file is there at the end, or not at all."""
     if not Path(path).absolute().parent.is_dir():
         raise InputError(f"{path}: cannot be written (its folder is not there); make it, or correct the name")
-    write_whole(path, csv_text([columns]) + buffer.getvalue().replace("nan", ""))
+    with writing_whole(path) as stream:
+
+        def write(columns: Mapping[str, ArrayLike | list[str]]) -> None:
+            names = [split_header(header)[0] for header in columns]
+            twice = [name for name in names if names.count(name) > 1]
+            if twice:
+                raise InputError(f"{path}: column '{twice[0]}' would occur twice in the header")
+            texts = [_texts(values) for values in columns.values()]
+            if len(set(map(len, texts))) != 1:
+                raise InputError(f"{path}: the columns to write must be of one length")
+            lines = [",".join(map(_quoted, columns)), *map(",".join, zip(*texts, strict=True))]
+            stream.write("".join(f"{line}\n" for line in lines[1 if stream.tell() else 0 :]).encode())
+
+        yield write
+
+
+def _texts(values: ArrayLike | list[str]) -> list[str]:
+    if isinstance(values, list) and any(isinstance(cell, str) for cell in values):
+        return [_quoted(csv_cell(str(cell))) for cell in values]
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 1:
+        raise InputError("the columns to write must be one-dimensional")
+    return _numbers(array)
+
+
+def _numbers(values: NDArray[np.float64]) -> list[str]:
+    """Numbers with 17 significant digits; empty where there is none."""
+    return ["" if value != value else f"{value:.17g}" for value in values.tolist()]
+
+
+def _quoted(cell: str) -> str:
+    return '"' + cell.replace('"', '""') + '"' if any(mark in cell for mark in ',"\r\n') else cell

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
+from ccnn_torch.mechanisms.frames.judge import coupled_count
 from ccnn_torch.mechanisms.registry import REGISTRY
+from ccnn_torch.records.load import load_records
 from ccnn_torch.records.sources import read_source
 from ccnn_torch.records.table import Table
 from ccnn_torch.starter.recognise import (
@@ -64,6 +66,7 @@ def starter_config(
         f"records: {json.dumps(_relative(records, out), ensure_ascii=False)}",
         *_mechanism_lines(name, why, out),
         *_column_lines(columns, found, table),
+        *_count_lines(columns, found, table, machine, records),
         f"split: {split}   # {reason}",
         *_other_lines(found, table),
     ]
@@ -156,6 +159,27 @@ def _column_lines(columns: dict[str, str], found: Recognised, table: Table) -> l
     entries = [f"  {_quoted(header)}: {json.dumps(target, ensure_ascii=False)}" for header, target in needed.items()]
     entries += [f'  {_quoted(n)}: ignore   # no unit: write "{n}[unit]" to have it as an input' for n in bare]
     return [*lines, "columns:", *entries]
+
+
+def _count_lines(
+    columns: dict[str, str], found: Recognised, table: Table, machine: Mechanism | None, records: Path
+) -> list[str]:
+    """The map of joints of a Fanuc, whose third joint may be counted from the horizontal: by what fits the rows."""
+    if not isinstance(machine, SerialArm) or "fanuc_w" not in found.pose:
+        return []
+    try:
+        rows = load_records(
+            records, machine, [], learns=False, columns={table.header(name): target for name, target in columns.items()}
+        )
+        counted = coupled_count(machine, rows.joints, rows.pose)
+    except InputError:
+        # What is wrong with the rows is told by the command that reads them.
+        return []
+    if counted is None:
+        return []
+    shown = {ours: name if name.isidentifier() else f"'{name}'" for name, ours in found.meaning.items()}
+    text = " ".join(shown.get(word, word) for word in counted.split())
+    return [f"joint_map: {{q3: {_quoted(text)}}}   # J3 counts from the horizontal: so the rows fit far better"]
 
 
 def _other_lines(found: Recognised, table: Table) -> list[str]:

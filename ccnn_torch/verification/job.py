@@ -36,6 +36,9 @@ def verify_model(
     compensated: bool = False,
     refit_frames: bool = False,
     allow_code: bool = False,
+    columns: Mapping[str, str] | None = None,
+    joint_map: Mapping[str, str] | None = None,
+    mechanism_keys: Mapping[str, Any] | None = None,
 ) -> Verified:
     """Judge a model on new rows.
 
@@ -50,13 +53,19 @@ def verify_model(
         refit_frames: a rigid motion of the measuring frame is fitted before rows are judged, to "before" and "after"
             each its own: the tracker was moved since the model was made.
         allow_code: run the Python file that the model names for a user's own mechanism.
+        columns: header in the records -> ``name[unit]`` or ``ignore``; those of the model's run when None or empty.
+        joint_map: joint -> sum of columns; that of the model's run, where the records count so, when None or empty.
+        mechanism_keys: keys of the mechanism's constructor.
 
     Raises:
         InputError: the rows lack a column, are not of this machine, or frames cannot be fitted to them.
     """
-    machine = nominal_mechanism(model, mechanism, allow_code)
+    machine = nominal_mechanism(model, mechanism, allow_code, mechanism_keys)
     names = [c.name for c in model.covariates]
-    loaded = load_records(records, machine, names, learns=False, columns=mapped_columns(model, records))
+    there, counted = mapped_columns(model, records, machine)
+    loaded = load_records(
+        records, machine, names, learns=False, columns=columns or there, joint_map=joint_map or counted
+    )
     if isinstance(machine, SerialArm) and loaded.orientation == "none":
         machine = machine.with_orientation("none")
     if not refit_frames:

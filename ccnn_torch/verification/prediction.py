@@ -18,6 +18,8 @@ from ccnn_torch.plugins import code_refused
 from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.records import Records
 from ccnn_torch.records.headers import columns_there
+from ccnn_torch.records.joint_map import read_joint_map
+from ccnn_torch.records.read_table import mapped
 from ccnn_torch.records.sources import read_source
 from ccnn_torch.verification.moved_frame import Motion
 
@@ -38,7 +40,9 @@ class Rows:
     predicted: Tensor
 
 
-def nominal_mechanism(model: LoadedModel | IdentifiedGeometry, spec: str | None, allow_code: bool) -> Mechanism:
+def nominal_mechanism(
+    model: LoadedModel | IdentifiedGeometry, spec: str | None, allow_code: bool, keys: Mapping[str, Any] | None = None
+) -> Mechanism:
     """The nominal machine that the model was made for, its frames as they were fitted then."""
     about = model.facts["mechanism"]
     if spec is None:
@@ -46,7 +50,7 @@ def nominal_mechanism(model: LoadedModel | IdentifiedGeometry, spec: str | None,
             return model.nominal
         with code_refused(f"{model.path}: its mechanism", allow_code):
             return mechanism_from_description(about, allow_code=True)
-    given = load_mechanism(spec)
+    given = load_mechanism(spec, **(keys or {}))
     if isinstance(given, SerialArm) and len(about["pose"]) == 3:
         given = given.with_orientation("none")
     for key in ("name", "joints", "pose"):
@@ -59,11 +63,17 @@ def nominal_mechanism(model: LoadedModel | IdentifiedGeometry, spec: str | None,
     return given
 
 
-def mapped_columns(model: LoadedModel | IdentifiedGeometry, records: Any) -> dict[str, str]:
-    """The map of columns that the model's run had, as far as the new rows have these headers."""
-    if not model.columns or isinstance(records, Records):
-        return {}
-    return columns_there(read_source(records).units, model.columns)
+def mapped_columns(
+    model: LoadedModel | IdentifiedGeometry, records: Any, machine: Mechanism
+) -> tuple[dict[str, str], dict[str, str]]:
+    """The maps of columns and of joints that the model's run had, as far as the new rows have these headers."""
+    if isinstance(records, Records) or not (model.columns or model.joint_map):
+        return {}, {}
+    table = read_source(records)
+    columns = columns_there(table.units, model.columns)
+    counted = read_joint_map(model.joint_map, machine.joints, model.columns)
+    shown = counted is not None and counted.is_in(table.names, mapped(table, columns))
+    return columns, model.joint_map if shown else {}
 
 
 def predict(model: LoadedModel | IdentifiedGeometry, machine: Mechanism, records: Records, compensated: bool) -> Rows:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from ccnn_torch.compensation.geometry.serial import SerialGeometry, _chain, _placed
 from stand_ins import Sigmoids
 from torch import Tensor
 
@@ -23,7 +24,6 @@ from ccnn_torch.compensation import (
 from ccnn_torch.compensation.export.to_onnx import to_onnx
 from ccnn_torch.compensation.geometry import identified as _geometry
 from ccnn_torch.compensation.geometry.expanded import ExpandedGeometry, expand_geometry
-from ccnn_torch.compensation.geometry.serial import SerialGeometry, _chain, _placed
 from ccnn_torch.compensation.model_files.onnx_session import check_graph, open_onnx
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from ccnn_torch.compensation.geometry.serial import SerialGeometry
 from kinds import masked
 from stand_ins import fields, tripod_compensator
 from test_geometry import arm_compensator, small_network
@@ -17,7 +18,6 @@ from torch import Tensor
 
 from ccnn_torch import export_model
 from ccnn_torch.compensation import Compensator, fit_compensator, load_model, save_model
-from ccnn_torch.compensation.geometry.serial import SerialGeometry
 from ccnn_torch.compensation.model_files.onnx_session import open_onnx
 from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.coordinates import Coordinate

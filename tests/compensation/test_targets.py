@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ccnn_torch.compensation.targets.from_geometry import compensator_of_geometry
 from kinds import KINDS, little, masked, six_joints
 from structured_text import Instance, parse_blocks
 from torch import Tensor
@@ -28,7 +29,6 @@ from ccnn_torch.compensation.model_files.onnx_session import open_onnx
 from ccnn_torch.compensation.targets import from_graph
 from ccnn_torch.compensation.targets.c99 import print_c99
 from ccnn_torch.compensation.targets.form import Form
-from ccnn_torch.compensation.targets.from_geometry import compensator_of_geometry
 from ccnn_torch.compensation.targets.from_model import form_of, traced_program
 from ccnn_torch.compensation.targets.golden import Golden, golden_vectors, require_equal
 from ccnn_torch.compensation.targets.run import run_form, run_program

@@ -221,7 +221,7 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     effects = config.effects
     verdict = verdict_of(effects, mechanism) if isinstance(effects, str) and effects.startswith("from:") else None
     source = with_test_file(config.records if given is None else given, config.split)
-    records = load_records(source, mechanism, config.covariates, columns=config.columns)
+    records = load_records(source, mechanism, config.covariates, columns=config.columns, joint_map=config.joint_map)
     doubts = check_memory(config, len(records), len(mechanism.joints))
     check_rows(records, mechanism)
     if isinstance(mechanism, SerialArm) and records.orientation == "none":

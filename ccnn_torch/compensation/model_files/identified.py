@@ -38,10 +38,16 @@ class IdentifiedGeometry:
         joints, covariates, pose: coordinates in order; geometry has no covariates.
         facts: `mechanism`: the nominal one's description.
         columns: the map of columns that its records had: header in a file -> ``name[unit]`` or ``ignore``.
+        joint_map: joint -> sum of columns, where its controller counts otherwise.
     """
 
     def __init__(
-        self, path: Path, nominal: Mechanism, identified: Mechanism, columns: dict[str, str] | None = None
+        self,
+        path: Path,
+        nominal: Mechanism,
+        identified: Mechanism,
+        columns: dict[str, str] | None = None,
+        joint_map: dict[str, str] | None = None,
     ) -> None:
         """Take both geometries of one mechanism.
 
@@ -52,6 +58,7 @@ class IdentifiedGeometry:
         self.joints: tuple[Coordinate, ...] = nominal.joints
         self.pose: tuple[Coordinate, ...] = nominal.pose
         self.columns = columns or {}
+        self.joint_map = joint_map or {}
         self.covariates: tuple[Coordinate, ...] = ()
         self.facts: dict[str, Any] = {"mechanism": nominal.describe()}
 
@@ -107,7 +114,7 @@ def load_geometry(
         check_signature(source, content, b"", public_key)
     file = _parsed(path, source, content)
     nominal, identified = (mechanism_of_file(file, what, allow_code) for what in ("nominal", "value"))
-    return IdentifiedGeometry(path, nominal, identified, file.columns)
+    return IdentifiedGeometry(path, nominal, identified, file.columns, file.joint_map)
 
 
 def load_compensation(

@@ -19,7 +19,7 @@ from ccnn_torch.compensation.model_files.metadata import coordinates
 from ccnn_torch.compensation.model_files.onnx_session import RUN_ERRORS, TAKE_AGAIN, Array, said
 from ccnn_torch.compensation.model_files.signature import check_signature
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.errors import FallbackWarning, InputError, ModelFileError
+from ccnn_torch.errors import FallbackWarning, InputError, ModelFileError, out_of_memory
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.plugins import code_refused
 
@@ -63,6 +63,7 @@ class LoadedModel:
 
         Raises:
             InputError: covariates are missing, or a last dimension is wrong.
+            MemoryError: the rows do not fit into memory; give fewer at once.
         """
         given = as_matrix(joints, self.joints, "joints")
         lead = given.shape[:-1]
@@ -78,7 +79,9 @@ class LoadedModel:
         rows = given.reshape(-1, given.shape[-1])
         try:
             found = self._run(rows, flat)
-        except RUN_ERRORS:
+        except RUN_ERRORS as reason:
+            if out_of_memory(reason):
+                raise MemoryError from None
             # A graph may take one row and no two.
             found = {}
         checked = kept(found, rows, flat, self._promise)
@@ -97,6 +100,11 @@ class LoadedModel:
     def columns(self) -> dict[str, str]:
         """The map of columns that its run had: header in a file -> ``name[unit]`` or ``ignore``."""
         return dict(self.card.get("columns") or {})
+
+    @property
+    def joint_map(self) -> dict[str, str]:
+        """Joint -> sum of columns, where the controller of its run counts otherwise."""
+        return dict(self.card.get("joint_map") or {})
 
     @property
     def middle(self) -> Array:

@@ -55,6 +55,9 @@ class _Order:
         compensator = self.compensator()
         form = form_of(compensator, self.dtype, self.sd)
         form.facts = [f"Compensation of the joints of {self.source()}.", *([self.told] if self.told else [])]
+        if self.model.joint_map:
+            counted = ", ".join(f"{joint} = {text}" for joint, text in self.model.joint_map.items())
+            form.facts.append(f"Joints are the mechanism's; of what the controller shows they are {counted}.")
         golden = golden_vectors(compensator, form)
         require_equal(form, golden)
         return form, golden

@@ -35,7 +35,11 @@ def compensate_lines(config: DiagnoseConfig, diagnosis: Diagnosis, path: Path) -
     recorded = {n: v for n, v in situation.covariates.items() if n not in diagnosis.inferred}
     situation = replace(situation, covariates=recorded)
     keys = {"records": _records(config), "mechanism": typed_path(str(config.mechanism))}
-    for key, value in (("columns", config.columns), ("mechanism_keys", config.mechanism_keys)):
+    for key, value in (
+        ("columns", config.columns),
+        ("joint_map", config.joint_map),
+        ("mechanism_keys", config.mechanism_keys),
+    ):
         if value:
             keys[key] = json.dumps(value, ensure_ascii=False)
     covariates = config.covariates

@@ -16,6 +16,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import ConstraintConfig, IdentifyConfig
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.records import Records, Table, stack_columns
+from ccnn_torch.records.joint_map import read_joint_map, with_joints
 from ccnn_torch.records.pose_columns import check_joints
 from ccnn_torch.records.sources import read_source
 
@@ -61,7 +62,8 @@ def read_constraint(config: IdentifyConfig, mechanism: Mechanism, given: Given |
     source = with_test_file(config.records if given is None else given, config.split)
     if isinstance(source, Records):
         raise InputError("records: a constraint has columns of its own; give the path of its file, or a DataFrame")
-    table = read_source(source, config.columns)
+    counted = read_joint_map(config.joint_map, mechanism.joints, config.columns)
+    table = with_joints(read_source(source, config.columns), counted)
     check_joints(table, mechanism.joints)
     there = _taking_part(table, about.where)
     joints = torch.from_numpy(stack_columns(table, mechanism.joints, _ANGLE_LIMIT))[there]

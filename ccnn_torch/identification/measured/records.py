@@ -42,7 +42,7 @@ def from_records(config: IdentifyConfig, mechanism: Mechanism, given: Given | No
 
 def read_records(config: IdentifyConfig, source: Given, mechanism: Mechanism) -> tuple[Records, Mechanism]:
     """Records that fit a mechanism, and the mechanism as it was measured there (with or without orientation)."""
-    records = load_records(source, mechanism, [], learns=False, columns=config.columns)
+    records = load_records(source, mechanism, [], learns=False, columns=config.columns, joint_map=config.joint_map)
     if isinstance(mechanism, SerialArm):
         if mechanism.frame_per or mechanism.tool_per:
             raise InputError(

@@ -6,6 +6,7 @@ parameters:
   A1x: {value: -0.5057, nominal: -0.5, unit: m}
   …
 columns: {A1: "q1[deg]"}   # where the records had other headers
+joint_map: {q3: "J3 - J2"}   # where the controller counts its joints otherwise
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _FORM = "a mechanism file has mechanism, keys and parameters: {NAME: {value: …
 
 
 class MechanismFile:
-    """A mechanism file: `spec` and `keys` build the mechanism, `columns` are the headers that its records mapped."""
+    """A mechanism file: `spec` and `keys` build the mechanism; `columns`, `joint_map` are as its records had them."""
 
     def __init__(self, path: str, content: Mapping[str, Any]) -> None:
         """Check the form; names and units are checked against the mechanism by `parameters_of`."""
@@ -32,10 +33,12 @@ class MechanismFile:
         spec, keys, parameters = (content.get(k) for k in ("mechanism", "keys", "parameters"))
         if not isinstance(spec, str) or not isinstance(keys, Mapping) or not isinstance(parameters, Mapping):
             raise InputError(f"{path}: {_FORM}")
-        columns = content.get("columns") or {}
-        if not isinstance(columns, Mapping) or not all(isinstance(v, str) for pair in columns.items() for v in pair):
-            raise InputError(f"{path}: columns: must map headers to name[unit], e.g. {{A1: 'q1[deg]'}}")
-        self.spec, self.keys, self.columns = spec, dict(keys), dict(columns)
+        maps = [content.get(key) or {} for key in ("columns", "joint_map")]
+        for key, found, example in zip(("columns", "joint_map"), maps, ("A1: 'q1[deg]'", "q3: 'J3 - J2'"), strict=True):
+            if not isinstance(found, Mapping) or not all(isinstance(v, str) for pair in found.items() for v in pair):
+                raise InputError(f"{path}: {key}: must map texts to texts, e.g. {{{example}}}")
+        self.columns, self.joint_map = (dict(found) for found in maps)
+        self.spec, self.keys = spec, dict(keys)
         self._entries: Mapping[str, Any] = parameters
 
     def parameters_of(self, mechanism: Mechanism, what: str) -> dict[str, float]:
@@ -72,12 +75,18 @@ def read_mechanism_file(path: str, content: bytes | None = None) -> MechanismFil
     return MechanismFile(path, tree)
 
 
-def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float], columns: Mapping[str, str] | None = None) -> str:
+def mechanism_text(
+    mechanism: Mechanism,
+    nominal: Mapping[str, float],
+    columns: Mapping[str, str] | None = None,
+    joint_map: Mapping[str, str] | None = None,
+) -> str:
     """A mechanism file's text; `load_mechanism` of it gives the same mechanism with the same parameters, bit by bit.
 
     Args:
         nominal: what was there before, by name [SI].
         columns: the headers that its records mapped.
+        joint_map: the joints as sums of its records' columns.
     """
     about = mechanism.describe()
     tree = {
@@ -88,5 +97,6 @@ def mechanism_text(mechanism: Mechanism, nominal: Mapping[str, float], columns: 
             for p in mechanism.geometry
         },
         **({"columns": dict(columns)} if columns else {}),
+        **({"joint_map": dict(joint_map)} if joint_map else {}),
     }
     return dump_yaml(tree, width=120)

@@ -18,6 +18,7 @@ def write_machine(
     folder: Path,
     stem: str,
     columns: Mapping[str, str] | None = None,
+    joint_map: Mapping[str, str] | None = None,
 ) -> list[Path]:
     """Write `STEM.yaml`, of a serial arm also `STEM.urdf` and, where it is one of DH parameters, `STEM_dh.yaml`.
 
@@ -27,8 +28,9 @@ def write_machine(
         folder: where to.
         stem: of the files' names.
         columns: the headers that its records mapped.
+        joint_map: the joints as sums of its records' columns.
     """
-    texts = {f"{stem}.yaml": mechanism_text(mechanism, nominal, columns)}
+    texts = {f"{stem}.yaml": mechanism_text(mechanism, nominal, columns, joint_map)}
     if isinstance(mechanism, SerialArm):
         texts[f"{stem}.urdf"] = urdf_text(mechanism)
         if mechanism.convention != "urdf":

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
+from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, fit_frames
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.numerics.outliers import inlying
 
@@ -17,6 +17,8 @@ from ccnn_torch.numerics.outliers import inlying
 _SHARE, _ANGLE = 0.015, 0.03
 # The same as a share of how far the tool moves: a fit that leaves more explains nothing.
 _OF_MOTION = 0.2
+# A count of the joints that leaves less than this share of what another leaves is the right one of the two.
+_FAR_BETTER = 0.2
 # More rows than this share are not outliers: another model describes them.
 _OUTLIERS = 0.25
 
@@ -74,6 +76,13 @@ def judge_frames(
             f"{share:.0%} of the measured poses by far more than the others, up to {1e3 * float(length.max()):.3g} mm"
         )
     if wrong:
+        counted = coupled_count(arm, joints, pose)
+        if counted is not None:
+            raise InputError(
+                f"{where}: with base and tool frame fitted, {arm.name} misses {wrong}, and fits with the third joint "
+                f"counted as {counted}, as on controllers that count it from the horizontal; write "
+                f'joint_map: {{q3: "{counted}"}}'
+            )
         raise InputError(
             f"{where}: with base and tool frame fitted, {arm.name} still misses {wrong}, so this model does not "
             "describe these rows; check the units, the order, signs and zeros of the joints, the convention (standard "
@@ -88,6 +97,33 @@ def judge_frames(
         f"{len(rows)} {'row is a gross outlier' if len(rows) == 1 else 'rows are gross outliers'}, up to "
         f"{1e3 * size:.3g} mm off, and frames and links are fitted without{named}."
     ]
+
+
+def coupled_count(arm: SerialArm, joints: Tensor, pose: Tensor) -> str | None:
+    """The third joint as a sum of what the controller shows, where frames fit far better with it than without.
+
+    Controllers such as Fanuc's count the third joint from the horizontal: what they show is q3 + q2 or q3 - q2.
+
+    Args:
+        arm: whose unknown frames are fitted, if it has any.
+        joints: as the controller shows them, `s x n` [SI].
+        pose: measured, `s x p` [SI].
+
+    Returns:
+        `q3 - q2` or `q3 + q2`; None where neither fits, or frames are by group.
+    """
+    if len(arm.joints) < 3 or arm.frame_per or arm.tool_per:
+        return None
+    left = {}
+    for text, sign in (("q3", 0.0), ("q3 - q2", -1.0), ("q3 + q2", 1.0)):
+        trial = joints.clone()
+        trial[:, 2] += sign * joints[:, 1]
+        values = fit_frames(arm, trial, pose)
+        error = arm.pose_error(arm.forward_kinematics(trial, values), pose)
+        turned = torch.zeros_like(error.position) if error.rotation is None else error.rotation
+        left[text] = float(torch.hypot(error.position, ROTATION_WEIGHT * turned).median())
+    best = min(left, key=lambda text: left[text])
+    return best if best != "q3" and left[best] < _FAR_BETTER * left["q3"] and left[best] < _SHARE * arm.reach else None
 
 
 def _median(size: Tensor, used: Tensor) -> float:

@@ -1,0 +1,215 @@
+"""`ccnn compensate`: a table of joints, poses or commands with what a model makes of it, part by part."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry, load_compensation
+from ccnn_torch.compensation.model_files.load import LoadedModel
+from ccnn_torch.compensation.wanted_poses import WantedPoses
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.errors import FallbackWarning, InputError
+from ccnn_torch.records.headers import columns_there
+from ccnn_torch.records.joint_map import JointMap, read_joint_map
+from ccnn_torch.records.load import JOINT_LIMIT
+from ccnn_torch.records.pose_columns import stack_columns
+from ccnn_torch.records.read_table import mapped, read_parts
+from ccnn_torch.records.table import Table, writing_table
+from ccnn_torch.units import from_si
+
+Array: TypeAlias = NDArray[Any]
+Model: TypeAlias = LoadedModel | IdentifiedGeometry
+
+ROWS = 1024
+"""Rows that a model takes at once: its calls count for nothing then, and it takes a hundred MB."""
+
+DAMPED = 3
+"""Status of a row whose command was damped beside a singularity."""
+
+
+@dataclass
+class Compensated:
+    """What became of the rows.
+
+    Attributes:
+        rows: how many were written.
+        outside: how many are outside the domain.
+        damped: how many have a damped command.
+        fallback: how many violate the limits of the model's card; `first` names the first.
+    """
+
+    rows: int = 0
+    outside: int = 0
+    damped: int = 0
+    fallback: int = 0
+    first: str = ""
+
+
+def compensate_table(
+    model: Path,
+    input: Path,
+    output: Path,
+    pose: bool = False,
+    back: bool = False,
+    sd: bool = False,
+    public_key: Path | None = None,
+    allow_code: bool = False,
+    tool: Sequence[float] | None = None,
+    base: Sequence[float] | None = None,
+) -> tuple[list[str], str]:
+    """Write the input's columns with commands, deviations and flags; see `ccnn compensate --help` for the columns.
+
+    Args:
+        model: a model file or identified.yaml.
+        input, output: CSV files (`input` also .xlsx).
+        pose, back, sd: as the options of `ccnn compensate`.
+        public_key, allow_code: as of `load_model`.
+        tool, base: as of `WantedPoses`.
+
+    Returns:
+        Sentences on what was written; and one on rows in which the model violates the limits in its card, else empty.
+
+    Raises:
+        InputError: a file cannot be read or is not in this form; nothing is written then.
+    """
+    loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
+    poses = WantedPoses(loaded, allow_code, tool, base) if pose else None
+    found = write_compensated(loaded, input, output, poses, back, sd)
+    said = sentences(output, found, trained=isinstance(loaded, LoadedModel))
+    if poses is not None and poses.chooses:
+        said.append(poses.sentence)
+    refused = (
+        f"{output}: in {found.fallback} of {found.rows} rows, the first from {found.first} of {input}, {model} "
+        "violates the limits in its card (finite numbers, |deviation| within the limit); they were written without any "
+        "correction and with inside_domain = 0: do not use this model"
+    )
+    return said, refused if found.fallback else ""
+
+
+def write_compensated(
+    loaded: Model,
+    input: Path,
+    output: Path,
+    poses: WantedPoses | None = None,
+    back: bool = False,
+    sd: bool = False,
+    rows: int = ROWS,
+) -> Compensated:
+    """The table of `compensate_table`, read, computed and written in parts of so many rows."""
+    result = Compensated()
+    counted = read_joint_map(loaded.joint_map, loaded.joints, loaded.columns)
+    with writing_table(output) as write:
+        for original in read_parts(input, rows):
+            # Headers that the model's run mapped are mapped alike; OUT repeats them as they are.
+            table = mapped(original, columns_there(original.units, loaded.columns))
+            # A file of poses or commands alone is of the controller as well; one with the mechanism's joints is not.
+            own = poses is None and all(c.name in original for c in loaded.joints)
+            shown = counted if counted is not None and (counted.is_in(original.names, table) or not own) else None
+            joints, units = poses.joints(table, shown) if poses is not None else _joints(loaded, table, back, shown)
+            covariates = stack_columns(table, loaded.covariates) if loaded.covariates else None
+            with warnings.catch_warnings():
+                # Reported at the end, with the line of the table.
+                warnings.simplefilter("ignore", FallbackWarning)
+                found = loaded(joints, covariates)
+            if sd and "deviation_sd" not in found:
+                raise InputError(
+                    f"--sd: {loaded.path} is identified geometry, which has no standard deviation of a command"
+                )
+            added = _added(loaded, found, units, back, sd, shown)
+            names = {header.partition("[")[0] for header in added}
+            write({original.header(n): original.cells(n) for n in original.names if n not in names} | added)
+            _count(result, table, found, back)
+    return result
+
+
+def _joints(loaded: Model, table: Table, back: bool, shown: JointMap | None) -> tuple[Array, dict[str, str]]:
+    """Joints `rows x n` [SI], and the unit of each as written."""
+    own = [c.name for c in loaded.joints] if shown is None else shown.columns
+    names = {c.name: column for c, column in zip(loaded.joints, own, strict=True)}
+    if back and all(f"command_{name}" in table for name in names):
+        names = {name: f"command_{name}" for name in names}
+    _refuse_other_machine(loaded, table)
+    columns = tuple(Coordinate(names[c.name], c.unit) for c in loaded.joints)
+    values = stack_columns(table, columns, JOINT_LIMIT)
+    units = {c.name: table.units[names[c.name]] for c in loaded.joints}
+    return values if shown is None else shown.of_shown(values), units
+
+
+def _refuse_other_machine(loaded: Model, table: Table) -> None:
+    """Raise `InputError` for a file with more joints than the model; a missing one is reported when it is read."""
+    known = {c.name for c in loaded.joints}
+    other = [name for name in table.names if name[:1] == "q" and name[1:].isdigit() and name not in known]
+    if other:
+        mechanism = loaded.facts["mechanism"]["name"]
+        raise InputError(
+            f"{table.path}: column '{other[0]}' is no joint of this model, which was made for {mechanism} "
+            f"({', '.join(c.header for c in loaded.joints)}); take the model of the other machine, or rename the column"
+        )
+
+
+def _added(
+    loaded: Model, found: dict[str, Array], units: dict[str, str], back: bool, sd: bool, shown: JointMap | None
+) -> dict[str, ArrayLike]:
+    """The columns that OUT gets, in the units and in the count that the joints were written in."""
+
+    def named(what: str, values: Array) -> dict[str, ArrayLike]:
+        return {
+            f"{what}_{c.name}[{units[c.name]}]": from_si(values[:, k], c.unit, units[c.name])
+            for k, c in enumerate(loaded.joints)
+        }
+
+    if shown is not None:
+        found = found | {name: shown.shown(found[name]) for name in ("command", "ideal")}
+        found["deviation"] = shown.change_shown(found["deviation"])
+        if sd:
+            found["deviation_sd"] = shown.spread_shown(found["deviation_sd"])
+    if back:
+        return named("ideal", found["ideal"]) | {"inside_domain[1]": found["ideal_inside_domain"]}
+    added = named("command", found["command"]) | named("deviation", found["deviation"])
+    added["inside_domain[1]"] = found["inside_domain"]
+    if "status" in found:
+        added["status[1]"] = found["status"]
+    return added | (named("deviation_sd", found["deviation_sd"]) if sd else {})
+
+
+def _count(result: Compensated, table: Table, found: dict[str, Array], back: bool) -> None:
+    bad = np.flatnonzero(found["fallback"])
+    if len(bad) and not result.fallback:
+        result.first = table.name_rows(bad[:1])
+    result.rows += len(table)
+    result.fallback += len(bad)
+    result.outside += int((~found["ideal_inside_domain" if back else "inside_domain"]).sum())
+    if "status" in found and not back:
+        result.damped += int((found["status"] == DAMPED).sum())
+
+
+def sentences(output: Path, found: Compensated, trained: bool) -> list[str]:
+    """What was written, and how many rows are outside the domain or damped."""
+    said = [f"{output}: {found.rows} rows written."]
+    if found.outside:
+        what = (
+            "outside the domain that the model was trained on" if trained else "out of the identified machine's reach"
+        )
+        then = (
+            "their correction fades into the safe one, the mean training deviation"
+            if trained
+            else "their joints are as they were"
+        )
+        said.append(f"{found.outside} of them {_is(found.outside)} {what} (inside_domain = 0): {then}.")
+    if found.damped:
+        said.append(
+            f"{found.damped} of them {_is(found.damped)} beside a singularity (status = {DAMPED}): their commands are "
+            "damped, the nearest safe ones to the pose."
+        )
+    return said
+
+
+def _is(count: int) -> str:
+    return "is" if count == 1 else "are"

@@ -1,0 +1,89 @@
+"""One config and the same options for every command that reads records."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ccnn_torch.diagnosis.config import load_diagnose_config
+from ccnn_torch.identification.config import load_identify_config
+from ccnn_torch.planning.config import load_plan_config
+from ccnn_torch.records import read_table
+from ccnn_torch.verification.config import load_verify_config
+
+Cli = Callable[..., tuple[int, str, str]]
+PLANNED = ("candidates=300", "--quiet", "--poses", 8, "--out")
+
+
+@pytest.fixture
+def config(tmp_path: Path, cli: Cli) -> Path:
+    """What `ccnn new` writes for rows of a five-bar under other headers."""
+    assert cli("simulate", "--mechanism", "five_bar", "--effect", "geometry", "--rows", 60, "--noise", "1e-5",
+               "--out", tmp_path / "rows.csv", "--quiet")[0] == 0  # fmt: skip
+    rows = tmp_path / "rows.csv"
+    names, _, below = rows.read_text().partition("\n")
+    rows.write_text(names.replace("q1[rad]", "J1").replace("q2[rad]", "J2").replace("x[", "X[") + "\n" + below)
+    out = tmp_path / "robot.yaml"
+    new = cli("new", rows, "--mechanism", "five_bar", "--units", "m,rad", "--out", out)
+    assert new[0] == 0, new
+    return out
+
+
+def test_the_config_of_new_goes_into_every_command(config: Path, tmp_path: Path, cli: Cli) -> None:
+    for words in (
+        ("check", config),
+        ("check", "--config", config, "--quiet"),
+        ("diagnose", config, "--out", tmp_path / "d", "--no-network", "effects=[geometry]"),
+        ("identify", config, "--out", tmp_path / "i", "save_report=false"),
+        ("identify", "--config", config, f"--out={tmp_path / 'j'}", "--quiet", "save_report=false"),
+        ("run", "--config", config, "--out", tmp_path / "r", "methods=[constant]", "save_report=false", "--quiet"),
+        ("plan", config, *PLANNED, tmp_path / "p.csv"),
+        ("plan", "--config", config, "--records", tmp_path / "rows.csv", *PLANNED, tmp_path / "p.csv"),
+        ("verify", tmp_path / "i" / "identified.yaml", "--config", config, "--out", tmp_path / "v"),
+    ):
+        code, out, err = cli(*words)
+        assert code in ((0, 1) if words[0] == "verify" else (0,)), (words, out, err)
+        unused = {"check": "split", "diagnose": "split", "identify": "split.validation", "verify": "split"}
+        said = f"robot.yaml: {unused.get(words[0], '')} is a key of ccnn run and is not used here."
+        assert (said in out) is (words[0] in unused and "--quiet" not in words), (words, out)
+
+
+def test_options_stand_for_keys(config: Path, tmp_path: Path, cli: Cli) -> None:
+    rows = tmp_path / "rows.csv"
+    table = read_table(rows)
+    assert "J1" in table
+    code, _, err = cli("identify", "--records", rows, "--mechanism", "five_bar", "--out", tmp_path / "i", "--quiet")
+    assert code == 2 and "there is no column 'q1'" in err
+    columns = 'columns={J1: "q1[rad]", J2: "q2[rad]", X: "x[m]"}'
+    options = ("--records", rows, "--mechanism", "five_bar", "--out", tmp_path / "i", "--quiet")
+    assert cli("identify", columns, *options)[0] == 0
+    assert (
+        cli("run", columns, "methods=[constant]", "save_report=false", *options[:-2], tmp_path / "r", "--quiet")[0] == 0
+    )
+    model = tmp_path / "i" / "identified.yaml"
+    assert cli("verify", model, "--records", rows, "--out", tmp_path / "v", "--quiet")[0] in (0, 1)
+    for words, sentence in (
+        (("verify", model, "--out", tmp_path / "v"), "records: are missing; give RECORDS.csv, --records"),
+        (("plan", "--poses", 3, "--out", tmp_path / "p.csv"), "mechanism: is missing; give --mechanism"),
+        (("check", config, "--config", config), "two configs are given"),
+    ):
+        code, _, err = cli(*words)
+        assert code == 2 and sentence in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("load", [load_diagnose_config, load_identify_config, load_plan_config, load_verify_config])
+def test_what_no_command_knows_is_refused_with_the_nearest_key(
+    load: Callable[..., object], config: Path, tmp_path: Path
+) -> None:
+    notes: list[str] = []
+    load(config, (), notes.append)
+    assert len(notes) == 1
+    text = config.read_text()
+    config.write_text(text.replace("split:", "splt:"))
+    with pytest.raises(Exception, match="there is no key 'splt'; did you mean 'split'"):
+        load(config)
+    config.write_text(text + "engine: local\nmethods: [gp]\ngp: {steps: 3}\n")
+    load(config, (), notes.append)
+    assert "engine, gp, methods" in notes[-1]
