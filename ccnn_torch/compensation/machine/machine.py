@@ -36,8 +36,8 @@ class Rule(NamedTuple):
     """
 
     rotation_weight: float = 0.04
-    nearest: float = 0.004
-    damping: float = 0.004
+    nearest: float = 0.002
+    damping: float = 0.002
 
     def farther(self, times: float) -> Rule:
         """Damped from so many times as far from singular poses on, so many times as much."""
