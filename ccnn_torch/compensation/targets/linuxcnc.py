@@ -10,6 +10,7 @@ from ccnn_torch.compensation.targets.form import Form, Program
 from ccnn_torch.compensation.targets.from_model import traced_program
 from ccnn_torch.compensation.targets.printing import costs, print_program, wrapped
 from ccnn_torch.compensation.targets.template import filled
+from ccnn_torch.display import identifiers, plain
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
@@ -47,6 +48,8 @@ def print_linuxcnc(form: Form | None, mechanism: Mechanism, source: str) -> dict
     text = print_program(nominal, dialect, {})
     serial = isinstance(mechanism, SerialArm)
     covariates = form.covariates if form else []
+    names = identifiers([header.partition("[")[0] for header in covariates])
+    pins = [(f"in_{name}", plain(header)) for name, header in zip(names, covariates, strict=True)]
     code = [c_constants(name, values, dialect) for name, values in text.tables.items()] + [c_function(nominal, text)]
     home = mechanism.home_joints if serial else mechanism.home_pose
     about = wrapped([f"Kinematics of {source}.", *(costs(form) if form else [])])
@@ -55,22 +58,18 @@ def print_linuxcnc(form: Form | None, mechanism: Mechanism, source: str) -> dict
         about="\n".join(f" * {line}" for line in about),
         joints=len(mechanism.joints),
         covariates=max(len(covariates), 1),
-        pins=[(_pin(header), header) for header in covariates],
+        pins=pins,
         rows=len(mechanism.joints) if not serial else 3 if mechanism.orientation == "none" else 6,
         units=["CCNN_UNITS_PER_METRE" if j.unit == "m" else "CCNN_DEGREES" for j in mechanism.joints],
-        home=[repr(v) for v in home.tolist()],
+        home=[dialect.literal(v) for v in home.tolist()],
         source=c_compensation(form, "static ") if form else "",
         nominal="\n\n".join(code).replace("table", "nominal_table"),
         serial=serial,
         vector=_is_vector(mechanism),
         fields=[] if serial or _is_vector(mechanism) else [(f, _unit(f)) for f in _fields(mechanism).values()],
     )
-    readme = filled("linuxcnc.md.jinja", joints=len(mechanism.joints), axes=_axes(mechanism))
+    readme = filled("linuxcnc.md.jinja", joints=len(mechanism.joints), axes=_axes(mechanism), pins=pins)
     return {"ccnnkins.comp": component, "README.md": readme}
-
-
-def _pin(header: str) -> str:
-    return "in_" + header.partition("[")[0]
 
 
 def _closed_form(mechanism: Mechanism) -> Program:
