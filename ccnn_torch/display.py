@@ -10,7 +10,9 @@ from typing import Any
 
 # All but letters, digits and signs that open, close or continue nothing in C, Structured Text, HAL, CSV and Markdown;
 # `*` and `/` stand within a unit, and no sign at the beginning makes a formula of a cell or a request of a manual page.
-_NOT_PLAIN = re.compile(r"[^A-Za-z0-9 _.,:;=+%()\[\]^'*/-]|^[=+.'-]|(?<![A-Za-z0-9])[*/]|[*/](?![A-Za-z0-9])")
+_NOT_PLAIN = re.compile(
+    r"[^A-Za-z0-9 _.,:;=+%()\[\]^'*/-]|^[=+.'-]|(?<![A-Za-z0-9])[*/]|[*](?![A-Za-z0-9])|/(?![A-Za-z0-9(])"
+)
 
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
@@ -75,10 +77,10 @@ def visible(text: str, longest: int = 200) -> str:
 def plain(text: str) -> str:
     """Escape text from outside for a comment, a description or a cell of an exported file.
 
-    What is no letter of ASCII, no digit and no sign that is harmless in every language becomes its code, \\u002a; so do
-    a `*` and a `/` that are not between letters or digits, as those of `N*m` are.
+    What is no letter of ASCII, no digit and no sign that is harmless in every language becomes its code, {U+002A}; so
+    do a `*` and a `/` that do not stand as in a unit, `W/(m^2*K)`. HAL's compiler would read a \\u002a back.
     """
-    return _NOT_PLAIN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return _NOT_PLAIN.sub(lambda found: f"{{U+{ord(found[0]):04X}}}", text)
 
 
 def identifiers(texts: Sequence[str], longest: int = 24) -> list[str]:

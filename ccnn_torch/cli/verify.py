@@ -28,6 +28,9 @@ def verify(
     refit_frames: Annotated[
         bool, typer.Option("--refit-frames", help="The measuring device was moved since the model was made.")
     ] = False,
+    public_key: Annotated[
+        Path | None, typer.Option("--public-key", metavar="PUBLIC.pem", help="Take only a model signed by this key.")
+    ] = None,
     allow_code: Annotated[
         bool, typer.Option("--allow-code", help="Run the Python file that the model names as its mechanism.")
     ] = False,
@@ -53,7 +56,7 @@ def verify(
         from ccnn_torch.verification.job import verify_model
         from ccnn_torch.verification.page import write_verify_report
 
-        loaded = load_compensation(model, allow_code=allow_code)
+        loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
         found = verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code)
         write_verify_report(out, found.results, found.arrays)
     results = found.results

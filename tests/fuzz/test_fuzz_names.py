@@ -135,8 +135,9 @@ def component(text: str, wanted: str, folder: Path) -> None:
     """Pins of other names, and the same code but for these."""
     (about, code), (plain, same) = (part.split("\n;;\n") for part in (text, wanted))
     pins, named = (re.findall(r"^pin in float (\w+) ", part, re.MULTILINE) for part in (about, plain))
-    line = re.compile(r'pin in float in_[A-Za-z0-9_]{1,30} "Covariate [^"\\\n]*(\\u[0-9a-f]{4,}[^"\\\n]*)*";')
+    line = re.compile(r'pin in float in_[A-Za-z0-9_]{1,30} "Covariate [ -~]*";')
     assert len({pin.replace("_", "-").rstrip("-") for pin in pins}) == len(pins) == len(named)
+    assert not {*"\\"} & {*about} and about.count('"') == plain.count('"')
     rest, other = ([row for row in part.splitlines() if "pin in float" not in row] for part in (about, plain))
     assert rest == other and sum(line.fullmatch(row) is not None for row in about.splitlines()) == len(pins)
     for k, (new, old) in enumerate(zip(pins, named, strict=True)):
