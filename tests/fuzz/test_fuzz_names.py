@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from xml.etree import ElementTree
 
@@ -79,8 +80,6 @@ def code_of(text: str, folder: Path, compiler: str) -> str:
 
 @cache
 def plain_names() -> dict[str, str]:
-    from tempfile import TemporaryDirectory
-
     with TemporaryDirectory() as folder:
         return exported(Path(folder), "arm", ["q1", "q2"], ["time", "temperature"], ["s", "K"])
 

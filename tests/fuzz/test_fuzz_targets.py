@@ -10,7 +10,6 @@ import subprocess
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -73,6 +72,11 @@ EXTREMES += [
 numbers = st.one_of(st.sampled_from(EXTREMES), st.floats())
 
 
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("programs")
+
+
 @cache
 def made(kind: str, dtype: str) -> tuple[Compensator, Form, Golden] | None:
     """None where single precision does not hold the model."""
@@ -91,8 +95,9 @@ def made(kind: str, dtype: str) -> tuple[Compensator, Form, Golden] | None:
 
 
 @cache
-def program(kind: str, dtype: str, build: str) -> Path:
-    folder = Path(mkdtemp())
+def program(home: Path, kind: str, dtype: str, build: str) -> Path:
+    folder = home / f"{kind}, {dtype}, {build}"
+    folder.mkdir()
     _, form, golden = made(kind, dtype)  # type: ignore[misc]
     for name, text in {**print_c99(form, golden), "main.c": MAIN}.items():
         (folder / name).write_text(text)
@@ -114,8 +119,8 @@ def blocks(kind: str, dtype: str) -> dict[str, Any] | None:
     return parse_blocks(text) if len(text) <= LONGEST else None
 
 
-def in_c(kind: str, form: Form, build: str, rows: Array) -> dict[str, Array]:
-    words = [str(program(kind, form.dtype, build))]
+def in_c(home: Path, kind: str, form: Form, build: str, rows: Array) -> dict[str, Array]:
+    words = [str(program(home, kind, form.dtype, build))]
     ran = subprocess.run(words, input=rows.astype(form.dtype).tobytes(), capture_output=True)
     assert ran.returncode == 0 and not ran.stderr, ran.stderr.decode()
     n = len(form.joints)
@@ -186,7 +191,9 @@ def drawn(compensator: Compensator, seed: int, values: list[float]) -> Array:
 
 @given(kind=st.sampled_from([*MODELS]), single=st.booleans(), seed=st.integers(0, 2**32), values=st.lists(numbers))
 @example("covariates", False, 3, [])
-def test_every_target_is_the_model(pytestconfig: Any, kind: str, single: bool, seed: int, values: list[float]) -> None:
+def test_every_target_is_the_model(
+    home: Path, pytestconfig: Any, kind: str, single: bool, seed: int, values: Any
+) -> None:
     whole = pytestconfig.getoption("--fuzz-cases") is not None
     known = made(kind, "float32" if single else "float64")
     if known is None:
@@ -202,7 +209,7 @@ def test_every_target_is_the_model(pytestconfig: Any, kind: str, single: bool, s
     if not single:
         ways["onnx"] = in_onnx(kind, joints, covariates, outputs)
     builds = [b for b, (compiler, _) in BUILDS.items() if shutil.which(compiler) and (whole or b == "sanitized")]
-    ways |= {build: in_c(kind, form, build, rows) for build in builds}
+    ways |= {build: in_c(home, kind, form, build, rows) for build in builds}
     text = in_structured_text(kind, form, rows) if whole else None
     ways |= {} if text is None else {"st": text}
     for way, found in ways.items():
