@@ -109,6 +109,7 @@ def verify(
     compensated: bool = False,
     refit_frames: bool = False,
     allow_code: bool = False,
+    public_key: str | Path | None = None,
 ) -> dict[str, Any]:
     """Test a model on new rows, against the error promised by its held-out rows; nothing is written.
 
@@ -119,6 +120,7 @@ def verify(
         compensated: the machine was commanded by the model while it was measured; the joints are then those wanted.
         refit_frames: the measuring device was moved since the model was made.
         allow_code: run the Python file that the model names for a user's own mechanism.
+        public_key: PEM file with an Ed25519 key, by which the model must be signed.
 
     Returns:
         The content of verify.json; its `kept` says whether the promise is kept.
@@ -126,5 +128,5 @@ def verify(
     Raises:
         InputError: the model or the rows cannot be used; the sentence says what to change.
     """
-    loaded = load_compensation(model, allow_code=allow_code)
+    loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
     return verify_model(loaded, records, mechanism, compensated, refit_frames, allow_code).results

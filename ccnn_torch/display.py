@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
+
+# All but letters, digits and signs that open, close or continue nothing in C, Structured Text, HAL, CSV and Markdown;
+# `*` and `/` stand within a unit, and no sign at the beginning makes a formula of a cell or a request of a manual page.
+_NOT_PLAIN = re.compile(
+    r"[^A-Za-z0-9 _.,:;=+%()\[\]^'*/-]|^[=+.'-]|(?<![A-Za-z0-9])[*/]|[*](?![A-Za-z0-9])|/(?![A-Za-z0-9(])"
+)
 
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
@@ -65,6 +72,26 @@ def visible(text: str, longest: int = 200) -> str:
     if len(text) > longest:
         text = f"{text[: longest * 2 // 3]} … {text[len(text) - longest // 3 :]}"
     return "".join(c if is_shown(c) else c.encode("unicode_escape").decode() for c in text)
+
+
+def plain(text: str) -> str:
+    """Escape text from outside for a comment, a description or a cell of an exported file.
+
+    What is no letter of ASCII, no digit and no sign that is harmless in every language becomes its code, {U+002A}; so
+    do a `*` and a `/` that do not stand as in a unit, `W/(m^2*K)`. HAL's compiler would read a \\u002a back.
+    """
+    return _NOT_PLAIN.sub(lambda found: f"{{U+{ord(found[0]):04X}}}", text)
+
+
+def identifiers(texts: Sequence[str], longest: int = 24) -> list[str]:
+    """Names of letters, digits and `_` for texts from outside, each another one; what is such a name stays."""
+    found: list[str] = []
+    for text in texts:
+        name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")[:longest].rstrip("_") or "unnamed"
+        taken = {other.lower() for other in found}
+        others = (f"{name}_{k}" for k in range(2, len(texts) + 2))
+        found.append(name if name.lower() not in taken else next(n for n in others if n.lower() not in taken))
+    return found
 
 
 def is_shown(character: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import torch
 
 import ccnn_torch
 from ccnn_torch import calibrate
+from ccnn_torch.compensation import new_key_pair, sign_model
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import PoseError, load_mechanism
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
@@ -93,6 +95,21 @@ def test_a_promise_is_kept_on_rows_of_the_same_machine(model: Path, tmp_path: Pa
     assert found["text"] in page and page.count("<svg") == 4 and "<script" not in page
     assert "The promise is kept" in out
     assert ccnn_torch.verify(model, tmp_path / "new.csv")["position"] == position
+
+
+def test_a_public_key_takes_signed_models_alone(model: Path, tmp_path: Path, cli: Cli) -> None:
+    new = delta_rows(tmp_path / "new.csv", seed=1, rows=60)
+    folder = shutil.copytree(model.parent, tmp_path / "model")
+    private, public = new_key_pair(tmp_path / "ours")
+    words = ("verify", folder / model.name, new, "--out", tmp_path / "v", "--public-key", public)
+    code, out, err = cli(*words)
+    assert (code, out) == (2, "") and "has no signature model.safetensors.sig beside it" in err
+    assert not (tmp_path / "v").exists()
+    with pytest.raises(InputError, match="has no signature"):
+        ccnn_torch.verify(folder / model.name, new, public_key=public)
+    sign_model(folder / model.name, private)
+    assert cli(*words)[0] == 0
+    assert ccnn_torch.verify(folder / model.name, new, public_key=public)["kept"]
 
 
 def test_rows_that_it_was_made_from_are_no_test(model: Path, tmp_path: Path) -> None:

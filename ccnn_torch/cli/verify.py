@@ -36,6 +36,9 @@ def verify(
     refit_frames: Annotated[
         bool, typer.Option("--refit-frames", help="The measuring device was moved since the model was made.")
     ] = False,
+    public_key: Annotated[
+        Path | None, typer.Option("--public-key", metavar="PUBLIC.pem", help="Take only a model signed by this key.")
+    ] = None,
     allow_code: Annotated[
         bool, typer.Option("--allow-code", help="Run the Python file that the model names as its mechanism.")
     ] = False,
@@ -66,7 +69,7 @@ def verify(
         wanted = load_verify_config(file, changes, noted(quiet))
         if wanted.records is None:
             raise InputError("records: are missing; give RECORDS.csv, --records, or the key in a config")
-        loaded = load_compensation(model, allow_code=allow_code)
+        loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
         read = {"columns": wanted.columns, "joint_map": wanted.joint_map, "mechanism_keys": wanted.mechanism_keys}
         found = verify_model(loaded, wanted.records, wanted.mechanism, compensated, refit_frames, allow_code, **read)
         write_verify_report(out, found.results, found.arrays)

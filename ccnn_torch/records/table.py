@@ -19,7 +19,6 @@ from ccnn_torch.files.write import writing_whole
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import LARGEST, parse_header, split_header, to_si, write_hint
 
-
 FILE = "file"
 """The column that numbers the files where there are several: 0, 1, …"""
 

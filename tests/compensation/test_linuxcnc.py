@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from stand_ins import tripod_compensator
-from test_geometry import six_joint_arm
+from test_geometry import six_joint_arm, three_joint_arm
 from torch import Tensor
 
 from ccnn_torch import export_model
@@ -22,7 +22,12 @@ from ccnn_torch.compensation.targets.from_model import form_of
 from ccnn_torch.compensation.targets.linuxcnc import print_linuxcnc
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
-from ccnn_torch.numerics.rotations import euler_zyx_to_matrix, matrix_to_rotation_vector
+from ccnn_torch.numerics.rotations import (
+    euler_zyx_to_matrix,
+    geodesic_angle,
+    matrix_to_euler_zyx,
+    matrix_to_rotation_vector,
+)
 
 COMPILER = shutil.which("gcc") or shutil.which("cc")
 MODULES = Path("/usr/lib/linuxcnc/modules")
@@ -140,6 +145,64 @@ def test_kinematics_of_other_machines(name: str, tmp_path: Path) -> None:
         code, found = kins.inverse(pose)
         assert code == 0
         np.testing.assert_allclose(found[: len(ideal)] / scale, ideal, rtol=0, atol=1e-8)
+
+
+def turn_of(world: np.ndarray) -> Tensor:
+    """Rotation of roll, pitch, yaw on A, B, C."""
+    return euler_zyx_to_matrix(torch.deg2rad(torch.from_numpy(world[..., 3:]).flip(-1)))
+
+
+@pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
+def test_no_accepted_inverse_has_another_orientation(tmp_path: Path) -> None:
+    """From everywhere to everywhere in SO(3), half turns and upright pitches among them."""
+    arm = six_joint_arm()[0]
+    kins = Compiled(print_linuxcnc(None, arm, "a test")["ccnnkins.comp"], tmp_path)
+    generator = np.random.default_rng(3)
+    accepted = {"near": 0, "far": 0}
+    for k in range(400):
+        start, end = np.radians(generator.uniform(-120, 120, (2, 6)))
+        if k % 4 == 0:
+            # The wrist turned half a turn, about one of its axes or two.
+            end = start + np.pi * np.eye(6)[5] + (k % 8 == 0) * 1e-7 * generator.normal(size=6)
+        position, turn = (v[0] for v in arm.forward_frame(torch.from_numpy(end)[None]))
+        upright = torch.tensor([0.3, np.pi / 2, k], dtype=torch.float64)
+        turn = euler_zyx_to_matrix(upright) if k % 4 == 1 else turn
+        angles = matrix_to_euler_zyx(turn).flip(-1)
+        world = np.concatenate([1e3 * position.numpy(), np.degrees(angles.numpy())])
+        code, stood = kins.forward(np.degrees(start))
+        assert code == 0
+        code, found = kins.inverse(world)
+        assert code in (0, -1)
+        if code == 0:
+            code, back = kins.forward(found)
+            off = float(geodesic_angle(turn_of(back), turn_of(world)))
+            assert code == 0 and off < 1e-7 and np.abs(back[:3] - world[:3]).max() < 1e-5, (k, off)
+            far = float(geodesic_angle(turn_of(stood), turn_of(world))) > np.pi / 2
+            accepted["far" if far else "near"] += 1
+    assert accepted["near"] > 30 and accepted["far"] > 150, accepted
+
+
+@pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
+def test_a_platform_may_be_turned_by_half_a_turn(tmp_path: Path) -> None:
+    machine = load_mechanism("stewart")
+    kins = Compiled(print_linuxcnc(None, machine, "a test")["ccnnkins.comp"], tmp_path)
+    for angles in ((180, 0, 0), (0, 0, 180), (180, 0, 90), (0, 90, 180), (179.9999999, 0, 0), (0, 0, -179.99999)):
+        world = np.array([10.0, -20.0, 1e3 * float(machine.home_pose[2]), *angles])
+        vector = matrix_to_rotation_vector(turn_of(world))
+        pose = torch.cat([torch.from_numpy(world[:3]) / 1e3, vector])
+        code, found = kins.inverse(world)
+        assert code == 0
+        np.testing.assert_allclose(found / 1e3, machine.solve_inverse(pose[None])[0].numpy(), rtol=0, atol=1e-8)
+
+
+def test_which_axes_a_component_serves_is_said() -> None:
+    for machine, sentence in (
+        (three_joint_arm()[0], "X, Y, Z alone"),
+        (six_joint_arm()[0], "A, B, C: roll, pitch, yaw"),
+        (load_mechanism("tripod"), "Y = y, Z = z, A = phi; others are not followed"),
+    ):
+        files = print_linuxcnc(None, machine, "a test")
+        assert sentence in files["README.md"] and sentence in files["ccnnkins.comp"].partition("\n;;\n")[0]
 
 
 def test_what_linuxcnc_cannot_have() -> None:

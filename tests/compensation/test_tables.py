@@ -37,6 +37,17 @@ class _Screws(torch.nn.Module):
         return torch.cat([bent[..., :-1], bent[..., :1]], -1)
 
 
+class _Backlash(torch.nn.Module):
+    """As `_Screws`, but each joint stops short by a tenth on the way up, and beyond by as much on the way down."""
+
+    def __init__(self, joints: int) -> None:
+        super().__init__()
+        self.joints = joints
+
+    def forward(self, features: Tensor) -> Tensor:
+        return torch.sigmoid(3 * features[..., : self.joints]) - 0.1 * features[..., self.joints :]
+
+
 def on(machine: Mechanism, network: torch.nn.Module, size: float) -> Compensator:
     joints = machine.sample_joints(150, torch.Generator().manual_seed(3))
     n = joints.shape[1]
@@ -105,6 +116,48 @@ def test_tables_of_single_axes_where_one_suffices() -> None:
         missed = machine.forward_kinematics(joints + compensator.deviation(joints)) - pose
     assert abs(float(rows[4].split(",")[4]) + 1e3 * float(missed[0, 2])) < 1e-6
     assert float(mesh["min_x"]) == pytest.approx(1e3 * float(low[0]))
+
+
+def with_backlash(together: bool) -> Compensator:
+    machine = load_mechanism("delta_linear")
+    generator = torch.Generator().manual_seed(3)
+    joints = machine.sample_joints(300, generator)
+    ways = (torch.randint(0, 2, joints.shape, generator=generator) * 2 - 1).double()
+    ways = ways[:, :1].expand_as(ways) if together else ways
+    inputs, network = torch.cat([joints, ways], -1), _Backlash(3)
+    blank, flat = torch.ones(1, len(joints), dtype=torch.float64), torch.zeros(6, dtype=torch.bool)
+    scaling = Scaling.fit(inputs[None], torch.zeros_like(joints)[None], blank, flat).repeat(0)
+    scaling.deviation.fill_(2e-4)
+    with torch.no_grad():
+        deviations = scaling.restore(network(scaling.features(inputs)))
+    names = [Coordinate(f"direction{k}", "1") for k in (1, 2, 3)]
+    return fit_compensator(network, scaling, inputs, deviations, machine.joints, names)
+
+
+def test_tables_of_single_axes_hold_both_directions_of_approach() -> None:
+    compensator = with_backlash(together=False)
+    tables = print_tables(compensator, None)
+    screw = np.array([[float(v) for v in line.split()] for line in tables["linuxcnc_q2.comp"].splitlines()])
+    table = [line.split() for line in tables["heidenhain_q2.com"].splitlines()[2:-1]]
+    joints = compensator.domain.centre[:3].repeat(30, 1)
+    joints[:, 1] += torch.linspace(-0.5, 0.5, 30, dtype=torch.float64) * compensator.domain.half_range[1]
+    for column, way in ((1, 1.0), (2, -1.0)):
+        ways = torch.tensor([0.0, way, 0.0], dtype=torch.float64).expand(30, 3)
+        with torch.no_grad():
+            wanted = compensator.deviation(joints, ways)[:, 1].numpy() * 1e3
+        found = -np.interp(joints[:, 1] * 1e3, screw[:, 0], screw[:, column])
+        assert np.abs(found - wanted).max() < 2e-3
+    # 2e-4 m times 0.1 short of the command upwards, and so much beyond it downwards.
+    np.testing.assert_allclose(screw[:, 1] - screw[:, 2], 0.04, atol=2e-3)
+    np.testing.assert_allclose([float(row[2]) for row in table], screw[:, 1] - screw[:, 2], atol=1e-5)
+    np.testing.assert_allclose([float(row[3]) for row in table], -screw[:, 1], atol=1e-5)
+    assert "leaves in either direction 0.02" in tables["README.md"]
+
+
+def test_directions_that_are_known_only_together_are_not_told_apart() -> None:
+    tables = print_tables(with_backlash(together=True), None)
+    screw = [line.split() for line in tables["linuxcnc_q2.comp"].splitlines()]
+    assert all(up == down for _, up, down in screw) and "either direction" not in tables["README.md"]
 
 
 def test_identified_links_go_back_into_a_simulator(tmp_path: Path, cli: Cli) -> None:

@@ -10,6 +10,7 @@ from ccnn_torch.compensation.targets.form import Form, Program
 from ccnn_torch.compensation.targets.from_model import traced_program
 from ccnn_torch.compensation.targets.printing import costs, print_program, wrapped
 from ccnn_torch.compensation.targets.template import filled
+from ccnn_torch.display import identifiers, plain, visible
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 
@@ -47,6 +48,8 @@ def print_linuxcnc(form: Form | None, mechanism: Mechanism, source: str) -> dict
     text = print_program(nominal, dialect, {})
     serial = isinstance(mechanism, SerialArm)
     covariates = form.covariates if form else []
+    names = identifiers([header.partition("[")[0] for header in covariates])
+    pins = [(f"in_{name}", plain(header)) for name, header in zip(names, covariates, strict=True)]
     code = [c_constants(name, values, dialect) for name, values in text.tables.items()] + [c_function(nominal, text)]
     home = mechanism.home_joints if serial else mechanism.home_pose
     about = wrapped([f"Kinematics of {source}.", *(costs(form) if form else [])])
@@ -55,22 +58,20 @@ def print_linuxcnc(form: Form | None, mechanism: Mechanism, source: str) -> dict
         about="\n".join(f" * {line}" for line in about),
         joints=len(mechanism.joints),
         covariates=max(len(covariates), 1),
-        pins=[(_pin(header), header) for header in covariates],
+        pins=pins,
+        axes=wrapped([f"Axes: {_axes(mechanism)}."]),
         rows=len(mechanism.joints) if not serial else 3 if mechanism.orientation == "none" else 6,
+        found=12 if serial else len(mechanism.joints),
         units=["CCNN_UNITS_PER_METRE" if j.unit == "m" else "CCNN_DEGREES" for j in mechanism.joints],
-        home=[repr(v) for v in home.tolist()],
+        home=[dialect.literal(v) for v in home.tolist()],
         source=c_compensation(form, "static ") if form else "",
         nominal="\n\n".join(code).replace("table", "nominal_table"),
         serial=serial,
         vector=_is_vector(mechanism),
         fields=[] if serial or _is_vector(mechanism) else [(f, _unit(f)) for f in _fields(mechanism).values()],
     )
-    readme = filled("linuxcnc.md.jinja", joints=len(mechanism.joints), axes=_axes(mechanism))
+    readme = filled("linuxcnc.md.jinja", joints=len(mechanism.joints), axes=plain(_axes(mechanism)), pins=pins)
     return {"ccnnkins.comp": component, "README.md": readme}
-
-
-def _pin(header: str) -> str:
-    return "in_" + header.partition("[")[0]
 
 
 def _closed_form(mechanism: Mechanism) -> Program:
@@ -92,20 +93,33 @@ def _closed_form(mechanism: Mechanism) -> Program:
 
 
 def _fields(mechanism: Mechanism) -> dict[str, str]:
-    """Pose coordinate -> its part of LinuxCNC's pose: lengths by their names, angles in order."""
-    names = [c.name for c in mechanism.pose]
-    angles = iter(_ANGLES)
-    return {n: f"tran.{n}" if n in ("x", "y", "z") else next(angles) for n in names}
+    """Pose coordinate -> its part of LinuxCNC's pose: lengths by their names, angles in order.
+
+    Raises:
+        MethodFailedError: there is a length that is not x, y or z, or a fourth angle.
+    """
+    lengths = {c.name: f"tran.{c.name}" for c in mechanism.pose if c.unit == "m" and c.name in ("x", "y", "z")}
+    angles = dict(zip([c.name for c in mechanism.pose if c.unit == "rad"], _ANGLES, strict=False))
+    for c in mechanism.pose:
+        if c.name not in lengths | angles:
+            raise MethodFailedError(
+                f"linuxcnc has lengths x, y, z [m] and three angles [rad]; '{mechanism.name}' has {visible(c.header)}"
+            )
+    return {c.name: (lengths | angles)[c.name] for c in mechanism.pose}
 
 
 def _axes(mechanism: Mechanism) -> str:
     if isinstance(mechanism, SerialArm):
-        return "X, Y, Z in the frame in which the machine was measured" + (
-            ", A, B, C: roll, pitch, yaw" if mechanism.orientation != "none" else ""
-        )
+        if mechanism.orientation == "none":
+            return (
+                "X, Y, Z alone, in the frame in which the machine was measured. Its records have no orientation: what "
+                "A, B, C command is not followed, and what they show is that of the nominal arm"
+            )
+        return "X, Y, Z in the frame in which the machine was measured, A, B, C: roll, pitch, yaw"
     if _is_vector(mechanism):
         return "X, Y, Z, and A, B, C: roll, pitch, yaw of the platform"
-    return ", ".join(f"{field.removeprefix('tran.').upper()} = {name}" for name, field in _fields(mechanism).items())
+    served = ", ".join(f"{field.removeprefix('tran.').upper()} = {n}" for n, field in _fields(mechanism).items())
+    return f"{served}; others are not followed"
 
 
 def _is_vector(mechanism: Mechanism) -> bool:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccnn_torch.compensation.targets.form import BOOLEAN, Array, Expression, Form, Leaf, Let, Loop, Program, leaves
+from ccnn_torch.display import plain
 from ccnn_torch.errors import MethodFailedError
 
 # What is used once is written where it is used, up to so many characters.
@@ -205,5 +206,6 @@ def costs(form: Form) -> list[str]:
 
 
 def wrapped(lines: list[str], width: int = 96) -> list[str]:
-    """Sentences in lines of a comment."""
-    return [part for line in lines for part in (textwrap.wrap(line, width) or [""])]
+    """Sentences in lines of a comment, which no name from a model file can end."""
+    wrapper = textwrap.TextWrapper(width, break_long_words=False, break_on_hyphens=False)
+    return [part for line in lines for part in (wrapper.wrap(plain(line)) or [""])]

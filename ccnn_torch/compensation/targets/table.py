@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ccnn_torch.compensation.compensator import Compensator
+from ccnn_torch.display import identifiers, plain
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.mechanisms import Mechanism
 
@@ -18,7 +20,7 @@ Array = NDArray[Any]
 
 # Points of the whole grid at most, and along one axis (LinuxCNC takes 256).
 _MOST, _ALONG = 20_000, 64
-_CHECKED = 2000
+_CHECKED, _FEWEST = 2000, 50
 # What one axis alone must explain of its own deviation, by RMS, so that its table is worth having.
 _SUFFICES = 0.2
 _MESH = 9
@@ -29,7 +31,8 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[
     """Contents of the files by name: the grid, tables of single axes, a mesh, and what each leaves.
 
     Args:
-        compensator: fitted; its covariates stand at the middle of the domain.
+        compensator: fitted; its covariates stand at the middle of the domain, but for directions of approach in tables
+            of single axes.
         mechanism: nominal, for the mesh; None where it is not known.
 
     Raises:
@@ -42,33 +45,44 @@ def print_tables(compensator: Compensator, mechanism: Mechanism | None) -> dict[
     low, high = (v[:n].numpy() for v in (compensator.domain.low, compensator.domain.high))
     lines = [np.linspace(a, b, count) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*lines, indexing="ij"), -1)
-    values = _deviation(compensator, grid.reshape(-1, n)).reshape(grid.shape)
-    checked = _inside(compensator, low + (high - low) * np.random.default_rng(0).random((_CHECKED, n)))
-    truth = _deviation(compensator, checked)
+    middle = compensator.domain.centre[n:]
+    values = _deviation(compensator, grid.reshape(-1, n), middle).reshape(grid.shape)
+    drawn = low + (high - low) * np.random.default_rng(0).random((_CHECKED, n))
+    checked = _inside(compensator, drawn, middle)
+    truth = _deviation(compensator, checked, middle)
     tables = {"table.csv": _csv(compensator, grid.reshape(-1, n), values.reshape(-1, n))}
     told = [_said("table.csv", "all joints, linear between the points", truth, _between(lines, values, checked))]
-    rows = []
+    rows, lost, files = [], [], identifiers([joint.name for joint in joints])
     for j, joint in enumerate(joints):
-        name, scale = _NAMES.get(joint.unit, (joint.unit, 1.0))
+        name, scale = _NAMES.get(joint.unit, (plain(joint.unit), 1.0))
         line = np.linspace(low[j], high[j], _ALONG)
-        own = np.array([truth[near, j].mean() for near in _bins(checked[:, j], line)])
-        left = truth[:, j] - np.interp(checked[:, j], line, own)
-        share = _rms(left) / max(_rms(truth[:, j]), 1e-300)
+        ways, seen = _approached(compensator, j, drawn)
+        both = np.stack([_deviation(compensator, seen, way)[:, j] for way in ways])
+        own = np.array([both[:, near].mean(1) for near in _bins(seen[:, j], line)]).T
+        left = both - np.stack([np.interp(seen[:, j], line, one) for one in own])
+        share = _rms(left) / max(_rms(both), 1e-300)
         rows.append(
-            f"| {joint.name} | {_rms(truth[:, j]) * scale:.3g} {name} | {_rms(left) * scale:.3g} {name} | "
+            f"| `{plain(joint.name)}` | {_rms(both) * scale:.3g} {name} | {_rms(left) * scale:.3g} {name} | "
             f"{np.abs(left).max() * scale:.3g} {name} | {'yes' if share <= _SUFFICES else 'no: c99, st or table.csv'} |"
         )
+        if ways[0] is not ways[1]:
+            lost.append(f"{_rms(both[0] - both[1]) / 2 * scale:.3g} {name} of `{plain(joint.name)}`")
         if share <= _SUFFICES:
-            tables[f"linuxcnc_{joint.name}.comp"] = _screw(line * scale, own * scale)
-            tables[f"heidenhain_{joint.name}.com"] = _heidenhain(joint.name, name, line * scale, own * scale)
+            tables[f"linuxcnc_{files[j]}.comp"] = _screw(line * scale, *own * scale)
+            tables[f"heidenhain_{files[j]}.com"] = _heidenhain(files[j], name, line * scale, *own * scale)
     axes = "| joint | deviation, RMS | left by its own table, RMS | at most | one axis suffices |\n"
     told.append(axes + "| --- | --- | --- | --- | --- |\n" + "\n".join(rows))
     if mechanism is not None and [c.name for c in mechanism.pose] == ["x", "y", "z"]:
         tables["klipper_mesh.cfg"], sentence = _mesh(compensator, mechanism)
         told.append(sentence)
+    if lost:
+        told.append(
+            "Directions of approach: tables of single axes hold both. Every other file stands between them, and leaves "
+            f"in either direction {', '.join(lost)} (RMS)."
+        )
     told += [text for form, text in _FORMS.items() if any(name.startswith(form) for name in tables)]
-    middle = compensator.domain.centre[n:].tolist()
-    at = ", ".join(f"{c.name} = {v:.6g} {c.unit}" for c, v in zip(compensator.covariates, middle, strict=True))
+    stand = zip(compensator.covariates, middle.tolist(), strict=True)
+    at = ", ".join(f"`{plain(c.name)} = {v:.6g} {plain(c.unit)}`" for c, v in stand)
     return tables | {"README.md": README.format(told="\n\n".join(told), at=f" Covariates stand at {at}." if at else "")}
 
 
@@ -83,26 +97,45 @@ _FORMS = {
     "linuxcnc": "`linuxcnc_JOINT.comp`: `COMP_FILE` of its `[JOINT_N]`, with `COMP_FILE_TYPE = 1` (nominal, forward "
     "trim, reverse trim).",
     "heidenhain": "`heidenhain_JOINT.com`: columns AXISPOS, BACKLASH and the axis, in the form of the manufacturer's "
-    "manuals, with the deviation as it is; it was not tried on a control, so check its sign with one point.",
+    "manuals. The axis has the deviation as it is in the positive direction of traverse, BACKLASH what the negative "
+    "direction adds to it. It was not tried on a control, so check the signs with one point in both directions, and in "
+    "the control's manual whether its BACKLASH is this difference.",
     "klipper": "`klipper_mesh.cfg` is a saved profile of `[bed_mesh]` for the section SAVE_CONFIG of printer.cfg.",
 }
 
 
-def _deviation(compensator: Compensator, joints: Array) -> Array:
-    covariates = compensator.domain.centre[joints.shape[1] :].repeat(len(joints), 1)
+def _deviation(compensator: Compensator, joints: Array, covariates: Tensor) -> Array:
+    given = covariates.expand(len(joints), -1) if len(covariates) else None
     with torch.no_grad():
-        found: Array = compensator.deviation(
-            torch.from_numpy(joints), covariates if covariates.shape[1] else None
-        ).numpy()
+        found: Array = compensator.deviation(torch.from_numpy(joints), given).numpy()
     return found
 
 
-def _inside(compensator: Compensator, joints: Array) -> Array:
+def _within(compensator: Compensator, joints: Array, covariates: Tensor) -> Array:
+    inputs = torch.cat([torch.from_numpy(joints), covariates.expand(len(joints), -1)], -1)
+    inside: Array = (compensator.domain.excess(compensator.domain.cage(inputs)) <= 0).squeeze(-1).numpy()
+    return inside
+
+
+def _inside(compensator: Compensator, joints: Array, covariates: Tensor) -> Array:
     """Those in the domain; all where too few are."""
-    covariates = compensator.domain.centre[joints.shape[1] :].repeat(len(joints), 1)
-    inputs = torch.cat([torch.from_numpy(joints), covariates], -1)
-    inside = (compensator.domain.excess(compensator.domain.cage(inputs)) <= 0).squeeze(-1).numpy()
-    return joints[inside] if inside.sum() > 50 else joints
+    inside = _within(compensator, joints, covariates)
+    return joints[inside] if inside.sum() > _FEWEST else joints
+
+
+def _approached(compensator: Compensator, j: int, joints: Array) -> tuple[list[Tensor], Array]:
+    """Covariates with joint j coming from below and from above, the others in the middle, and the joints in the domain.
+
+    Both are the middle where the model does not know of directions, or knows that joint's only together with others'.
+    """
+    middle = compensator.domain.centre[len(compensator.joints) :]
+    way = torch.tensor([float(c.name == f"direction{j + 1}") for c in compensator.covariates], dtype=torch.float64)
+    if way.any():
+        ways = [torch.where(way > 0, sign, middle) for sign in (1.0, -1.0)]
+        inside = _within(compensator, joints, ways[0]) & _within(compensator, joints, ways[1])
+        if inside.sum() > _FEWEST:
+            return ways, joints[inside]
+    return [middle, middle], _inside(compensator, joints, middle)
 
 
 def _between(lines: list[Array], values: Array, points: Array) -> Array:
@@ -134,19 +167,21 @@ def _said(name: str, what: str, truth: Array, found: Array) -> str:
 def _csv(compensator: Compensator, grid: Array, values: Array) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([c.header for c in compensator.joints] + [f"deviation_{c.header}" for c in compensator.joints])
+    headers = [plain(c.header) for c in compensator.joints]
+    writer.writerow(headers + [f"deviation_{header}" for header in headers])
     writer.writerows([repr(float(v)) for v in row] for row in np.hstack([grid, values]))
     return text.getvalue()
 
 
-def _screw(line: Array, own: Array) -> str:
+def _screw(line: Array, up: Array, down: Array) -> str:
     """Nominal position and what is added to it, forward and back."""
-    return "".join(f"{x:.6f} {-d:.6f} {-d:.6f}\n" for x, d in zip(line, own, strict=True))
+    return "".join(f"{x:.6f} {-d:.6f} {-e:.6f}\n" for x, d, e in zip(line, up, down, strict=True))
 
 
-def _heidenhain(joint: str, unit: str, line: Array, own: Array) -> str:
+def _heidenhain(joint: str, unit: str, line: Array, up: Array, down: Array) -> str:
     head = f"BEGIN {joint.upper()}.COM {unit.upper()}\n{'NR':<4}{'AXISPOS':>14}{'BACKLASH':>12}{joint.upper():>12}\n"
-    rows = [f"{k:<4}{x:>+14.4f}{0:>+12.4f}{d:>+12.5f}\n" for k, (x, d) in enumerate(zip(line, own, strict=True))]
+    values = enumerate(zip(line, down - up, up, strict=True))
+    rows = [f"{k:<4}{x:>+14.4f}{back:>+12.5f}{d:>+12.5f}\n" for k, (x, back, d) in values]
     return head + "".join(rows) + "[END]\n"
 
 
@@ -171,7 +206,7 @@ def _missed(compensator: Compensator, mechanism: Mechanism, xs: Array, ys: Array
     """Position error of the uncompensated machine, `y x x x 3` [m]; 0 where it cannot go."""
     pose = torch.tensor([[x, y, z] for y in ys for x in xs], dtype=torch.float64)
     joints = mechanism.solve_inverse(pose)
-    reached = mechanism.forward_kinematics(
-        joints + torch.from_numpy(_deviation(compensator, joints.nan_to_num().numpy()))
-    )
+    middle = compensator.domain.centre[joints.shape[1] :]
+    off = torch.from_numpy(_deviation(compensator, joints.nan_to_num().numpy(), middle))
+    reached = mechanism.forward_kinematics(joints + off)
     return (reached - pose).nan_to_num().numpy().reshape(len(ys), len(xs), 3)

@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element, SubElement
 import torch
 from torch import Tensor
 
+from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import dump_yaml
 from ccnn_torch.mechanisms.machines.link_frames import compose
@@ -31,7 +32,7 @@ def dh_text(arm: SerialArm) -> str:
     values = arm.nominal.tolist()
     links = arm.nominal[6:-6].reshape(len(arm.joints), -1).T.tolist()
     tree: dict[str, Any] = {
-        "robot": arm.name,
+        "robot": visible(arm.name),
         "dof": len(arm.joints),
         "convention": _CONVENTIONS[arm.convention],
         "units": {"length": "m", "angle": "rad"},
@@ -58,7 +59,7 @@ def urdf_text(arm: SerialArm) -> str:
     a calibration does not know and which are written as 0.
     """
     origins, last = _chain(arm)
-    root = Element("robot", name=arm.name)
+    root = Element("robot", name=visible(arm.name))
     names = ["base_link", *(f"link{i + 1}" for i in range(len(origins))), "tool"]
     for name in names:
         SubElement(root, "link", name=name)
@@ -79,7 +80,7 @@ def mjcf_text(arm: SerialArm) -> str:
     MuJoCo wants masses, which a calibration does not know: each link has 1 kg and 0.01 kg m², without gravity.
     """
     origins, last = _chain(arm)
-    root = Element("mujoco", model=arm.name)
+    root = Element("mujoco", model=visible(arm.name))
     SubElement(root, "compiler", angle="radian", autolimits="true")
     SubElement(root, "option", gravity="0 0 0")
     body = SubElement(root, "worldbody")
