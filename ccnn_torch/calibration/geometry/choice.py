@@ -109,9 +109,8 @@ def choose_model(
         geometry = "none"
     identify = {"auto": (True, False), "identify": (True,), "none": (False,)}[geometry]
     effects = (False,) if verdict is None else (True,) if asked_effects else (False, True)
-    candidates = [Candidate(i, e, learner) for learner in (False, True) for e in effects for i in identify]
-    # A machine that is nominal and learns nothing is no model.
-    candidates = [c for c in candidates if any(c)]
+    # Effects that a diagnosis found stand beside identified geometry wherever that may be a part.
+    physical = [Candidate(i, e, False) for e in effects for i in (identify if not e else identify[:1]) if i or e]
     asked = "" if geometry == "auto" else geometry_why or f"geometry={geometry} was asked for."
     if len(identify) == len(effects) == 1:
         return ModelChoice(identify[0], effects[0], _ELSE, asked)
@@ -124,7 +123,7 @@ def choose_model(
     whole = Split(torch.arange(len(rows)), none, none, None if split.groups is None else split.groups[rows])
     try:
         folds = [replace(f, validation=none, test=f.validation) for f in fold_splits(whole, kind, _FOLDS, seed)]
-        errors = _errors(mechanism, few, folds, seed, settings, candidates, verdict)
+        errors = _errors(mechanism, few, folds, seed, settings, physical, False in identify, verdict)
     except (InputError, MethodFailedError) as problem:
         why = f"Candidates could not be cross-validated: {problem}"
         return ModelChoice(geometry == "identify", effects[0], _ELSE, why)
@@ -137,12 +136,18 @@ def _errors(
     folds: list[Split],
     seed: int,
     settings: dict[str, Any],
-    candidates: list[Candidate],
+    physical: list[Candidate],
+    nominal_too: bool,
     verdict: Verdict | None,
 ) -> dict[Candidate, Tensor]:
-    """Mean squared pose error of the held-out rows of each fold, `k` [m²], by candidate, the simplest first."""
+    """Mean squared pose error of the held-out rows of each fold, `k` [m²], by candidate, the simplest first.
+
+    Args:
+        physical: candidates without a learner; one is put on what the best of them leaves.
+        nominal_too: whether it may learn everything, on the nominal machine.
+    """
     joints, pose, weight = records.joints, records.pose, settings["rotation_weight"]
-    fitted = fit_machine(mechanism, records, folds, identify=any(c.identify for c in candidates))
+    fitted = fit_machine(mechanism, records, folds, identify=any(c.identify for c in physical))
     names = [c.name for c in records.covariate_coordinates]
     held = torch.zeros(len(folds), len(joints), dtype=torch.float64)
     for k, fold in enumerate(folds):
@@ -155,7 +160,7 @@ def _errors(
 
     nominal = joint_deviations(mechanism, joints, pose, parameters=fitted.parameters, **settings)
     machines: dict[tuple[bool, bool], Physics] = {}
-    for c in candidates:
+    for c in physical:
         if c.effects and verdict is not None and c[:2] not in machines:
             machines[c[:2]] = fit_effects(
                 verdict, mechanism, records, folds, fitted.parameters, nominal.usable, c.identify
@@ -181,7 +186,12 @@ def _errors(
             moved = joints + _learned(mechanism, records, targets, folds, seed, physics.values)(joints)
         return square(torch.stack([physics.poses(k, at) for k, at in enumerate(moved)]), pose)
 
-    rows = {c: error(c) for c in candidates}
+    rows = {c: error(c) for c in physical}
+    learned = [Candidate(False, False, True)] if nominal_too or not physical else []
+    if physical:
+        best = min(physical, key=lambda c: float((rows[c].nan_to_num(1e6) * held).sum(-1).median()))
+        learned.append(best._replace(learner=True))
+    rows |= {c: error(c) for c in learned}
     # A gross outlier is no evidence for any of them, and would decide alone.
     length = torch.stack([r.nan_to_num(math.inf) for r in rows.values()]).amin(0).sqrt()
     held = held * inlying(length, held > 0, 3, 0)

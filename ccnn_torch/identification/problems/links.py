@@ -8,7 +8,7 @@ from torch import Tensor
 from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, TOOL_SPREAD
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 from ccnn_torch.mechanisms.pose import frame_gap
-from ccnn_torch.numerics.least_squares import jacobian_of, levenberg_marquardt
+from ccnn_torch.numerics.least_squares import levenberg_marquardt
 from ccnn_torch.numerics.outliers import inlying
 
 # The noise and the parameters are estimated in turn; the noise has settled after two rounds.
@@ -76,7 +76,10 @@ def fit_links(
             return torch.cat([(gap(by_row(values)) * root).flatten(-2), (values - arm.nominal) * pull], dim=-1)
 
         def slope(values: Tensor, pull: Tensor = pull, root: Tensor = root) -> Tensor:
-            rows = jacobian_of(gap, by_row(values))[1] * root[..., None]
+            # The derivative of log(R Rmᵀ) is taken as the rate of rotation itself: the gradient is the same.
+            rows = arm.parameter_jacobian(joints, by_row(values))
+            rows[..., 3:, :] *= rotation_weight
+            rows = rows * root[..., None]
             return torch.cat([rows.flatten(-3, -2), torch.diag_embed(pull)], dim=-2)
 
         value = levenberg_marquardt(residual, value, slope, max_iterations=20, damping=1e-6).value

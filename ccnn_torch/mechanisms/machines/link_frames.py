@@ -39,6 +39,56 @@ def _origin(links: Tensor, turn: Tensor, slide: Tensor, axes: Tensor) -> tuple[T
     return fixed @ motion, links[..., :3] + slid
 
 
+Screws = tuple[Tensor, Tensor]
+Frames = tuple[Tensor, Tensor]
+
+
+def _standard_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor) -> Screws:
+    """Of theta and d about and along z of the frame before, of a and alpha along and about x of the frame after."""
+    z, x = before[0][..., 2], after[0][..., 0]
+    parts = [_shift(x), _turn(x, after[1], tip), _shift(z), _turn(z, before[1], tip)]
+    return torch.stack([p[0] for p in parts], -2), torch.stack([p[1] for p in parts], -2)
+
+
+def _modified_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor) -> Screws:
+    """Of alpha and a about and along x of the frame before, of theta and d about and along z of the frame after."""
+    x, z = before[0][..., 0], after[0][..., 2]
+    parts = [_shift(x), _turn(x, before[1], tip), _shift(z), _turn(z, after[1], tip)]
+    return torch.stack([p[0] for p in parts], -2), torch.stack([p[1] for p in parts], -2)
+
+
+def _origin_screws(links: Tensor, before: Frames, after: Frames, tip: Tensor) -> Screws:
+    """Of x, y, z along the axes of the frame before, of roll, pitch and yaw about the origin that they lead to."""
+    rotation, place = before
+    origin = place + (rotation @ links[..., :3, None])[..., 0]
+    pitch, yaw = links[..., 4:].unbind(-1)
+    s, c, sp, cp = torch.sin(yaw), torch.cos(yaw), torch.sin(pitch), torch.cos(pitch)
+    zero, one = torch.zeros_like(s), torch.ones_like(s)
+    local = stack_last(c * cp, s * cp, -sp, -s, c, zero, zero, zero, one).reshape(*s.shape, 3, 3)
+    axes = (rotation @ local.mT).mT
+    slides = rotation.mT.expand(*axes.shape)
+    lever = (tip - origin)[..., None, :].expand(axes.shape)
+    turns = torch.linalg.cross(axes, lever, dim=-1)
+    return torch.cat([slides, turns], -2), torch.cat([torch.zeros_like(axes), axes], -2)
+
+
+def _shift(axis: Tensor) -> Screws:
+    return axis, torch.zeros_like(axis)
+
+
+def _turn(axis: Tensor, place: Tensor, tip: Tensor) -> Screws:
+    return torch.linalg.cross(axis, tip - place, dim=-1), axis
+
+
+SCREWS: dict[str, Callable[[Tensor, Frames, Frames, Tensor], Screws]] = {
+    "standard": _standard_screws,
+    "modified": _modified_screws,
+    "urdf": _origin_screws,
+}
+"""Convention -> velocity of a tip `... x n x 3` and rate of rotation by each parameter of each link, `... x n x k x 3`
+each, in the arm's base: from links `... x n x k`, the frames before and after each (rotation `... x n x 3 x 3`, place
+`... x n x 3`) and the tip."""
+
 # Transform, parameter names of a link, their units, and whether the joint axis is fixed in the frame before the link
 # (standard DH: z of frame i - 1) or in the one behind it.
 LINKS: dict[str, tuple[LinkTransform, tuple[str, ...], tuple[str, ...], bool]] = {

@@ -11,13 +11,19 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate, Parameter
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms.machines.link_frames import LINKS, compose
+from ccnn_torch.mechanisms.machines.link_frames import LINKS, SCREWS, compose
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.newton import carry_derivative, least_norm
 from ccnn_torch.mechanisms.pose import frame_gap
 from ccnn_torch.numerics.batching import expand_leading
 from ccnn_torch.numerics.least_squares import levenberg_marquardt
-from ccnn_torch.numerics.rotations import matrix_to_euler_zyx, matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.numerics.rotations import (
+    matrix_to_euler_zyx,
+    matrix_to_rotation_vector,
+    rotation_vector_rate,
+    rotation_vector_to_matrix,
+    skew,
+)
 
 MOST_JOINTS = 100
 """Most joints of an arm; twice those of any snake that was built, and few enough for every matrix of all of them."""
@@ -259,6 +265,38 @@ class SerialArm(Mechanism):
         if self.orientation == "none":
             return linear.mT
         return torch.cat([linear, (axes * turning * signs) @ base], dim=-1).mT
+
+    def parameter_jacobian(
+        self, joints: Tensor, parameters: Tensor | None = None, guess: Tensor | None = None
+    ) -> Tensor:
+        """By the screw of each parameter, closed form; see `Mechanism.parameter_jacobian`."""
+        values = self.resolve(parameters)
+        frames = self.link_frames(joints, values)
+        flange, place = frames[-1]
+        tip = place + (flange @ values[..., -6:-3, None])[..., 0]
+        rotations, places = (torch.stack([f[k] for f in frames], dim=-3 + k) for k in (0, 1))
+        count = len(self.joints)
+        links = values[..., 6:-6].reshape(*values.shape[:-1], count, -1)
+        lead = tip.shape[:-1]
+        before = rotations[..., :-1, :, :].expand(*lead, count, 3, 3), places[..., :-1, :].expand(*lead, count, 3)
+        after = rotations[..., 1:, :, :], places[..., 1:, :]
+        moved, turned = SCREWS[self.convention](
+            links.expand(*lead, *links.shape[-2:]), before, after, tip[..., None, :].expand(*lead, count, 3)
+        )
+        base = rotation_vector_to_matrix(values[..., 3:6])
+        # `... x 3 x k` each, in the frame of the poses.
+        linear = base @ moved.flatten(-3, -2).mT
+        angular = base @ turned.flatten(-3, -2).mT
+        base_rate, tool_rate = (rotation_vector_rate(values[..., k : k + 3]) for k in (3, values.shape[-1] - 3))
+        lever = (base @ tip[..., None])[..., 0]
+        whole = (base @ flange).expand(*lead, 3, 3)
+        eye = torch.eye(3, dtype=tip.dtype).expand(*lead, 3, 3)
+        none = torch.zeros_like(eye)
+        rows = torch.cat([eye, -skew(lever) @ base_rate, linear, whole, none], -1)
+        if self.orientation == "none":
+            return rows
+        spins = torch.cat([none, base_rate.expand(*lead, 3, 3), angular, none, whole @ tool_rate], -1)
+        return torch.cat([rows, spins], -2)
 
     def closure(self, pose: Tensor, joints: Tensor, parameters: Tensor | None = None) -> Tensor:
         """Position difference [m] and rotation vector [rad] from the pose to the arm's, `... x 6` (or `... x 3`)."""
