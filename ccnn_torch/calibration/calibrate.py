@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.calibration.config import METHODS, RunConfig, method_names
 from ccnn_torch.calibration.evaluate import Outcome, evaluate, pose_before
-from ccnn_torch.calibration.learning.fitting import Fitted, fit_method, refit
+from ccnn_torch.calibration.learning.fitting import Fitted, fit_method, on_other_rows, refit
 from ccnn_torch.calibration.learning.method_choice import Comparison, compare
 from ccnn_torch.calibration.result import assemble, best_method, plan_of
 from ccnn_torch.calibration.rows.prepare import Prepared, damping_of, over_all_rows, prepare
@@ -101,10 +101,7 @@ class Calibration:
         make = makers(self.config, prepared.default_method)[self.method]
         assert make is not None
         try:
-            fitted = refit(
-                self.method, make, whole.dataset, plan_of(self.config), outcome.fitted.choice, None, lambda *_: []
-            )
-            fitted.sd_scale = outcome.fitted.sd_scale
+            fitted = on_other_rows(outcome.fitted, make, whole.dataset, plan_of(self.config))
             found = compensator_of(self.config, whole, fitted, 0)
         except MethodFailedError:
             return None

@@ -129,25 +129,20 @@ def read_verdict(path: str | Path, mechanism: str, joints: Sequence[str]) -> Ver
     return found[0]
 
 
-def usable_verdict(content: Mapping[str, Any], situation: Situation) -> tuple[Verdict | None, list[str]]:
-    """The effects of a diagnosis that a model file can hold, and notes on those left out; None where there is none.
+def usable_verdict(verdict: Verdict, situation: Situation) -> tuple[Verdict | None, list[str]]:
+    """The effects that a model file can hold, and notes on those left out; None where there is none.
 
     Args:
-        content: of a `diagnosis.json`.
-        situation: rows, with their covariates.
+        situation: rows, with the covariates that were recorded.
     """
-    mechanism = situation.mechanism
-    names = [joint.name for joint in mechanism.joints]
-    verdict, *_ = _verdict_of(content, "the training rows", mechanism.name, names)
     notes, kept = not_held_notes([*verdict.parameters]), {}
     for name, values in verdict.parameters.items():
-        alone = replace(verdict, parameters={name: values}, outside=False)
         try:
             if name != OUTLIER and _held(name):
-                alone.on(situation)
+                replace(verdict, parameters={name: values}, outside=False).on(situation)
                 kept[name] = values
         except InputError as reason:
-            notes.append(f"{str(reason).removeprefix('the training rows: effects, ')}.")
+            notes.append(f"{str(reason).removeprefix(f'{verdict.path}: effects, ')}.")
     return (replace(verdict, parameters=kept) if kept else None), notes
 
 

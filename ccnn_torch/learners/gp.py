@@ -107,6 +107,7 @@ class GaussianProcess:
     """
 
     name = "gp"
+    conditions_on_rows = True
 
     def __init__(self, settings: GPSettings | None = None) -> None:
         self.settings = settings or GPSettings()

@@ -103,6 +103,7 @@ class GRNN:
     """
 
     name = "grnn"
+    conditions_on_rows = True
 
     def __init__(self, settings: GRNNSettings | None = None) -> None:
         self.settings = settings or GRNNSettings()

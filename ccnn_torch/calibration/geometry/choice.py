@@ -187,10 +187,12 @@ def _errors(
         return square(torch.stack([physics.poses(k, at) for k, at in enumerate(moved)]), pose)
 
     rows = {c: error(c) for c in physical}
-    learned = [Candidate(False, False, True)] if nominal_too or not physical else []
+    learned = []
     if physical:
         best = min(physical, key=lambda c: float((rows[c].nan_to_num(1e6) * held).sum(-1).median()))
         learned.append(best._replace(learner=True))
+    # Physics first: what it knows holds beside the measured region as well.
+    learned += [Candidate(False, False, True)] if nominal_too or not physical else []
     rows |= {c: error(c) for c in learned}
     # A gross outlier is no evidence for any of them, and would decide alone.
     length = torch.stack([r.nan_to_num(math.inf) for r in rows.values()]).amin(0).sqrt()

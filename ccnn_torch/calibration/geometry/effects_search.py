@@ -6,21 +6,20 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.rows.some_rows import rows_of
-from ccnn_torch.diagnosis import diagnose
-from ccnn_torch.diagnosis.from_file import Verdict, usable_verdict
-from ccnn_torch.effects import OUTLIER
+from ccnn_torch.diagnosis.from_file import Verdict
+from ccnn_torch.diagnosis.from_records import name_effects
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import BlackBox, Mechanism, SerialArm
 from ccnn_torch.records import Records
 
 # Rows that the search uses: more take longer and name the same.
-_MOST_ROWS = 600
+_MOST_ROWS = 400
 
 
 def search_effects(
     mechanism: Mechanism, records: Records, rows: Tensor, names: list[str] | None, seed: int
 ) -> tuple[Verdict | None, list[str]]:
-    """Diagnose some rows, at most 600 of them.
+    """Diagnose some rows, at most 400 of them.
 
     Args:
         rows: numbers of the rows that are not held out.
@@ -37,12 +36,10 @@ def search_effects(
     if len(rows) > _MOST_ROWS:
         rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]]
     try:
-        found = diagnose(rows_of(records, rows.sort().values), mechanism, effects=names, seed=seed)
+        verdict, notes, said, probability = name_effects(rows_of(records, rows.sort().values), mechanism, names, seed)
     except InputError as reason:
         return None, [f"Effects were not searched: {reason}"]
-    said = [name for name in found.verdict["effects"] if name != OUTLIER]
     if not said:
         return None, ["Effects were searched in the training rows, and none was named."]
-    verdict, notes = usable_verdict(found.to_json(), found.analysis.situation)
-    share = f"probability {found.verdict['probability']:.2f}"
-    return verdict, [f"Effects that the training rows show: {', '.join(said)} ({share}).", *notes]
+    shown = f"Effects that the training rows show: {', '.join(said)} (probability {probability:.2f})."
+    return verdict, [shown, *notes]

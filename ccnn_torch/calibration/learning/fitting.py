@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -155,3 +155,23 @@ def refit(
         which = ", ".join(str(k) for k in torch.nonzero(bad).squeeze(-1).tolist())
         raise MethodFailedError(f"{name} gives predictions that are not finite in repeat {which}")
     return fitted
+
+
+def on_other_rows(fitted: Fitted, make: Callable[[], Learner], dataset: Dataset, plan: Plan) -> Fitted:
+    """A trained method of one repeat with what it chose, on other rows.
+
+    A learner whose model is conditioned on its rows (`conditions_on_rows`) keeps its hyperparameters, another is
+    trained again for as many steps.
+
+    Raises:
+        MethodFailedError: as `refit`.
+    """
+    if not getattr(fitted.learner, "conditions_on_rows", False):
+        return replace(
+            refit(fitted.name, make, dataset, plan, fitted.choice, None, lambda *_: []), sd_scale=fitted.sd_scale
+        )
+    learner = make()
+    data = moved(dataset.scaled("fit", False, learner, fitted.scaling)[0], plan.device)
+    learner.start(data)
+    learner.load_state_dict(fitted.learner.state_dict())
+    return replace(fitted, learner=learner, data=data)
