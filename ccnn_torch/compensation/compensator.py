@@ -245,7 +245,7 @@ class Compensator(nn.Module):
 
     def next_correction(self, deviation: Tensor, correction: Tensor, steps: list[Step]) -> tuple[Tensor, list[Step]]:
         """What to subtract from the ideal joints next; see `secant.next_correction`."""
-        return next_correction(deviation, correction, steps, self.limit) if self.secant else (deviation, steps)
+        return next_correction(deviation, correction, steps, self.most) if self.secant else (deviation, steps)
 
     def hook(self, warn: bool = True) -> Hook:
         """For `mechanism.inverse_kinematics.register_forward_hook(compensator.hook(), with_kwargs=True)`.

@@ -21,7 +21,7 @@ from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.compensation.effects.effects import PhysicalEffects
 from ccnn_torch.compensation.geometry.identified import Geometry
 from ccnn_torch.compensation.machine.machine import ASTRAY, FARTHEST, Machine
-from ccnn_torch.compensation.secant import secant_steps
+from ccnn_torch.compensation.secant import Step, secant_steps
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.training import Scaling
@@ -106,7 +106,8 @@ def fit_compensator(
     domain = Domain.fit(inputs, reach, margin, transition)
     # A copy: what is compensated with does not change when the learner trains on.
     frozen = copy.deepcopy(network).requires_grad_(False)
-    size = {} if geometry is None and effects is None else {"count": 512, "at_once": 1024}
+    alone = geometry is None and effects is None and machine is None
+    size = {} if alone else {"count": 512, "at_once": 1024}
     machine = copy.deepcopy(machine)
     share = 1.0
     for _ in range(_DAMPINGS):
@@ -163,7 +164,7 @@ def settle(compensator: Compensator, inputs: Tensor) -> None:
     """
     machine, n = compensator.machine, len(compensator.joints)
     assert machine is not None
-    points = spread_points(inputs, compensator.domain, torch.Generator().manual_seed(1), _COUNTED)
+    points = spread_points(inputs, compensator.domain, torch.Generator().manual_seed(1), _COUNTED // 2)
     joints, covariates, strange = compensator._inputs(points[:, :n], points[:, n:])
     compensator.most.fill_(_FAR)
     compensator.domain.huge.fill_(FARTHEST)
@@ -179,12 +180,23 @@ def settle(compensator: Compensator, inputs: Tensor) -> None:
         if shares[-1] == 0:
             break
     machine.rule, (shares, correction, doubt) = kept, found
-    # More steps settle few more, and are damped rows' alone.
-    compensator.iterations = next(k for k, share in enumerate(shares, 1) if share <= shares[-1] + _FEW)
-    compensator.unsettled = shares[-1]
     near = doubt.squeeze(-1) <= ASTRAY
     largest = correction[near].abs().amax(0) if bool(near.any()) else compensator.limit
     compensator.most.copy_(torch.maximum(_ROOM * largest, compensator.limit))
+    # More steps settle few more.
+    compensator.iterations = _enough(shares)
+    compensator.unsettled = shares[-1]
+    if compensator.iterations > _GENTLE_STEPS // 2:
+        # What was learned is no part of the Jacobian: Broyden's method finds what it does.
+        compensator.secant = True
+        faster = _settling(compensator, joints, covariates, strange)[0]
+        compensator.secant = faster[-1] <= shares[-1] + _FEW and _enough(faster) < compensator.iterations
+        compensator.iterations = _enough(faster) if compensator.secant else compensator.iterations
+
+
+def _enough(shares: list[float]) -> int:
+    """Steps after which hardly more points settle."""
+    return next(k for k, share in enumerate(shares, 1) if share <= shares[-1] + _FEW)
 
 
 def _settling(
@@ -194,10 +206,10 @@ def _settling(
     assert compensator.machine is not None
     aim = compensator.machine.aim(joints)
     regular = aim[:, -1] <= 0
-    correction, shares = torch.zeros_like(joints), list[float]()
+    correction, shares, steps = torch.zeros_like(joints), list[float](), list[Step]()
     _, following, doubt = compensator.step(joints, covariates, strange, correction, aim)
     for _ in range(_MOST_STEPS):
-        correction = following
+        correction, steps = compensator.next_correction(following, correction, steps)
         _, following, doubt = compensator.step(joints - correction, covariates, strange, correction, aim)
         shares.append(float((doubt[regular] > 0).double().mean()) if bool(regular.any()) else 0.0)
         if shares[-1] == 0:

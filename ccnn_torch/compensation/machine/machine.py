@@ -21,7 +21,7 @@ _BACK = 0.8
 # How far the next step may move a joint that has settled [m or rad].
 SETTLED = 1e-9
 # How far in all, from which on it goes astray: the first step, which is near, is taken in the place of the last.
-ASTRAY = 0.01
+ASTRAY = 1e-3
 # Joints beyond it are none: what their sines and cosines are differs from library to library [m or rad].
 FARTHEST = 1e3
 

@@ -201,7 +201,8 @@ class Form:
         """Those that there are."""
         deviation = [self.deviation, self.secant]
         if self.machine is not None:
-            deviation = [self.machine.aim, self.machine.towards, self.machine.aim_back, self.machine.back]
+            own = self.machine
+            deviation = [own.aim, own.towards, own.aim_back, own.back, self.secant]
         return [p for p in (self.clean, *deviation, self.spread) if p is not None]
 
     @property
@@ -214,7 +215,7 @@ class Form:
         count = self.clean.operations()
         calls_of = [(self.deviation, self.iterations + 1), (self.secant, self.iterations)]
         if self.machine is not None:
-            calls_of = [(self.machine.aim, 1), (self.machine.towards, self.iterations + 1)]
+            calls_of = [(self.machine.aim, 1), (self.machine.towards, self.iterations + 1), calls_of[1]]
         for program, calls in calls_of:
             for op, times in (program.operations() if program else {}).items():
                 count[op] += times * calls

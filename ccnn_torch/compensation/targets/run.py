@@ -152,9 +152,13 @@ def _run_machine(
     out = {}
     for names, step in ((("command", "status"), towards), (("ideal", "ideal_status"), tried)):
         first = last = step(np.zeros_like(q))
-        correction = first["correction"]
+        correction, kept = np.zeros_like(q), np.zeros((len(q), form.kept), form.dtype)
         for _ in range(form.iterations):
-            correction = last["correction"]
+            if form.secant is not None and step is towards:
+                before = {"found": last["correction"], "correction": correction, "steps": kept}
+                correction, kept = run_program(form.secant, before, form.dtype).values()
+            else:
+                correction = last["correction"]
             last = step(correction)
         good = (last["doubt"] <= ASTRAY) & np.isfinite(correction).all(-1, keepdims=True)
         correction = np.where(good, correction, first["correction"])
