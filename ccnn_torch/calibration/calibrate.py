@@ -15,7 +15,7 @@ from ccnn_torch.calibration.config import METHODS, RunConfig, method_names
 from ccnn_torch.calibration.evaluate import Outcome, evaluate, pose_before
 from ccnn_torch.calibration.learning.fitting import Fitted, fit_method, on_other_rows, refit
 from ccnn_torch.calibration.learning.method_choice import Comparison, compare
-from ccnn_torch.calibration.result import assemble, best_method, plan_of
+from ccnn_torch.calibration.result import assemble, best_method, chosen_by, plan_of
 from ccnn_torch.calibration.rows.prepare import Prepared, damping_of, over_all_rows, prepare
 from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
@@ -55,7 +55,7 @@ class Calibration:
 
     def repeat(self, method: str | None = None) -> int:
         """The repeat that is exported: that of the best validation."""
-        return int(self.outcomes[method or self.method].fitted.score.argmin())
+        return int(self.outcomes[method or self.method].score.argmin())
 
     def mechanism(self, method: str | None = None) -> Mechanism:
         """The nominal machine, with the frames that belong to `compensator`."""
@@ -137,6 +137,7 @@ class Calibration:
         about = {
             "mechanism": self.mechanism(method).describe(),
             "method": method,
+            "chosen_by": chosen_by(self.config, self.prepared, self.outcomes[method]),
             "data_sha256": self.prepared.data_hash,
             "seed": self.config.seed + repeat,
             "metrics": metrics,
@@ -229,7 +230,12 @@ def compensator_of(config: RunConfig, prepared: Prepared, fitted: Fitted, repeat
     margin, limit = config.compensation.margin, _limit(config, len(prepared.mechanism.joints))
     inputs, covariates = prepared.dataset.inputs[repeat, there], prepared.covariate_coordinates
     scaling = fitted.scaling.repeat(repeat)
+    deviations = prepared.dataset.deviation[repeat, there]
     if fitted.name == "constant":
+        if prepared.choice is not None and prepared.choice.identify:
+            # Identified geometry has the zeros of the joints: their mean remainder is noise.
+            deviations = deviations - deviations.mean(0)
+            scaling.mean.zero_()
         # It looks at nothing, and a model asks only for what something in it uses.
         used = [] if prepared.physics is None else prepared.physics.uses(repeat)
         kept = [k for k, c in enumerate(covariates) if c.name in used]
@@ -246,7 +252,7 @@ def compensator_of(config: RunConfig, prepared: Prepared, fitted: Fitted, repeat
         network,
         scaling,
         inputs,
-        prepared.dataset.deviation[repeat, there],
+        deviations,
         prepared.mechanism.joints,
         covariates,
         limit=limit,

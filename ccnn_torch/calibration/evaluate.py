@@ -26,6 +26,8 @@ class Outcome:
     Attributes:
         deviation: predicted deviation at the commanded joints, `r x s x n` [SI]; of what the identified machine leaves
             where that is a part of the compensator.
+        score: what repeats and methods are compared by, lower is better, `r`: that of the training where it held rows
+            out, else the mean squared standardised error on the test rows.
         explained: pose error that the model leaves of the poses at the joints as they were commanded, `r x s`.
         after: pose error under the commands of the compensator, `r x s`; what is explained where there is none.
         after_systematic: the same without the machine's noise, where it is simulated.
@@ -36,6 +38,7 @@ class Outcome:
 
     fitted: Fitted
     deviation: Tensor
+    score: Tensor
     explained: PoseError
     after: PoseError
     after_systematic: PoseError | None = None
@@ -77,16 +80,27 @@ def evaluate(prepared: Prepared, fitted: Fitted, make: Callable[[int], Compensat
     """
     joints = prepared.joints
     deviation = fitted.predict(torch.cat([joints, prepared.covariates], -1))
+    score = fitted.score if fitted.choice is not None else _test_score(prepared, fitted, deviation)
     if prepared.simulation is None:
-        return _of_records(prepared, fitted, deviation, make)
+        return _of_records(prepared, fitted, deviation, score, make)
     command = joints
     for _ in range(_COMMAND_ITERATIONS):
         command = joints - fitted.predict(torch.cat([command, prepared.covariates], -1))
     after, systematic = prepared.simulation.pose_errors(command)
-    return Outcome(fitted, deviation, after, after, systematic)
+    return Outcome(fitted, deviation, score, after, after, systematic)
 
 
-def _of_records(prepared: Prepared, fitted: Fitted, deviation: Tensor, make: Callable[[int], Compensator]) -> Outcome:
+def _test_score(prepared: Prepared, fitted: Fitted, deviation: Tensor) -> Tensor:
+    """Mean squared standardised error on the usable test rows, `r`."""
+    rows = prepared.dataset.usable_rows("test")
+    apart = rows.take(deviation) - rows.take(prepared.dataset.deviation)
+    square = (apart / fitted.scaling.deviation.unsqueeze(1)).square().mean(-1)
+    return (square * rows.weights).sum(1) / rows.weights.sum(1)
+
+
+def _of_records(
+    prepared: Prepared, fitted: Fitted, deviation: Tensor, score: Tensor, make: Callable[[int], Compensator]
+) -> Outcome:
     repeats, found, without = range(len(prepared.joints)), list[Compensator](), ""
     try:
         found = [make(repeat) for repeat in repeats]
@@ -110,7 +124,7 @@ def _of_records(prepared: Prepared, fitted: Fitted, deviation: Tensor, make: Cal
         reached.append(_apart(_model(prepared, k, moved), wanted) + rest)
         damped += float((solved.status == 3).double().mean()) / len(prepared.joints)
     explained, after = _error(torch.stack(left)), _error(torch.stack(reached))
-    return Outcome(fitted, deviation, explained, after, None, tuple(found), without, damped)
+    return Outcome(fitted, deviation, score, explained, after, None, tuple(found), without, damped)
 
 
 def pose_with_effects(prepared: Prepared) -> PoseError | None:

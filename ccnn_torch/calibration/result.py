@@ -52,13 +52,13 @@ def plan_of(config: RunConfig) -> Plan:
 
 
 def best_method(outcomes: Mapping[str, Outcome]) -> str:
-    """The method whose median score over the repeats is lowest (validation, or training where none was held out)."""
+    """The method whose median score over the repeats is lowest, see `Outcome`."""
     return by_score(outcomes)[0]
 
 
 def by_score(outcomes: Mapping[str, Outcome]) -> list[str]:
     """The methods, the best first."""
-    return sorted(outcomes, key=lambda name: float(outcomes[name].fitted.score.median()))
+    return sorted(outcomes, key=lambda name: float(outcomes[name].score.median()))
 
 
 def assemble(
@@ -89,7 +89,7 @@ def assemble(
         methods[name] = {
             "test": errors,
             "ratio_to_floor": ratio_to_floor(errors, floor),
-            "score": spread(outcome.fitted.score),
+            "score": spread(outcome.score),
             "seconds": spread([each] * len(dataset.seeds)),
             **_certainty(outcome, dataset, test, inside, joints),
             "converged": _spread_or_none(outcome.fitted.converged),
@@ -105,6 +105,7 @@ def assemble(
         "case": None if config.case is None else case_label(config),
         "joints": [{"name": joint.name, "unit": joint.unit} for joint in joints],
         "best_method": best,
+        "chosen_by": chosen_by(config, prepared, outcomes[best]),
         "rows": row_counts(config, dataset),
         "before": before_block(test.take(prepared.total), test.weights, joints),
         "before_train": before_block(fit.take(prepared.total), fit.weights, joints),
@@ -120,6 +121,14 @@ def assemble(
         "notes": [*prepared.notes, *_notes(plan_of(config))],
         "versions": versions(),
     }
+
+
+def chosen_by(config: RunConfig, prepared: Prepared, outcome: Outcome) -> str:
+    """What chose the model: `folds`, `validation` rows or `test` rows; never the rows that it was trained on."""
+    folds = prepared.choice is not None and prepared.choice.by == "folds" and config.methods is None
+    if folds or plan_of(config).folds > 1:
+        return "folds"
+    return "test" if outcome.fitted.choice is None else "validation"
 
 
 def _notes(plan: Plan) -> list[str]:
