@@ -19,7 +19,7 @@ from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import load_config, make_config
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.cli.application import app
-from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
+from ccnn_torch.compensation import Care, build_machine, effect_deviation, expand_effects, load_model
 from ccnn_torch.compensation.export.to_onnx import to_onnx
 from ccnn_torch.compensation.model_files.onnx_session import open_onnx
 from ccnn_torch.compensation.networks import describe_network, network_from_description
@@ -106,7 +106,7 @@ def test_held_out_rows_come_near_the_noise(played: Path) -> None:
 
 def test_held_out_rows_do_not_change_the_coefficients(played: Path, tmp_path: Path) -> None:
     first = prepare(make_config(**keys(played)))
-    assert first.effects is not None
+    assert first.physics is not None
     lines = (played / "rows.csv").read_text(encoding="utf-8").splitlines()
     for row in first.dataset.splits[0].test.tolist():
         cells = lines[row + 1].split(",")
@@ -114,28 +114,26 @@ def test_held_out_rows_do_not_change_the_coefficients(played: Path, tmp_path: Pa
         lines[row + 1] = ",".join(cells)
     (tmp_path / "rows.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     other = prepare(make_config(**keys(played, records=str(tmp_path / "rows.csv"), split={"kind": "random"})))
-    assert other.effects is not None
+    assert other.physics is not None
     assert torch.equal(first.dataset.splits[0].test, other.dataset.splits[0].test)
-    assert first.effects.block() == other.effects.block()
+    assert first.physics.block() == other.physics.block()
 
 
 def test_the_network_learns_what_is_left_exactly(played: Path) -> None:
     found = prepare(make_config(**keys(played)))
-    assert found.effects is not None
-    left = found.dataset.deviation
-    whole = left + found.effects.deviation(found.joints + left)
-    usable = found.dataset.usable
-    torch.testing.assert_close(whole[usable], found.total[usable], rtol=0, atol=1e-10)
+    assert found.physics is not None
+    usable = found.dataset.usable[0]
+    reached = found.physics.poses(0, found.joints[0] + found.dataset.deviation[0])
+    torch.testing.assert_close(reached[usable], found.pose[0][usable], rtol=0, atol=1e-8)
 
 
 def test_with_identified_geometry_beside_it(played: Path) -> None:
     found = prepare(make_config(**keys(played, geometry="identify")))
-    assert found.effects is not None and found.geometry is not None
-    left, joints = found.dataset.deviation, found.joints
-    part = left + found.effects.deviation(joints + left)
-    whole = part + found.geometry.deviation(found.pose)(joints + part)
-    usable = found.dataset.usable
-    torch.testing.assert_close(whole[usable], found.total[usable], rtol=0, atol=1e-8)
+    assert found.physics is not None
+    left, usable = found.dataset.deviation, found.dataset.usable[0]
+    assert not torch.equal(found.physics.values[0, 0], found.mechanism.nominal)
+    reached = found.physics.poses(0, found.joints[0] + left[0])
+    torch.testing.assert_close(reached[usable], found.pose[0][usable], rtol=0, atol=1e-8)
     test = found.dataset.splits[0].test
     assert float(left[0, test].square().mean().sqrt()) < 0.1 * float(found.total[0, test].square().mean().sqrt())
 
@@ -155,18 +153,18 @@ def test_a_run_from_the_command_line_and_its_files(cli: Cli, tmp_path: Path) -> 
     assert pose["after"]["rms"]["median"] < 1.3 * 2**0.5 * NOISE < 0.2 * pose["before"]["rms"]["median"]
     assert "effects + constant removes" in (out / "results.md").read_text(encoding="utf-8")
     card = json.loads((out / "card.json").read_text(encoding="utf-8"))
-    assert card["format"] == "ccnn_torch compensator 4" and set(card["effects"]["numbers"]) == {"joint_gain"}
+    assert card["format"] == "ccnn_torch compensator 6"
+    assert set(card["machine"]["effects"]["numbers"]) == {"joint_gain"}
+    # The effect looks at no column, so that the model asks for none.
+    assert card["covariates"] == []
     assert any("double precision" in note for note in card["notes"])
     # Every form gives the commands of the master, and these reach the pose to the noise of the numbers.
     table = read_table(rows)
     master = load_model(out / "model.safetensors")
     joints = np.stack([table.column(c.name, c.unit) for c in master.joints], -1)
-    covariates = np.stack([table.column(c.name, c.unit) for c in master.covariates], -1)
-    wanted = master(joints, covariates)
-    program = torch.export.load(out / "model.pt2").module()
-    of_pt2 = program(torch.from_numpy(joints), torch.from_numpy(covariates))[0]
-    for command in (load_model(out / "model.onnx")(joints, covariates)["command"], of_pt2.numpy()):
-        np.testing.assert_allclose(command, wanted["command"], rtol=0, atol=1e-14)
+    wanted = master(joints)
+    command = load_model(out / "model.onnx")(joints)["command"]
+    np.testing.assert_allclose(command, wanted["command"], rtol=0, atol=1e-12)
     gain = torch.tensor([results["effects"]["coefficients"]["joint_gain"][q]["values"][0] for q in ("q1", "q2")])
     moved = (wanted["command"] + wanted["deviation"]) - joints
     assert np.abs(moved).max() < 1e-12 and (gain.abs() > 1e-4).all()

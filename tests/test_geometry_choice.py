@@ -36,18 +36,19 @@ def _prepared(folder: Path, geometry_error: float, wave: float, **keys: object) 
 
 def test_wrong_parameters_alone_need_no_learner(tmp_path: Path) -> None:
     found = _prepared(tmp_path, 3e-4, 0.0)
-    assert found.geometry is not None and found.default_method == "constant"
-    assert found.choice is not None and found.choice.why.startswith("Identified geometry alone is taken")
+    assert found.physics is not None and found.default_method == "constant"
+    assert found.choice is not None and found.choice.why.startswith("Identified geometry: the simplest of the best")
     results = calibrate(records=str(tmp_path / "rows.csv"), mechanism="tripod").results
     assert results["geometry"] == found.choice.block and list(results["methods"]) == ["constant"]
     assert results["pose"]["position"]["after"]["rms"]["median"] < 1e-5
+    assert results["chosen_by"] == "folds"
     assert found.choice.why in results["notes"]
 
 
 def test_what_geometry_leaves_is_learned(tmp_path: Path) -> None:
-    found = _prepared(tmp_path, 3e-4, 1e-4)
-    assert found.geometry is not None and found.default_method == "gp"
-    assert "identified + learner" in found.choice.why
+    found = _prepared(tmp_path, 3e-4, 1e-4, effects="none")
+    assert found.physics is not None and found.default_method == "gp"
+    assert "identified geometry + learner" in found.choice.why
 
 
 def test_held_out_rows_do_not_choose(tmp_path: Path) -> None:
@@ -65,9 +66,11 @@ def test_held_out_rows_do_not_choose(tmp_path: Path) -> None:
 
 def test_an_explicit_word_is_kept(tmp_path: Path) -> None:
     for word in ("none", "identify"):
-        found = _prepared(tmp_path, 3e-4, 0.0, geometry=word)
-        assert (found.geometry is not None) == (word == "identify") and found.default_method == "ccnn"
-        assert found.choice.block == {"chosen": word, "why": f"geometry={word} was asked for."}
+        found = _prepared(tmp_path, 3e-4, 0.0, geometry=word, effects="none")
+        assert (found.physics is not None) == (word == "identify")
+        assert found.default_method == ("constant" if word == "identify" else "ccnn")
+        assert found.choice.block["chosen"] == word
+        assert found.choice.block["why"].startswith(f"geometry={word} was asked for.")
     assert calibrate(case="tripod", methods=["constant"]).results["geometry"]["chosen"] == "none"
 
 

@@ -52,7 +52,6 @@ FILES = (
     "card.json",
     "model.safetensors",
     "model.onnx",
-    "model.pt2",
     "report.html",
 )
 

@@ -86,6 +86,7 @@ def choose_model(
     geometry: str,
     verdict: Verdict | None,
     asked_effects: bool,
+    learner_open: bool,
 ) -> ModelChoice:
     """Compare what the config leaves open by the held-out pose errors under the candidates' own commands.
 
@@ -98,6 +99,7 @@ def choose_model(
         geometry: the key of the config.
         verdict: effects that were found in the training rows, or that a file names; None without any.
         asked_effects: whether the effects are a part of every candidate.
+        learner_open: whether the config leaves the learner to the comparison.
     """
     name = mechanism.name
     geometry_why = ""
@@ -112,7 +114,7 @@ def choose_model(
     # Effects that a diagnosis found stand beside identified geometry wherever that may be a part.
     physical = [Candidate(i, e, False) for e in effects for i in (identify if not e else identify[:1]) if i or e]
     asked = "" if geometry == "auto" else geometry_why or f"geometry={geometry} was asked for."
-    if len(identify) == len(effects) == 1:
+    if not physical or (len(physical) == 1 and False not in identify and not learner_open):
         return ModelChoice(identify[0], effects[0], _ELSE, asked)
     rows = torch.cat([split.train, split.validation])
     if len(rows) > _MOST_ROWS:

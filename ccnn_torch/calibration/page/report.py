@@ -19,7 +19,7 @@ from ccnn_torch.report.figures.workspace import overview_plot, workspace_plot
 from ccnn_torch.report.html import InlineFigure, page_text
 from ccnn_torch.report.json_files import read_json
 
-_LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "model.onnx", "model.pt2", "config.yaml")
+_LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "model.onnx", "config.yaml")
 
 
 def html_text(

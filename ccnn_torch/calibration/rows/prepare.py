@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.config import RunConfig
+from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.geometry.choice import ModelChoice, choose_model
 from ccnn_torch.calibration.geometry.effects_search import search_effects
 from ccnn_torch.calibration.geometry.identified import fit_machine
@@ -300,7 +300,16 @@ def _choice(
         verdict, notes = search_effects(mechanism, records, rows, names, config.seed)
         if config.repeats > 1 and verdict is not None:
             notes.append("They were searched in the training rows of the first repeat, for all repeats.")
-    about = (split, config.split.kind, config.seed, settings, config.geometry, verdict, asked)
+    about = (
+        split,
+        config.split.kind,
+        config.seed,
+        settings,
+        config.geometry,
+        verdict,
+        asked,
+        method_names(config, "") == [""],
+    )
     choice = choose_model(mechanism, records, *about)
     return choice, verdict if choice.effects else None, notes
 
