@@ -67,7 +67,7 @@ def compensate(
 
     ccnn compensate runs/ur10/model.safetensors poses.csv commands.csv --pose
 
-    ccnn compensate runs/ur10/model.safetensors poses.csv commands.csv --pose --tool "10mm,0,120mm,0,90deg,0"
+    ccnn compensate runs/ur10/model.safetensors poses.csv out.csv --pose --tool "10mm,0,120mm,0,90deg,0"
 
     ccnn compensate checkpoints/tripod/model.onnx commands.csv ideal.csv --back
 
