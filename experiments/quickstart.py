@@ -8,7 +8,7 @@ calibration = ct.calibrate(case="tripod", seed=0)  # or records="my_robot.csv", 
 error = calibration.results["pose"]["position"]
 print(f"held-out position error: {1e6 * error['before']['rms']['median']:.0f} µm before, "
       f"{1e6 * error['after']['rms']['median']:.0f} µm after")  # fmt: skip
-calibration.save("runs/quickstart")  # model.safetensors, model.onnx, model.pt2, card.json
+calibration.save("runs/quickstart")  # model.safetensors, model.onnx, card.json
 
 mechanism = calibration.mechanism()
 mechanism.inverse_kinematics.register_forward_hook(calibration.compensator().hook(), with_kwargs=True)

@@ -46,9 +46,10 @@ def compensate(
 
     Headers that the model's run mapped by `columns` are mapped again.
 
-    OUT.csv repeats the columns of IN.csv and adds command_q1[unit]…, deviation_q1[unit]… and inside_domain[1] (0 =
-    outside the model's domain, where the correction tends to its safe value). With --back it adds ideal_q1[unit]…
-    and inside_domain[1]; the commands are the columns command_q1… where IN.csv has them, else q1…. With --pose a
+    OUT.csv repeats the columns of IN.csv and adds command_q1[unit]…, deviation_q1[unit]…, inside_domain[1] and
+    status[1]: 0 exact, 1 outside what was measured or fallen back, 2 input not finite, 3 damped near a singular pose,
+    at a limit or not settled (the nearest safe command). With --back it adds ideal_q1[unit]… and inside_domain[1];
+    the commands are the columns command_q1… where IN.csv has them, else q1…. With --pose a
     serial arm takes the branch of guess_q1[unit]… where given, else that of the previous row. With --sd it also adds
     deviation_sd_q1[unit]…: inside the domain, about 95 % of new measurements are within 1.96 times it of the predicted
     deviation. With identified.yaml, which ccnn identify writes, the commands are those of the identified kinematics.
@@ -57,8 +58,8 @@ def compensate(
     motion that is wanted, and OUT.csv gets corrected1[unit]…, the commands at which the machine follows it, and
     predicted1[unit]…, where it then goes.
 
-    Every row is checked against the limits in the model's card. Where the model violates them (a number that is not
-    finite, a deviation above the limit), the row has command = joints and inside_domain = 0, and the exit code is 2.
+    Every row is checked against the model's card. Where the model violates it (a number that is not finite, a
+    deviation above most_deviation), the row has command = joints and inside_domain = 0, and the exit code is 2.
 
     Examples:
 
@@ -66,7 +67,7 @@ def compensate(
 
     ccnn compensate runs/ur10/model.safetensors poses.csv commands.csv --pose
 
-    ccnn compensate runs/ur10/model.safetensors poses.csv commands.csv --pose --tool "10mm,0,120mm,0,90deg,0"
+    ccnn compensate runs/ur10/model.safetensors poses.csv out.csv --pose --tool "10mm,0,120mm,0,90deg,0"
 
     ccnn compensate checkpoints/tripod/model.onnx commands.csv ideal.csv --back
 

@@ -33,13 +33,13 @@ def export(
     identified.yaml the kinematics with the identified parameters. onnx writes model.onnx with master and card, and
     controller.onnx with the command alone. urdf writes an arm with its identified links as URDF, MuJoCo model and DH
     table. table writes the deviation over a grid, tables of single axes and a mesh where they suffice, and how far off
-    each of them is. Of an identified.yaml the others make a closed form of the correction, and say what it leaves.
+    each of them is.
 
-    Source code returns the same codes: 0 inside the domain; 1 outside, or where the model broke its limit; 2 where an
+    Source code returns the same codes: 0 exact; 1 outside the domain, or where the model broke its limit; 2 where an
     input is not finite: then command = joints, with the middle of the domain for what is no number and its edge for
-    infinity. Before a file is written its operations are compared with the
-    model: in float64 to 1e-12 of the limit (1e-9 with a Gaussian process, an arm's links or physical effects), in
-    float32 to 1e-5.
+    infinity; 3 damped near a singular pose, at a limit or not settled. Before a file is written its operations are
+    compared with the model: in float64 to 1e-12 of the limit (1e-9 with a Gaussian process, an identified machine or
+    physical effects), in float32 to 1e-5.
 
     Examples:
 

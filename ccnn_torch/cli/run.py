@@ -31,6 +31,9 @@ def run(
 ) -> None:
     """Train on a case study or on measured records; write tables, curves, plots and model files into a run folder.
 
+    On records cross-validation chooses first what the model holds: identified geometry, effects that a diagnosis of
+    the training rows names, a learner (keys geometry and effects).
+
     Examples:
 
     ccnn run experiments/tripod.yaml
