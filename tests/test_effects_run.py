@@ -19,7 +19,7 @@ from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import load_config, make_config
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.cli.application import app
-from ccnn_torch.compensation import Care, build_machine, effect_deviation, expand_effects, load_model
+from ccnn_torch.compensation import Care, effect_deviation, expand_effects, load_model
 from ccnn_torch.compensation.export.to_onnx import to_onnx
 from ccnn_torch.compensation.model_files.onnx_session import open_onnx
 from ccnn_torch.compensation.networks import describe_network, network_from_description

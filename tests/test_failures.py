@@ -107,7 +107,8 @@ def test_what_did_not_converge_is_marked_in_the_tables(file: Path) -> None:
 
 STEEP = '''
 import torch
-from ccnn_torch.learners.constant import Constant
+from ccnn_torch.compensation import register_network
+from ccnn_torch.learners.constant import Constant, ConstantNetwork
 
 
 class Steep(Constant):
@@ -124,6 +125,16 @@ class Waves(torch.nn.Module):
 
     def forward(self, inputs):
         return self.level(inputs) + 100 * torch.sin(1e3 * inputs[..., :1])
+
+    def describe(self):
+        return {**self.level.describe(), "kind": "waves"}
+
+    @classmethod
+    def from_description(cls, description):
+        return cls(ConstantNetwork.from_description(description))
+
+
+register_network("waves", Waves)
 '''
 
 

@@ -270,8 +270,8 @@ class Compensator(nn.Module):
             if not warned and bool((solved & ~inside).any()):
                 warned = True
                 warnings.warn(
-                    "a command is outside the domain that the compensator was trained on, where it falls back to the "
-                    "mean training deviation; this warning is given once",
+                    "a command is outside the domain that the compensator was trained on, where what it learned fades "
+                    "into the mean training deviation; this warning is given once",
                     OutsideDomainWarning,
                     stacklevel=2,
                 )
@@ -309,7 +309,8 @@ class Compensator(nn.Module):
         if self.machine is None:
             known = strange <= 0
             return _Way(torch.where(known, correction, 0.0), torch.where(known, found, 0.0), last, doubt)
-        good = (doubt <= ASTRAY) & torch.isfinite(correction).all(-1, keepdim=True)
+        # Written so that what is no number is not good.
+        good = (doubt <= ASTRAY) & (correction.abs() <= self.most * (1 + 1e-9)).all(-1, keepdim=True)
         learned = _Learned(*(torch.where(good, a, b) for a, b in zip(last, first, strict=True)))
         given = torch.where(strange <= 0, torch.where(good, correction, start), 0.0)
         return _Way(given, given, learned, doubt)
@@ -367,7 +368,8 @@ class Compensator(nn.Module):
             for _ in range(self.iterations):
                 correction = found
                 found, doubt = self.step_back(command - correction, correction, aim)
-            found = torch.where(doubt <= ASTRAY, correction, start)
+            good = (doubt <= ASTRAY) & (correction.abs() <= self.most * (1 + 1e-9)).all(-1, keepdim=True)
+            found = torch.where(good, correction, start)
         given = torch.where(strange <= 0, found, 0.0)
         return _Way(given, -given, learned, doubt)
 

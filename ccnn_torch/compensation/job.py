@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ccnn_torch.compensation.compensator import DAMPED
 from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry, load_compensation
 from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.wanted_poses import WantedPoses
@@ -29,9 +30,6 @@ Model: TypeAlias = LoadedModel | IdentifiedGeometry
 
 ROWS = 1024
 """Rows that a model takes at once: its calls count for nothing then, and it takes a hundred MB."""
-
-DAMPED = 3
-"""Status of a row whose command was damped beside a singularity."""
 
 
 @dataclass
@@ -171,11 +169,11 @@ def _added(
         if sd:
             found["deviation_sd"] = shown.spread_shown(found["deviation_sd"])
     if back:
-        return named("ideal", found["ideal"]) | {"inside_domain[1]": found["ideal_inside_domain"]}
+        flags = {"inside_domain[1]": found["ideal_inside_domain"], "status[1]": found["ideal_status"]}
+        return named("ideal", found["ideal"]) | flags
     added = named("command", found["command"]) | named("deviation", found["deviation"])
     added["inside_domain[1]"] = found["inside_domain"]
-    if "status" in found:
-        added["status[1]"] = found["status"]
+    added["status[1]"] = found["status"]
     return added | (named("deviation_sd", found["deviation_sd"]) if sd else {})
 
 
@@ -186,27 +184,20 @@ def _count(result: Compensated, table: Table, found: dict[str, Array], back: boo
     result.rows += len(table)
     result.fallback += len(bad)
     result.outside += int((~found["ideal_inside_domain" if back else "inside_domain"]).sum())
-    if "status" in found and not back:
-        result.damped += int((found["status"] == DAMPED).sum())
+    result.damped += int((found["ideal_status" if back else "status"] == DAMPED).sum())
 
 
 def sentences(output: Path, found: Compensated, trained: bool) -> list[str]:
     """What was written, and how many rows are outside the domain or damped."""
     said = [f"{output}: {found.rows} rows written."]
     if found.outside:
-        what = (
-            "outside the domain that the model was trained on" if trained else "out of the identified machine's reach"
-        )
-        then = (
-            "their correction fades into the safe one, the mean training deviation"
-            if trained
-            else "their joints are as they were"
-        )
-        said.append(f"{found.outside} of them {_is(found.outside)} {what} (inside_domain = 0): {then}.")
+        what = "what was measured" if trained else "the joints of the identified machine"
+        then = "what was learned fades there, geometry and effects hold" if trained else "its geometry holds there too"
+        said.append(f"{found.outside} of them {_is(found.outside)} outside {what} (inside_domain = 0): {then}.")
     if found.damped:
         said.append(
-            f"{found.damped} of them {_is(found.damped)} beside a singularity (status = {DAMPED}): their commands are "
-            "damped, the nearest safe ones to the pose."
+            f"{found.damped} of them {_is(found.damped)} near a singular pose or at a limit of the joints "
+            f"(status = {DAMPED}), with the nearest safe command."
         )
     return said
 

@@ -15,6 +15,8 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import parse_json, read_text
 from ccnn_torch.units import LARGEST
 
+TRAINING_ROWS = "the training rows"
+"""Where a verdict is from that no file holds."""
 # A diagnosis has some 100 kB.
 _LARGEST = 100_000_000
 
@@ -144,6 +146,12 @@ def usable_verdict(verdict: Verdict, situation: Situation) -> tuple[Verdict | No
         except InputError as reason:
             notes.append(f"{str(reason).removeprefix(f'{verdict.path}: effects, ')}.")
     return (replace(verdict, parameters=kept) if kept else None), notes
+
+
+def beside_geometry(verdict: Verdict) -> Verdict | None:
+    """The effects that add to identified geometry; None where there is none."""
+    kept = {n: v for n, v in verdict.parameters.items() if make_effect(n).kind != "parameters"}
+    return replace(verdict, parameters=kept) if kept else None
 
 
 def _verdict_of(

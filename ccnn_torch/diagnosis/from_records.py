@@ -14,7 +14,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.checks.mistakes import what_is_wrong
 from ccnn_torch.diagnosis.discrepancy.network import with_network
 from ccnn_torch.diagnosis.engine import diagnose_rows, name_rows
-from ccnn_torch.diagnosis.from_file import Verdict, usable_verdict
+from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Verdict, usable_verdict
 from ccnn_torch.diagnosis.residual.distance import size_of
 from ccnn_torch.diagnosis.residual.noise_evidence import Noise, column_names, noise_of_columns
 from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, simulator_inputs
@@ -98,7 +98,7 @@ def name_effects(
             named = [c.name for c in one.effect.coefficients(here)] + [s.name for s in one.effect.shapes(here)]
             of_one = dict(zip(named, numbers, strict=True))
             parameters[one.effect.name] = {name: value for name, value in of_one.items() if value}
-    verdict = Verdict("the training rows", situation.gravity, parameters, found.judgement.outside)
+    verdict = Verdict(TRAINING_ROWS, situation.gravity, parameters, found.judgement.outside)
     names = [*found.judgement.names]
     return *usable_verdict(verdict, situation), names, found.judgement.probability
 

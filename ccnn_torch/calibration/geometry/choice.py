@@ -107,6 +107,9 @@ def choose_model(
         geometry_why = f"{name} has no geometric parameters to identify."
     elif geometry != "none" and isinstance(mechanism, SerialArm) and (mechanism.frame_per or mechanism.tool_per):
         geometry_why = f"{name} has frames per group of rows, and identified geometry has one."
+    if geometry_why and geometry == "identify":
+        # It is refused where it is fitted, with what to do.
+        return ModelChoice(True, False, _ELSE, "geometry=identify was asked for.")
     if geometry_why:
         geometry = "none"
     identify = {"auto": (True, False), "identify": (True,), "none": (False,)}[geometry]

@@ -11,7 +11,7 @@ from torch import Tensor
 from ccnn_torch.calibration.rows.dataset import Dataset
 from ccnn_torch.compensation import Care, build_machine, expand_effects, expand_geometry, gains, geometric_deviation
 from ccnn_torch.coordinates import plausible_error
-from ccnn_torch.diagnosis.from_file import Known, Verdict, one_row_at_a_time, read_verdict
+from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Known, Verdict, one_row_at_a_time, read_verdict
 from ccnn_torch.diagnosis.refit import refit
 from ccnn_torch.display import short_path
 from ccnn_torch.effects import (
@@ -227,10 +227,14 @@ def fit_effects(
         values.append(own)
     acting = [[a for a in one if a.effect.kind != "parameters"] for one in every]
     named = ", ".join(k.effect.name for k in known)
-    notes.append(
-        f"Effects of {short_path(verdict.path)}: {named}. Their coefficients were fitted anew to the training rows of "
-        "each repeat; their periods and other shapes are the file's, which may have seen the held-out rows."
-    )
+    fitted_anew = "Their coefficients were fitted anew to the training rows of each repeat"
+    if verdict.path == TRAINING_ROWS:
+        notes.append(f"Effects: {named}. {fitted_anew}.")
+    else:
+        notes.append(
+            f"Effects of {short_path(verdict.path)}: {named}. {fitted_anew}; their periods and other shapes are the "
+            "file's, which may have seen the held-out rows."
+        )
     names = [c.name for c in records.covariate_coordinates]
     changed = torch.stack(values).unsqueeze(1)
     return Physics(short_path(verdict.path), situations, changed, acting, every, names), notes

@@ -21,7 +21,7 @@ from ccnn_torch.calibration.rows.dataset import Dataset, by_repeat, dataset_of
 from ccnn_torch.calibration.rows.memory import check_memory
 from ccnn_torch.config.held_out import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.diagnosis.from_file import Verdict
+from ccnn_torch.diagnosis.from_file import Verdict, beside_geometry
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
@@ -298,6 +298,8 @@ def _choice(
         names = None if isinstance(config.effects, str) else config.effects
         rows = torch.cat([split.train, split.validation])
         verdict, notes = search_effects(mechanism, records, rows, names, config.seed)
+        if verdict is not None and config.geometry != "none" and mechanism.geometry:
+            verdict = beside_geometry(verdict)
         if config.repeats > 1 and verdict is not None:
             notes.append("They were searched in the training rows of the first repeat, for all repeats.")
     about = (

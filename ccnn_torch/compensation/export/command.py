@@ -97,12 +97,13 @@ def _examples(machine: Machine | None, joints: Tensor) -> list[Tensor]:
     return [] if machine is None else [machine.aim(joints)]
 
 
-def _chosen(graph: Graph, known: Any, last: list[Any], first: list[Any]) -> list[Any]:
+def _chosen(graph: Graph, known: Any, last: list[Any], first: list[Any], most: Tensor) -> list[Any]:
     """Correction, δ, excess, weight, features and doubt of the last step, or of the first where that went astray."""
 
     def choose(doubt: Tensor, known: Tensor, *both: Tensor) -> list[Tensor]:
         half = len(both) // 2
-        found = [torch.where(doubt <= ASTRAY, a, b) for a, b in zip(both[:half], both[half:], strict=True)]
+        good = _small(both[0], most, doubt) <= ASTRAY
+        found = [torch.where(good, a, b) for a, b in zip(both[:half], both[half:], strict=True)]
         return [known * found[0], *found[1:]]
 
     pairs = [*last[:4], *first[:4]]
@@ -110,6 +111,12 @@ def _chosen(graph: Graph, known: Any, last: list[Any], first: list[Any]) -> list
     examples = [torch.ones(graph.rows, v.shape[1], dtype=torch.float64) for v in pairs]
     correction, excess, weight, features = Traced(choose, *blank, *examples)(graph, last[4], known, *pairs)
     return [correction, correction, excess, weight, last[4], features]
+
+
+def _small(correction: Tensor, most: Tensor, doubt: Tensor) -> Tensor:
+    """Doubt, and more than any where a correction is above its bound, `s x 1`."""
+    beyond = torch.relu(correction.abs() - most * (1 + 1e-9)) @ torch.ones_like(most).unsqueeze(-1)
+    return doubt + beyond / 1e-12
 
 
 def _back(graph: Graph, step: _Step, at: Any, more: Any, strange: Any, known: Any) -> list[Any]:
@@ -135,7 +142,7 @@ def _back(graph: Graph, step: _Step, at: Any, more: Any, strange: Any, known: An
         found, doubt = one(graph, at, correction, aim)
 
     def choose(doubt: Tensor, known: Tensor, last: Tensor, first: Tensor) -> Tensor:
-        return -known * torch.where(doubt <= ASTRAY, last, first)
+        return -known * torch.where(_small(last, own.most, doubt) <= ASTRAY, last, first)
 
     traced = Traced(choose, blank, blank.clone(), joints, nothing.clone())
     deviation = traced(graph, doubt, known, correction, start)[0]
@@ -202,7 +209,7 @@ def command_graph(
     there = [correction, last[0], last[1], last[2], last[4], last[3]]
     back = [first[0], first[0], first[1], first[2], first[4]]
     if machine is not None:
-        there = _chosen(graph, known, [correction, *last[1:]], [first[0], *first[1:]])
+        there = _chosen(graph, known, [correction, *last[1:]], [first[0], *first[1:]], compensator.most)
         back = _back(graph, step, at, more, strange, known)
 
     def inside(excess: Tensor) -> Tensor:

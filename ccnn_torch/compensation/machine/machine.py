@@ -218,7 +218,9 @@ class Machine(nn.Module):
 
 def limits_of(mechanism: Mechanism) -> tuple[Tensor, Tensor]:
     """Lowest and highest joints of the machine's file, `n` each [SI]; infinite where there are none."""
-    if isinstance(mechanism, SerialArm) and mechanism.recipe["keys"]["limits"] is not None:
-        return mechanism.limits[:, 0].clone(), mechanism.limits[:, 1].clone()
     none = torch.full((len(mechanism.joints),), math.inf, dtype=torch.float64)
-    return -none, none
+    if not isinstance(mechanism, SerialArm) or mechanism.recipe["keys"]["limits"] is None:
+        return -none, none
+    # Exactly a full turn is what a joint without limits is sampled over.
+    free = (mechanism.limits.abs() == math.pi).all(-1)
+    return torch.where(free, -none, mechanism.limits[:, 0]), torch.where(free, none, mechanism.limits[:, 1])

@@ -20,8 +20,7 @@ def read_model(path: Path) -> bytes:
     """
     if path.suffix == ".pt2":
         raise ModelFileError(
-            f"{path}: a .pt2 is written for other programs and never read back, because opening one can run code that "
-            f"it contains; give the .safetensors or .onnx beside it, or, if you trust its author, open it "
+            f"{path}: a .pt2 is never read back, because opening one can run code that it contains; give the .safetensors or .onnx beside it, or, if you trust its author, open it "
             f"yourself in Python: torch.export.load({str(path)!r}).module()"
         )
     if path.suffix not in MODEL_FORMS:

@@ -30,7 +30,7 @@ from ccnn_torch.version import __version__
 
 DTYPES = ("float64", "float32")
 # What a controller needs: without the way back and the standard deviation a graph takes three quarters of the time.
-COMMAND = ("command", "deviation", "inside_domain")
+COMMAND = ("command", "deviation", "inside_domain", "status")
 
 
 @dataclass

@@ -196,7 +196,7 @@ def costs(form: Form) -> list[str]:
     tables = {values.tobytes(): len(values) for program in form.programs for values in program.tables.values()}
     arrays = max(sum(program.sizes[b] for b in program.buffers) for program in form.programs)
     parts = {what: sum(count[op] for op in ops) for what, ops in _COUNTED.items()}
-    method = "Broyden's method" if form.secant else "the fixed point"
+    method = "Broyden's method" if form.secant else "Gauss and Newton's method" if form.machine else "the fixed point"
     return [
         f"Tables: {width * sum(tables.values())} bytes. Arrays at work: {width * arrays} bytes at most.",
         f"Operations of one command ({form.iterations} steps of {method}), always the same: "

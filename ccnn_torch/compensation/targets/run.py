@@ -160,7 +160,8 @@ def _run_machine(
             else:
                 correction = last["correction"]
             last = step(correction)
-        good = (last["doubt"] <= ASTRAY) & np.isfinite(correction).all(-1, keepdims=True)
+        small = (np.abs(correction) <= form.limit * (1 + 1e-9)).all(-1, keepdims=True)
+        good = (last["doubt"] <= ASTRAY) & small
         correction = np.where(good, correction, first["correction"])
         excess = np.where(good, last["excess"], first["excess"]) if "excess" in last else back["excess"]
         correction = np.where(strange[:, None], 0, correction)
