@@ -98,6 +98,9 @@ def test_held_out_rows_come_near_the_noise(played: Path) -> None:
     k = found.repeat()
     test = prepared.dataset.splits[k].test
     joints, covariates = prepared.joints[k, test], prepared.covariates[k, test]
+    # It asks for the columns alone that an effect uses.
+    assert [c.name for c in made.covariates] == ["load_x", "load_y"]
+    covariates = covariates[:, [c.name.startswith("load") for c in prepared.covariate_coordinates]]
     bar, told_of = found.mechanism(), made.solve(joints, covariates)
     left = bar.pose_error(prepared.pose[k, test], bar.forward_kinematics(told_of.ideal)).position
     inside = told_of.ideal_inside_domain

@@ -35,10 +35,10 @@ def _prepared(folder: Path, geometry_error: float, wave: float, **keys: object) 
 
 
 def test_wrong_parameters_alone_need_no_learner(tmp_path: Path) -> None:
-    found = _prepared(tmp_path, 3e-4, 0.0)
+    found = _prepared(tmp_path, 3e-4, 0.0, effects="none")
     assert found.physics is not None and found.default_method == "constant"
     assert found.choice is not None and found.choice.why.startswith("Identified geometry: the simplest of the best")
-    results = calibrate(records=str(tmp_path / "rows.csv"), mechanism="tripod").results
+    results = calibrate(records=str(tmp_path / "rows.csv"), mechanism="tripod", effects="none").results
     assert results["geometry"] == found.choice.block and list(results["methods"]) == ["constant"]
     assert results["pose"]["position"]["after"]["rms"]["median"] < 1e-5
     assert results["chosen_by"] == "folds"

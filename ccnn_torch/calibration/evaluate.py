@@ -109,6 +109,9 @@ def _of_records(
     left, reached, damped = [], [], 0.0
     for k in repeats:
         joints, covariates = prepared.joints[k], prepared.covariates[k]
+        if found:
+            names = [c.name for c in found[k].covariates]
+            covariates = covariates[:, [c.name in names for c in prepared.covariate_coordinates]]
         measured = _vectors(prepared, prepared.pose[k])
         with torch.no_grad():
             learned = found[k].learned(joints, covariates) if found else deviation[k]

@@ -20,8 +20,9 @@ def read_model(path: Path) -> bytes:
     """
     if path.suffix == ".pt2":
         raise ModelFileError(
-            f"{path}: a .pt2 is never read back, because opening one can run code that it contains; give the .safetensors or .onnx beside it, or, if you trust its author, open it "
-            f"yourself in Python: torch.export.load({str(path)!r}).module()"
+            f"{path}: a .pt2 is never read back, because opening one can run code that it contains; give the "
+            ".safetensors or .onnx beside it, or, if you trust its author, open it yourself in Python: "
+            f"torch.export.load({str(path)!r}).module()"
         )
     if path.suffix not in MODEL_FORMS:
         raise ModelFileError(f"{path}: a model file ends in {' or '.join(MODEL_FORMS)}, not in '{path.suffix}'")
