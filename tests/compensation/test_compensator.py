@@ -134,14 +134,14 @@ def test_a_network_without_a_variance_has_that_of_its_training_deviations() -> N
             fit_compensator(Plain(), scaling, joints, deviations, JOINTS, sd_scale=wrong)
 
 
-def test_strange_joints_go_to_the_domain(tripod: Compensator) -> None:
+def test_strange_joints_go_to_the_domain_without_a_correction(tripod: Compensator) -> None:
     domain = tripod.domain
     joints = torch.tensor([[NAN, 1.0, 1.0], [INF, 1.0, 1.0], [1.0, -INF, 1.0]], dtype=torch.float64)
-    command, deviation, inside = tripod(joints)
-    assert not bool(inside.any())
-    torch.testing.assert_close(deviation, tripod.safe.expand(3, 3))
+    found = tripod.solve(joints)
+    assert not bool(found.inside_domain.any()) and found.status.tolist() == found.ideal_status.tolist() == [2, 2, 2]
+    assert bool((found.deviation == 0).all()) and torch.equal(found.ideal, found.command)
     expected = torch.stack([domain.centre[0], domain.high[0], domain.low[1]])
-    torch.testing.assert_close((command + deviation)[[0, 1, 2], [0, 0, 1]], expected)
+    torch.testing.assert_close(found.command[[0, 1, 2], [0, 0, 1]], expected)
 
 
 def test_the_transition_has_no_kink(tripod: Compensator) -> None:

@@ -18,7 +18,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from kinds import KINDS
 from stand_ins import fields
-from test_geometry import arm_compensator
+from machines import compensated, known
 from test_targets import STRICT
 
 from ccnn_torch import export_model
@@ -47,7 +47,7 @@ WORSE = '*)??/\n*\\\n/";;\n(*<a>`|\x00\u202e../=1'
 @cache
 def models() -> tuple[Compensator, Compensator, SerialArm]:
     """With two covariates; and of an arm, whose links are identified."""
-    made, arm, *_ = arm_compensator()
+    made, arm = compensated("sliding arm"), known("sliding arm").mechanism
     return KINDS["covariates"](), made, arm
 
 
