@@ -77,6 +77,8 @@ def forge(folder: Path, value: float, replaced: list[Any] | None = None, outputs
         "inside_domain": helper.make_node("Equal", ["sum", "sum"], ["inside_domain"]),
         "ideal_inside_domain": helper.make_node("Equal", ["sum", "sum"], ["ideal_inside_domain"]),
     }
+    cast = {"to": TensorProto.INT64}
+    nodes |= {name: helper.make_node("Cast", ["sum"], [name], **cast) for name in ("status", "ideal_status")}
     nodes |= {node.output[0]: node for node in replaced or []}
 
     def tensor(name: str, kind: int = TensorProto.DOUBLE, *more: int) -> Any:
@@ -84,6 +86,7 @@ def forge(folder: Path, value: float, replaced: list[Any] | None = None, outputs
 
     declared = [tensor(name, TensorProto.DOUBLE, 3) for name in ("command", "deviation", "ideal", "deviation_sd")]
     declared += [tensor(name, TensorProto.BOOL) for name in ("inside_domain", "ideal_inside_domain")]
+    declared += [tensor(name, TensorProto.INT64) for name in ("status", "ideal_status")]
     given = {d.name: d for d in outputs or []}
     declared = [given.pop(d.name, d) for d in declared] + [*given.values()]
     graph = helper.make_graph([*nodes.values()], "forged", [tensor("joints", TensorProto.DOUBLE, 3)], declared)
@@ -103,6 +106,7 @@ def assert_safe(found: dict[str, np.ndarray], joints: np.ndarray) -> None:
     np.testing.assert_array_equal(found["ideal"], joints)
     assert (found["deviation"] == 0).all() and np.isfinite(found["deviation_sd"]).all()
     assert not found["inside_domain"].any() and not found["ideal_inside_domain"].any()
+    assert (found["status"] == 1).all() and (found["ideal_status"] == 1).all()
 
 
 JOINTS = tripod_joints(20).numpy()
@@ -125,6 +129,8 @@ def test_a_deviation_within_the_limit_passes_and_the_domain_is_the_cards(copied:
     assert not found["fallback"].any()
     np.testing.assert_allclose(found["command"], far - 1e-5, rtol=1e-15)
     assert found["inside_domain"].tolist() == found["ideal_inside_domain"].tolist() == [i != 3 for i in range(20)]
+    # The graph says 0 everywhere.
+    assert found["status"].tolist() == found["ideal_status"].tolist() == [int(i == 3) for i in range(20)]
 
 
 def make(kind: str, inputs: list[str], output: str, **keys: Any) -> Any:
@@ -138,6 +144,10 @@ BREAKS = {
     "a wide command": (
         [make("Concat", ["joints", "joints"], "command", axis=1)],
         [helper.make_tensor_value_info("command", TensorProto.DOUBLE, ["batch", 6])],
+    ),
+    "a status of another kind": (
+        [make("Cast", ["sum"], "status", to=TensorProto.FLOAT)],
+        [helper.make_tensor_value_info("status", TensorProto.FLOAT, ["batch"])],
     ),
     "a column of flags": (
         [make("Equal", ["joints", "joints"], "inside_domain")],
