@@ -16,12 +16,13 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from machines import compensated, known
 from onnx import TensorProto, helper, numpy_helper
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from stand_ins import tripod_joints
+from stand_ins import fields, tripod_joints
 
-from ccnn_torch.compensation import load_model
+from ccnn_torch.compensation import load_model, save_model
 from ccnn_torch.compensation.model_files.metadata import _digest, to_json
 from ccnn_torch.errors import FallbackWarning, ModelFileError
 from ccnn_torch.mechanisms import load_mechanism
@@ -421,6 +422,53 @@ def test_any_fact_replaced_by_anything_gives_a_sentence_or_finite_commands(
         path.write_bytes(good)
 
 
+@pytest.fixture
+def with_machine(tmp_path: Path) -> Path:
+    """Folder of the master of an arm with effects."""
+    name = "sliding arm with effects"
+    about = fields() | {"mechanism": known(name).mechanism.describe()}
+    save_model(tmp_path / "machine", compensated(name), about, forms=())
+    return tmp_path / "machine"
+
+
+@given(draw=st.randoms(use_true_random=False), value=ANYTHING)
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_fact_of_a_machine_replaced_by_anything(with_machine: Path, draw: Any, value: Any) -> None:
+    path = with_machine / "model.safetensors"
+    good = path.read_bytes()
+    facts = facts_of(with_machine)
+    place: Any = facts
+    last: Any = "machine"
+    # The mechanism's own keys are read as those of a mechanism file, which has tests of its own.
+    while isinstance(place[last], dict | list) and place[last] and (last == "machine" or draw.random() < 0.8):
+        place = place[last]
+        last = draw.choice([*place]) if isinstance(place, dict) else draw.randrange(len(place))
+    place[last] = value
+    try:
+        model = load_model(forge_master(with_machine, facts, lambda tensors: None))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FallbackWarning)
+            found = model(np.ones(3), np.ones(3))
+        assert np.isfinite(found["command"]).all()
+        most = np.array([model.facts["limits"][c.name]["most_deviation"] for c in model.joints])
+        assert (np.abs(found["deviation"]) <= most).all()
+    except ModelFileError as refused:
+        assert str(path) in str(refused)
+    finally:
+        path.write_bytes(good)
+
+
+@pytest.mark.parametrize("key", ["newton", "degree"])
+def test_a_machine_that_would_compute_for_ever_is_refused(tmp_path: Path, key: str) -> None:
+    about = fields() | {"mechanism": known("tripod").mechanism.describe()}
+    save_model(tmp_path, compensated("tripod"), about, forms=())
+    facts = facts_of(tmp_path)
+    facts["machine"][key] = 10**9
+    path = forge_master(tmp_path, facts, lambda tensors: None)
+    with pytest.raises(ModelFileError, match=rf"'machine\.{key}' wrong \(Input should be less than or equal to 100\)"):
+        load_model(path)
+
+
 def test_a_master_that_names_code_does_not_run_it(copied: Path, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').close()\n")
     spec = f"{tmp_path / 'own.py'}:Own"
@@ -434,9 +482,17 @@ def test_a_master_that_names_code_does_not_run_it(copied: Path, tmp_path: Path) 
             "care": [0.3, 0.01, None, None, []],
             "numbers": {},
         }
-        path = forge_master(copied, facts_of(copied) | {"effects": effects}, lambda tensors: None)
-        with pytest.raises(ModelFileError, match=r"names Python code, .*own\.py:Own, which would run.*allow_code=True"):
-            load_model(path)
+        machine = {
+            "kind": "forward",
+            "mechanism": effects["mechanism"],
+            "identified": [],
+            "effects": effects if acting else None,
+            "rule": {},
+        }
+        for part in ({"machine": machine}, {"effects": effects}):
+            path = forge_master(copied, facts_of(copied) | part, lambda tensors: None)
+            with pytest.raises(ModelFileError, match=r"names Python code, .*own\.py:Own, which would run.*=True"):
+                load_model(path)
     assert not (tmp_path / "ran").exists()
     with pytest.raises(ModelFileError):
         load_model(path, allow_code=True)
