@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from ccnn_torch.compensation.geometry.serial import SerialGeometry
 from kinds import masked
 from machines import compensated, known, small_network
 from stand_ins import fields, tripod_compensator
