@@ -383,7 +383,7 @@ class Compensator(nn.Module):
         fade = torch.relu(1 - excess)
         weight = fade * fade
         # Two products instead of safe + weight · (limited - safe): each end is then exact.
-        value = weight * self._limited(raw) + (1 - weight) * self.safe
+        value = self._limited(weight * self._limited(raw) + (1 - weight) * self.safe)
         return _Learned(value, weight, excess, features)
 
     def _deviation(self, joints: Tensor, covariates: Tensor, learned: _Learned) -> Tensor:

@@ -41,7 +41,7 @@ class Domain(nn.Module):
         centre, half_range: of the training inputs, `d` [the input's SI unit].
         directions: `2d x d` [1], the inputs and then the principal directions of z.
         middle, radius, width: of the two boxes (margin included) and their transitions, `2d` [1].
-        huge: magnitude from which an input counts as infinite, 0-d.
+        huge: magnitude from which an input counts as infinite, `d` [SI].
         low, high: edges of the box in the inputs, margin included, `d` [SI]; follow from the above.
     """
 
@@ -123,7 +123,7 @@ class Domain(nn.Module):
             (y.amax(0) + y.amin(0)) / 2,
             thickness * (1 + margin) + 1e-9,
             torch.maximum(transition * thickness, steepness),
-            torch.tensor(1e300, dtype=z.dtype),
+            torch.full_like(centre, 1e300),
         )
 
     def clean(self, inputs: Tensor) -> Known:

@@ -167,7 +167,7 @@ def settle(compensator: Compensator, inputs: Tensor) -> None:
     points = spread_points(inputs, compensator.domain, torch.Generator().manual_seed(1), _COUNTED // 2)
     joints, covariates, strange = compensator._inputs(points[:, :n], points[:, n:])
     compensator.most.fill_(_FAR)
-    compensator.domain.huge.fill_(FARTHEST)
+    compensator.domain.huge[:n] = FARTHEST
     rule, best = machine.rule, math.inf
     for doubling in range(_DOUBLINGS + 1):
         machine.rule = rule.farther(2.0**doubling)

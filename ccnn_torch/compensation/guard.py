@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch.compensation.compensator import Compensator
+from ccnn_torch.compensation.machine.machine import FARTHEST
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 
 Array = NDArray[Any]
 
-# From here an input counts as infinite; as in a `Domain`.
+# From here an input counts as infinite; as in a `Domain`, but for the joints of a machine.
 _HUGE = 1e300
 # Of the limit: how far command + deviation may be from the joints, and of the half range: from the domain's edge.
 # Exports agree with their master to 1e-9 of the limit.
@@ -30,6 +31,7 @@ class Promise:
     Attributes:
         limit: of |deviation|, `n` [SI]: the card's `most_deviation`.
         sd: standard deviation where the deviation is taken as 0, `n` [SI].
+        huge: magnitude from which an input counts as infinite, `d` [SI].
         centre, low, high: replacements of an input that is no number, and for an infinite one, `d` [SI].
         half_range: unit of the rows of `directions`, `d` [SI].
         directions: `k x d` [1], with `least` and `most`, `k` [1]: inside the domain, directions · (x - centre) /
@@ -38,6 +40,7 @@ class Promise:
 
     limit: Array
     sd: Array
+    huge: Array
     centre: Array
     low: Array
     high: Array
@@ -62,9 +65,13 @@ class Promise:
             np.array([entry[k] for entry in limits], dtype=float)
             for k in ("most_deviation", "safe_correction", "safe_sd")
         )
+        huge = np.full(len(centre), _HUGE)
+        if "machine" in facts:
+            huge[: len(limits)] = FARTHEST
         return cls(
             limit,
             np.hypot(safe, sd),
+            huge,
             centre,
             low,
             high,
@@ -82,11 +89,11 @@ class Promise:
         centre, low, high = domain.centre.numpy(), domain.low.numpy(), domain.high.numpy()
         most, sd = compensator.most.numpy(), compensator.fallback_sd.numpy()
         boxes = domain.half_range.numpy(), domain.directions.numpy(), middle - radius, middle + radius
-        return cls(most, sd, centre, low, high, *boxes)
+        return cls(most, sd, domain.huge.numpy(), centre, low, high, *boxes)
 
     def cleaned(self, inputs: Array) -> tuple[Array, Array]:
         """Finite inputs `s x d` [SI], as a `Domain` makes them, and which were not, `s x d`, bool."""
-        strange = ~(np.abs(inputs) < _HUGE)
+        strange = ~(np.abs(inputs) < self.huge)
         edge = np.where(np.isnan(inputs), self.centre, np.where(inputs > 0, self.high, self.low))
         return np.where(strange, edge, inputs), strange
 

@@ -4,27 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from pathlib import Path
 
 import torch
+from machines import MACHINES, compensated, known, near, overconstrained, small_network
 from stand_ins import Sigmoids, arm_compensator, tripod_compensator, tripod_joints
-from test_geometry import TAMED, six_joint_arm, small_network, tripod_with_errors
-from test_geometry import arm_compensator as geometry_of_an_arm
 from test_learned_models import LEARNERS
 from torch import Tensor
 
-from ccnn_torch.compensation import Care, Compensator, expand_effects, fit_compensator, fit_geometry_module
+from ccnn_torch.compensation import (
+    Care,
+    Compensator,
+    build_machine,
+    expand_effects,
+    expand_geometry,
+    fit_compensator,
+    geometric_deviation,
+)
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect
-from ccnn_torch.effects.covariates import draw_covariates
 from ccnn_torch.evolution.harmonics import Harmonics
 from ccnn_torch.evolution.masked_network import MaskedNetwork
 from ccnn_torch.evolution.waves import Waves
 from ccnn_torch.learners import TrainingData
-from ccnn_torch.mechanisms import load_mechanism
+from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.training import Scaling, train
-
-ARM = str(Path(__file__).parent.parent / "effects" / "arm.yaml")
 
 
 def learned(name: str) -> Compensator:
@@ -69,8 +71,9 @@ def masked(density: float = 0.4) -> Compensator:
 
 def six_joints(harmonics: int = 6, links: bool = True) -> Compensator:
     """An arm with identified links; masked network, periodic nodes and harmonics of its gears on what they leave."""
-    arm, identified, joints = six_joint_arm()
-    geometry = fit_geometry_module(arm, arm.nominal, identified, joints, 0.1, *TAMED) if links else None
+    arm = known("arm")
+    joints = arm.joints
+    machine = build_machine(arm.mechanism, arm.identified, None, joints, 0.1) if links else None
     generator = torch.Generator().manual_seed(8)
     blank, turning = torch.ones(1, len(joints), dtype=torch.float64), torch.ones(6, dtype=torch.bool)
     scaling = Scaling.fit(joints[None], torch.zeros_like(joints)[None], blank, turning, angles=True).repeat(0)
@@ -86,7 +89,7 @@ def six_joints(harmonics: int = 6, links: bool = True) -> Compensator:
     network = MaskedNetwork(own_masks, weights, draw(6, 2, 13), 1 + draw(6).abs(), waves, 18, gears)
     with torch.no_grad():
         deviations = scaling.restore(network(scaling.features(joints)))
-    return fit_compensator(network, scaling, joints, deviations, arm.joints, geometry=geometry)
+    return fit_compensator(network, scaling, joints, deviations, arm.mechanism.joints, machine=machine)
 
 
 def little(joints: int, covariates: int, nodes: int, turning: bool) -> Compensator:
@@ -104,60 +107,34 @@ def little(joints: int, covariates: int, nodes: int, turning: bool) -> Compensat
     return fit_compensator(network, scaling, inputs, deviations, names, [Coordinate("time", "s")] * covariates)
 
 
+def little_arm() -> Compensator:
+    """One link that turns between limits just outside of what was measured."""
+    arm = SerialArm("one", "standard", [[0.4, 0.0, 0.0, 0.0]], limits=[[-0.1, 1.1]], orientation="none")
+    joints = torch.rand(60, 1, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    return near(arm, 1e-4, joints).compensator()
+
+
 def expanded() -> Compensator:
-    """Identified geometry of a parallel machine, as a polynomial."""
-    tripod, identified, joints = tripod_with_errors()
-    module = fit_geometry_module(tripod, tripod.nominal, identified, joints)
+    """Identified geometry and effects of a machine without closed forms, as polynomials."""
+    made = overconstrained()
+    mechanism, joints = made.mechanism, made.joints
+    exact = geometric_deviation(mechanism, mechanism.nominal, made.identified)
+    geometry = expand_geometry(exact, joints)
+    situation = made.situation(joints, made.inputs[:, 2:])
+    effects = expand_effects(situation, made.acting, [], 0.1, Care(0.3, 1e-2, 3.0, 6.0))
     network, scaling, deviations = small_network(joints, 2e-5)
-    return fit_compensator(network, scaling, joints, deviations, tripod.joints, geometry=module)
+    return fit_compensator(network, scaling, joints, deviations, mechanism.joints, geometry=geometry, effects=effects)
 
 
-def with_effects(name: str, effects: Sequence[str]) -> Compensator:
-    """Physical effects of a machine, with their covariates, and a network beside them."""
-    mechanism, generator = load_mechanism(name), torch.Generator().manual_seed(2)
-    joints = mechanism.sample_joints(2000, generator)
-    joints = joints[mechanism.condition_number(joints, 0.3) < 8][:80]
-    middle = joints.mean(0)
-    joints = joints[(joints - middle).norm(dim=-1).argsort()][:60]
-    covariates = draw_covariates(mechanism, joints, generator)
-    del covariates["time"]
-    situation = Situation(mechanism, joints, covariates, default_gravity(mechanism))
-    acting = []
-    for effect in map(make_effect, effects):
-        shape = [s.grid[len(s.grid) // 2] if s.usual is None else s.usual for s in effect.shapes(situation)]
-        sizes = [0.0 if c.secondary else 0.05 * c.scale for c in effect.coefficients(situation)]
-        acting.append(Acting(effect, *(torch.tensor(v, dtype=torch.float64) for v in (shape, sizes))))
-    module = expand_effects(situation, acting, [*covariates], 0.1, Care(0.3, 1e-2, 3.0, 6.0))
-    inputs = torch.cat([joints, *(v.unsqueeze(-1) for v in covariates.values())], -1)
-    network, scaling, deviations = small_network(inputs, 1e-6)
-    n = len(mechanism.joints)
-    scaling.mean, scaling.deviation = scaling.mean[:n], scaling.deviation[:n]
-    units = {"temperature": "K"}
-    return fit_compensator(
-        _First(network, n), scaling, inputs, deviations[:, :n], mechanism.joints,
-        [Coordinate(key, units.get(key, "1")) for key in covariates], effects=module,
-    )  # fmt: skip
-
-
-class _First(torch.nn.Module):
-    """The first outputs of a network."""
-
-    def __init__(self, network: torch.nn.Module, count: int) -> None:
-        super().__init__()
-        self.network, self.count = network, count
-
-    def forward(self, features: Tensor) -> Tensor:
-        return self.network(features)[..., : self.count]
-
-
+# Of these the others hold everything that a form has; to trace them again takes time.
+_EAGER_ALONE = ("arm", "arm with effects", "tripod")
 KINDS: dict[str, Callable[[], Compensator]] = {
     "tripod": tripod_compensator,
     "covariates": arm_compensator,
     "masked": masked,
     "steep": lambda: tripod_compensator(gain=2.0, size=2e-2),
-    "sliding arm": lambda: geometry_of_an_arm()[0],
     "six joints": six_joints,
-    "expanded geometry": expanded,
-    "effects of a five-bar": lambda: with_effects("five_bar", ("compliance", "backlash")),
+    "polynomials": expanded,
+    **{name: (lambda name=name: compensated(name)) for name in MACHINES if name not in _EAGER_ALONE},
     **{name: (lambda name=name: learned(name)) for name in LEARNERS},
 }

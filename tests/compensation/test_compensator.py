@@ -90,12 +90,16 @@ def test_no_input_gives_nan_or_more_than_the_limit(values: list[float]) -> None:
     assert bool((solution.deviation.abs() <= ARM.limit).all())
     assert all(bool(torch.isfinite(value).all()) for value in solution)
     assert bool((solution.deviation_sd > 0).all())
-    torch.testing.assert_close(ARM.sd(solution.command, inputs[2:]), solution.deviation_sd, rtol=1e-9, atol=0)
     moved = solution.command + solution.deviation
     finite = inputs.abs() < ARM.domain.huge
     clean = torch.where(finite[:2], inputs[:2], moved)
     torch.testing.assert_close(moved, clean, rtol=1e-15, atol=1e-15)
-    if not bool(finite.all()):
+    if bool(finite.all()):
+        sd = ARM.sd(solution.command, inputs[2:])
+        torch.testing.assert_close(sd, solution.deviation_sd, rtol=1e-9, atol=0)
+    else:
+        assert int(solution.status) == int(solution.ideal_status) == 2
+        assert bool((solution.deviation == 0).all()) and torch.equal(solution.deviation_sd, ARM.fallback_sd)
         assert not bool(solution.inside_domain) and not bool(solution.ideal_inside_domain)
 
 
@@ -111,8 +115,10 @@ def test_the_standard_deviation_inside_outside_and_between(tripod: Compensator) 
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
     assert bool((weight == 1).any() and (weight == 0).any() and ((weight > 0) & (weight < 1)).any())
     far = torch.tensor([[50.0, 1, 1], [NAN, 1, 1], [1, INF, 1], [1e300, -1e308, 0]], dtype=torch.float64)
-    assert torch.equal(tripod.sd(far), tripod.safe_sd.expand(4, 3))
-    assert torch.equal(tripod.solve(far).deviation_sd, tripod.safe_sd.expand(4, 3))
+    # What is not finite is commanded as it is: the mean deviation is then an error, too.
+    beyond = torch.cat([tripod.safe_sd[None], torch.hypot(tripod.safe, tripod.safe_sd).expand(3, 3)])
+    assert torch.equal(tripod.sd(far), beyond)
+    assert torch.equal(tripod.solve(far).deviation_sd, beyond)
     deviations = tripod.deviation(tripod_joints())
     torch.testing.assert_close(tripod.safe_sd, (deviations - tripod.safe).square().mean(0).sqrt())
 
@@ -134,14 +140,14 @@ def test_a_network_without_a_variance_has_that_of_its_training_deviations() -> N
             fit_compensator(Plain(), scaling, joints, deviations, JOINTS, sd_scale=wrong)
 
 
-def test_strange_joints_go_to_the_domain(tripod: Compensator) -> None:
+def test_strange_joints_go_to_the_domain_without_a_correction(tripod: Compensator) -> None:
     domain = tripod.domain
     joints = torch.tensor([[NAN, 1.0, 1.0], [INF, 1.0, 1.0], [1.0, -INF, 1.0]], dtype=torch.float64)
-    command, deviation, inside = tripod(joints)
-    assert not bool(inside.any())
-    torch.testing.assert_close(deviation, tripod.safe.expand(3, 3))
+    found = tripod.solve(joints)
+    assert not bool(found.inside_domain.any()) and found.status.tolist() == found.ideal_status.tolist() == [2, 2, 2]
+    assert bool((found.deviation == 0).all()) and torch.equal(found.ideal, found.command)
     expected = torch.stack([domain.centre[0], domain.high[0], domain.low[1]])
-    torch.testing.assert_close((command + deviation)[[0, 1, 2], [0, 0, 1]], expected)
+    torch.testing.assert_close(found.command[[0, 1, 2], [0, 0, 1]], expected)
 
 
 def test_the_transition_has_no_kink(tripod: Compensator) -> None:

@@ -16,12 +16,13 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from machines import compensated, known
 from onnx import TensorProto, helper, numpy_helper
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from stand_ins import tripod_joints
+from stand_ins import fields, tripod_joints
 
-from ccnn_torch.compensation import load_model
+from ccnn_torch.compensation import load_model, save_model
 from ccnn_torch.compensation.model_files.metadata import _digest, to_json
 from ccnn_torch.errors import FallbackWarning, ModelFileError
 from ccnn_torch.mechanisms import load_mechanism
@@ -77,6 +78,8 @@ def forge(folder: Path, value: float, replaced: list[Any] | None = None, outputs
         "inside_domain": helper.make_node("Equal", ["sum", "sum"], ["inside_domain"]),
         "ideal_inside_domain": helper.make_node("Equal", ["sum", "sum"], ["ideal_inside_domain"]),
     }
+    cast = {"to": TensorProto.INT64}
+    nodes |= {name: helper.make_node("Cast", ["sum"], [name], **cast) for name in ("status", "ideal_status")}
     nodes |= {node.output[0]: node for node in replaced or []}
 
     def tensor(name: str, kind: int = TensorProto.DOUBLE, *more: int) -> Any:
@@ -84,6 +87,7 @@ def forge(folder: Path, value: float, replaced: list[Any] | None = None, outputs
 
     declared = [tensor(name, TensorProto.DOUBLE, 3) for name in ("command", "deviation", "ideal", "deviation_sd")]
     declared += [tensor(name, TensorProto.BOOL) for name in ("inside_domain", "ideal_inside_domain")]
+    declared += [tensor(name, TensorProto.INT64) for name in ("status", "ideal_status")]
     given = {d.name: d for d in outputs or []}
     declared = [given.pop(d.name, d) for d in declared] + [*given.values()]
     graph = helper.make_graph([*nodes.values()], "forged", [tensor("joints", TensorProto.DOUBLE, 3)], declared)
@@ -103,6 +107,7 @@ def assert_safe(found: dict[str, np.ndarray], joints: np.ndarray) -> None:
     np.testing.assert_array_equal(found["ideal"], joints)
     assert (found["deviation"] == 0).all() and np.isfinite(found["deviation_sd"]).all()
     assert not found["inside_domain"].any() and not found["ideal_inside_domain"].any()
+    assert (found["status"] == 1).all() and (found["ideal_status"] == 1).all()
 
 
 JOINTS = tripod_joints(20).numpy()
@@ -125,6 +130,8 @@ def test_a_deviation_within_the_limit_passes_and_the_domain_is_the_cards(copied:
     assert not found["fallback"].any()
     np.testing.assert_allclose(found["command"], far - 1e-5, rtol=1e-15)
     assert found["inside_domain"].tolist() == found["ideal_inside_domain"].tolist() == [i != 3 for i in range(20)]
+    # The graph says 0 everywhere.
+    assert found["status"].tolist() == found["ideal_status"].tolist() == [int(i == 3) for i in range(20)]
 
 
 def make(kind: str, inputs: list[str], output: str, **keys: Any) -> Any:
@@ -138,6 +145,10 @@ BREAKS = {
     "a wide command": (
         [make("Concat", ["joints", "joints"], "command", axis=1)],
         [helper.make_tensor_value_info("command", TensorProto.DOUBLE, ["batch", 6])],
+    ),
+    "a status of another kind": (
+        [make("Cast", ["sum"], "status", to=TensorProto.FLOAT)],
+        [helper.make_tensor_value_info("status", TensorProto.FLOAT, ["batch"])],
     ),
     "a column of flags": (
         [make("Equal", ["joints", "joints"], "inside_domain")],
@@ -411,6 +422,53 @@ def test_any_fact_replaced_by_anything_gives_a_sentence_or_finite_commands(
         path.write_bytes(good)
 
 
+@pytest.fixture
+def with_machine(tmp_path: Path) -> Path:
+    """Folder of the master of an arm with effects."""
+    name = "sliding arm with effects"
+    about = fields() | {"mechanism": known(name).mechanism.describe()}
+    save_model(tmp_path / "machine", compensated(name), about, forms=())
+    return tmp_path / "machine"
+
+
+@given(draw=st.randoms(use_true_random=False), value=ANYTHING)
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_fact_of_a_machine_replaced_by_anything(with_machine: Path, draw: Any, value: Any) -> None:
+    path = with_machine / "model.safetensors"
+    good = path.read_bytes()
+    facts = facts_of(with_machine)
+    place: Any = facts
+    last: Any = "machine"
+    # The mechanism's own keys are read as those of a mechanism file, which has tests of its own.
+    while isinstance(place[last], dict | list) and place[last] and (last == "machine" or draw.random() < 0.8):
+        place = place[last]
+        last = draw.choice([*place]) if isinstance(place, dict) else draw.randrange(len(place))
+    place[last] = value
+    try:
+        model = load_model(forge_master(with_machine, facts, lambda tensors: None))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FallbackWarning)
+            found = model(np.ones(3), np.ones(3))
+        assert np.isfinite(found["command"]).all()
+        most = np.array([model.facts["limits"][c.name]["most_deviation"] for c in model.joints])
+        assert (np.abs(found["deviation"]) <= most).all()
+    except ModelFileError as refused:
+        assert str(path) in str(refused)
+    finally:
+        path.write_bytes(good)
+
+
+@pytest.mark.parametrize("key", ["newton", "degree"])
+def test_a_machine_that_would_compute_for_ever_is_refused(tmp_path: Path, key: str) -> None:
+    about = fields() | {"mechanism": known("tripod").mechanism.describe()}
+    save_model(tmp_path, compensated("tripod"), about, forms=())
+    facts = facts_of(tmp_path)
+    facts["machine"][key] = 10**9
+    path = forge_master(tmp_path, facts, lambda tensors: None)
+    with pytest.raises(ModelFileError, match=rf"'machine\.{key}' wrong \(Input should be less than or equal to 100\)"):
+        load_model(path)
+
+
 def test_a_master_that_names_code_does_not_run_it(copied: Path, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').close()\n")
     spec = f"{tmp_path / 'own.py'}:Own"
@@ -424,9 +482,17 @@ def test_a_master_that_names_code_does_not_run_it(copied: Path, tmp_path: Path) 
             "care": [0.3, 0.01, None, None, []],
             "numbers": {},
         }
-        path = forge_master(copied, facts_of(copied) | {"effects": effects}, lambda tensors: None)
-        with pytest.raises(ModelFileError, match=r"names Python code, .*own\.py:Own, which would run.*allow_code=True"):
-            load_model(path)
+        machine = {
+            "kind": "forward",
+            "mechanism": effects["mechanism"],
+            "identified": [],
+            "effects": effects if acting else None,
+            "rule": {},
+        }
+        for part in ({"machine": machine}, {"effects": effects}):
+            path = forge_master(copied, facts_of(copied) | part, lambda tensors: None)
+            with pytest.raises(ModelFileError, match=r"names Python code, .*own\.py:Own, which would run.*=True"):
+                load_model(path)
     assert not (tmp_path / "ran").exists()
     with pytest.raises(ModelFileError):
         load_model(path, allow_code=True)

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from machines import known
 from stand_ins import tripod_compensator
-from test_geometry import six_joint_arm, three_joint_arm
 from torch import Tensor
 
 from ccnn_torch import export_model
@@ -122,9 +122,9 @@ def test_compensated_kinematics_of_the_tripod(tmp_path: Path) -> None:
 def test_kinematics_of_other_machines(name: str, tmp_path: Path) -> None:
     generator = torch.Generator().manual_seed(2)
     draw = 0.4 * torch.rand(10, 6, generator=generator, dtype=torch.float64) - 0.2
-    machine = six_joint_arm()[0] if name == "arm" else load_mechanism(name)
+    machine = known("arm").mechanism if name == "arm" else load_mechanism(name)
     if isinstance(machine, SerialArm):
-        near = six_joint_arm()[2][:10]
+        near = known("arm").joints[:10]
         position, turn = machine.forward_frame(near)
         angles = [torch.atan2(turn[:, 2, 1], turn[:, 2, 2]), torch.asin(-turn[:, 2, 0])]
         angles.append(torch.atan2(turn[:, 1, 0], turn[:, 0, 0]))
@@ -155,7 +155,7 @@ def turn_of(world: np.ndarray) -> Tensor:
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler here")
 def test_no_accepted_inverse_has_another_orientation(tmp_path: Path) -> None:
     """From everywhere to everywhere in SO(3), half turns and upright pitches among them."""
-    arm = six_joint_arm()[0]
+    arm = known("arm").mechanism
     kins = Compiled(print_linuxcnc(None, arm, "a test")["ccnnkins.comp"], tmp_path)
     generator = np.random.default_rng(3)
     accepted = {"near": 0, "far": 0}
@@ -197,8 +197,8 @@ def test_a_platform_may_be_turned_by_half_a_turn(tmp_path: Path) -> None:
 
 def test_which_axes_a_component_serves_is_said() -> None:
     for machine, sentence in (
-        (three_joint_arm()[0], "X, Y, Z alone"),
-        (six_joint_arm()[0], "A, B, C: roll, pitch, yaw"),
+        (known("sliding arm").mechanism, "X, Y, Z alone"),
+        (known("arm").mechanism, "A, B, C: roll, pitch, yaw"),
         (load_mechanism("tripod"), "Y = y, Z = z, A = phi; others are not followed"),
     ):
         files = print_linuxcnc(None, machine, "a test")

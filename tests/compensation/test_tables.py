@@ -10,10 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from ccnn_torch.compensation.geometry.serial import SerialGeometry
 from kinds import masked
+from machines import compensated, known, small_network
 from stand_ins import fields, tripod_compensator
-from test_geometry import arm_compensator, small_network
 from torch import Tensor
 
 from ccnn_torch import export_model
@@ -22,7 +21,7 @@ from ccnn_torch.compensation.model_files.onnx_session import open_onnx
 from ccnn_torch.compensation.targets.table import print_tables
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
-from ccnn_torch.mechanisms import Mechanism, load_mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.mechanisms.files.mechanism_file import mechanism_text
 from ccnn_torch.training import Scaling
 
@@ -161,7 +160,9 @@ def test_directions_that_are_known_only_together_are_not_told_apart() -> None:
 
 
 def test_identified_links_go_back_into_a_simulator(tmp_path: Path, cli: Cli) -> None:
-    made, arm, identified, joints, _ = arm_compensator()
+    made, about_arm = compensated("sliding arm"), known("sliding arm")
+    arm, identified, joints = about_arm.mechanism, about_arm.identified, about_arm.joints
+    assert isinstance(arm, SerialArm) and made.machine is not None
     about = fields() | {"mechanism": arm.describe()}
     path = save_model(tmp_path, made, about, forms=("safetensors",))["safetensors"]
     assert cli("export", path, "--to", "urdf", "--out", tmp_path / "robot")[0] == 0
@@ -169,8 +170,7 @@ def test_identified_links_go_back_into_a_simulator(tmp_path: Path, cli: Cli) -> 
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot" / "robot.xml"))
     data, site = mujoco.MjData(model), 0
     # The tool's rotation is not determined by positions: that of the model counts.
-    assert isinstance(made.geometry, SerialGeometry)
-    truth, nominal = arm.forward_frame(joints, made.geometry.identified), arm.forward_frame(joints)
+    truth, nominal = arm.forward_frame(joints, made.machine.identified), arm.forward_frame(joints)
     torch.testing.assert_close(truth[0], arm.forward_frame(joints, identified)[0], rtol=0, atol=1e-12)
     assert (truth[0] - nominal[0]).norm(dim=-1).min() > 1e-7
     for k in range(10):
@@ -183,7 +183,7 @@ def test_identified_links_go_back_into_a_simulator(tmp_path: Path, cli: Cli) -> 
     again = load_mechanism(str(tmp_path / "robot" / "robot.yaml"))
     torch.testing.assert_close(again.forward_frame(joints)[0], truth[0], rtol=0, atol=1e-15)  # type: ignore[attr-defined]
     # From identified.yaml, as well.
-    real = arm.with_nominal(made.geometry.identified)
+    real = arm.with_nominal(made.machine.identified)
     names = [p.name for p in arm.geometry]
     text = mechanism_text(real, dict(zip(names, arm.nominal.tolist(), strict=True)))
     (tmp_path / "identified.yaml").write_text(text)

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from ccnn_torch.compensation.targets.from_geometry import compensator_of_geometry
-from kinds import KINDS, little, masked, six_joints
+from kinds import KINDS, little, little_arm, masked, six_joints
 from structured_text import Instance, parse_blocks
 from torch import Tensor
 
@@ -69,7 +68,7 @@ def test_every_kind_of_model_gives_its_numbers_in_c(kind: str, tmp_path: Path) -
     _, form, golden = made_kind(kind)
     worst = require_equal(form, golden)
     assert {*worst} == {"command", "deviation", "ideal", "status", "ideal_status", "sd"}
-    assert len(golden.joints) > 1100 and {*golden.outputs["status"].tolist()} == {0, 1, 2}
+    assert len(golden.joints) > 1100 and {*golden.outputs["status"].tolist()} >= {0, 1, 2}
     assert f"0 of {len(golden.joints)} vectors failed" in compiled(form, golden, tmp_path)
     # Nothing that Structured Text lacks; what it computes is compared below.
     assert "CCNN_DeviationSd" in print_structured_text(form, golden)["compensator.st"]
@@ -85,9 +84,9 @@ def test_single_precision_is_right_to_its_share_of_the_limit(kind: str, tmp_path
     assert "double" not in source and not re.search(r"\d\.\d+(e-?\d+)?[^\df.e]", source)
 
 
-def test_single_precision_does_not_hold_the_links_of_an_arm() -> None:
+def test_single_precision_does_not_hold_a_machine() -> None:
     # A length of 1 m is rounded by more of the limit than single precision may be off.
-    with pytest.raises(MethodFailedError, match="computes the arm's links: a length of 1 m is rounded"):
+    with pytest.raises(MethodFailedError, match="computes the machine's kinematics: 1 m is rounded"):
         require_equal(*made(KINDS["sliding arm"](), "float32", sd=False))
 
 
@@ -148,17 +147,20 @@ def test_missing_covariates_and_numbers_that_are_none(tmp_path: Path) -> None:
     np.testing.assert_allclose(given, wanted[0], rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize("dtype, arrays", [("float32", False), ("float64", True)])
-def test_structured_text_is_parsed_and_gives_the_numbers(
-    dtype: str, arrays: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    compensator = little(2, 0, 3, turning=False) if arrays else little(1, 1, 2, turning=True)
+@pytest.mark.parametrize("kind", ["single precision", "arrays", "machine"])
+def test_structured_text_is_parsed_and_gives_the_numbers(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    single, arrays = kind == "single precision", kind == "arrays"
+    if kind == "machine":
+        compensator = little_arm()
+    else:
+        compensator = little(2, 0, 3, turning=False) if arrays else little(1, 1, 2, turning=True)
+    dtype = "float32" if single else "float64"
     if arrays:
         # As in a large model, whose parser would take minutes.
         monkeypatch.setattr(from_graph, "_ELEMENTS", 2)
         monkeypatch.setattr(from_graph, "_PRODUCTS", 4)
-    compensator.secant = dtype == "float64"
-    form, golden = made(compensator, dtype, sd=dtype == "float32")
+    compensator.secant = arrays
+    form, golden = made(compensator, dtype, sd=single)
     files = print_structured_text(form, golden)
     assert (" DO" in files["compensator.st"].partition("CCNN_Compensate")[0]) == arrays
     blocks = parse_blocks(files["compensator.st"] + files["selftest.st"])
@@ -280,23 +282,23 @@ def test_bad_input_is_one_sentence(cli: Cli, folder: Path, tmp_path: Path) -> No
     assert not out.exists()
 
 
-@pytest.mark.parametrize("error, said", [(2e-4, ""), (0.2, "no closed form even over the middle 20% of its range")])
-def test_identified_geometry_alone(error: float, said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("error", [2e-4, 0.02])
+def test_identified_geometry_alone(error: float, tmp_path: Path) -> None:
+    """The same compensator as `ccnn compensate` commands by, however far off the machine is."""
     bar = load_mechanism("five_bar")
     rows = zip(bar.geometry, bar.nominal.tolist(), strict=True)
     path = tmp_path / "identified.yaml"
     lines = [f"  {p.name}: {{value: {v + error!r}, nominal: {v!r}, unit: {json.dumps(p.unit)}}}" for p, v in rows]
     path.write_text("\n".join(["mechanism: five_bar", "keys: {}", "parameters:", *lines]))
-    if said:
-        with pytest.raises(MethodFailedError, match=said):
-            export_model(path, "c99", tmp_path / "out")
-        return
-    # The closed form is the model's own solution, and nothing is written that is not the closed form.
     model = load_geometry(path)
-    made, told = compensator_of_geometry(model)
-    joints = made.domain.centre + 0.5 * made.domain.half_range * (2 * torch.rand(50, 2).double() - 1)
-    with torch.no_grad():
-        command = made(joints)[0].numpy()
-    np.testing.assert_allclose(command, model(joints.numpy())["command"], rtol=0, atol=1e-3 * float(made.limit.max()))
-    header = export_model(path, "c99", tmp_path / "out")["compensator.h"].read_text()
-    assert told.split(":")[0] in header and "middle" in told
+    domain = model.compensator.domain
+    draw = torch.rand(50, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    joints = domain.centre + 0.5 * domain.half_range * (2 * draw - 1)
+    found = model(joints.numpy())
+    exact = found["status"] == 0
+    assert exact.sum() > 20
+    wanted, real = bar.forward_kinematics(joints), model.identified.forward_kinematics
+    reached = real(torch.from_numpy(found["command"]))
+    assert float((reached - wanted)[exact].abs().max()) < 1e-9
+    files = export_model(path, "c99", tmp_path / "out")
+    assert "five_bar" in files["compensator.h"].read_text()

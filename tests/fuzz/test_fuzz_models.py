@@ -56,11 +56,11 @@ def compensated(folder: Path, model: str, words: list[str]) -> None:
     card = folder / "card.json"
     limits = json.loads(card.read_text()).get("limits", {}) if card.is_file() else {}
     for name, values in columns(folder / "OUT.csv").items():
-        if name.startswith(("command_", "ideal_q", "deviation_", "inside_")):
+        if name.startswith(("command_", "ideal_q", "deviation_", "inside_", "status")):
             assert all(map(math.isfinite, values)), name
         joint = name.removeprefix("deviation_")
         if joint != name and joint in limits:
-            assert max(map(abs, values)) <= limits[joint]["limit"] * (1 + 1e-6), name
+            assert max(map(abs, values)) <= limits[joint]["most_deviation"] * (1 + 1e-6), name
 
 
 VALUES = st.sampled_from([*TOKENS, 0, -1, 1e300, 0.5, None, True, [], {}, [1.0]])

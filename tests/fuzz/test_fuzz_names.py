@@ -17,8 +17,8 @@ from blark.parse import parse_source_code
 from hypothesis import example, given
 from hypothesis import strategies as st
 from kinds import KINDS
+from machines import known
 from stand_ins import fields
-from test_geometry import arm_compensator
 from test_targets import STRICT
 
 from ccnn_torch import export_model
@@ -47,7 +47,7 @@ WORSE = '*)??/\n*\\\n/";;\n(*<a>`|\x00\u202e../=1'
 @cache
 def models() -> tuple[Compensator, Compensator, SerialArm]:
     """With two covariates; and of an arm, whose links are identified."""
-    made, arm, *_ = arm_compensator()
+    made, arm = known("sliding arm").compensator(), known("sliding arm").mechanism
     return KINDS["covariates"](), made, arm
 
 

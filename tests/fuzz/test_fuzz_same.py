@@ -20,7 +20,7 @@ def figures(folder, text, name, encoding="utf-8"):
     (folder / "r.csv").write_bytes(text.encode(encoding))
     (folder / "c.yaml").write_text("name: same\n")
     mechanism = "arm.yaml" if name == "arm" else name
-    # Of an arm, to find the damping of identified links takes seconds; its frames are fitted in either case.
+    # To identify the links of an arm takes seconds; its frames are fitted in either case.
     geometry = "none" if name == "arm" else "identify"
     words = ["run", "c.yaml", "records=r.csv", f"mechanism={mechanism}", "methods=[constant]", f"geometry={geometry}"]
     out = f"o{len(list(folder.iterdir()))}"

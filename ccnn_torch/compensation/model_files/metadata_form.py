@@ -12,6 +12,7 @@ from ccnn_torch.errors import ModelFileError
 
 # No model that can be solved for needs as many; a forged one may not compute for ever.
 _MOST_ITERATIONS = 10_000
+_MOST_TERMS = 100
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Size = Annotated[float, Field(allow_inf_nan=False, ge=0)]
@@ -61,6 +62,11 @@ class _Domain(_Form):
     principal: _Principal
 
 
+class _Machine(_Form):
+    degree: Annotated[int, Field(ge=0, le=_MOST_TERMS)] = 0
+    newton: Annotated[int, Field(ge=0, le=_MOST_TERMS)] = 0
+
+
 class _Facts(_Form):
     mechanism: _Mechanism
     joints: Annotated[list[_Coordinate], Field(min_length=1)]
@@ -69,7 +75,7 @@ class _Facts(_Form):
     network: dict[str, Any]
     geometry: dict[str, Any] = {}
     effects: dict[str, Any] = {}
-    machine: dict[str, Any] = {}
+    machine: _Machine = _Machine()
     domain: _Domain
     limits: dict[str, _Limit]
     lipschitz: _Size

@@ -122,7 +122,7 @@ def form_of(compensator: Compensator, dtype: str = "float64", sd: bool = False) 
     compensator = copy.deepcopy(compensator)
     iterations = compensator.iterations
     if dtype == "float32":
-        compensator.domain.huge.fill_(_HUGE_SINGLE)
+        compensator.domain.huge.clamp_(max=_HUGE_SINGLE)
         if not compensator.secant:
             iterations = iterations_needed(Steepness(compensator.lipschitz, 1.0), SINGLE_TOLERANCE / 10)
     n = len(compensator.joints)
