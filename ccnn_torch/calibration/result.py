@@ -29,6 +29,8 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.simulation.case_study import Simulation
 
+# Above so many times what the model explains a sentence says why.
+_REACHED = 1.1
 _NO_GEOMETRY = {"chosen": "none", "why": "A simulated case compares learners."}
 _PACKAGES = ("ccnn-torch", "torch", "numpy", "scipy", "onnx", "onnxruntime", "safetensors")
 
@@ -98,6 +100,7 @@ def assemble(
         }
     constant = constant_errors(learned, measured, fit.weights, test.weights, joints)
     best = best_method(outcomes)
+    pose = _pose(config, prepared, before, outcomes[best])
     return {
         "name": config.name,
         "seed": config.seed,
@@ -113,12 +116,12 @@ def assemble(
         "constant": {"test": constant, "ratio_to_floor": ratio_to_floor(constant, floor)},
         "floor": floor,
         "auto": None if comparison is None else comparison.block(best),
-        "pose": _pose(config, prepared, before, outcomes[best]),
+        "pose": pose,
         "records": None if prepared.simulated else _records(prepared),
         **_effects(prepared, test),
         "data_sha256": prepared.data_hash,
         "geometry": _NO_GEOMETRY if prepared.choice is None else prepared.choice.block,
-        "notes": [*prepared.notes, *_notes(plan_of(config))],
+        "notes": [*prepared.notes, *_notes(plan_of(config)), *_not_reached(pose, outcomes[best].damped)],
         "versions": versions(),
     }
 
@@ -141,6 +144,22 @@ def _notes(plan: Plan) -> list[str]:
         blocks = "neighbouring blocks" if plan.kind == "block" else "whole groups" * (plan.kind == "group") or "rows"
         return [f"What was chosen was chosen by cross-validation in {plan.folds} folds of {blocks}."]
     return []
+
+
+def _not_reached(pose: Mapping[str, Any], damped: float) -> list[str]:
+    """A sentence where the commands leave clearly more than what the model does not explain."""
+    found = []
+    for kind, unit in (("position", "mm"), ("rotation", "mrad")):
+        after, explained = ((pose[kind] or {}).get(key) for key in ("after", "explained"))
+        sizes = [1e3 * (block["rms"]["median"] or 0.0) for block in (after, explained) if block is not None]
+        if len(sizes) == 2 and sizes[0] > _REACHED * sizes[1]:
+            found.append(f"{sizes[0]:.3g} {unit} of {kind} where the model leaves {sizes[1]:.3g} unexplained")
+    if not found:
+        return []
+    return [
+        f"The commands of the file leave {' and '.join(found)}: at {damped:.1%} of the rows they are damped, near a "
+        "singular pose or at a limit of the joints (status 3)."
+    ]
 
 
 def _certainty(
