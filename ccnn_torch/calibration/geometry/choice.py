@@ -117,7 +117,8 @@ def choose_model(
     # Effects that a diagnosis found stand beside identified geometry wherever that may be a part.
     physical = [Candidate(i, e, False) for e in effects for i in (identify if not e else identify[:1]) if i or e]
     asked = "" if geometry == "auto" else geometry_why or f"geometry={geometry} was asked for."
-    if not physical or (len(physical) == 1 and False not in identify and not learner_open):
+    nominal_too = False in identify and not asked_effects
+    if not physical or (len(physical) == 1 and not nominal_too and not learner_open):
         return ModelChoice(identify[0], effects[0], _ELSE, asked)
     rows = torch.cat([split.train, split.validation])
     if len(rows) > _MOST_ROWS:
@@ -128,7 +129,7 @@ def choose_model(
     whole = Split(torch.arange(len(rows)), none, none, None if split.groups is None else split.groups[rows])
     try:
         folds = [replace(f, validation=none, test=f.validation) for f in fold_splits(whole, kind, _FOLDS, seed)]
-        errors = _errors(mechanism, few, folds, seed, settings, physical, False in identify, verdict)
+        errors = _errors(mechanism, few, folds, seed, settings, physical, nominal_too, verdict)
     except (InputError, MethodFailedError) as problem:
         why = f"Candidates could not be cross-validated: {problem}"
         return ModelChoice(geometry == "identify", effects[0], _ELSE, why)
@@ -153,7 +154,6 @@ def _errors(
     """
     joints, pose, weight = records.joints, records.pose, settings["rotation_weight"]
     fitted = fit_machine(mechanism, records, folds, identify=any(c.identify for c in physical))
-    names = [c.name for c in records.covariate_coordinates]
     held = torch.zeros(len(folds), len(joints), dtype=torch.float64)
     for k, fold in enumerate(folds):
         held[k, fold.test] = 1.0
@@ -166,14 +166,13 @@ def _errors(
     nominal = joint_deviations(mechanism, joints, pose, parameters=fitted.parameters, **settings)
     machines: dict[tuple[bool, bool], Physics] = {}
     for c in physical:
-        if c.effects and verdict is not None and c[:2] not in machines:
-            machines[c[:2]] = fit_effects(
-                verdict, mechanism, records, folds, fitted.parameters, nominal.usable, c.identify
-            )[0]
-        elif c.identify and c[:2] not in machines:
+        if c.effects and verdict is not None:
+            about = (folds, fitted.parameters, nominal.usable, c.identify)
+            machines[c[:2]] = fit_effects(verdict, mechanism, records, *about)[0]
+        else:
             assert fitted.geometry is not None
             base = mechanism.nominal.expand_as(fitted.geometry) if fitted.parameters is None else fitted.parameters
-            machines[c[:2]] = identified_alone(mechanism, records, base, fitted.geometry, names)
+            machines[c[:2]] = identified_alone(mechanism, records, base, fitted.geometry)
 
     def error(c: Candidate) -> Tensor:
         physics = machines.get(c[:2])

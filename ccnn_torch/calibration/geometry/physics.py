@@ -52,7 +52,6 @@ class Physics:
         values: all parameters of the real machine, `r x 1 x k` [SI].
         acting: effects on joints and pose, of each repeat.
         every: all of the effects, those on the parameters as well, whose change is in `values`.
-        covariates: names of the compensator's, in order.
     """
 
     source: str
@@ -60,7 +59,6 @@ class Physics:
     values: Tensor
     acting: list[list[Acting]]
     every: list[list[Acting]]
-    covariates: list[str]
 
     def frames(self, repeat: int, moved: Tensor) -> Tensor:
         """Frame of the pose of all rows at command and what was learned there, `s x n` [SI], as `reached` gives it."""
@@ -158,14 +156,11 @@ def _care(situation: Situation) -> Care:
     return care._replace(gain=gain, inverse_gain=inverse_gain)
 
 
-def identified_alone(
-    mechanism: Mechanism, records: Records, nominal: Tensor, values: Tensor, covariates: list[str]
-) -> Physics:
+def identified_alone(mechanism: Mechanism, records: Records, nominal: Tensor, values: Tensor) -> Physics:
     """The machines of all repeats without any effect.
 
     Args:
         nominal, values: all parameters, frames fitted and identified, `r x 1 x k` [SI].
-        covariates: names of the compensator's, in order.
     """
     gravity = default_gravity(mechanism)
     guess = records.pose if records.pose.shape[-1] == len(mechanism.pose) else None
@@ -173,7 +168,7 @@ def identified_alone(
         Situation(mechanism.with_nominal(own[0]), records.joints, {}, gravity, None, guess)
         for own in nominal.expand_as(values)
     ]
-    return Physics("", situations, values, [[] for _ in situations], [[] for _ in situations], covariates)
+    return Physics("", situations, values, [[] for _ in situations], [[] for _ in situations])
 
 
 def verdict_of(key: str, mechanism: Mechanism) -> Verdict:
@@ -235,9 +230,8 @@ def fit_effects(
             f"Effects of {short_path(verdict.path)}: {named}. {fitted_anew}; their periods and other shapes are the "
             "file's, which may have seen the held-out rows."
         )
-    names = [c.name for c in records.covariate_coordinates]
     changed = torch.stack(values).unsqueeze(1)
-    return Physics(short_path(verdict.path), situations, changed, acting, every, names), notes
+    return Physics(short_path(verdict.path), situations, changed, acting, every), notes
 
 
 def _refuse_lacking(verdict: Verdict, mechanism: Mechanism, records: Records) -> None:

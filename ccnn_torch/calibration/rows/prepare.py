@@ -251,7 +251,6 @@ def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepare
         mechanism, records.joints, records.pose, parameters=fitted.parameters, **settings
     )
     learned, physics, notes = fitted.parameters, None, [*fitted.notes]
-    names = [c.name for c in records.covariate_coordinates]
     if verdict is not None:
         about = (splits, fitted.parameters, total.usable, choice.identify)
         physics, more = fit_effects(verdict, mechanism, records, *about)
@@ -259,7 +258,7 @@ def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepare
     elif choice.identify:
         assert fitted.geometry is not None
         nominal = mechanism.nominal.expand_as(fitted.geometry) if fitted.parameters is None else fitted.parameters
-        physics = identified_alone(mechanism, records, nominal, fitted.geometry, names)
+        physics = identified_alone(mechanism, records, nominal, fitted.geometry)
     if physics is not None:
         learned = physics.values
         deviations = physics.targets(records.joints, records.pose, settings)
