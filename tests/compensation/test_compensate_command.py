@@ -58,7 +58,7 @@ def test_commands_and_the_way_back(folder: Path, tmp_path: Path, ideal: Path, fo
         "row[1]", "q1[m]", "q2[mm]", "q3[m]",
         "command_q1[m]", "command_q2[mm]", "command_q3[m]",
         "deviation_q1[m]", "deviation_q2[mm]", "deviation_q3[m]",
-        "inside_domain[1]",
+        "inside_domain[1]", "status[1]",
     ]  # fmt: skip
     joints = columns(ideal, "q1", "q2", "q3")
     np.testing.assert_array_equal(columns(out, "q1", "q2", "q3"), joints)
@@ -73,7 +73,16 @@ def test_commands_and_the_way_back(folder: Path, tmp_path: Path, ideal: Path, fo
     alone = tmp_path / "alone.csv"
     write_table(alone, {f"q{i + 1}[m]": command[:, i] for i in range(3)})
     compensate(model, alone, again, back=True)
-    assert list(read_table(again).units) == ["q1", "q2", "q3", "ideal_q1", "ideal_q2", "ideal_q3", "inside_domain"]
+    assert list(read_table(again).units) == [
+        "q1",
+        "q2",
+        "q3",
+        "ideal_q1",
+        "ideal_q2",
+        "ideal_q3",
+        "inside_domain",
+        "status",
+    ]
     np.testing.assert_allclose(columns(again, "ideal_q1", "ideal_q2", "ideal_q3"), joints, rtol=1e-15)
 
 

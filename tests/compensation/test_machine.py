@@ -195,7 +195,7 @@ def test_on_a_line_through_a_wrist_the_command_does_not_jump() -> None:
 
 def test_a_damped_command_is_where_its_objective_has_no_slope() -> None:
     machine, made = at_the_wrist()
-    joints = torch.cat([line_through_the_wrist(), points(made)[0]])
+    joints = torch.cat([line_through_the_wrist(), points(made, count=600)[0]])
     found, pull = solved(made, joints), pull_of(made, joints)
     # Damped, but neither at a bound nor on its way: steps farther do not move it.
     twin = copy.copy(made)

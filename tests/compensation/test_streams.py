@@ -189,7 +189,8 @@ class Statuses(IdentifiedGeometry):
 
     def __call__(self, joints: ArrayLike, covariates: ArrayLike | None = None) -> dict[str, Any]:
         found = super().__call__(joints, covariates)
-        return found | {"status": np.minimum(np.arange(len(found["command"])), 3)}
+        states = np.minimum(np.arange(len(found["command"])), 3)
+        return found | {"status": states, "ideal_status": states[::-1]}
 
 
 def test_the_status_stands_after_inside_domain(tmp_path: Path) -> None:
@@ -201,10 +202,11 @@ def test_the_status_stands_after_inside_domain(tmp_path: Path) -> None:
     names = read_table(tmp_path / "out.csv").names
     assert names[-2:] == ("inside_domain", "status") and found.damped == 2
     np.testing.assert_array_equal(read_table(tmp_path / "out.csv").column("status"), [0, 1, 2, 3, 3])
-    assert "2 of them are beside a singularity (status = 3)" in sentences(tmp_path, found, trained=False)[-1]
-    # The way back is that of a command, which the status says nothing of.
+    told = sentences(tmp_path, found, trained=False)[-1]
+    assert "2 of them are near a singular pose or at a limit of the joints (status = 3)" in told
+    # The way back has one of its own.
     write_compensated(loaded, tmp_path / "in.csv", tmp_path / "out.csv", back=True)
-    assert "status" not in read_table(tmp_path / "out.csv")
+    np.testing.assert_array_equal(read_table(tmp_path / "out.csv").column("status"), [3, 3, 2, 1, 0])
 
 
 @pytest.mark.parametrize("guided", [True, False])

@@ -203,7 +203,7 @@ def test_onnx_as_a_target(tmp_path: Path) -> None:
     wanted = load_model(path)(point)
     assert np.abs(load_model(files["model.onnx"])(point)["command"] - wanted["command"]).max() < 1e-15
     session = open_onnx(files["controller.onnx"].read_bytes())
-    assert [o.name for o in session.get_outputs()] == ["command", "deviation", "inside_domain"]
+    assert [o.name for o in session.get_outputs()] == ["command", "deviation", "inside_domain", "status"]
     assert np.abs(session.run(["command"], {"joints": point})[0] - wanted["command"]).max() < 1e-15
 
 

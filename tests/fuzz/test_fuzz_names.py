@@ -59,7 +59,8 @@ def exported(folder: Path, machine: str, joints: list[str], more: list[str], uni
     about = fields() | {"mechanism": load_mechanism("five_bar").describe() | {"name": machine}}
     model = save_model(folder / "model", compensator, about, forms=("safetensors",))["safetensors"]
     keys = arm.recipe["keys"] | {"name": machine}
-    on_arm.geometry._arm = (SerialArm(**keys),)  # type: ignore[union-attr, assignment]
+    assert on_arm.machine is not None
+    on_arm.machine._mechanism = (SerialArm(**keys),)
     about = fields() | {"mechanism": arm.describe() | {"name": machine, "keys": keys}}
     links = save_model(folder / "links", on_arm, about, forms=("safetensors",))["safetensors"]
     found = {}
