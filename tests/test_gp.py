@@ -316,3 +316,20 @@ def test_the_network_has_the_learners_numbers() -> None:
 def test_settings_out_of_range(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         GPSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_a_model_is_conditioned_on_more_rows_without_another_search() -> None:
+    generator = torch.Generator().manual_seed(0)
+    inputs = 2 * torch.rand(1, 60, 3, generator=generator, dtype=torch.float64) - 1
+    targets = torch.sin(3 * inputs[..., :2]) + 0.02 * torch.randn(1, 60, 2, generator=generator, dtype=torch.float64)
+    few, all_rows = make_learner("gp", {"steps": 40}), make_learner("gp", {"steps": 40})
+    for learner, count in ((few, 30), (all_rows, 60)):
+        ones, seeds = torch.ones(1, count, dtype=torch.float64), torch.zeros(1, dtype=torch.int64)
+        learner.start(TrainingData(inputs[:, :count], targets[:, :count], ones, seeds))
+    while not few.finished:
+        few.step()
+    all_rows.condition(few.state_dict())
+    at = 2 * torch.rand(1, 400, 3, generator=generator, dtype=torch.float64) - 1
+    errors = [(m.predict(at) - torch.sin(3 * at[..., :2])).square().mean().sqrt() for m in (few, all_rows)]
+    assert float(errors[1]) < 0.8 * float(errors[0])
+    torch.testing.assert_close(all_rows.network(0)(at[0]), all_rows.predict(at)[0], rtol=0, atol=1e-12)

@@ -107,7 +107,6 @@ class GaussianProcess:
     """
 
     name = "gp"
-    conditions_on_rows = True
 
     def __init__(self, settings: GPSettings | None = None) -> None:
         self.settings = settings or GPSettings()
@@ -248,6 +247,12 @@ class GaussianProcess:
         """Take back a state; call `start` with the same data first."""
         self._accept(state)
         self._stepping = False
+
+    def condition(self, state: dict[str, Tensor]) -> None:
+        """Take the hyperparameters of a model on other rows, and condition on those of `start`."""
+        self.load_state_dict(state)
+        # Fewer than any, so that the weights of the rows of the search are not taken.
+        self._few = 0
 
     def _accept(self, state: dict[str, Tensor]) -> None:
         # Steps write in place, and what was given stays as it is.

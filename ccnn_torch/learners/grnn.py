@@ -103,7 +103,6 @@ class GRNN:
     """
 
     name = "grnn"
-    conditions_on_rows = True
 
     def __init__(self, settings: GRNNSettings | None = None) -> None:
         self.settings = settings or GRNNSettings()
@@ -197,6 +196,10 @@ class GRNN:
             "move": self._move,
             "step": self._step,
         }
+
+    def condition(self, state: dict[str, Tensor]) -> None:
+        """Take the bandwidths of a model on other rows, for those of `start`."""
+        self.load_state_dict(state)
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take back a state; call `start` with the same data first."""

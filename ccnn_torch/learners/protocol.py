@@ -54,6 +54,8 @@ class Learner(Protocol):
             `r x s x o` [1]. Its networks then have a method `variance` that gives the same numbers.
         refits, begin_from(state): whether, and how, it goes on from the state of an earlier training on fewer of the
             same rows in the same scaling; called after `start`, in place of beginning anew.
+        condition(state): takes what a model on other rows has learned beside them (hyperparameters), for those of
+            `start`; a learner without it is trained again.
         converged -> Tensor: property, `r`, bool: False where the learner's own criterion was not met when its steps
             ended, or where the data let it do no more than the constant.
 

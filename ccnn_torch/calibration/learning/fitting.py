@@ -160,18 +160,19 @@ def refit(
 def on_other_rows(fitted: Fitted, make: Callable[[], Learner], dataset: Dataset, plan: Plan) -> Fitted:
     """A trained method of one repeat with what it chose, on other rows.
 
-    A learner whose model is conditioned on its rows (`conditions_on_rows`) keeps its hyperparameters, another is
-    trained again for as many steps.
+    A learner whose model is conditioned on its rows (`condition`) keeps its hyperparameters, another is trained again
+    for as many steps.
 
     Raises:
         MethodFailedError: as `refit`.
     """
-    if not getattr(fitted.learner, "conditions_on_rows", False):
+    learner = make()
+    condition = getattr(learner, "condition", None)
+    if condition is None:
         return replace(
             refit(fitted.name, make, dataset, plan, fitted.choice, None, lambda *_: []), sd_scale=fitted.sd_scale
         )
-    learner = make()
     data = moved(dataset.scaled("fit", False, learner, fitted.scaling)[0], plan.device)
     learner.start(data)
-    learner.load_state_dict(fitted.learner.state_dict())
+    condition(fitted.learner.state_dict())
     return replace(fitted, learner=learner, data=data)
