@@ -322,7 +322,7 @@ def test_a_model_is_conditioned_on_more_rows_without_another_search() -> None:
     generator = torch.Generator().manual_seed(0)
     inputs = 2 * torch.rand(1, 60, 3, generator=generator, dtype=torch.float64) - 1
     targets = torch.sin(3 * inputs[..., :2]) + 0.02 * torch.randn(1, 60, 2, generator=generator, dtype=torch.float64)
-    few, all_rows = make_learner("gp", {"steps": 40}), make_learner("gp", {"steps": 40})
+    few, all_rows = (GaussianProcess(GPSettings(steps=40)) for _ in range(2))
     for learner, count in ((few, 30), (all_rows, 60)):
         ones, seeds = torch.ones(1, count, dtype=torch.float64), torch.zeros(1, dtype=torch.int64)
         learner.start(TrainingData(inputs[:, :count], targets[:, :count], ones, seeds))
