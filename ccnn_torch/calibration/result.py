@@ -183,9 +183,11 @@ def _spread_or_none(values: Tensor | None) -> dict[str, Any] | None:
 def _pose_of(prepared: Prepared, outcome: Outcome) -> dict[str, Any]:
     """The pose error that a method leaves, over all test rows."""
     left, weights = _held_out(prepared, outcome.after)
-    block = pose_block(left, left, weights, explained=_held_out(prepared, outcome.explained)[0])
+    explained = None if prepared.simulated else _held_out(prepared, outcome.explained)[0]
+    block = pose_block(left, left, weights, explained=explained)
+    kept = [] if explained is None else ["explained"]
     return {
-        name: part and {"unit": part["unit"], **part["after"], "explained": part["explained"]}
+        name: part and {"unit": part["unit"], **part["after"], **{key: part[key] for key in kept}}
         for name, part in block.items()
     }
 
@@ -235,7 +237,7 @@ def _pose(config: RunConfig, prepared: Prepared, before: PoseError, outcome: Out
     errors = {
         "before": before,
         "after": outcome.after,
-        "explained": outcome.explained,
+        "explained": None if prepared.simulated else outcome.explained,
         "geometry": pose_with_geometry(prepared),
         "effects": pose_with_effects(prepared),
         # What no joint deviation can explain.

@@ -53,7 +53,7 @@ def tidy_rows(results: Mapping[str, Any]) -> Iterator[Row]:
                 for measure in ("rms", "max"):
                     yield row(method, "test", f"{name}_{measure}", "", left["unit"], left[measure])
     for name, block in results["pose"].items():
-        for when in ("before", "after", "geometry", "effects", "not_compensable"):
+        for when in ("before", "after", "explained", "geometry", "effects", "not_compensable"):
             for measure, spread in ((block or {}).get(when) or {}).items():
                 method = (results.get("best_method") or "") if when == "after" else when
                 yield row(method, "test", f"{name}_{measure}", "", block["unit"], spread)

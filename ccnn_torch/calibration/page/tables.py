@@ -249,6 +249,12 @@ def _pose_table(results: Results) -> Table:
             ("geometry", "RMS geometry alone", "Geometry alone: link parameters and frames fitted to the same rows."),
             ("effects", "RMS effects alone", "Effects alone: those of the diagnosis, fitted to the training rows."),
             (
+                "explained",
+                "RMS not explained",
+                "Not explained: what the model leaves of the poses at the joints as commanded; after: what is left "
+                "under the commands of the file.",
+            ),
+            (
                 "not_compensable",
                 "RMS not compensable",
                 "Not compensable: the part of the measured error that the (damped) joint deviations do not explain.",
@@ -271,5 +277,5 @@ def _pose_table(results: Results) -> Table:
         columns += [f"{measure} before", f"{measure} after", f"{measure} removed [%]"]
     columns += [column for _, column, _ in extras]
     note = " ".join([*(sentence for _, _, sentence in extras), _repeats(results)]).strip()
-    details = ("max before", "max after", "max removed [%]", "RMS not compensable")
+    details = ("max before", "max after", "max removed [%]", "RMS not explained", "RMS not compensable")
     return Table("Pose error on held-out rows", tuple(columns), tuple(rows), note, details=details)
