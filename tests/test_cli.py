@@ -163,7 +163,7 @@ def test_own_records_train_compensate_and_come_back(cli: Cli, tmp_path: Path) ->
             *("q1", "q2", "q3"),
             *("command_q1", "command_q2", "command_q3"),
             *("deviation_q1", "deviation_q2", "deviation_q3"),
-            "inside_domain",
+            *("inside_domain", "status"),
         )
     code, _, err = cli("compensate", out / "model.pt2", program, commands)
     assert code == 2 and "never read back" in err and len(err.splitlines()) == 1

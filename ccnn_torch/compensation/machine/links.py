@@ -22,13 +22,7 @@ _NOTHING = 1e-15
 
 
 class Links(nn.Module):
-    """One geometry of an arm: where its tool is, and how the joints move it.
-
-    Attributes:
-        one_slope: see `ForwardForm`; the derivative of an arm costs less than its pose.
-    """
-
-    one_slope = False
+    """One geometry of an arm: where its tool is, and how the joints move it."""
 
     _links: Tensor
     _spins: Tensor
@@ -52,8 +46,8 @@ class Links(nn.Module):
         }.items():
             self.register_buffer(name, value, persistent=False)
 
-    def at(self, joints: Tensor, slope: bool = True) -> Placed:
-        """At joints `... x n` [SI]; the derivative is always there."""
+    def at(self, joints: Tensor) -> Placed:
+        """At joints `... x n` [SI]."""
         turned, other = torch.cos(joints) * self._turns, torch.sin(joints) * self._turns + joints * self._slides
         moved = turned[..., None, None] * self._links[0] + other[..., None, None] * self._links[1] + self._links[2]
         chain = [moved[..., 0, :, :]]

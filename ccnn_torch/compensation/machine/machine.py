@@ -96,7 +96,7 @@ class Machine(nn.Module):
 
     def aim(self, joints: Tensor) -> Tensor:
         """What a command is to reach, for ideal joints `... x n` [SI]: pose and λ² side by side, `... x a`."""
-        return self._aim(self._nominal.at(joints, slope=False), self._identified.at(joints))
+        return self._aim(self._nominal.at(joints), self._identified.at(joints))
 
     def aim_back(self, moved: Tensor, covariates: Tensor) -> Tensor:
         """The same for the way back: the pose that the machine has; moved: command and what was learned there."""
@@ -118,7 +118,7 @@ class Machine(nn.Module):
 
     def next_back(self, joints: Tensor, correction: Tensor, aim: Tensor) -> Tensor:
         """The same for the way back: what to subtract from the command; joints: ideal ones, tried."""
-        return self._step(self._nominal.at(joints, slope=not self._nominal.one_slope), correction, aim)
+        return self._step(self._nominal.at(joints), correction, aim)
 
     def within(self, ideal: Tensor, correction: Tensor, most: Tensor) -> Tensor:
         """A correction of at most `most`, `n`, that takes no joint farther beyond its limits than it is; all [SI]."""
@@ -158,26 +158,23 @@ class Machine(nn.Module):
         self._nominal, self._identified = make(mechanism, mechanism.nominal), make(mechanism, self.identified)
 
     def _reached(self, moved: Tensor, covariates: Tensor) -> Placed:
-        slope = not self._identified.one_slope
         if self.effects is None:
-            return self._identified.at(moved, slope)
+            return self._identified.at(moved)
         joints, shift = self.effects.changes(moved, covariates)
-        placed = self._identified.at(moved if joints is None else moved + joints, slope)
+        placed = self._identified.at(moved if joints is None else moved + joints)
         return placed if shift is None else placed.shifted(shift)
 
     def _aim(self, wanted: Placed, moving: Placed, share: float = 1.0) -> Tensor:
-        """Pose wanted, λ² of the kinematics that move, and where it serves all steps their weighted Jacobian."""
+        """Pose wanted, and λ² of the kinematics that move."""
         parts = [wanted.position] if wanted.rotation is None else [wanted.position, wanted.rotation.flatten(-2)]
-        slope = self._slope(moving)
-        pull = self._damping(slope, share)
+        pull = self._damping(self._slope(moving), share)
         lost = [placed.lost for placed in (wanted, moving) if placed.lost is not None]
         for one in lost:
             pull = pull + self.rule.damping**2 * one
-        return torch.cat([*parts, *([slope.flatten(-2)] if self._nominal.one_slope else []), pull], -1)
+        return torch.cat([*parts, pull], -1)
 
     def _slope(self, placed: Placed) -> Tensor:
         """Weighted Jacobian, transposed, `... x n x c`."""
-        assert placed.linear is not None and placed.turning is not None
         if placed.rotation is None:
             return placed.linear
         return torch.cat([placed.linear, self.rule.rotation_weight * placed.turning], -1)
@@ -198,11 +195,7 @@ class Machine(nn.Module):
             gap = torch.cat([gap, self.rule.rotation_weight * skew_vector(turn)], -1)
         # Where the machine has no pose, back to the ideal joints.
         pull = aim[..., -1:] if placed.lost is None else aim[..., -1:] + placed.lost
-        if placed.linear is None:
-            n = correction.shape[-1]
-            slope = aim[..., -1 - n * gap.shape[-1] : -1].reshape(*gap.shape[:-1], n, gap.shape[-1])
-        else:
-            slope = self._slope(placed)
+        slope = self._slope(placed)
         unit = torch.eye(min(slope.shape[-2:]), dtype=slope.dtype)
         more = (pull.unsqueeze(-1) + _REGULAR) * unit
         if slope.shape[-2] <= slope.shape[-1]:
