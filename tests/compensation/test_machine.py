@@ -30,6 +30,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation import Compensator, Solution, load_model, save_model
 from ccnn_torch.compensation.export.export import probe_points
+from ccnn_torch.compensation.machine.alone import machine_alone
 from ccnn_torch.compensation.machine.inverse import InverseMachine
 from ccnn_torch.compensation.machine.machine import SETTLED, Machine, limits_of
 from ccnn_torch.compensation.targets.from_model import form_of
@@ -389,3 +390,20 @@ def test_which_machine_is_inverted_and_which_is_none() -> None:
         assert isinstance(compensated(name).machine, InverseMachine) == inverse
     assert isinstance(known("arm").mechanism, SerialArm)
     assert load_mechanism("overconstrained_2dof").closed_form is None
+
+
+def test_what_the_real_machine_cannot_reach_is_no_exact_command() -> None:
+    """Legs so much shorter that a part of the nominal poses is out of their reach."""
+    tripod = load_mechanism("tripod")
+    values = tripod.nominal.clone()
+    values[0] = 0.68
+    pose = torch.tensor([[0.0, 0.69, 0.0], [0.0, 0.5, 0.0]], dtype=torch.float64)
+    assert torch.isfinite(tripod.solve_inverse(pose, values)).all(-1).tolist() == [False, True]
+    joints = tripod.solve_inverse(pose)
+    made = machine_alone(tripod, tripod.with_nominal(values))
+    with torch.no_grad():
+        found = made.solve(joints)
+    assert found.status.tolist() == [3, 0]
+    assert torch.equal(found.command[0], joints[0])
+    reached = tripod.forward_kinematics(found.command[1:], values, pose[1:])
+    torch.testing.assert_close(reached, pose[1:], rtol=0, atol=1e-9)

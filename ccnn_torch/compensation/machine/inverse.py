@@ -46,12 +46,14 @@ class InverseMachine(Machine):
 
     def aim(self, joints: Tensor) -> Tensor:
         """Pose coordinates `... x p` [SI], and 1 where the machine cannot take the pose."""
-        return self._flat_pose(*self._closed[0].standing(joints, self.newton))
+        pose, there = self._closed[0].standing(joints, self.newton)
+        return self._flat_pose(pose, there, self.identified)
 
     def aim_back(self, moved: Tensor, covariates: Tensor) -> Tensor:
         joints, shift = (None, None) if self.effects is None else self.effects.changes(moved, covariates)
         pose, there = self._closed[1].standing(moved if joints is None else moved + joints, self.newton)
-        return self._flat_pose(pose if shift is None else pose + self._coordinates(pose, shift), there)
+        pose = pose if shift is None else pose + self._coordinates(pose, shift)
+        return self._flat_pose(pose, there, self.mechanism.nominal)
 
     def next_correction(
         self, moved: Tensor, covariates: Tensor, ideal: Tensor, correction: Tensor, aim: Tensor
@@ -81,8 +83,10 @@ class InverseMachine(Machine):
     def _prepare(self) -> None:
         pass
 
-    def _flat_pose(self, pose: Tensor, there: Tensor) -> Tensor:
-        return torch.cat([pose, torch.where(there, 0.0, 1.0)], -1)
+    def _flat_pose(self, pose: Tensor, there: Tensor, values: Tensor) -> Tensor:
+        """Pose coordinates, and 0 where they are reached with these parameters, too, else 1."""
+        reached = torch.isfinite(self.mechanism.solve_inverse(pose, values)).all(-1, keepdim=True)
+        return torch.cat([pose, torch.where(torch.logical_and(there, reached), 0.0, 1.0)], -1)
 
     def _coordinates(self, pose: Tensor, shift: Tensor) -> Tensor:
         """Pose coordinates `... x p` of a small shift `... x c` of the frame."""
