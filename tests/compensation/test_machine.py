@@ -403,7 +403,8 @@ def test_what_the_real_machine_cannot_reach_is_no_exact_command() -> None:
     made = machine_alone(tripod, tripod.with_nominal(values))
     with torch.no_grad():
         found = made.solve(joints)
-    assert found.status.tolist() == [3, 0]
+    # Commands so far from the nominal joints are outside what was sampled.
+    assert found.status.tolist() == [3, 1]
     assert torch.equal(found.command[0], joints[0])
     reached = tripod.forward_kinematics(found.command[1:], values, pose[1:])
     torch.testing.assert_close(reached, pose[1:], rtol=0, atol=1e-9)
