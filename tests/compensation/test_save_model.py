@@ -8,7 +8,7 @@ import pytest
 import torch
 from stand_ins import fields
 
-from ccnn_torch.compensation import Compensator, save_model
+from ccnn_torch.compensation import Compensator, load_model, save_model
 from ccnn_torch.errors import InputError
 
 
@@ -17,9 +17,15 @@ def test_fields_are_checked(tmp_path: Path, tripod: Compensator) -> None:
         save_model(tmp_path, tripod, {k: v for k, v in fields().items() if k != "seed"})
     with pytest.raises(InputError, match="must be JSON"):
         save_model(tmp_path, tripod, fields() | {"metrics": {"mse": float("nan")}})
-    with pytest.raises(InputError, match="may not be named 'limits'"):
-        save_model(tmp_path, tripod, fields() | {"limits": 3})
     assert not list(tmp_path.iterdir())
+
+
+def test_the_card_of_a_model_serves_the_next_one(tmp_path: Path, tripod: Compensator) -> None:
+    save_model(tmp_path / "a", tripod, fields() | {"method": "ccnn"}, forms=())
+    card = load_model(tmp_path / "a" / "model.safetensors").card
+    save_model(tmp_path / "b", tripod, card | {"limits": 3, "machine": {"kind": "forward"}}, forms=())
+    again = load_model(tmp_path / "b" / "model.safetensors").card
+    assert again["method"] == "ccnn" and again["limits"] == card["limits"] and "machine" not in again
 
 
 def test_a_network_without_description_is_refused(tmp_path: Path, tripod: Compensator) -> None:

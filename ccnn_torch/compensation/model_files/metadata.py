@@ -22,6 +22,8 @@ from ccnn_torch.version import __version__
 _FORMATS = "ccnn_torch compensator "
 FORMAT = f"{_FORMATS}6"
 _LIMITS = ("limit", "most_deviation", "safe_correction", "safe_sd", "sd_scale")
+OPTIONAL = ("secant", "geometry", "effects", "machine")
+"""Keys of parts that not every model has."""
 _REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
 _PACKAGES = ("torch", "onnx", "onnxruntime", "safetensors", "numpy")
 
@@ -58,12 +60,10 @@ def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, A
     }
     if compensator.secant:
         facts["secant"] = True
-    if compensator.geometry is not None:
-        facts["geometry"] = compensator.geometry.describe()
-    if compensator.effects is not None:
-        facts["effects"] = compensator.effects.describe()
-    if compensator.machine is not None:
-        facts["machine"] = compensator.machine.describe()
+    for name in OPTIONAL[1:]:
+        part = getattr(compensator, name)
+        if part is not None:
+            facts[name] = part.describe()
     facts["sha256"] = {"tensors": tensor_digest(dict(compensator.state_dict()))}
     facts["sha256"]["keys"] = _digest(facts)
     return facts

@@ -12,9 +12,9 @@ from safetensors.torch import save
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.export.export import export_float32, export_onnx
-from ccnn_torch.compensation.model_files.metadata import facts_of, to_json
+from ccnn_torch.compensation.model_files.metadata import OPTIONAL, facts_of, to_json
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
-from ccnn_torch.errors import InputError, MethodFailedError
+from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.files.write import write_whole
 
 FORMS = ("safetensors", "onnx", "float32.onnx")
@@ -44,7 +44,8 @@ def save_model(
         folder: made where it is not there.
         compensator: fitted.
         fields: `mechanism` (its `describe()`), `metrics`, `data_sha256`, `seed`: these go into every file and must not
-            hold times or paths; further ones go into the card alone.
+            hold times or paths; further ones go into the card alone. An older card may be given: what it says of that
+            model's files and numbers is left out.
         method: name of the files.
         forms: which to write; the master is always written, and the exports take seconds each.
 
@@ -58,9 +59,6 @@ def save_model(
     """
     facts = facts_of(compensator, fields)
     text = to_json(facts)
-    taken = sorted(set(fields) & {*_OWN, *facts} - {"mechanism", "metrics", "data_sha256", "seed"})
-    if taken:
-        raise InputError(f"a model's field may not be named {taken[0]!r}, which the card holds itself")
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in compensator.state_dict().items()}
     contents = {"safetensors": save(tensors, metadata={METADATA_KEY: text})}
     notes = settled_notes(compensator)
@@ -76,7 +74,7 @@ def save_model(
     for kind, content in contents.items():
         write_whole(paths[kind], content)
     card = {
-        **{key: value for key, value in fields.items() if key not in facts},
+        **{key: value for key, value in fields.items() if key not in (*facts, *_OWN, *OPTIONAL)},
         **facts,
         "files": {paths[kind].name: hashlib.sha256(content).hexdigest() for kind, content in contents.items()},
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
