@@ -84,9 +84,6 @@ def render_readme_table() -> str:
         compare = f"geometry alone {geometry} mm" + (f", published network {published} mm" if published != "–" else "")
         return measured(name, f"{training} rows, {test} test poses", before, after, compare)
 
-    ur10 = [
-        _cell("measured_robots", "shipped", key).split(" / ")[0] for key in ("frames", "geometry + ccnn", "geometry")
-    ]
     tripod = [
         _cell("tripod", *cell).split(" [")[0]
         for cell in (("constant", "all"), ("ccnn", "all"), ("floor", "all"), ("ccnn", "paper, all"))
@@ -97,7 +94,7 @@ def render_readme_table() -> str:
     best = [_cell("suite_summary", method, "best or tied").split(" (")[0] for method in ("ccnn", "gp")]
     rows = [
         ["held-out error", "before", "after", "compare with"],
-        measured("UR10", "500 rows", ur10[0], ur10[1], f"geometry alone {ur10[2]} mm"),
+        tracker("UR10"),
         tracker("UR5"),
         tracker("WAM"),
         [

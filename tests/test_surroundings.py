@@ -14,6 +14,8 @@ MAIN = "from ccnn_torch.cli import main; main()"
 # Raises SIGINT in the import of a module, as Ctrl-C there does; what catches it makes an ImportError of it.
 STOPPED = """
 import signal, sys
+# A background job has it ignored, and children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 class Finder:
     def find_spec(self, name, *_):
         if name == {name!r}:

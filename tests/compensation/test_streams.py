@@ -167,7 +167,12 @@ def test_ctrl_c_leaves_the_old_file(tmp_path: Path, tripod: Compensator, cli: Cl
     (tmp_path / "in.csv").write_text("q1[m],q2[m],q3[m]\n1,1,1\n1,1,1\n")
     (tmp_path / "out.csv").write_text("old")
     files = sorted(tmp_path.iterdir())
-    code, _, said = cli("compensate", tmp_path / "model.safetensors", tmp_path / "in.csv", tmp_path / "out.csv")
+    # A background job has the signal ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        code, _, said = cli("compensate", tmp_path / "model.safetensors", tmp_path / "in.csv", tmp_path / "out.csv")
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert code == 130 and said == "interrupted; nothing was written\n"
     assert (tmp_path / "out.csv").read_text() == "old" and sorted(tmp_path.iterdir()) == files
 
