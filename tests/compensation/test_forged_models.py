@@ -372,6 +372,24 @@ def test_tensors_that_do_not_fit(copied: Path, change: Callable[[dict[str, torch
         load_model(path)
 
 
+def refused_or_bounded(folder: Path, facts: dict[str, Any], bound: str, *covariates: np.ndarray) -> None:
+    """The master with these facts is refused by its path, or its deviation keeps the bound of that key; then undone."""
+    path = folder / "model.safetensors"
+    good = path.read_bytes()
+    try:
+        model = load_model(forge_master(folder, facts, lambda tensors: None))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FallbackWarning)
+            found = model(np.ones(len(model.joints)), *covariates)
+        assert np.isfinite(found["command"]).all()
+        most = np.array([model.facts["limits"][c.name][bound] for c in model.joints])
+        assert (np.abs(found["deviation"]) <= most).all()
+    except ModelFileError as refused:
+        assert str(path) in str(refused)
+    finally:
+        path.write_bytes(good)
+
+
 @pytest.mark.parametrize("number", [-(2**63) - 1, 10**400])
 def test_an_integer_of_many_digits_is_a_number_or_refused(copied: Path, number: int) -> None:
     for change in (
@@ -380,11 +398,7 @@ def test_an_integer_of_many_digits_is_a_number_or_refused(copied: Path, number: 
     ):
         facts = facts_of(copied)
         change(facts)
-        path = forge_master(copied, facts, lambda tensors: None)
-        try:
-            assert np.isfinite(load_model(path)(np.zeros(3))["command"]).all()
-        except ModelFileError as refused:
-            assert str(path) in str(refused)
+        refused_or_bounded(copied, facts, "limit")
 
 
 LEAVES = ("domain", "limits", "joints", "network", "lipschitz", "iterations", "covariates", "pose", "mechanism")
@@ -400,26 +414,13 @@ ANYTHING = st.recursive(
 def test_any_fact_replaced_by_anything_gives_a_sentence_or_finite_commands(
     copied: Path, key: str, deep: bool, draw: Any, value: Any
 ) -> None:
-    path = copied / "model.safetensors"
-    good = path.read_bytes()
     facts = facts_of(copied)
     place, last = facts, key
     while deep and isinstance(place[last], dict | list) and place[last]:
         place = place[last]
         last = draw.choice([*place]) if isinstance(place, dict) else draw.randrange(len(place))
     place[last] = value
-    try:
-        model = load_model(forge_master(copied, facts, lambda tensors: None))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FallbackWarning)
-            found = model(np.ones(len(model.joints)))
-        assert np.isfinite(found["command"]).all()
-        limit = np.array([model.facts["limits"][c.name]["limit"] for c in model.joints])
-        assert (np.abs(found["deviation"]) <= limit).all()
-    except ModelFileError as refused:
-        assert str(path) in str(refused)
-    finally:
-        path.write_bytes(good)
+    refused_or_bounded(copied, facts, "limit")
 
 
 @pytest.fixture
@@ -434,8 +435,6 @@ def with_machine(tmp_path: Path) -> Path:
 @given(draw=st.randoms(use_true_random=False), value=ANYTHING)
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_fact_of_a_machine_replaced_by_anything(with_machine: Path, draw: Any, value: Any) -> None:
-    path = with_machine / "model.safetensors"
-    good = path.read_bytes()
     facts = facts_of(with_machine)
     place: Any = facts
     last: Any = "machine"
@@ -444,18 +443,7 @@ def test_any_fact_of_a_machine_replaced_by_anything(with_machine: Path, draw: An
         place = place[last]
         last = draw.choice([*place]) if isinstance(place, dict) else draw.randrange(len(place))
     place[last] = value
-    try:
-        model = load_model(forge_master(with_machine, facts, lambda tensors: None))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FallbackWarning)
-            found = model(np.ones(3), np.ones(3))
-        assert np.isfinite(found["command"]).all()
-        most = np.array([model.facts["limits"][c.name]["most_deviation"] for c in model.joints])
-        assert (np.abs(found["deviation"]) <= most).all()
-    except ModelFileError as refused:
-        assert str(path) in str(refused)
-    finally:
-        path.write_bytes(good)
+    refused_or_bounded(with_machine, facts, "most_deviation", np.ones(3))
 
 
 @pytest.mark.parametrize("key", ["newton", "degree"])

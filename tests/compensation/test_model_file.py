@@ -139,6 +139,12 @@ def test_files_hold_no_path_and_no_time(folder: Path) -> None:
         assert b"2026-" not in content and b"date" not in content.replace(b"update", b"")
 
 
+def test_a_name_that_is_no_text_is_refused_and_nothing_is_written(tmp_path: Path, tripod: Compensator) -> None:
+    with pytest.raises(InputError, match=r"fields must be JSON: .*surrogates not allowed"):
+        save_model(tmp_path, tripod, fields() | {"metrics": {"\ud800": 1.0}}, forms=())
+    assert not [*tmp_path.iterdir()]
+
+
 def test_metadata_is_one_key_of_sorted_json(folder: Path) -> None:
     with safe_open(folder / "model.safetensors", framework="pt") as file:
         metadata = file.metadata()

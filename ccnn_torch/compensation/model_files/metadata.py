@@ -104,11 +104,13 @@ def coordinates(entries: list[dict[str, str]]) -> tuple[Coordinate, ...]:
 
 
 def to_json(value: Mapping[str, Any], indent: int | None = None) -> str:
-    """Sorted JSON without NaN."""
+    """Sorted JSON without NaN, which UTF-8 can hold."""
     try:
-        return json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False, indent=indent)
+        text = json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False, indent=indent)
+        text.encode()
     except (TypeError, ValueError) as problem:
         raise InputError(f"a model's fields must be JSON: {problem}") from None
+    return text
 
 
 def from_json(text: str | bytes) -> Any:
