@@ -180,7 +180,7 @@ def test_a_kill_before_the_first_file_stood_is_no_dead_end(tmp_path: Path) -> No
     (path / "plots" / ".ccnn-4567.part").write_text("")
     with RunFolder.existing(path):
         assert list((path / "plots").iterdir()) == []
-    with pytest.raises(InputError, match="holds files already"), RunFolder.fresh(str(path), "name"):
+    with pytest.raises(InputError, match=r"that run: ccnn run --resume \S+$"), RunFolder.fresh(str(path), "name"):
         raise AssertionError
     # One that nothing was written into goes away again.
     shutil.rmtree(path)

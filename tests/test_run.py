@@ -159,7 +159,8 @@ def test_the_limit_of_the_config_holds_for_every_joint() -> None:
 
 def test_a_taken_folder_is_not_written_into(tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
-    with pytest.raises(InputError, match="holds files already"):
+    # There is no run to resume, so that no hint says how.
+    with pytest.raises(InputError, match=r"holds files already; give another folder with out=…$"):
         start_run(short(out=str(tmp_path)), quiet=True)
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
 

@@ -60,9 +60,8 @@ class RunFolder:
             InputError: the folder holds files already, is in use, or cannot be made.
         """
         path = Path(out) if out else Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
-        taken = InputError(
-            f"{path} holds files already; give another folder with out=…, or resume that run: {resume} {path}"
-        )
+        resumes = f", or resume that run: {resume} {path}" if cls(path).config.is_file() else ""
+        taken = InputError(f"{path} holds files already; give another folder with out=…{resumes}")
         if path.exists() and not path.is_dir():
             raise taken
         try:
