@@ -307,7 +307,7 @@ def test_a_lag_is_left_out_and_said(played: Path) -> None:
     names = [c.name for c in rows.covariate_coordinates]
     covariates = dict(zip(names, rows.covariates[0].unbind(-1), strict=True))
     situation = Situation(rows.mechanism, rows.joints[0], covariates, default_gravity(rows.mechanism))
-    verdict = Verdict("d.json", None, {"thermal": {"growth": 1.1e-5, "lag": 900.0, "at once": 1e-6}})
+    verdict = Verdict("d.json", None, (("thermal", {"growth": 1.1e-5, "lag": 900.0, "at once": 1e-6}),))
     known, notes = verdict.on(situation)
     assert len(notes) == 1 and "What thermal has of lag, at once comes from before" in notes[0]
     assert known[0].shape.shape == (0,) and float(known[0].coefficients[0]) == 1.1e-5

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from fitted import fitted_geometry
 from mechanisms.catalogue import make
 
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import make_config
 from ccnn_torch.calibration.rows.prepare import Prepared, prepare
-from ccnn_torch.identification import fit_links
 from ccnn_torch.mechanisms import fit_frames, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation
 from ccnn_torch.records import write_table
@@ -89,7 +89,7 @@ def test_positions_alone_turn_no_joint_that_they_do_not_show(name: str, tmp_path
     position, rotation = seen.forward_frame(joints, truth.expand(150, -1))
     position = position + 3e-5 * torch.randn(position.shape, generator=generator, dtype=torch.float64)
     frames = fit_frames(blind, joints[:100], position[:100])
-    links = fit_links(blind, joints[:100], position[:100], frames)
+    links = fitted_geometry(blind, joints[:100], position[:100], frames)
 
     def turned(values: torch.Tensor) -> float:
         """Of the held-out rows, once the tool's rotation, which no position shows, is taken out [rad]."""

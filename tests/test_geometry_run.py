@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fitted import fitted_geometry
 from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
@@ -16,7 +17,6 @@ from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.cli.application import app
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification import fit_geometry
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, stack_columns, write_table
 from ccnn_torch.report.arrays import load_arrays
@@ -121,10 +121,10 @@ def test_held_out_rows_do_not_change_the_geometry() -> None:
     tripod = load_mechanism("tripod")
     joints = tripod.sample_joints(60, torch.Generator().manual_seed(1))
     pose = tripod.forward_kinematics(joints, tripod.nominal + 2e-4)
-    weights = (torch.arange(60) < 40).to(torch.float64)
-    first = fit_geometry(tripod, joints, pose, tripod.nominal, weights)
+    rows = torch.arange(60) < 40
+    first = fitted_geometry(tripod, joints, pose, rows=rows)
     pose[50:] += 1e-2
-    torch.testing.assert_close(fit_geometry(tripod, joints, pose, tripod.nominal, weights), first, rtol=0, atol=0)
+    torch.testing.assert_close(fitted_geometry(tripod, joints, pose, rows=rows), first, rtol=0, atol=0)
     error = tripod.forward_kinematics(joints[:50], first) - tripod.forward_kinematics(
         joints[:50], tripod.nominal + 2e-4
     )

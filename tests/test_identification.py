@@ -6,9 +6,9 @@ import math
 
 import pytest
 import torch
+from fitted import fitted_geometry
 from torch import Tensor
 
-from ccnn_torch.identification import fit_links
 from ccnn_torch.mechanisms.frames.fit import fit_frames
 from ccnn_torch.mechanisms.machines.serial import SerialArm
 
@@ -60,17 +60,15 @@ def machine(kind: str, seed: int) -> tuple[SerialArm, Tensor, Tensor, Tensor]:
 @pytest.mark.parametrize("kind", ["six", "seven"])
 def test_links_predict_held_out_poses(kind: str) -> None:
     arm, truth, joints, pose = machine(kind, seed=1)
-    weights = torch.ones(2, 160, dtype=torch.float64)
-    weights[0, 100:] = 0
-    weights[1, :60] = 0
+    rows = torch.ones(2, 160, dtype=torch.bool)
+    rows[0, 100:] = False
+    rows[1, :60] = False
     pose[100:101, 0] += 0.5  # a held-out row of the first repeat must not be looked at
-    frames = fit_frames(arm, joints, pose, weights)
-    fitted = fit_links(arm, joints, pose, frames, weights)
-    assert fitted.shape == frames.shape == (2, len(arm.geometry))
+    frames = fit_frames(arm, joints, pose, rows.double())
+    fitted = [fitted_geometry(arm, joints, pose, *own) for own in zip(frames, rows, strict=True)]
+    assert frames.shape == (2, len(arm.geometry))
     held_out = slice(101, 160)
     real = arm.forward_kinematics(joints[held_out], truth)
     before = arm.pose_error(arm.forward_kinematics(joints[held_out], frames[0]), real).position.square().mean().sqrt()
     after = arm.pose_error(arm.forward_kinematics(joints[held_out], fitted[0]), real).position.square().mean().sqrt()
     assert float(after) < 3e-5 < 3e-4 < float(before)
-    alone = fit_links(arm, joints, pose, frames[0], weights[0])
-    torch.testing.assert_close(alone, fitted[0], rtol=0, atol=1e-8)

@@ -6,8 +6,8 @@ import math
 
 import pytest
 import torch
+from fitted import fitted_geometry
 
-from ccnn_torch.identification import fit_links
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.mechanisms.frames.fit import fit_frames
 
@@ -46,7 +46,7 @@ def test_a_tilt_between_parallel_axes_needs_them() -> None:
     pose = full.forward_kinematics(joints, truth)
     left = []
     for kind in (arm, full):
-        found = fit_links(kind, joints[:100], pose[:100], fit_frames(kind, joints[:100], pose[:100]))
+        found = fitted_geometry(kind, joints[:100], pose[:100], fit_frames(kind, joints[:100], pose[:100]))
         error = kind.pose_error(kind.forward_kinematics(joints[100:], found), pose[100:])
         left.append(float(error.position.square().mean().sqrt()))
     assert left[1] < 1e-5 < 5e-5 < left[0]

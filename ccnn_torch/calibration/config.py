@@ -209,8 +209,8 @@ class RunConfig(_Part):
     effects: str | list[str] = Field(
         default="auto",
         description="physical causes that are a part of the model, so that the network learns only what they leave: "
-        "auto = those that a diagnosis of the training rows names, where cross-validation finds that they pay (none "
-        "for cases); a list = the same among these; from:DIR/diagnosis.json = those that a diagnosis named; none",
+        "auto = those without which the training rows would be less probable, where cross-validation finds that they "
+        "pay (none for cases); a list = the same among these; from:DIR/diagnosis.json = what a diagnosis named; none",
     )
     rotation_weight: float = Field(
         default=0.04, gt=0, description="weight of orientation against position in m per rad (η of eq. 5)"

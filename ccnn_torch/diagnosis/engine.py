@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -77,48 +77,6 @@ def _made(situation: Situation, effects: Sequence[Effect | str] | None) -> list[
     return [make_effect(e, situation.mechanism) if isinstance(e, str) else owned(e) for e in named]
 
 
-class Named(NamedTuple):
-    """What is named, and from which rows.
-
-    Attributes:
-        rows: which are fit to be diagnosed.
-        chosen: numbers of those that were, `s`.
-        known: the noise, where it is not estimated.
-        every, lacking: candidates, and what the records lack for those that cannot be asked for.
-    """
-
-    rows: PlausibleRows
-    chosen: Tensor
-    known: Noise | None
-    analysis: Analysis
-    judgement: Judgement
-    every: list[Effect]
-    lacking: dict[str, str]
-
-
-def name_rows(
-    situation: Situation,
-    measured: Tensor,
-    noise: Tensor | None = None,
-    effects: Sequence[Effect | str] | None = None,
-    seed: int = 0,
-    instrument: Noise | None = None,
-) -> Named:
-    """The names of a diagnosis alone; arguments and errors as `diagnose_rows`."""
-    at_step("searching the effects")
-    rows = usable_rows(situation, measured)
-    situation, measured, chosen = drawn_rows(situation, measured, rows.fine, seed)
-    every = _made(situation, effects)
-    usable, lacking = candidates(situation, every)
-    if noise is not None:
-        known: Noise | None = Noise(noise, "given")
-    else:
-        known = instrument or noise_of_repeats(situation, measured)
-    analysis = analyse(situation, measured, usable, noise, None if known is None else known.sd)
-    at_step("judging on held-out rows")
-    return Named(rows, chosen, known, analysis, judge(analysis), every, lacking)
-
-
 def diagnose_rows(
     situation: Situation,
     measured: Tensor,
@@ -143,12 +101,21 @@ def diagnose_rows(
     Raises:
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
+    at_step("searching the effects")
+    rows = usable_rows(situation, measured)
+    copies = int((rows.fine & copies_of(situation, measured)).sum())
     every_row = situation, measured
-    found = name_rows(situation, measured, noise, effects, seed, instrument)
-    rows, chosen, known, analysis, judgement, every, lacking = found
-    copies = int((rows.fine & copies_of(*every_row)).sum())
-    situation, measured = analysis.situation, measured[chosen]
+    situation, measured, chosen = drawn_rows(situation, measured, rows.fine, seed)
     residual = pose_residual(situation, measured)
+    every = _made(situation, effects)
+    usable, lacking = candidates(situation, every)
+    if noise is not None:
+        known: Noise | None = Noise(noise, "given")
+    else:
+        known = instrument or noise_of_repeats(situation, measured)
+    analysis = analyse(situation, measured, usable, noise, None if known is None else known.sd)
+    at_step("judging on held-out rows")
+    judgement = judge(analysis)
     # What no column would bring into sight is no reason to record one.
     unseen = lacking | dict.fromkeys(analysis.idle, UNSHOWN)
     directions = {} if inferred else directions_of_order(every_row[0])

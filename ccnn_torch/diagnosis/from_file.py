@@ -44,14 +44,14 @@ class Verdict:
     Attributes:
         path: the file.
         gravity: `3` [m/s²] as it was diagnosed with, or None where the file does not say.
-        parameters: of each effect of the verdict, in its order: name -> value [SI].
+        effects: those of the verdict in its order, by name, with their numbers: name -> value [SI].
         outside: whether something is there beside them that no effect describes.
         covariates: those that varied in the rows that were diagnosed.
     """
 
     path: str
     gravity: Tensor | None
-    parameters: dict[str, dict[str, float]]
+    effects: tuple[tuple[str, Mapping[str, float]], ...]
     outside: bool = False
     covariates: tuple[str, ...] = ()
 
@@ -73,7 +73,7 @@ class Verdict:
         alone, found, notes = one_row_at_a_time(situation), [], []
         if self.outside:
             notes.append("Beside the effects something is there that none describes: it is left to the network.")
-        for name, values in self.parameters.items():
+        for name, values in self.effects:
             effect = make_effect(name)
             key = f"{self.path}: effects, {name}"
             lacking = effect.missing(situation.mechanism, [*situation.covariates])
@@ -137,21 +137,15 @@ def usable_verdict(verdict: Verdict, situation: Situation) -> tuple[Verdict | No
     Args:
         situation: rows, with the covariates that were recorded.
     """
-    notes, kept = not_held_notes([*verdict.parameters]), {}
-    for name, values in verdict.parameters.items():
+    notes, kept = not_held_notes([name for name, _ in verdict.effects]), []
+    for one in verdict.effects:
         try:
-            if name != OUTLIER and _held(name):
-                replace(verdict, parameters={name: values}, outside=False).on(situation)
-                kept[name] = values
+            if one[0] != OUTLIER and _held(one[0]):
+                replace(verdict, effects=(one,), outside=False).on(situation)
+                kept.append(one)
         except InputError as reason:
             notes.append(f"{str(reason).removeprefix(f'{verdict.path}: effects, ')}.")
-    return (replace(verdict, parameters=kept) if kept else None), notes
-
-
-def beside_geometry(verdict: Verdict) -> Verdict | None:
-    """The effects that add to identified geometry; None where there is none."""
-    kept = {n: v for n, v in verdict.parameters.items() if make_effect(n).kind != "parameters"}
-    return replace(verdict, parameters=kept) if kept else None
+    return (replace(verdict, effects=tuple(kept)) if kept else None), notes
 
 
 def _verdict_of(
@@ -177,13 +171,13 @@ def _verdict_of(
             f"run has {mechanism} with {', '.join(joints)}; give the same mechanism"
         )
     down = None if gravity is None else torch.tensor(gravity, dtype=torch.float64)
-    parameters = {name: listed.get(name, {}) for name in names}
-    return Verdict(path, down, parameters, outside, covariates), nothing, listed
+    effects = tuple((name, listed.get(name, {})) for name in names)
+    return Verdict(path, down, effects, outside, covariates), nothing, listed
 
 
 def _refuse(path: str, verdict: Verdict, nothing: bool, listed: Mapping[str, Any]) -> None:
     """Raise InputError where a verdict has no effects to take."""
-    names, outside = [*verdict.parameters], verdict.outside
+    names, outside = [name for name, _ in verdict.effects], verdict.outside
     key, remedy = f"{path}: verdict", "write effects=none"
     if nothing:
         raise InputError(f"{key}: none: the gap is no more than the noise, so there is no effect to take; {remedy}")
@@ -222,7 +216,7 @@ def _held(name: str) -> bool:
     return name in EFFECTS
 
 
-def _known(effect: Effect, situation: Situation, values: dict[str, float]) -> Known:
+def _known(effect: Effect, situation: Situation, values: Mapping[str, float]) -> Known:
     coefficients, shapes = effect.coefficients(situation), effect.shapes(situation)
     middles = [s.grid[len(s.grid) // 2] for s in shapes]
     return Known(

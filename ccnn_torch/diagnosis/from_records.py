@@ -13,8 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.checks.mistakes import what_is_wrong
 from ccnn_torch.diagnosis.discrepancy.network import with_network
-from ccnn_torch.diagnosis.engine import diagnose_rows, name_rows
-from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Verdict, usable_verdict
+from ccnn_torch.diagnosis.engine import diagnose_rows
 from ccnn_torch.diagnosis.residual.distance import size_of
 from ccnn_torch.diagnosis.residual.noise_evidence import Noise, column_names, noise_of_columns
 from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, simulator_inputs
@@ -73,34 +72,6 @@ def diagnose(
         )
     said = replace(said, lines=tuple(records.lines.tolist()), notes=[*said.notes, *_unread(records, situation, said)])
     return with_network(said, seed) if network else said
-
-
-def name_effects(
-    records: Records, mechanism: Mechanism, effects: Sequence[str] | None = None, seed: int = 0
-) -> tuple[Verdict | None, list[str], list[str], float]:
-    """The names of a diagnosis alone, as a model can hold them.
-
-    Returns:
-        The effects with their numbers, None where none can be held; a sentence for each that was left out; all names;
-        and the probability of the verdict.
-
-    Raises:
-        InputError: as `diagnose`.
-    """
-    situation = situation_of(records, mechanism)
-    with naming(records):
-        found = name_rows(situation, records.pose, None, effects, seed, _instrument(records, situation))
-    acting, here = found.analysis.acting(found.judgement.found), found.analysis.situation
-    parameters = {}
-    for one in acting:
-        if one.effect.name in found.judgement.names:
-            numbers = [*one.coefficients.tolist(), *one.shape.tolist()]
-            named = [c.name for c in one.effect.coefficients(here)] + [s.name for s in one.effect.shapes(here)]
-            of_one = dict(zip(named, numbers, strict=True))
-            parameters[one.effect.name] = {name: value for name, value in of_one.items() if value}
-    verdict = Verdict(TRAINING_ROWS, situation.gravity, parameters, found.judgement.outside)
-    names = [*found.judgement.names]
-    return *usable_verdict(verdict, situation), names, found.judgement.probability
 
 
 def _instrument(records: Records, situation: Situation) -> Noise | None:

@@ -1,6 +1,7 @@
 """Physical causes of error, one file each, all of one protocol."""
 
 from ccnn_torch.effects.apply import Acting as Acting
+from ccnn_torch.effects.apply import labelled as labelled
 from ccnn_torch.effects.apply import measured_pose as measured_pose
 from ccnn_torch.effects.apply import moved_joints as moved_joints
 from ccnn_torch.effects.apply import pose_residual as pose_residual

@@ -29,6 +29,15 @@ class Acting(NamedTuple):
         return (basis @ self.coefficients.unsqueeze(-2).unsqueeze(-1)).squeeze(-1)
 
 
+def labelled(acting: Sequence[Acting]) -> list[tuple[str, Acting]]:
+    """Effects with their names, which are counted where one acts several times: `transmission`, `transmission 2`."""
+    names, found = [one.effect.name for one in acting], []
+    for i, one in enumerate(acting):
+        times = names[: i + 1].count(names[i])
+        found.append((names[i] if times == 1 else f"{names[i]} {times}", one))
+    return found
+
+
 def signature(situation: Situation, effect: Effect, shape: Tensor) -> Tensor:
     """First-order change of position and rotation vector per unit of each coefficient, `... x s x c x m`."""
     basis = effect.basis(situation, shape)

@@ -12,7 +12,6 @@ from ccnn_torch.identification.problems.constraints import socket_problem as soc
 from ccnn_torch.identification.problems.constraints import tool_points as tool_points
 from ccnn_torch.identification.problems.forward import forward_problem as forward_problem
 from ccnn_torch.identification.problems.inverse import inverse_problem as inverse_problem
-from ccnn_torch.identification.problems.links import fit_links as fit_links
 from ccnn_torch.identification.problems.parameters import ParameterChoice as ParameterChoice
 from ccnn_torch.identification.problems.parameters import Selection as Selection
 from ccnn_torch.identification.problems.parameters import select_parameters as select_parameters
@@ -21,7 +20,6 @@ from ccnn_torch.identification.problems.problem import Fit as Fit
 from ccnn_torch.identification.problems.problem import Problem as Problem
 from ccnn_torch.identification.problems.problem import Progress as Progress
 from ccnn_torch.identification.problems.problem import Solver as Solver
-from ccnn_torch.identification.solvers.geometry import fit_geometry as fit_geometry
 from ccnn_torch.identification.solvers.legs import solve_per_leg as solve_per_leg
 from ccnn_torch.identification.solvers.legs import split_by_leg as split_by_leg
 from ccnn_torch.identification.solvers.lm import solve_lm as solve_lm

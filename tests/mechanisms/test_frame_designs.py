@@ -3,9 +3,9 @@
 import pytest
 import torch
 from catalogue import make
+from fitted import fitted_geometry
 
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification import fit_links
 from ccnn_torch.mechanisms import fit_frames, judge_frames, read_dh_file
 
 CORNERS = torch.tensor([[0.0, 0, 0], [1, -1, 1], [-1, -1, 1], [-1, 1, -1], [1, 1, -1]], dtype=torch.float64)
@@ -83,7 +83,7 @@ def test_links_that_are_fitted_next_stay_within_reach(tmp_path):
     joints = _joints(arm, "cube", generator)
     pose, _ = _measured(arm, joints, generator)
     fitted = fit_frames(arm, joints[:75], pose[:75])
-    links = fit_links(arm, joints[:75], pose[:75], fitted)
+    links = fitted_geometry(arm, joints[:75], pose[:75], fitted)
     assert _rms(arm, joints[75:], pose[75:], links) < 1.001 * _rms(arm, joints[75:], pose[75:], fitted)
     assert float(links[-6:-3].norm()) < arm.reach
 
@@ -101,7 +101,7 @@ def test_gross_outliers_move_neither_frames_nor_links(name, kind, tmp_path):
         wrong[bad] = pose[bad.roll(1)]
     weights = (torch.arange(200) < 150).double()
     frames = [fit_frames(arm, joints, p, weights) for p in (pose, wrong)]
-    links = [fit_links(arm, joints[train], p[train], f) for p, f in zip((pose, wrong), frames, strict=True)]
+    links = [fitted_geometry(arm, joints[train], p[train], f) for p, f in zip((pose, wrong), frames, strict=True)]
     for clean, robust in (frames, links):
         best = _rms(arm, joints[test], pose[test], clean)
         assert _rms(arm, joints[test], pose[test], robust) < 1.1 * best

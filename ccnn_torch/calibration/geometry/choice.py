@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.geometry.identified import fit_machine
-from ccnn_torch.calibration.geometry.physics import Physics, fit_effects, identified_alone
+from ccnn_torch.calibration.geometry.frames import frames_of_repeats
+from ccnn_torch.calibration.geometry.physics import fit_physics
 from ccnn_torch.calibration.learning.early_stop import Plan
 from ccnn_torch.calibration.learning.fitting import fit_method
 from ccnn_torch.calibration.rows.dataset import dataset_of
@@ -153,7 +153,7 @@ def _errors(
         nominal_too: whether it may learn everything, on the nominal machine.
     """
     joints, pose, weight = records.joints, records.pose, settings["rotation_weight"]
-    fitted = fit_machine(mechanism, records, folds, identify=any(c.identify for c in physical))
+    frames, _ = frames_of_repeats(mechanism, records, folds, "geometry" if physical else "")
     held = torch.zeros(len(folds), len(joints), dtype=torch.float64)
     for k, fold in enumerate(folds):
         held[k, fold.test] = 1.0
@@ -163,27 +163,20 @@ def _errors(
         turned = 0.0 if error.rotation is None else weight**2 * error.rotation.square()
         return (error.position.square() + turned).expand(len(folds), -1)
 
-    nominal = joint_deviations(mechanism, joints, pose, parameters=fitted.parameters, **settings)
-    machines: dict[tuple[bool, bool], Physics] = {}
-    for c in physical:
-        if c.effects and verdict is not None:
-            about = (folds, fitted.parameters, nominal.usable, c.identify)
-            machines[c[:2]] = fit_effects(verdict, mechanism, records, *about)[0]
-        else:
-            assert fitted.geometry is not None
-            base = mechanism.nominal.expand_as(fitted.geometry) if fitted.parameters is None else fitted.parameters
-            machines[c[:2]] = identified_alone(mechanism, records, base, fitted.geometry)
+    nominal = joint_deviations(mechanism, joints, pose, parameters=frames, **settings)
+    about = (mechanism, records, folds, frames, nominal.usable)
+    machines = {c[:2]: fit_physics(verdict if c.effects else None, *about, c.identify)[0] for c in physical}
 
     def error(c: Candidate) -> Tensor:
         physics = machines.get(c[:2])
         if physics is None:
-            learned = _learned(mechanism, records, nominal, folds, seed, fitted.parameters)
+            learned = _learned(mechanism, records, nominal, folds, seed, frames)
             # The same joints are wanted, so that what a command misses is added to what the model misses.
             command = joints.expand(len(folds), -1, -1)
             for _ in range(_COMMANDS):
                 command = joints - learned(command)
             moved = joints + learned(joints) + (command + learned(command) - joints)
-            return square(mechanism.forward_kinematics(moved, fitted.parameters, guess=pose), pose)
+            return square(mechanism.forward_kinematics(moved, frames, guess=pose), pose)
         moved = joints.expand(len(folds), -1, -1)
         if c.learner:
             targets = physics.targets(joints, pose, settings)

@@ -1,33 +1,42 @@
-"""`effects: auto`: the effects that a diagnosis of the training rows names."""
+"""`effects: auto`: the effects that the training rows ask for."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from ccnn_torch.calibration.geometry.joint_fit import effects_that_pay, fit_jointly
+from ccnn_torch.calibration.geometry.physics import loose_parameters, on_fitted_frames
 from ccnn_torch.calibration.rows.some_rows import rows_of
-from ccnn_torch.diagnosis.from_file import Verdict
-from ccnn_torch.diagnosis.from_records import name_effects
+from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Verdict, usable_verdict
+from ccnn_torch.diagnosis.from_records import situation_of
+from ccnn_torch.effects import make_effect
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import BlackBox, Mechanism, SerialArm
 from ccnn_torch.records import Records
 
-# Rows that the search uses: more take longer and name the same.
-_MOST_ROWS = 400
+# Rows that the search uses: more take longer and show the same.
+_MOST_ROWS = 1000
+_EFFECTS = ("joint_gain", "transmission", "backlash", "friction", "compliance", "gravity", "thermal", "coupling")
+"""What is looked for where nothing is asked: all of the library that acts within the machine and that a command can
+know. Frames and geometry are fitted beside; an error of the measuring device is none of the machine."""
 
 
 def search_effects(
-    mechanism: Mechanism, records: Records, rows: Tensor, names: list[str] | None, seed: int
+    mechanism: Mechanism, records: Records, rows: Tensor, names: list[str] | None, seed: int, identify: bool
 ) -> tuple[Verdict | None, list[str]]:
-    """Diagnose some rows, at most 400 of them.
+    """Look for effects in some rows, at most 1000 of them.
 
     Args:
         rows: numbers of the rows that are not held out.
-        names: effects to look for; all of the library when None.
-        seed: of the choice of rows and of the diagnosis.
+        names: effects to look for; those that act within the machine when None.
+        seed: of the choice of rows.
+        identify: whether all parameters of the machine are fitted beside.
 
     Returns:
-        The effects that were named and that a model file can hold, None without any; and notes, one sentence each.
+        The effects that pay, None without any; and notes, one sentence each.
     """
     if isinstance(mechanism, BlackBox):
         return None, ["Effects were not searched: of a simulator every row takes long; see ccnn diagnose."]
@@ -35,11 +44,32 @@ def search_effects(
         return None, ["Effects were not searched: one compensator needs one frame, and these rows have several."]
     if len(rows) > _MOST_ROWS:
         rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:_MOST_ROWS]]
+    few = rows_of(records, rows.sort().values)
     try:
-        verdict, notes, said, probability = name_effects(rows_of(records, rows.sort().values), mechanism, names, seed)
+        recorded = situation_of(few, mechanism)
     except InputError as reason:
         return None, [f"Effects were not searched: {reason}"]
-    if not said:
-        return None, ["Effects were searched in the training rows, and none was named."]
-    shown = f"Effects that the training rows show: {', '.join(said)} (probability {probability:.2f})."
-    return verdict, [shown, *notes]
+    made = [make_effect(name, mechanism) for name in _EFFECTS if names is None or name in names]
+    made += [make_effect(name, mechanism) for name in names or () if name not in _EFFECTS]
+    asked = [e for e in made if not (identify and e.kind == "parameters")]
+    asked = [e for e in asked if names is not None or not e.missing(mechanism, [*recorded.covariates])]
+    named = Verdict(TRAINING_ROWS, recorded.gravity, tuple((e.name, {}) for e in asked))
+    usable, notes = usable_verdict(named, recorded)
+    notes = notes if names is not None else []
+    situation = on_fitted_frames(recorded)
+    kept = () if usable is None else tuple(name for name, _ in usable.effects)
+    effects = [e for e in asked if e.name in kept]
+    loose, fine = loose_parameters(situation.mechanism, identify), torch.ones(len(few), dtype=torch.bool)
+    known = effects_that_pay(situation, few.pose, effects, fine, loose) if effects else []
+    if not known:
+        return None, ["Effects were searched in the training rows, and none pays.", *notes]
+    acting, _ = fit_jointly(situation, few.pose, known, fine, loose)
+    numbers = []
+    for one, fitted in zip(known, acting, strict=True):
+        coefficients, shapes = one.effect.coefficients(situation), one.effect.shapes(situation)
+        values = {coefficients[k].name: float(fitted.coefficients[k]) for k in one.used}
+        values |= {s.name: float(v) for s, v in zip(shapes, one.shape, strict=True)}
+        numbers.append((one.effect.name, values))
+    said = ", ".join(dict.fromkeys(name for name, _ in numbers))
+    notes = [f"Effects without which the training rows would be less probable: {said}.", *notes]
+    return replace(named, effects=tuple(numbers)), notes

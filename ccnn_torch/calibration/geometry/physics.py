@@ -8,16 +8,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ccnn_torch.calibration.geometry.joint_fit import fit_jointly
 from ccnn_torch.calibration.rows.dataset import Dataset
 from ccnn_torch.compensation import Care, build_machine, expand_effects, expand_geometry, gains, geometric_deviation
-from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Known, Verdict, one_row_at_a_time, read_verdict
-from ccnn_torch.diagnosis.refit import refit
 from ccnn_torch.display import short_path
 from ccnn_torch.effects import (
     Acting,
     Situation,
     default_gravity,
+    labelled,
     make_effect,
     measured_pose,
     moved_joints,
@@ -25,10 +25,8 @@ from ccnn_torch.effects import (
     without_pose_effects,
 )
 from ccnn_torch.errors import InputError
-from ccnn_torch.identification import fit_geometry
-from ccnn_torch.mechanisms import Framed, Mechanism, SerialArm
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT, fit_frames
-from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
+from ccnn_torch.mechanisms import Mechanism, SerialArm
+from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
@@ -36,8 +34,6 @@ from ccnn_torch.records.splits import Split
 _FROM = "from:"
 # Steps of r <- δ - e(q + r); each gains a factor of e's slope, at most 0.1.
 _STEPS = 6
-# Times geometry and effects are fitted in turn.
-_TURNS = 2
 # How much larger than at the training rows what effects take from the kinematics may become.
 _ABOVE = 1.1
 
@@ -139,7 +135,7 @@ class Physics:
     def block(self) -> dict[str, Any]:
         """For results.json: each coefficient's value in every repeat, by effect and name."""
         found: dict[str, Any] = {}
-        for i, one in enumerate(self.every[0]):
+        for i, (label, one) in enumerate(labelled(self.every[0])):
             named: dict[str, Any] = {}
             for j, c in enumerate(one.effect.coefficients(self.situations[0])):
                 values = [float(repeat[i].coefficients[j]) for repeat in self.every]
@@ -147,7 +143,7 @@ class Physics:
                     named[c.name] = {"unit": c.unit, "values": values}
             for j, s in enumerate(one.effect.shapes(self.situations[0])):
                 named[s.name] = {"unit": s.unit, "values": [float(repeat[i].shape[j]) for repeat in self.every]}
-            found[one.effect.name] = named
+            found[label] = named
         return found
 
 
@@ -158,28 +154,13 @@ def _care(situation: Situation) -> Care:
     return care._replace(gain=gain, inverse_gain=inverse_gain)
 
 
-def identified_alone(mechanism: Mechanism, records: Records, nominal: Tensor, values: Tensor) -> Physics:
-    """The machines of all repeats without any effect.
-
-    Args:
-        nominal, values: all parameters, frames fitted and identified, `r x 1 x k` [SI].
-    """
-    gravity = default_gravity(mechanism)
-    guess = records.pose if records.pose.shape[-1] == len(mechanism.pose) else None
-    situations = [
-        Situation(mechanism.with_nominal(own[0]), records.joints, {}, gravity, None, guess)
-        for own in nominal.expand_as(values)
-    ]
-    return Physics("", situations, values, [[] for _ in situations], [[] for _ in situations])
-
-
 def verdict_of(key: str, mechanism: Mechanism) -> Verdict:
     """The verdict that the key `effects` names; raises as `read_verdict`."""
     return read_verdict(key.removeprefix(_FROM), mechanism.name, [joint.name for joint in mechanism.joints])
 
 
-def fit_effects(
-    verdict: Verdict,
+def fit_physics(
+    verdict: Verdict | None,
     mechanism: Mechanism,
     records: Records,
     splits: list[Split],
@@ -187,59 +168,69 @@ def fit_effects(
     usable: Tensor,
     identify: bool,
 ) -> tuple[Physics, list[str]]:
-    """Fit the verdict's coefficients to the rows of each repeat that are not held out; shapes are the file's.
+    """Fit geometry and a verdict's effects together to the rows of each repeat that are not held out.
 
     Args:
+        verdict: effects with their shapes, which stay; None = no effects.
         parameters: with fitted frames, `r x 1 x k`; None = nominal.
         usable: rows fit to learn from, `[r x] s` bool.
-        identify: whether all parameters are to be identified beside the effects.
+        identify: whether all parameters are to be identified.
 
     Returns:
-        The machines with the effects, and notes.
+        The machines, and notes.
+
+    Raises:
+        InputError: there is nothing to identify, or records are without a column of an effect.
     """
-    if parameters is not None and parameters.shape[1] > 1:
+    if identify and not mechanism.geometry:
         raise InputError(
-            f"effects: {mechanism.name} has frames per group of rows (frame_per, tool_per), and one compensator needs "
-            "one frame; take the rows of one group, or write effects=none"
+            f"mechanism '{mechanism.name}' has no parameters that could be identified; write geometry=none"
         )
+    gravity = default_gravity(mechanism) if verdict is None or verdict.gravity is None else verdict.gravity
     covariates = {c.name: records.covariates[:, i] for i, c in enumerate(records.covariate_coordinates)}
-    gravity = default_gravity(mechanism) if verdict.gravity is None else verdict.gravity
     guess = records.pose if records.pose.shape[-1] == len(mechanism.pose) else None
-    _refuse_lacking(verdict, mechanism, records)
-    known, notes = verdict.on(Situation(mechanism, records.joints, covariates, gravity, None, guess))
-    if identify and any(k.effect.kind == "parameters" for k in known):
-        known = [k for k in known if k.effect.kind != "parameters"]
-        notes.append("The verdict's geometry is left to geometry=identify, which fits all parameters.")
+    rows = Situation(mechanism, records.joints, covariates, gravity, parameters, guess)
+    known, notes = list[Known](), list[str]()
+    if verdict is not None:
+        _refuse_lacking(verdict, mechanism, records)
+        known, notes = verdict.on(replace(rows, parameters=None))
+        if identify and any(k.effect.kind == "parameters" for k in known):
+            known = [k for k in known if k.effect.kind != "parameters"]
+            notes.append("The verdict's geometry is left to geometry=identify, which fits all parameters.")
     situations, every, values = [], [], []
     for k, split in enumerate(splits):
-        base = mechanism.nominal if parameters is None else parameters[k, 0]
-        machine = mechanism if parameters is None else mechanism.with_nominal(base)
-        situation = one_row_at_a_time(Situation(machine, records.joints, covariates, gravity, None, guess))
-        rows = torch.zeros(len(records.joints), dtype=torch.bool)
-        rows[Dataset.part(split, "fit")] = True
-        rows &= usable.expand(len(splits), -1)[k]
-        fitted, own = _fitted(situation, records, known, rows, identify)
+        base = None if parameters is None else parameters[k, 0]
+        situation = on_fitted_frames(replace(rows, parameters=base))
+        fit = torch.zeros(len(records.joints), dtype=torch.bool)
+        fit[Dataset.part(split, "fit")] = True
+        fit &= usable.expand(len(splits), -1)[k]
+        fitted, own = fit_jointly(situation, records.pose, known, fit, loose_parameters(mechanism, identify))
+        for one in fitted:
+            if one.effect.kind == "parameters":
+                own = own + one.change(situation)[0]
         situations.append(situation)
         every.append(fitted)
         values.append(own)
     acting = [[a for a in one if a.effect.kind != "parameters"] for one in every]
-    named = ", ".join(k.effect.name for k in known)
-    fitted_anew = "Their coefficients were fitted anew to the training rows of each repeat"
-    if verdict.path == TRAINING_ROWS:
-        notes.append(f"Effects: {named}. {fitted_anew}.")
-    else:
+    if identify:
         notes.append(
-            f"Effects of {short_path(verdict.path)}: {named}. {fitted_anew}; their periods and other shapes are the "
-            "file's, which may have seen the held-out rows."
+            f"Geometry identified on the training rows of each repeat: {len(mechanism.geometry)} parameters, each "
+            "drawn to its nominal value by a plausible error; the network learns only what they leave."
         )
-    changed = torch.stack(values).unsqueeze(1)
-    return Physics(short_path(verdict.path), situations, changed, acting, every), notes
+    source = "" if verdict is None else short_path(verdict.path)
+    if verdict is not None:
+        named = ", ".join(dict.fromkeys(k.effect.name for k in known))
+        fitted_anew = "Their coefficients were fitted anew to the training rows of each repeat"
+        seen = "; their periods and other shapes are the file's, which may have seen the held-out rows"
+        found = verdict.path == TRAINING_ROWS
+        notes.append(f"Effects{'' if found else f' of {source}'}: {named}. {fitted_anew}{'' if found else seen}.")
+    return Physics(source, situations, torch.stack(values).unsqueeze(1), acting, every), notes
 
 
 def _refuse_lacking(verdict: Verdict, mechanism: Mechanism, records: Records) -> None:
     """Raise InputError where the records have no column, or no varying one, that the verdict's effects need."""
     inputs = [c.name for c in records.covariate_coordinates]
-    for name in verdict.parameters:
+    for name, _ in verdict.effects:
         effect = make_effect(name)
         lacking = effect.missing(mechanism, inputs)
         if not lacking:
@@ -253,52 +244,18 @@ def _refuse_lacking(verdict: Verdict, mechanism: Mechanism, records: Records) ->
         )
 
 
-def _fitted(
-    situation: Situation, records: Records, known: list[Known], rows: Tensor, identify: bool
-) -> tuple[list[Acting], Tensor]:
-    """The effects on some rows, and the machine's parameters that go with them, `k`."""
-    mechanism = situation.mechanism
+def on_fitted_frames(situation: Situation) -> Situation:
+    """The same rows on a machine whose nominal parameters are the situation's, each as if it were isolated."""
+    if situation.parameters is not None:
+        mechanism = situation.mechanism.with_nominal(situation.parameters)
+        situation = replace(situation, mechanism=mechanism, parameters=None)
+    return one_row_at_a_time(situation)
+
+
+def loose_parameters(mechanism: Mechanism, identify: bool) -> list[int]:
+    """Numbers of the parameters that are fitted beside effects: all of them, or those of unknown frames."""
     unknown = getattr(mechanism, "unknown_frames", ())
-    loose = [k for k, g in enumerate(mechanism.geometry) if identify or g.name.partition("_")[0] in unknown]
-    weights, values = rows.to(torch.float64), mechanism.nominal
-    here, acting = situation, refit(situation, records.pose, known, rows, _columns(situation, loose))
-    for _ in range(_TURNS if loose else 0):
-        without = _without(here, records.pose, acting)
-        if identify:
-            values = fit_geometry(mechanism, records.joints, without, mechanism.nominal, weights)
-        elif isinstance(mechanism, Framed):
-            values = mechanism.inlying_frames(records.joints, without, weights)
-        else:
-            assert isinstance(mechanism, SerialArm)
-            values = fit_frames(mechanism, records.joints, without, weights, columns=records.columns)
-        here = replace(situation, parameters=values)
-        acting = refit(here, records.pose, known, rows, _columns(here, loose))
-    for one in acting:
-        if one.effect.kind == "parameters":
-            values = values + one.change(situation)[0]
-    return acting, values
-
-
-def _columns(situation: Situation, loose: list[int]) -> Tensor | None:
-    """What parameters that are fitted beside can do, per plausible error, `s x c x P`."""
-    if not loose:
-        return None
-    sizes = torch.tensor([plausible_error(situation.mechanism.geometry[k]) for k in loose], dtype=torch.float64)
-    return situation.parameter_jacobian[..., loose] * sizes
-
-
-def _without(situation: Situation, measured: Tensor, acting: list[Acting]) -> Tensor:
-    """Measured poses with the effects taken away, `s x p` [SI]; as measured where that is no pose."""
-    mechanism = situation.mechanism
-    there, (place, turn) = reached(situation, acting), mechanism.frame(situation.pose)
-    position, rotation = mechanism.frame(measured)
-    frame = position - (there[..., :3] - place)
-    if rotation is not None and turn is not None and there.shape[-1] == 6:
-        turned = rotation_vector_to_matrix(there[..., 3:]) @ turn.mT
-        frame = torch.cat([frame, matrix_to_rotation_vector(turned.mT @ rotation)], -1)
-    found = measured_pose(situation, torch.nan_to_num(frame))
-    fine = torch.isfinite(frame).all(-1, keepdim=True) & torch.isfinite(found).all(-1, keepdim=True)
-    return torch.where(fine, found, measured)
+    return [k for k, g in enumerate(mechanism.geometry) if identify or g.name.partition("_")[0] in unknown]
 
 
 def _rows(situation: Situation, rows: Tensor) -> Situation:

@@ -247,7 +247,7 @@ def _pose_table(results: Results) -> Table:
         extra
         for extra in (
             ("geometry", "RMS geometry alone", "Geometry alone: link parameters and frames fitted to the same rows."),
-            ("effects", "RMS effects alone", "Effects alone: those of the diagnosis, fitted to the training rows."),
+            ("effects", "RMS effects alone", "Effects alone: with geometry, fitted to the training rows."),
             (
                 "explained",
                 "RMS not explained",

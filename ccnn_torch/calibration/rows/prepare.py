@@ -15,13 +15,13 @@ from torch import Tensor
 from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.geometry.choice import ModelChoice, choose_model
 from ccnn_torch.calibration.geometry.effects_search import search_effects
-from ccnn_torch.calibration.geometry.identified import fit_machine
-from ccnn_torch.calibration.geometry.physics import Physics, fit_effects, identified_alone, verdict_of
+from ccnn_torch.calibration.geometry.frames import frames_of_repeats
+from ccnn_torch.calibration.geometry.physics import Physics, fit_physics, verdict_of
 from ccnn_torch.calibration.rows.dataset import Dataset, by_repeat, dataset_of
 from ccnn_torch.calibration.rows.memory import check_memory
 from ccnn_torch.config.held_out import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.diagnosis.from_file import Verdict, beside_geometry
+from ccnn_torch.diagnosis.from_file import Verdict
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
@@ -226,6 +226,8 @@ def _from_records(config: RunConfig, seeds: list[int], given: Given | None) -> P
     check_rows(records, mechanism)
     if isinstance(mechanism, SerialArm) and records.orientation == "none":
         mechanism = mechanism.with_orientation("none")
+    if isinstance(mechanism, SerialArm) and config.geometry != "none":
+        mechanism = mechanism.with_link_frames()
     held = rows_of_test_file(config.split, records.parts)
     splits = _splits(config, mechanism.frame(records.pose)[0], records.columns, seeds, held)
     settings = _pseudoerror_settings(config, mechanism)
@@ -246,26 +248,28 @@ def over_all_rows(prepared: Prepared) -> Prepared:
 def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepared:
     """Frames, geometry and effects fitted to the rows that are not held out, and what is left to be learned."""
     mechanism, records, settings, choice, verdict = source
-    fitted = fit_machine(mechanism, records, splits, choice.identify)
-    total = deviations = joint_deviations(
-        mechanism, records.joints, records.pose, parameters=fitted.parameters, **settings
-    )
-    learned, physics, notes = fitted.parameters, None, [*fitted.notes]
+    one_for = "effects" if verdict is not None else "geometry" if choice.identify else ""
+    frames, notes = frames_of_repeats(mechanism, records, splits, one_for)
+    total = deviations = joint_deviations(mechanism, records.joints, records.pose, parameters=frames, **settings)
+    about = (mechanism, records, splits, frames, total.usable)
+    learned, physics, geometry = frames, None, None
+    # For comparison, where it costs nothing.
+    one_frame = frames is not None and frames.shape[1] == 1 and isinstance(mechanism, SerialArm)
+    if choice.identify or one_frame:
+        geometry, said = fit_physics(None, *about, True)
+        notes += said if choice.identify and verdict is None else []
     if verdict is not None:
-        about = (splits, fitted.parameters, total.usable, choice.identify)
-        physics, more = fit_effects(verdict, mechanism, records, *about)
-        notes += more
+        physics, said = fit_physics(verdict, *about, choice.identify)
+        notes += said
     elif choice.identify:
-        assert fitted.geometry is not None
-        nominal = mechanism.nominal.expand_as(fitted.geometry) if fitted.parameters is None else fitted.parameters
-        physics = identified_alone(mechanism, records, nominal, fitted.geometry)
+        physics = geometry
     if physics is not None:
         learned = physics.values
         deviations = physics.targets(records.joints, records.pose, settings)
     jacobian = mechanism.jacobian(records.joints, learned, guess=records.pose)
     return Prepared(
         mechanism=mechanism,
-        parameters=fitted.parameters,
+        parameters=frames,
         joints=by_repeat(records.joints, seeds),
         covariates=by_repeat(records.covariates, seeds),
         covariate_coordinates=records.covariate_coordinates,
@@ -274,7 +278,7 @@ def _fitted_to(source: Source, splits: list[Split], seeds: list[int]) -> Prepare
         total=by_repeat(total.deviation, seeds),
         dataset=dataset_of(mechanism, records.joints, records.covariates, deviations, splits, seeds, jacobian),
         data_hash=records.data_hash,
-        identified=fitted.geometry,
+        identified=None if geometry is None else geometry.values,
         physics=physics,
         choice=choice,
         source=source,
@@ -296,9 +300,8 @@ def _choice(
     if config.effects != "none" and not asked:
         names = None if isinstance(config.effects, str) else config.effects
         rows = torch.cat([split.train, split.validation])
-        verdict, notes = search_effects(mechanism, records, rows, names, config.seed)
-        if verdict is not None and config.geometry != "none" and mechanism.geometry:
-            verdict = beside_geometry(verdict)
+        identify = config.geometry != "none" and bool(mechanism.geometry)
+        verdict, notes = search_effects(mechanism, records, rows, names, config.seed, identify)
         if config.repeats > 1 and verdict is not None:
             notes.append("They were searched in the training rows of the first repeat, for all repeats.")
     about = (

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ccnn_torch.compensation.effects.kinematic_fields import Fields, looked_at, make_fields
 from ccnn_torch.compensation.geometry.matrices import inverse
-from ccnn_torch.effects import Acting, Situation, make_effect
+from ccnn_torch.effects import Acting, Situation, labelled, make_effect
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 
 # Joints that move the platform less than this are held back [m per joint unit]: a thousandth of what is usual.
@@ -227,10 +227,10 @@ def expand_effects(
             names |= {"jacobian"} | ({"parameter_jacobian"} if one.effect.kind == "parameters" else set())
     fields = make_fields(mechanism, situation.gravity, names, situation.joints, margin)
     numbers: dict[str, dict[str, float]] = {}
-    for one in acting:
+    for label, one in labelled(acting):
         named = [c.name for c in one.effect.coefficients(situation)] + [s.name for s in one.effect.shapes(situation)]
         values = [*one.coefficients.tolist(), *one.shape.tolist()]
-        numbers[one.effect.name] = dict(zip(named, values, strict=True))
+        numbers[label] = dict(zip(named, values, strict=True))
     care = None if care is None else care._replace(free=tuple(free))
     module = PhysicalEffects(mechanism, situation.gravity, covariates, acting, fields, care, numbers)
     module.requires_grad_(False)

@@ -26,9 +26,14 @@ def moved(situation: Situation, acting: Sequence[Acting]) -> Situation:
     return replace(situation, joints=joints, parameters=parameters, guess=situation.pose)
 
 
-def remainder(situation: Situation, measured: Tensor, acting: Sequence[Acting]) -> Tensor:
-    """Measured less reached with the effects, `s x c` [m, rad]; NaN where the machine with them cannot be."""
-    there = reached(situation, acting)
+def remainder(
+    situation: Situation, measured: Tensor, acting: Sequence[Acting], parameters: Tensor | None = None
+) -> Tensor:
+    """Measured less reached with the effects, `s x c` [m, rad]; NaN where the machine with them cannot be.
+
+    parameters: of the machine that moves; those of the situation when None.
+    """
+    there = reached(situation, acting, parameters)
     position, rotation = situation.mechanism.frame(measured)
     left = position - there[..., :3]
     if rotation is None or there.shape[-1] == 3:

@@ -1,0 +1,291 @@
+"""Geometry and effects fitted to rows together, and which effects the rows ask for.
+
+The model is that of the diagnosis: whitened rows, linear in the coefficients about the machine as fitted so far, each
+group of coefficients with a normal prior whose scale is brought to its most probable value (MacKay 1992). What the
+rows do not show is drawn to 0, so that many effects can be there at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ccnn_torch.coordinates import plausible_error
+from ccnn_torch.diagnosis.candidates.atom import scales
+from ccnn_torch.diagnosis.candidates.library import LOG_PRIOR
+from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows
+from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
+from ccnn_torch.diagnosis.from_file import Known
+from ccnn_torch.diagnosis.residual.linearisation import moved, remainder, signature_at
+from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
+from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, Whitening, moving_channels, renewed
+from ccnn_torch.effects import Acting, Effect, Situation
+
+# Gauss-Newton steps, at most.
+_ROUNDS = 4
+# Times an effect that may have any period acts, at most: a gear train errs with several.
+_TIMES = 3
+_PARAMETERS = "parameters"
+
+
+class JointFit(NamedTuple):
+    """Effects with their coefficients, and the machine's parameters without those effects, `k` [SI]."""
+
+    acting: list[Acting]
+    parameters: Tensor
+
+
+def fit_jointly(
+    situation: Situation, measured: Tensor, known: Sequence[Known], usable: Tensor, loose: Sequence[int]
+) -> JointFit:
+    """Fit the coefficients of effects, with the shapes that they have, and parameters beside them.
+
+    Rows that are far off are set aside or weighed down, as in the diagnosis.
+
+    Args:
+        situation: all rows on the nominal machine, `s x n`.
+        measured: poses, `s x p` [SI].
+        known: effects with shapes; of their coefficients those that are used.
+        usable: rows to fit to, `s` bool.
+        loose: numbers of the parameters that are fitted beside.
+
+    Returns:
+        The effects, 0 for coefficients that are not used; and all parameters.
+    """
+    model = _Model(situation, known, loose)
+    at, white = model.nominal.new_zeros(model.size), None
+    before: tuple[Tensor, Tensor] | None = None
+    for _ in range(_ROUNDS):
+        rows = model.about(at, measured, usable)
+        white = rows.whitening() if white is None else white
+        white = replace(white, weight=torch.where(rows.fine, white.weight, 0.0))
+        if before is not None and white(rows.left).square().sum() > white(before[0]).square().sum():
+            # A step that leads away from the rows.
+            at = before[1]
+            break
+        before = rows.left, at
+        fit = fit_sets(rows.grams(white), [rows.groups], 0.0)
+        at = _spread(fit, model.size)
+        white = rows.renewed(white, fit, at)
+    return JointFit(model.acting(at), model.parameters(at))
+
+
+def effects_that_pay(
+    situation: Situation, measured: Tensor, effects: Sequence[Effect], usable: Tensor, loose: Sequence[int]
+) -> list[Known]:
+    """The effects without which the rows would be less probable, beside all others, with their shapes.
+
+    All are there at first, at the shapes of the textbook or, where that is more probable, at those that the rows show.
+    One that may have any period may be there several times. Then the one that adds least to the marginal likelihood is
+    left out, or what is secondary in it, as long as it adds less than it costs to have it in the library. What stands
+    for another one is left out so, too.
+
+    Args:
+        situation, measured, usable, loose: as in `fit_jointly`.
+        effects: candidates, all of which the rows have the covariates for.
+    """
+    start = fit_jointly(situation, measured, [], usable, loose).parameters
+    known = [_first(effect, situation) for effect in effects]
+    # Those that may act again do nothing as yet.
+    again = [replace(k, used=()) for k in known for _ in range(1, _TIMES) if _has_any_period(k.effect, situation)]
+    model = _Model(situation, [*known, *again], loose)
+    rows = model.about(model.begin(start), measured, usable)
+    white = rows.whitening()
+    scans: dict[str, Scan] = {}
+    for i, one in enumerate(model.known):
+        if one.shape.numel():
+            scan = scans.get(one.effect.name) or Scan(situation, rows.there, one.effect, white)
+            scans[one.effect.name] = scan
+            rows = _at_better_shape(rows, i, scan)
+    return _without_idle(rows, white)
+
+
+class _Model:
+    """Effects and parameters as one vector of coefficients, each in plausible sizes."""
+
+    def __init__(self, situation: Situation, known: Sequence[Known], loose: Sequence[int]) -> None:
+        self.situation, self.known, self.loose = situation, [*known], [*loose]
+        self.nominal = situation.mechanism.resolve(situation.parameters)
+        geometry = situation.mechanism.geometry
+        self.sizes = [scales(k.effect.coefficients(situation), self.nominal) for k in known]
+        self.sizes.append(self.nominal.new_tensor([plausible_error(geometry[k]) for k in self.loose]))
+        self.size = sum(map(len, self.sizes))
+
+    def parts(self, at: Tensor) -> list[Tensor]:
+        """Coefficients [SI] effect by effect, and last the parameters' change."""
+        return [c * s for c, s in zip(torch.split(at, [len(s) for s in self.sizes]), self.sizes, strict=True)]
+
+    def begin(self, parameters: Tensor) -> Tensor:
+        """The vector of a machine without effects."""
+        change = (parameters - self.nominal)[self.loose] / self.sizes[-1]
+        return torch.cat([change.new_zeros(self.size - len(change)), change])
+
+    def acting(self, at: Tensor) -> list[Acting]:
+        """The effects."""
+        return [Acting(k.effect, k.shape, c) for k, c in zip(self.known, self.parts(at), strict=False)]
+
+    def parameters(self, at: Tensor) -> Tensor:
+        """All of them, `k`."""
+        return self.nominal.index_add(0, torch.tensor(self.loose, dtype=torch.int64), self.parts(at)[-1])
+
+    def about(self, at: Tensor, measured: Tensor, usable: Tensor) -> _Rows:
+        """The rows as a linear model about the machine with these coefficients."""
+        acting, parameters = self.acting(at), self.parameters(at)
+        there = moved(self.situation, acting)
+        assert there.parameters is not None
+        there = replace(there, parameters=there.parameters + parameters - self.nominal)
+        columns = [self.columns(there, k) for k in self.known]
+        columns.append(there.parameter_jacobian[..., self.loose] * self.sizes[-1])
+        every = torch.cat(columns, -1)
+        left = remainder(self.situation, measured, acting, parameters)
+        fine = usable & torch.isfinite(left).all(-1) & torch.isfinite(every).flatten(1).all(-1)
+        left = torch.where(fine[:, None], left, 0.0)
+        every = torch.where(fine[:, None, None], every, 0.0)
+        return _Rows(self, there, fine, every, left, left + every @ at)
+
+    def columns(self, there: Situation, known: Known) -> Tensor:
+        """Of one effect, `s x c x m`; 0 for coefficients that are not used."""
+        columns = signature_at(self.situation, there, known.effect, known.shape)
+        used = torch.zeros(columns.shape[-1], dtype=torch.bool)
+        used[list(known.used)] = True
+        return torch.where(used, columns, 0.0)
+
+    def labels(self) -> list[tuple[str, str]]:
+        """What the coefficients of a group have in common: what they are of, and which part."""
+        found = [
+            (k.effect.name, "secondary" if c.secondary else "")
+            for k in self.known
+            for c in k.effect.coefficients(self.situation)
+        ]
+        unknown = getattr(self.situation.mechanism, "unknown_frames", ())
+        for p in (self.situation.mechanism.geometry[k] for k in self.loose):
+            frame = p.name.partition("_")[0]
+            found.append((_PARAMETERS, frame if frame in unknown else p.unit))
+        return found
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows, linear about a machine.
+
+    Attributes:
+        there: the machine.
+        fine: rows that count, `s`.
+        columns: change of the pose by each coefficient in plausible sizes, `s x c x P` [m, rad].
+        left: what the machine leaves, `s x c` [m, rad].
+        target: what the linear model has to explain, `s x c` [m, rad].
+    """
+
+    model: _Model
+    there: Situation
+    fine: Tensor
+    columns: Tensor
+    left: Tensor
+    target: Tensor
+
+    @property
+    def grouped(self) -> dict[tuple[str, str], Tensor]:
+        """The columns of each group that do anything."""
+        acts = self.columns.abs().amax((0, 1)) > 0
+        found: dict[tuple[str, str], list[int]] = {}
+        for k, label in enumerate(self.model.labels()):
+            if acts[k]:
+                found.setdefault(label, []).append(k)
+        return {label: torch.tensor(group) for label, group in found.items()}
+
+    @property
+    def groups(self) -> list[Tensor]:
+        return [*self.grouped.values()]
+
+    def whitening(self) -> Whitening:
+        """From the richest fit."""
+        channels = moving_channels(self.model.situation)
+        return fitted_whitening(self.target, [self.columns[..., g] for g in self.groups], channels, None, self.fine)
+
+    def grams(self, white: Whitening) -> Grams:
+        return grams_of(white(self.columns), white(self.target))
+
+    def renewed(self, white: Whitening, fit: Fits, at: Tensor) -> Whitening:
+        """Noise and weights from what a fit leaves."""
+        values = max(float(self.fine.sum()) * len(white.channels), 1.0)
+        free = max(1 - float(fit.effective[0]) / values, LEAST_FREE)
+        return renewed(white, self.target - self.columns @ at, self.target, free, False, self.fine)
+
+    def with_shape(self, i: int, known: Known) -> _Rows:
+        """The same with another shape of one of the effects, which does nothing yet."""
+        model = _Model(self.model.situation, [*self.model.known], self.model.loose)
+        model.known[i] = known
+        own = torch.where(self.fine[:, None, None], model.columns(self.there, known).nan_to_num(), 0.0)
+        columns = self.columns.clone()
+        columns[..., _span(model, i)] = own
+        return replace(self, model=model, columns=columns)
+
+
+def _spread(fit: Fits, size: int) -> Tensor:
+    """The first set's coefficients among all, `P`; 0 where the set has none."""
+    real = fit.columns[0] >= 0
+    return fit.mean.new_zeros(size).index_copy(0, fit.columns[0][real], fit.mean[0][real])
+
+
+def _span(model: _Model, i: int) -> slice:
+    begin = sum(len(s) for s in model.sizes[:i])
+    return slice(begin, begin + len(model.sizes[i]))
+
+
+def _has_any_period(effect: Effect, situation: Situation) -> bool:
+    """Whether an effect has shapes and the textbook none for any of them."""
+    shapes = effect.shapes(situation)
+    return bool(shapes) and all(s.usual is None for s in shapes)
+
+
+def _first(effect: Effect, situation: Situation) -> Known:
+    """An effect at the shapes of the textbook: once a turn, for one; without what can have any period."""
+    shapes, every = effect.shapes(situation), effect.coefficients(situation)
+    value = [s.grid[0] if s.usual is None else s.usual for s in shapes]
+    open_to = {c for s in shapes if s.refined and s.usual is None for c in s.columns or range(len(every))}
+    used = tuple(k for k in range(len(every)) if k not in open_to)
+    return Known(effect, torch.tensor(value, dtype=torch.float64), torch.zeros(len(every), dtype=torch.float64), used)
+
+
+def _at_better_shape(rows: _Rows, i: int, scan: Scan) -> _Rows:
+    """With one of the effects at the shapes that explain most beside the others, where that pays for their search."""
+    model, known, white = rows.model, rows.model.known[i], scan.white
+    others = rows.columns.clone()
+    others[..., _span(model, i)] = 0.0
+    others = others[..., others.abs().amax((0, 1)) > 0]
+    found = scan.best(SearchRows(white(rows.target), white(others)))
+    used = tuple(range(len(known.coefficients))) if found.used is None else found.used
+    tried = rows.with_shape(i, replace(known, shape=found.value, used=used))
+    evidence = [float(fit_sets(r.grams(white), [r.groups], 0.0).log_evidence) for r in (rows, tried)]
+    return tried if evidence[1] - found.charge > evidence[0] else rows
+
+
+def _without_idle(rows: _Rows, white: Whitening) -> list[Known]:
+    """The effects whose marginal likelihood pays for them, one after the other."""
+    grams, groups = rows.grams(white), rows.grouped
+    while True:
+        names = [label for label in groups if label[0] != _PARAMETERS]
+        # With an effect goes what is secondary in it.
+        removed = [[n for n in names if n[0] == name and part in ("", n[1])] for name, part in names]
+        if not removed:
+            break
+        sets = [[g for label, g in groups.items() if label not in gone] for gone in ([], *removed)]
+        evidence = fit_sets(grams, sets, 0.0).log_evidence
+        gain = evidence[1:] - evidence[0]
+        best = int(gain.argmax())
+        if float(gain[best]) < LOG_PRIOR:
+            break
+        groups = {label: g for label, g in groups.items() if label not in removed[best]}
+    kept = torch.zeros(rows.model.size, dtype=torch.bool)
+    for group in groups.values():
+        kept[group] = True
+    found = []
+    for i, one in enumerate(rows.model.known):
+        used = tuple(torch.nonzero(kept[_span(rows.model, i)]).squeeze(-1).tolist())
+        if used:
+            found.append(replace(one, used=used))
+    return found
