@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.geometry.joint_fit import fit_jointly
+from ccnn_torch.diagnosis.joint_fit import fit_jointly
 from ccnn_torch.effects import Situation, default_gravity
 from ccnn_torch.mechanisms import Mechanism
 

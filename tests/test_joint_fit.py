@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.geometry.joint_fit import JointFit, effects_that_pay, fit_jointly
+from ccnn_torch.diagnosis.joint_fit import JointFit, effects_that_pay, fit_jointly
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, reached
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix

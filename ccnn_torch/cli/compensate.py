@@ -14,7 +14,9 @@ from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
 
 
 def compensate(
-    model: Annotated[Path, typer.Argument(help=".safetensors, .onnx, identified.yaml or identified_motion.json.")],
+    model: Annotated[
+        Path, typer.Argument(help=".safetensors, .onnx, identified.yaml, diagnosis.json or identified_motion.json.")
+    ],
     input: Annotated[Path, typer.Argument(metavar="IN.csv", help="Ideal joints; columns are name[unit].")],
     output: Annotated[Path, typer.Argument(metavar="OUT.csv", help="IN's columns and the commands.")],
     pose: Annotated[bool, typer.Option("--pose", help="IN has wanted poses instead of joints.")] = False,
@@ -52,7 +54,8 @@ def compensate(
     the commands are the columns command_q1… where IN.csv has them, else q1…. With --pose a
     serial arm takes the branch of guess_q1[unit]… where given, else that of the previous row. With --sd it also adds
     deviation_sd_q1[unit]…: inside the domain, about 95 % of new measurements are within 1.96 times it of the predicted
-    deviation. With identified.yaml, which ccnn identify writes, the commands are those of the identified kinematics.
+    deviation. With identified.yaml, which ccnn identify writes, the commands are those of the identified kinematics,
+    with diagnosis.json, which ccnn diagnose writes, those of the machine with the effects that it names.
 
     With identified_motion.json, which ccnn diagnose --motion writes, IN.csv has time[s] and command1[unit]…, the
     motion that is wanted, and OUT.csv gets corrected1[unit]…, the commands at which the machine follows it, and

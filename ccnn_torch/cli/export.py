@@ -11,7 +11,9 @@ from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
 
 
 def export(
-    model: Annotated[Path, typer.Argument(help="A .safetensors file with its card, or an identified.yaml.")],
+    model: Annotated[
+        Path, typer.Argument(help="A .safetensors file with its card, an identified.yaml or diagnosis.json.")
+    ],
     to: Annotated[str, typer.Option(help="c99, st (IEC 61131-3 Structured Text), linuxcnc, onnx, urdf or table.")],
     out: Annotated[Path, typer.Option(help="Folder to write to.")],
     dtype: Annotated[str, typer.Option(help="float64 or float32, in which the controller computes.")] = "float64",

@@ -14,7 +14,7 @@ from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
 
 
 def verify(
-    model: Annotated[Path, typer.Argument(help="A .safetensors or .onnx file, or identified.yaml.")],
+    model: Annotated[Path, typer.Argument(help="A .safetensors or .onnx file, an identified.yaml or diagnosis.json.")],
     out: Annotated[Path, typer.Option(help="Folder to write verify.json and verify.html to.")],
     records: Annotated[
         str | None, typer.Argument(metavar="RECORDS.csv", help="New rows: joints and measured poses.")

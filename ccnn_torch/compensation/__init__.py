@@ -16,6 +16,7 @@ from ccnn_torch.compensation.geometry.identified import geometric_deviation as g
 from ccnn_torch.compensation.machine.inverse import build_machine as build_machine
 from ccnn_torch.compensation.machine.machine import Machine as Machine
 from ccnn_torch.compensation.machine.machine import Rule as Rule
+from ccnn_torch.compensation.machine.parts import machine_parts as machine_parts
 from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry as IdentifiedGeometry
 from ccnn_torch.compensation.model_files.identified import load_compensation as load_compensation
 from ccnn_torch.compensation.model_files.identified import sign_model as sign_model

@@ -115,6 +115,32 @@ def as_matrix(values: ArrayLike, wanted: tuple[Coordinate, ...], what: str) -> A
     return array
 
 
+def as_rows(
+    joints: ArrayLike,
+    covariates: ArrayLike | None,
+    coordinates: tuple[tuple[Coordinate, ...], tuple[Coordinate, ...]],
+) -> tuple[Array, Array | None, tuple[int, ...]]:
+    """Rows of joints `s x n`, of covariates `s x m` (None where the model has none), and the leading dimensions.
+
+    Args:
+        coordinates: joints and covariates of the model, in order.
+
+    Raises:
+        InputError: covariates are missing, or a last dimension is wrong.
+    """
+    given = as_matrix(joints, coordinates[0], "joints")
+    lead, flat = given.shape[:-1], None
+    if coordinates[1]:
+        if covariates is None:
+            names = ", ".join(c.header for c in coordinates[1])
+            raise InputError(f"the model needs the covariates {names}; give covariates=… in this order")
+        extra = as_matrix(covariates, coordinates[1], "covariates")
+        if extra.shape[:-1] not in (lead, ()):
+            raise InputError(f"covariates for {lead} rows of joints must have as many rows, got {extra.shape[:-1]}")
+        flat = np.broadcast_to(extra, (*lead, extra.shape[-1])).reshape(-1, extra.shape[-1])
+    return given.reshape(-1, given.shape[-1]), flat, lead
+
+
 @np.errstate(invalid="ignore", over="ignore")
 def kept(found: Mapping[str, Any], joints: Array, covariates: Array | None, promise: Promise) -> dict[str, Array]:
     """The outputs, with what breaks the promise replaced by the safe fallback.

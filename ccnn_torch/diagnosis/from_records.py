@@ -14,6 +14,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis.checks.mistakes import what_is_wrong
 from ccnn_torch.diagnosis.discrepancy.network import with_network
 from ccnn_torch.diagnosis.engine import diagnose_rows
+from ccnn_torch.diagnosis.named_machine import named_machine
 from ccnn_torch.diagnosis.residual.distance import size_of
 from ccnn_torch.diagnosis.residual.noise_evidence import Noise, column_names, noise_of_columns
 from ccnn_torch.diagnosis.residual.simulator_inputs import refuse_lost_rows, simulator_inputs
@@ -70,7 +71,8 @@ def diagnose(
         said = diagnose_rows(
             situation, records.pose, noise_of(noise, situation), effects, seed, _instrument(records, situation)
         )
-    said = replace(said, lines=tuple(records.lines.tolist()), notes=[*said.notes, *_unread(records, situation, said)])
+    notes = [*said.notes, *_unread(records, situation, said)]
+    said = replace(said, lines=tuple(records.lines.tolist()), notes=notes, machine=named_machine(said))
     return with_network(said, seed) if network else said
 
 

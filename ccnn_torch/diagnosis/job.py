@@ -69,7 +69,11 @@ def _verdict(config: DiagnoseConfig, tell: Callable[..., None]) -> Diagnosis:
     records, mechanism, effects = _loaded(config)
     noise = _noise(config, records)
     with simulated_rows(lambda n: tell(note=f"{n:,} rows simulated")):
-        return diagnose(records, mechanism, noise=noise, effects=effects, gravity=config.gravity, seed=config.seed)
+        keys: dict[str, Any] = {"noise": noise, "effects": effects, "gravity": config.gravity, "seed": config.seed}
+        said = diagnose(records, mechanism, **keys)
+    if said.machine is not None:
+        said.machine.update(columns=config.columns, joint_map=config.joint_map)
+    return said
 
 
 def _complete(config: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: bool, details: bool) -> None:

@@ -88,4 +88,5 @@ def write_corrected(folder: Path, diagnosis: Diagnosis) -> None:
     elif isinstance(machine, Framed) and machine.unknown_frames:
         machine = machine.with_nominal(machine.inlying_frames(*rows))
     nominal = dict(zip(names, before.tolist(), strict=True))
-    write_machine(machine, nominal, folder, Path(CORRECTED[0]).stem)
+    maps = [(diagnosis.machine or {}).get(key) for key in ("columns", "joint_map")]
+    write_machine(machine, nominal, folder, Path(CORRECTED[0]).stem, *maps)

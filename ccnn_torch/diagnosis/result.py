@@ -39,6 +39,7 @@ class Diagnosis:
             more surely than 0.9.
         notes: what was left out and why, one sentence each.
         acting: the verdict's effects with their numbers, to be simulated or compensated.
+        machine: with these, as a compensator takes it; None where a model can hold nothing of them.
         analysis, judgement: everything that was evaluated.
         lines: line of every row in the file that it came from, the header being line 1; () for rows of no file.
         inferred: covariates that were not recorded and were taken from the order of the rows.
@@ -66,6 +67,7 @@ class Diagnosis:
     judgement: Judgement = field(repr=False)
     lines: tuple[int, ...] = field(default=(), repr=False)
     inferred: tuple[str, ...] = field(default=(), repr=False)
+    machine: dict[str, Any] | None = field(default=None, repr=False)
 
     def to_json(self) -> Mapping[str, Any]:
         """The form of `diagnosis.json` (schema `diagnosis`)."""

@@ -7,6 +7,7 @@ from ccnn_torch.effects.apply import moved_joints as moved_joints
 from ccnn_torch.effects.apply import pose_residual as pose_residual
 from ccnn_torch.effects.apply import reached as reached
 from ccnn_torch.effects.apply import signature as signature
+from ccnn_torch.effects.apply import used_covariates as used_covariates
 from ccnn_torch.effects.apply import without_pose_effects as without_pose_effects
 from ccnn_torch.effects.protocol import Coefficient as Coefficient
 from ccnn_torch.effects.protocol import Effect as Effect

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -83,6 +84,28 @@ def moved_joints(situation: Situation, acting: Sequence[Acting]) -> Tensor:
     """What the effects on the joints add to them, `... x s x n` [SI]."""
     changes = [one.change(situation) for one in acting if one.effect.kind == "joints"]
     return sum(changes, torch.zeros_like(situation.joints))
+
+
+def used_covariates(situation: Situation, acting: Sequence[Acting]) -> list[str]:
+    """Names of the covariates without which the effects change."""
+    before = _changes(situation, acting)
+    kept = []
+    for name in situation.covariates:
+        fewer = {n: v for n, v in situation.covariates.items() if n != name}
+        if not torch.equal(_changes(replace(situation, covariates=fewer), acting), before):
+            kept.append(name)
+    return kept
+
+
+def _changes(situation: Situation, acting: Sequence[Acting]) -> Tensor:
+    """What the effects change, side by side, `s x d`; NaN where one cannot act without what is missing."""
+    parts = [torch.zeros_like(situation.joints[:, :1])]
+    for one in acting:
+        lacking = bool(one.effect.missing(situation.mechanism, [*situation.covariates]))
+        # Of some effects there is less where a column is missing.
+        lacking |= len(one.effect.coefficients(situation)) != len(one.coefficients)
+        parts.append(torch.full_like(parts[0], torch.nan) if lacking else one.change(situation).nan_to_num())
+    return torch.cat(parts, -1)
 
 
 def without_pose_effects(situation: Situation, measured: Tensor, acting: Sequence[Acting]) -> Tensor:

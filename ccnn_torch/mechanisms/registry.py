@@ -63,6 +63,7 @@ REGISTRY: dict[str, Callable[..., Mechanism]] = {
 
 _READERS: dict[str, Callable[..., Mechanism]] = {".yaml": read_dh_file, ".yml": read_dh_file, ".urdf": read_urdf}
 _YAML = (".yaml", ".yml")
+_MODELS = (".safetensors", ".onnx", ".json")
 
 _FORMS = "a serial arm's geometry file (.yaml, .urdf), or your own class or simulator as path/to/file.py:Name"
 
@@ -74,8 +75,9 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
 
     Args:
         spec: a name in the registry (`tripod`, `five_bar`, `stewart`, …), a DH file (.yaml), a URDF (.urdf), an
-            identified machine's mechanism file (.yaml, as `ccnn identify` writes it), or `path/to/file.py:Name`: a
-            class, a `Simulator`, or a function that makes one.
+            identified machine's mechanism file (.yaml, as `ccnn identify` writes it), the machine of a model file
+            (.safetensors, .onnx) or of a diagnosis.json, or `path/to/file.py:Name`: a class, a `Simulator`, or a
+            function that makes one.
         allow_code: run the Python file that an identified machine's mechanism file names.
         keys: keys of its constructor (tripod: L, r, per_leg; DH file: orientation; URDF: base, tip, orientation;
             framed: mechanism, its keys, base, tool; …).
@@ -90,6 +92,13 @@ def load_mechanism(spec: str, *, allow_code: bool = False, **keys: Any) -> Mecha
         file = read_mechanism_file(spec)
         if file is not None:
             return mechanism_of_file(file, "value", allow_code, keys)
+    if Path(spec).suffix.lower() in _MODELS and spec not in REGISTRY:
+        if keys:
+            raise InputError(f"mechanism_keys: {spec} has the keys of its own machine; leave out {', '.join(keys)}")
+        # Model files hold more than a machine: what reads them comes after this package.
+        from ccnn_torch.compensation.model_files.identified import load_machine
+
+        return load_machine(spec, allow_code=allow_code)
     maker = _maker(spec)
     if is_plugin(spec):
         mechanism = checked_plugin(spec, functools.partial(_call, spec, maker, keys))

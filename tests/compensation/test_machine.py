@@ -30,7 +30,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation import Compensator, Solution, load_model, save_model
 from ccnn_torch.compensation.export.export import probe_points
-from ccnn_torch.compensation.machine.alone import machine_alone
+from ccnn_torch.compensation.machine.alone import all_over, machine_alone
 from ccnn_torch.compensation.machine.inverse import InverseMachine
 from ccnn_torch.compensation.machine.machine import SETTLED, Machine, limits_of
 from ccnn_torch.compensation.targets.from_model import form_of
@@ -400,7 +400,7 @@ def test_what_the_real_machine_cannot_reach_is_no_exact_command() -> None:
     pose = torch.tensor([[0.0, 0.69, 0.0], [0.0, 0.5, 0.0]], dtype=torch.float64)
     assert torch.isfinite(tripod.solve_inverse(pose, values)).all(-1).tolist() == [False, True]
     joints = tripod.solve_inverse(pose)
-    made = machine_alone(tripod, tripod.with_nominal(values))
+    made = machine_alone(all_over(tripod), values, margin=0.0)
     with torch.no_grad():
         found = made.solve(joints)
     # Commands so far from the nominal joints are outside what was sampled.

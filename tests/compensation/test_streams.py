@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ccnn_torch.compensation import Compensator, IdentifiedGeometry, load_compensation, register_network, save_model
 from ccnn_torch.compensation.job import sentences, write_compensated
+from ccnn_torch.compensation.model_files.identified import load_geometry
 from ccnn_torch.compensation.wanted_poses import WantedPoses
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import SerialArm, load_mechanism
@@ -200,7 +201,9 @@ class Statuses(IdentifiedGeometry):
 
 def test_the_status_stands_after_inside_domain(tmp_path: Path) -> None:
     machine = load_mechanism("five_bar")
-    loaded = Statuses(tmp_path / "identified.yaml", machine, machine)
+    write_machine(machine, {p.name: p.nominal for p in machine.geometry}, tmp_path, "identified")
+    loaded = load_geometry(tmp_path / "identified.yaml")
+    loaded.__class__ = Statuses
     joints = machine.sample_joints(5, torch.Generator().manual_seed(0)).numpy()
     write_table(tmp_path / "in.csv", {"q1[rad]": joints[:, 0], "q2[rad]": joints[:, 1]})
     found = write_compensated(loaded, tmp_path / "in.csv", tmp_path / "out.csv")

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.calibration.geometry.joint_fit import fit_jointly
 from ccnn_torch.calibration.rows.dataset import Dataset
-from ccnn_torch.compensation import Care, build_machine, expand_effects, expand_geometry, gains, geometric_deviation
-from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Known, Verdict, one_row_at_a_time, read_verdict
+from ccnn_torch.compensation import machine_parts
+from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Known, Verdict, read_verdict
+from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
 from ccnn_torch.display import short_path
 from ccnn_torch.effects import (
     Acting,
@@ -22,11 +22,11 @@ from ccnn_torch.effects import (
     measured_pose,
     moved_joints,
     reached,
+    used_covariates,
     without_pose_effects,
 )
 from ccnn_torch.errors import InputError
-from ccnn_torch.mechanisms import Mechanism, SerialArm
-from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
+from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
@@ -34,8 +34,6 @@ from ccnn_torch.records.splits import Split
 _FROM = "from:"
 # Steps of r <- δ - e(q + r); each gains a factor of e's slope, at most 0.1.
 _STEPS = 6
-# How much larger than at the training rows what effects take from the kinematics may become.
-_ABOVE = 1.1
 
 
 @dataclass(frozen=True)
@@ -90,23 +88,7 @@ class Physics:
 
     def uses(self, repeat: int) -> list[str]:
         """Names of the covariates without which the effects change."""
-        here, kept = self.situations[repeat], list[str]()
-        before = self._acted(here, repeat)
-        for name in here.covariates:
-            fewer = {n: v for n, v in here.covariates.items() if n != name}
-            if not torch.equal(self._acted(replace(here, covariates=fewer), repeat), before):
-                kept.append(name)
-        return kept
-
-    def _acted(self, situation: Situation, repeat: int) -> Tensor:
-        """What the effects change, side by side, `s x d`; NaN where one cannot act without what is missing."""
-        parts = [torch.zeros_like(situation.joints[:, :1])]
-        for one in self.acting[repeat]:
-            lacking = bool(one.effect.missing(situation.mechanism, [*situation.covariates]))
-            # Of some effects there is less where a column is missing.
-            lacking |= len(one.effect.coefficients(situation)) != len(one.coefficients)
-            parts.append(torch.full_like(parts[0], torch.nan) if lacking else one.change(situation).nan_to_num())
-        return torch.cat(parts, -1)
+        return used_covariates(self.situations[repeat], self.acting[repeat])
 
     def modules(self, repeat: int, rows: Tensor, margin: float, covariates: list[str]) -> dict[str, Any]:
         """The machine of one repeat for a model file, as `fit_compensator` takes it.
@@ -117,20 +99,10 @@ class Physics:
             covariates: names of the compensator's, in order.
 
         Raises:
-            InputError, MethodFailedError: see `build_machine`, `expand_effects` and `expand_geometry`.
+            InputError, MethodFailedError: see `machine_parts`.
         """
-        situation, acting, values = self.situations[repeat], self.acting[repeat], self.values[repeat, 0]
-        there, mechanism = _rows(situation, rows), situation.mechanism
-        closed = isinstance(mechanism, SerialArm) or mechanism.closed_form is not None
-        care = None if closed else _care(there)
-        effects = expand_effects(there, acting, covariates, margin, care) if acting else None
-        machine = build_machine(mechanism, values, effects, there.joints, margin)
-        if machine is not None:
-            return {"machine": machine}
-        geometry = None
-        if not torch.equal(values, mechanism.nominal):
-            geometry = expand_geometry(geometric_deviation(mechanism, mechanism.nominal, values), there.joints, margin)
-        return {"geometry": geometry, "effects": effects}
+        there = _rows(self.situations[repeat], rows)
+        return machine_parts(there, self.acting[repeat], self.values[repeat, 0], covariates, margin)
 
     def block(self) -> dict[str, Any]:
         """For results.json: each coefficient's value in every repeat, by effect and name."""
@@ -145,13 +117,6 @@ class Physics:
                 named[s.name] = {"unit": s.unit, "values": [float(repeat[i].shape[j]) for repeat in self.every]}
             found[label] = named
         return found
-
-
-def _care(situation: Situation) -> Care:
-    """Near singular poses effects of a machine without closed forms grow no further than at the training rows."""
-    care = Care(ROTATION_WEIGHT, 0.0)
-    gain, inverse_gain = (_ABOVE * float(sizes.max()) for sizes in gains(situation.jacobian, care))
-    return care._replace(gain=gain, inverse_gain=inverse_gain)
 
 
 def verdict_of(key: str, mechanism: Mechanism) -> Verdict:
@@ -242,20 +207,6 @@ def _refuse_lacking(verdict: Verdict, mechanism: Mechanism, records: Records) ->
             f"{what}; the column is there but no input of this run, because it is constant or not among covariates: "
             "name it there, give records in which it varies, or write effects=none"
         )
-
-
-def on_fitted_frames(situation: Situation) -> Situation:
-    """The same rows on a machine whose nominal parameters are the situation's, each as if it were isolated."""
-    if situation.parameters is not None:
-        mechanism = situation.mechanism.with_nominal(situation.parameters)
-        situation = replace(situation, mechanism=mechanism, parameters=None)
-    return one_row_at_a_time(situation)
-
-
-def loose_parameters(mechanism: Mechanism, identify: bool) -> list[int]:
-    """Numbers of the parameters that are fitted beside effects: all of them, or those of unknown frames."""
-    unknown = getattr(mechanism, "unknown_frames", ())
-    return [k for k, g in enumerate(mechanism.geometry) if identify or g.name.partition("_")[0] in unknown]
 
 
 def _rows(situation: Situation, rows: Tensor) -> Situation:

@@ -2,40 +2,63 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
+from torch import Tensor
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.fit import fit_compensator
-from ccnn_torch.compensation.geometry.expanded import expand_geometry
-from ccnn_torch.compensation.geometry.identified import geometric_deviation
-from ccnn_torch.compensation.machine.inverse import build_machine
+from ccnn_torch.compensation.machine.parts import machine_parts
+from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.effects import Acting, Situation, default_gravity
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.learners.constant import ConstantNetwork
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.training import Scaling
 
-_ROWS, _FEWEST = 2500, 100
-_MARGIN = 0.0
+ROWS = 2500
+"""Rows that show where the machine is used."""
+_FEWEST = 100
 
 
-def machine_alone(nominal: Mechanism, identified: Mechanism) -> Compensator:
-    """The compensator of a machine of which the geometry alone is known; its domain is what sampled joints fill.
+def all_over(nominal: Mechanism) -> Situation:
+    """Rows all over the workspace of a machine of which nothing else is known."""
+    joints = nominal.sample_joints(ROWS, torch.Generator().manual_seed(0))
+    return Situation(nominal, joints, {}, default_gravity(nominal))
+
+
+def machine_alone(
+    rows: Situation,
+    values: Tensor,
+    acting: Sequence[Acting] = (),
+    covariates: Sequence[Coordinate] = (),
+    margin: float = 0.1,
+) -> Compensator:
+    """The compensator of a machine that was identified, without a learner.
+
+    Args:
+        rows: on the nominal machine; what they fill is its domain.
+        values: all parameters as identified, `k` [SI].
+        acting: effects on joints and pose.
+        covariates: of the rows, in order.
+        margin: by how much the domain is larger than what the rows fill.
 
     Raises:
-        MethodFailedError: the machine has no closed form, and its geometry is no polynomial either.
+        InputError, MethodFailedError: see `machine_parts`, or few of the rows are poses.
     """
-    joints = nominal.sample_joints(_ROWS, torch.Generator().manual_seed(0))
-    there = torch.isfinite(nominal.forward_kinematics(joints)).all(-1)
-    joints = joints[there & torch.isfinite(joints).all(-1)]
-    if len(joints) < _FEWEST:
-        raise MethodFailedError(f"{nominal.name} takes {len(joints)} of {_ROWS} of its poses, too few for a model")
-    values, still = identified.nominal, torch.zeros_like(joints)
-    machine = build_machine(nominal, values, None, joints, _MARGIN)
-    geometry = None
-    if machine is None:
-        geometry = expand_geometry(geometric_deviation(nominal, nominal.nominal, values), joints, _MARGIN)
-    rows, turning = torch.ones(1, len(still), dtype=torch.float64), torch.zeros(still.shape[-1], dtype=torch.bool)
-    scaling = Scaling.fit(joints[None], still[None], rows, turning).repeat(0)
+    nominal, names = rows.mechanism, [c.name for c in covariates]
+    there = torch.isfinite(nominal.forward_kinematics(rows.joints)).all(-1) & torch.isfinite(rows.joints).all(-1)
+    if int(there.sum()) < _FEWEST:
+        raise MethodFailedError(
+            f"{nominal.name} takes {int(there.sum())} of {len(there)} of its poses, too few for a model"
+        )
+    given = {name: rows.covariates[name][there] for name in names}
+    fine = Situation(nominal, rows.joints[there], given, rows.gravity)
+    inputs = torch.cat([fine.joints, *(given[name][:, None] for name in names)], -1)
+    still, turning = torch.zeros_like(fine.joints), torch.zeros(inputs.shape[-1], dtype=torch.bool)
+    weights = torch.ones(1, len(still), dtype=torch.float64)
+    scaling = Scaling.fit(inputs[None], still[None], weights, turning).repeat(0)
     network = ConstantNetwork(still[0], still[0])
-    about = (network, scaling, joints, still, nominal.joints)
-    return fit_compensator(*about, margin=_MARGIN, geometry=geometry, machine=machine)
+    parts = machine_parts(fine, acting, values, names, margin)
+    return fit_compensator(network, scaling, inputs, still, nominal.joints, covariates, margin=margin, **parts)

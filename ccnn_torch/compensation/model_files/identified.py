@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,15 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch.compensation.compensator import Compensator
-from ccnn_torch.compensation.guard import Promise, as_matrix, kept
-from ccnn_torch.compensation.machine.alone import machine_alone
+from ccnn_torch.compensation.guard import Promise, as_rows, kept
+from ccnn_torch.compensation.machine.alone import ROWS, all_over, machine_alone
 from ccnn_torch.compensation.model_files.card import MODEL_FORMS, card_of, read_model
-from ccnn_torch.compensation.model_files.load import LoadedModel, load_model
+from ccnn_torch.compensation.model_files.load import LoadedModel, load_model, machine_of_model
+from ccnn_torch.compensation.model_files.metadata import from_json
 from ccnn_torch.compensation.model_files.signature import check_signature, sign_content, signature_path
 from ccnn_torch.coordinates import Coordinate
+from ccnn_torch.effects import Situation, default_gravity
+from ccnn_torch.effects.found_machine import FoundMachine, machine_of_block
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.mechanisms import Mechanism, mechanism_of_file
@@ -32,42 +36,41 @@ class IdentifiedGeometry:
     An ideal joint vector means the pose f(q; nominal); the command is that of the identified machine at this pose.
 
     Attributes:
-        path: the mechanism file.
+        path: the file.
+        machine: as it was found.
         nominal, identified: the mechanism with either geometry.
-        compensator: both as a compensator that has learned nothing.
-        joints, covariates, pose: coordinates in order; geometry has no covariates.
+        compensator: the machine as a compensator that has learned nothing.
+        joints, covariates, pose: coordinates in order; geometry alone has no covariates.
         facts: `mechanism`: the nominal one's description.
         columns: the map of columns that its records had: header in a file -> ``name[unit]`` or ``ignore``.
         joint_map: joint -> sum of columns, where its controller counts otherwise.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        nominal: Mechanism,
-        identified: Mechanism,
-        columns: dict[str, str] | None = None,
-        joint_map: dict[str, str] | None = None,
-    ) -> None:
-        """Take both geometries of one mechanism.
+    def __init__(self, path: Path, machine: FoundMachine, rows: Callable[[], Situation] | None = None) -> None:
+        """Take a machine.
 
-        Raises:
-            ModelFileError: the machine has no closed form, and its geometry is no polynomial of the joints either.
+        Args:
+            path: the file.
+            machine: as it was found.
+            rows: of geometry alone, that fill its domain; all over the measured region when None.
         """
-        self.path, self.nominal, self.identified = path, nominal, identified
-        self.joints: tuple[Coordinate, ...] = nominal.joints
-        self.pose: tuple[Coordinate, ...] = nominal.pose
-        self.columns = columns or {}
-        self.joint_map = joint_map or {}
-        self.covariates: tuple[Coordinate, ...] = ()
-        self.facts: dict[str, Any] = {"mechanism": nominal.describe()}
+        self.path, self.machine = path, machine
+        self._rows = rows
+        self.nominal, self.identified = machine.nominal, machine.identified
+        self.joints: tuple[Coordinate, ...] = self.nominal.joints
+        self.pose: tuple[Coordinate, ...] = self.nominal.pose
+        self.columns, self.joint_map, self.covariates = machine.columns, machine.joint_map, machine.covariates
+        self.facts: dict[str, Any] = {"mechanism": self.nominal.describe()}
 
     @cached_property
     def compensator(self) -> Compensator:
-        """Made when a command is first asked for."""
+        """Made when a command is first asked for; raises ModelFileError where the machine cannot be commanded."""
         try:
-            return machine_alone(self.nominal, self.identified)
-        except MethodFailedError as reason:
+            if self._rows is not None:
+                return machine_alone(self._rows(), self.machine.values, margin=0.0)
+            about = (self.machine.values, self.machine.acting, self.covariates)
+            return machine_alone(self.machine.rows(ROWS), *about)
+        except (InputError, MethodFailedError) as reason:
             raise ModelFileError(f"{self.path}: {reason}") from None
 
     @property
@@ -81,40 +84,65 @@ class IdentifiedGeometry:
 
         Args:
             joints: `... x n` [SI].
-            covariates: none.
+            covariates: `... x m` [SI] in the order of `covariates`; None where there are none.
 
         Returns:
             As a `LoadedModel`, without `deviation_sd`: there is no learner.
 
         Raises:
-            InputError: the last dimension is wrong.
+            InputError: covariates are missing, or a last dimension is wrong.
         """
-        array = as_matrix(joints, self.joints, "joints")
-        rows = array.reshape(-1, array.shape[-1])
-        compensator = self.compensator
+        rows, flat, lead = as_rows(joints, covariates, (self.joints, self.covariates))
+        compensator, given = self.compensator, None if flat is None else torch.tensor(flat)
         with torch.no_grad():
-            found = {k: v.numpy() for k, v in compensator.solve(torch.tensor(rows))._asdict().items()}
-        checked = kept(found, rows, None, Promise.of_compensator(compensator))
+            found = {k: v.numpy() for k, v in compensator.solve(torch.tensor(rows), given)._asdict().items()}
+        checked = kept(found, rows, flat, Promise.of_compensator(compensator))
         del checked["deviation_sd"]
-        return {name: value.reshape((*array.shape[:-1], *value.shape[1:])) for name, value in checked.items()}
+        return {name: value.reshape((*lead, *value.shape[1:])) for name, value in checked.items()}
 
 
 def load_geometry(
     path: str | Path, *, public_key: str | Path | None = None, allow_code: bool = False
 ) -> IdentifiedGeometry:
-    """Read `identified.yaml`, or the `identified.yaml` beside an `identified.json`.
+    """Read `identified.yaml`, the `identified.yaml` beside an `identified.json`, or a `diagnosis.json`.
 
     Raises:
-        ModelFileError: the file is not one that `ccnn identify` wrote.
+        ModelFileError: the file is not one that `ccnn identify` or `ccnn diagnose` wrote.
         InputError: it lacks a key or a parameter, or names code that was not allowed.
     """
     path = Path(path)
     source, content = _read_geometry(path)
     if public_key is not None:
         check_signature(source, content, b"", public_key)
+    if source.suffix == ".json" and (diagnosed := _diagnosed(path, content, allow_code)) is not None:
+        return IdentifiedGeometry(path, diagnosed)
     file = _parsed(path, source, content)
     nominal, identified = (mechanism_of_file(file, what, allow_code) for what in ("nominal", "value"))
-    return IdentifiedGeometry(path, nominal, identified, file.columns, file.joint_map)
+    none = torch.zeros(0, 2, dtype=torch.float64)
+    about = (default_gravity(nominal), none, (), none, file.columns, file.joint_map)
+    machine = FoundMachine(nominal, identified.nominal, [], *about)
+    return IdentifiedGeometry(path, machine, lambda: all_over(nominal))
+
+
+def load_machine(path: str | Path, *, allow_code: bool = False) -> Mechanism:
+    """The machine of any file that a command writes, identified parameters as the nominal ones, without effects.
+
+    Args, raises: as of `load_compensation`.
+    """
+    found = load_compensation(path, allow_code=allow_code)
+    return found.identified if isinstance(found, IdentifiedGeometry) else machine_of_model(found, allow_code)
+
+
+def _diagnosed(path: Path, content: bytes, allow_code: bool) -> FoundMachine | None:
+    """The machine in a diagnosis.json; None where the file is another one."""
+    try:
+        found = from_json(content)
+        block = found["machine"]
+    except (ValueError, KeyError, TypeError):
+        return None
+    if block is None:
+        raise ModelFileError(f"{path}: machine: no effect was named that a model could hold; calibrate with ccnn run")
+    return machine_of_block(block, str(path), allow_code)
 
 
 def load_compensation(
@@ -152,7 +180,8 @@ def sign_model(path: str | Path, key: str | Path) -> Path:
     path = Path(path)
     if path.suffix.lower() in _FORMS:
         source, content = _read_geometry(path)
-        _parsed(path, source, content)
+        if source.suffix != ".json":
+            _parsed(path, source, content)
         path, card = source, b""
     else:
         content = read_model(path)
@@ -163,8 +192,9 @@ def sign_model(path: str | Path, key: str | Path) -> Path:
 
 
 def _read_geometry(path: Path) -> tuple[Path, bytes]:
-    """The mechanism file of an identified machine, and its bytes."""
-    source = path.with_suffix(".yaml") if path.suffix == ".json" else path
+    """The file of an identified machine, for its identified.json the one beside it; and its bytes."""
+    beside = path.with_suffix(".yaml")
+    source = beside if path.suffix == ".json" and beside.is_file() else path
     try:
         return source, source.read_bytes() if source.is_file() else b""
     except OSError as reason:

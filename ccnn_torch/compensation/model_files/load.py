@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
 from ccnn_torch.compensation.compensator import Compensator, Hook
-from ccnn_torch.compensation.guard import Promise, as_matrix, kept
+from ccnn_torch.compensation.guard import Promise, as_rows, kept
 from ccnn_torch.compensation.model_files.card import card_of, read_model
 from ccnn_torch.compensation.model_files.master import Run, open_model
 from ccnn_torch.compensation.model_files.metadata import coordinates
@@ -20,7 +21,7 @@ from ccnn_torch.compensation.model_files.onnx_session import RUN_ERRORS, TAKE_AG
 from ccnn_torch.compensation.model_files.signature import check_signature
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import FallbackWarning, InputError, ModelFileError, out_of_memory
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 from ccnn_torch.plugins import code_refused
 
 
@@ -65,18 +66,7 @@ class LoadedModel:
             InputError: covariates are missing, or a last dimension is wrong.
             MemoryError: the rows do not fit into memory; give fewer at once.
         """
-        given = as_matrix(joints, self.joints, "joints")
-        lead = given.shape[:-1]
-        flat = None
-        if self.covariates:
-            if covariates is None:
-                names = ", ".join(c.header for c in self.covariates)
-                raise InputError(f"the model needs the covariates {names}; give covariates=… in this order")
-            extra = as_matrix(covariates, self.covariates, "covariates")
-            if extra.shape[:-1] not in (lead, ()):
-                raise InputError(f"covariates for {lead} rows of joints must have as many rows, got {extra.shape[:-1]}")
-            flat = np.broadcast_to(extra, (*lead, extra.shape[-1])).reshape(-1, extra.shape[-1])
-        rows = given.reshape(-1, given.shape[-1])
+        rows, flat, lead = as_rows(joints, covariates, (self.joints, self.covariates))
         try:
             found = self._run(rows, flat)
         except RUN_ERRORS as reason:
@@ -191,6 +181,13 @@ def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_
     except RUN_ERRORS as reason:
         raise ModelFileError(f"{path}: cannot be run ({said(reason)})" + TAKE_AGAIN) from None
     return model
+
+
+def machine_of_model(model: LoadedModel, allow_code: bool = False) -> Mechanism:
+    """The machine of a model, identified parameters as the nominal ones; effects and what was learned left out."""
+    mechanism = mechanism_from_description(model.facts["mechanism"], allow_code)
+    identified = model.facts.get("machine", {}).get("identified")
+    return mechanism if identified is None else mechanism.with_nominal(torch.tensor(identified, dtype=torch.float64))
 
 
 def _words(value: str | list[str]) -> str:

@@ -72,7 +72,7 @@ def calibrated(
 
     Args:
         machine, rows, measured: what was measured.
-        command: one of `COMMANDS`; `diagnose` is followed by the run that its effects are for.
+        command: one of `COMMANDS`; of `diagnose` the model is its diagnosis.json.
         keys: overrides `key=value` of the calibration.
         out: folder for the files.
     """
@@ -92,12 +92,11 @@ def calibrated(
         if contestant.call("identify", "config.yaml", "out=model", *keys):
             contestant.model = out / "model" / "identified.yaml"
         return contestant
-    effects: list[str] = []
     if command == "diagnose":
-        if not contestant.call("diagnose", "--config", "config.yaml", "--out", "diagnosis"):
-            return contestant
-        effects = ["effects=from:diagnosis/diagnosis.json"]
-    if contestant.call("run", "config.yaml", "out=model", "save_report=false", *effects, *keys):
+        if contestant.call("diagnose", "--config", "config.yaml", "--no-network", "--out", "model"):
+            contestant.model = out / "model" / "diagnosis.json"
+        return contestant
+    if contestant.call("run", "config.yaml", "out=model", "save_report=false", *keys):
         contestant.model = out / "model" / "model.safetensors"
         if not contestant.model.is_file():
             contestant.said.append("run: exit 0 without a model file")
@@ -113,6 +112,10 @@ def promised(contestant: Contestant) -> dict[str, float | None]:
     if contestant.command == "identify":
         test = json.loads((folder / "identified.json").read_text())["test"]
         return found | {name: _figure(test.get(name), "after") for name in ("position", "rotation")}
+    if contestant.command == "diagnose":
+        said = json.loads(contestant.model.read_text())
+        gaps = {"position": said["gap"], "rotation": said["gap_rotation"]}
+        return found | {name: _figure(gap, "after") for name, gap in gaps.items()}
     pose = json.loads((folder / "results.json").read_text())["pose"]
     for name in ("position", "rotation"):
         found[name] = _figure(pose.get(name), "after")
@@ -164,7 +167,10 @@ def _by_c(contestant: Contestant, machine: Machine, rows: Rows) -> Commands | No
         return None
     folder, count = contestant.folder / "c", len(machine.units)
     card = contestant.model.parent / "card.json"
-    names = [_name(c) for c in json.loads(card.read_text())["covariates"]] if card.is_file() else []
+    if contestant.command == "diagnose":
+        names = [*json.loads(contestant.model.read_text())["machine"]["covariates"]]
+    else:
+        names = [_name(c) for c in json.loads(card.read_text())["covariates"]] if card.is_file() else []
     numbers = {"joints": count, "covariates": len(names), "most": max(len(names), 1)}
     (folder / "main.c").write_text(_MAIN % {**numbers, "given": "covariates" if names else "NULL"})
     sources, program = ["main.c", "compensator.c"], folder / "judge"

@@ -19,11 +19,12 @@ from ccnn_torch.diagnosis.candidates.atom import scales
 from ccnn_torch.diagnosis.candidates.library import LOG_PRIOR
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows
 from ccnn_torch.diagnosis.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
-from ccnn_torch.diagnosis.from_file import Known
+from ccnn_torch.diagnosis.from_file import Known, one_row_at_a_time
 from ccnn_torch.diagnosis.residual.linearisation import moved, remainder, signature_at
 from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, Whitening, moving_channels, renewed
 from ccnn_torch.effects import Acting, Effect, Situation
+from ccnn_torch.mechanisms import Mechanism
 
 # Gauss-Newton steps, at most.
 _ROUNDS = 4
@@ -102,6 +103,20 @@ def effects_that_pay(
             scans[one.effect.name] = scan
             rows = _at_better_shape(rows, i, scan)
     return _without_idle(rows, white)
+
+
+def on_fitted_frames(situation: Situation) -> Situation:
+    """The same rows on a machine whose nominal parameters are the situation's, each as if it were isolated."""
+    if situation.parameters is not None:
+        mechanism = situation.mechanism.with_nominal(situation.parameters)
+        situation = replace(situation, mechanism=mechanism, parameters=None)
+    return one_row_at_a_time(situation)
+
+
+def loose_parameters(mechanism: Mechanism, identify: bool) -> list[int]:
+    """Numbers of the parameters that are fitted beside effects: all of them, or those of unknown frames."""
+    unknown = getattr(mechanism, "unknown_frames", ())
+    return [k for k, g in enumerate(mechanism.geometry) if identify or g.name.partition("_")[0] in unknown]
 
 
 class _Model:

@@ -1,0 +1,115 @@
+"""The machine of a diagnosis.json, and that of a model file, wherever a machine is asked for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from ccnn_torch import diagnose, load_mechanism, load_records
+from ccnn_torch.calibration.calibrate import calibrate
+from ccnn_torch.calibration.config import make_config
+from ccnn_torch.compensation import IdentifiedGeometry, load_compensation
+from ccnn_torch.effects import Situation, default_gravity, measured_pose, reached
+from ccnn_torch.errors import InputError
+from ccnn_torch.mechanisms import FiveBar
+from ccnn_torch.simulation.job import simulate_records
+from ccnn_torch.simulation.outputs import write_simulated
+
+Block = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A diagnosis.json of a five-bar with wrong lengths and backlash; its records beside it."""
+    folder = tmp_path_factory.mktemp("found")
+    made = simulate_records("five_bar", ["geometry:A1x=0.0004", "backlash"], 120, 1e-5, seed=3)
+    write_simulated(folder / "rows.csv", made)
+    mechanism = load_mechanism("five_bar")
+    said = diagnose(load_records(folder / "rows.csv", mechanism), mechanism)
+    assert said.machine is not None and {e["name"] for e in said.machine["effects"]} == {"backlash"}
+    (folder / "diagnosis.json").write_text(json.dumps({"machine": said.machine}), encoding="utf-8")
+    return folder / "diagnosis.json"
+
+
+def test_its_commands_bring_the_machine_to_the_nominal_pose(found: Path) -> None:
+    model = load_compensation(found)
+    assert isinstance(model, IdentifiedGeometry)
+    names = [c.name for c in model.covariates]
+    assert {"direction1", "direction2"} <= set(names) and "temperature" not in names
+    region = model.machine.rows(50)
+    given = {n: v.sign() if n.startswith("direction") else v for n, v in region.covariates.items()}
+    answer = model(region.joints.numpy(), torch.stack([given[n] for n in names], -1).numpy())
+    exact = torch.from_numpy(answer["status"] < 2)
+    assert float(exact.double().mean()) > 0.9
+    there = Situation(model.nominal, torch.from_numpy(answer["command"]), given, region.gravity)
+    pose = measured_pose(there, reached(there, model.machine.acting, model.machine.values))
+    wanted = model.nominal.forward_kinematics(region.joints)
+    torch.testing.assert_close(pose[exact], wanted[exact], rtol=0, atol=1e-7)
+    with pytest.raises(InputError, match=r"needs the covariates .*direction1"):
+        model(region.joints.numpy())
+
+
+def test_it_is_a_mechanism(found: Path) -> None:
+    machine, known = load_mechanism(str(found)), load_compensation(found)
+    assert isinstance(machine, FiveBar) and isinstance(known, IdentifiedGeometry)
+    torch.testing.assert_close(machine.nominal, known.machine.values, rtol=0, atol=0)
+    assert not torch.equal(machine.nominal, known.nominal.nominal)
+    with pytest.raises(InputError, match=r"mechanism_keys: .* leave out l"):
+        load_mechanism(str(found), l=0.3)
+
+
+def test_so_is_that_of_a_model_file(found: Path, tmp_path: Path) -> None:
+    keys = {"records": str(found.with_name("rows.csv")), "mechanism": "five_bar", "geometry": "identify"}
+    made = calibrate(make_config(**keys, effects="none", methods=["constant"]))
+    made.save(tmp_path, forms=("onnx",))
+    machine = made.compensator().machine
+    assert machine is not None
+    for name in ("model.safetensors", "model.onnx"):
+        torch.testing.assert_close(load_mechanism(str(tmp_path / name)).nominal, machine.identified, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda b: b["effects"][0].update(name="nonsense"), "nonsense"),
+        (lambda b: b["effects"][0].update(name="geometry"), "geometry"),
+        (lambda b: b["effects"][0]["coefficients"].pop(), "backlash"),
+        (lambda b: b["effects"][0].update(coefficients=[1e300]), "coefficients"),
+        (lambda b: b["parameters"].popitem(), "machine: is not as ccnn diagnose writes it"),
+        (lambda b: b.pop("gravity"), "gravity"),
+        (lambda b: b["joints"].update(q1=[0.0]), "joints"),
+        (lambda b: b["nominal"].update(spec="evil.py:Machine"), "not allowed|allow-code|code"),
+        (lambda b: b.update(covariates=7), "covariates"),
+    ],
+)
+def test_a_forged_one_is_refused_in_one_sentence(
+    found: Path, tmp_path: Path, change: Callable[[Block], Any], said: str
+) -> None:
+    content = json.loads(found.read_text(encoding="utf-8"))
+    change(content["machine"])
+    (tmp_path / "diagnosis.json").write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(InputError, match=said) as refused:
+        load_compensation(tmp_path / "diagnosis.json")
+    assert "\n" not in str(refused.value) and "diagnosis.json" in str(refused.value)
+
+
+def test_without_a_machine_it_says_what_to_do(tmp_path: Path) -> None:
+    path = tmp_path / "diagnosis.json"
+    path.write_text('{"machine": null}', encoding="utf-8")
+    with pytest.raises(InputError, match="no effect was named that a model could hold; calibrate with ccnn run"):
+        load_compensation(path)
+    for text in ("{}", "[", "7", '"machine"'):
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(InputError, match=r"diagnosis\.json"):
+            load_compensation(path)
+
+
+def test_gravity_of_the_rows_is_that_of_the_machine(found: Path) -> None:
+    machine = load_compensation(found)
+    assert isinstance(machine, IdentifiedGeometry)
+    torch.testing.assert_close(machine.machine.gravity, default_gravity(load_mechanism("five_bar")), rtol=0, atol=0)
