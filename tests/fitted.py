@@ -1,4 +1,4 @@
-"""Geometry fitted to rows as `ccnn run` fits it, for tests of machines and frames."""
+"""An arm of six axes, and geometry fitted to rows as `ccnn run` fits it, for tests of machines and frames."""
 
 from __future__ import annotations
 
@@ -7,7 +7,25 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.joint_fit import fit_jointly
 from ccnn_torch.effects import Situation, default_gravity
-from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.mechanisms import Mechanism, SerialArm
+
+LIMITS = [(-1.5, 1.5), (-1.2, -0.3), (0.4, 1.6), (-1.5, 1.5), (0.3, 1.6), (-2.0, 2.0)]
+QUARTER = 1.5707963267948966
+# a, alpha, d, theta of each link.
+LINKS = [
+    [0.05, -QUARTER, 0.3, 0.0],
+    [0.4, 0.0, 0.0, 0.0],
+    [0.03, -QUARTER, 0.0, 0.0],
+    [0.0, QUARTER, 0.4, 0.0],
+    [0.0, -QUARTER, 0.0, 0.0],
+    [0.0, 0.0, 0.08, 0.0],
+]
+
+
+def six_axis_arm() -> SerialArm:
+    """In the URDF form, its elbow and its wrist on one branch."""
+    tool = (0.05, 0.02, 0.1, 0.0, 0.0, 0.0)
+    return SerialArm("arm", "standard", LINKS, limits=LIMITS, tool=tool).with_link_frames()
 
 
 def fitted_geometry(

@@ -6,31 +6,15 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from fitted import six_axis_arm
 from torch import Tensor
 
 from ccnn_torch.diagnosis.joint_fit import JointFit, effects_that_pay, fit_jointly
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, reached
-from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 
 NOISE = 2e-5
 LIBRARY = ("joint_gain", "transmission", "gravity", "coupling")
-LIMITS = [(-1.5, 1.5), (-1.2, -0.3), (0.4, 1.6), (-1.5, 1.5), (0.3, 1.6), (-2.0, 2.0)]
-QUARTER = 1.5707963267948966
-# a, alpha, d, theta of each link.
-LINKS = [
-    [0.05, -QUARTER, 0.3, 0.0],
-    [0.4, 0.0, 0.0, 0.0],
-    [0.03, -QUARTER, 0.0, 0.0],
-    [0.0, QUARTER, 0.4, 0.0],
-    [0.0, -QUARTER, 0.0, 0.0],
-    [0.0, 0.0, 0.08, 0.0],
-]
-
-
-def arm() -> SerialArm:
-    tool = (0.05, 0.02, 0.1, 0.0, 0.0, 0.0)
-    return SerialArm("arm", "standard", LINKS, limits=LIMITS, tool=tool).with_link_frames()
 
 
 def waves(orders: float, size: float, situation: Situation) -> Acting:
@@ -50,7 +34,7 @@ def sagging(situation: Situation) -> Acting:
 
 
 def rows(count: int, seed: int) -> Situation:
-    machine = arm()
+    machine = six_axis_arm()
     joints = machine.sample_joints(count, torch.Generator().manual_seed(seed))
     return Situation(machine, joints, {}, default_gravity(machine))
 

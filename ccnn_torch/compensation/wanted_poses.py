@@ -14,6 +14,7 @@ from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, SerialArm, mechanism_from_description
+from ccnn_torch.mechanisms.frames.fit import ROTATION_WEIGHT
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.plugins import code_refused
 from ccnn_torch.records.joint_map import JointMap
@@ -26,6 +27,8 @@ from ccnn_torch.units import si_unit_of
 _CLOSE = 1e-8
 # Initial guesses solved at once where that of the previous row does not converge.
 _STARTS = 64
+# Joints all over the measured region, among which the first row's guess is looked for.
+_LOOKED_AT = 2000
 
 
 class WantedPoses:
@@ -67,8 +70,8 @@ class WantedPoses:
         self._behind_pose = torch.eye(4, dtype=torch.float64)
         if tool is not None:
             self._behind_pose = torch.linalg.inv(_frame(tool)) @ _frame(_measured_tool(loaded, self._mechanism))
-        self._first = _first_guess(loaded)
-        self._before = self._first
+        self._first, self._region = torch.from_numpy(loaded.middle), torch.from_numpy(loaded.region)
+        self._before: Tensor | None = None
         self.chooses = False
 
     @property
@@ -77,7 +80,8 @@ class WantedPoses:
         first, last = self._mechanism.joints[0], self._mechanism.joints[-1]
         return (
             "An arm reaches a pose on several branches (elbow, wrist): these are the joints nearest to those of the "
-            f"previous row, and may be on another branch than intended; give guess_{first.header} to "
+            "previous row, in the first row to what was measured, and may be on another branch than intended; give "
+            f"guess_{first.header} to "
             f"guess_{last.header} near the joints wanted."
         )
 
@@ -101,7 +105,8 @@ class WantedPoses:
             guess = torch.from_numpy(near if shown is None else shown.of_shown(near))
         self.chooses = bool(mechanism.orientations) and not guided
         if self.chooses:
-            joints = _follow(mechanism, poses, self._before)
+            before = _nearest(mechanism, self._region, poses[0]) if self._before is None else self._before
+            joints = _follow(mechanism, poses, before)
             self._before = joints[-1]
         else:
             joints = mechanism.solve_inverse(poses, guess=guess)
@@ -157,9 +162,13 @@ def _units(table: Table, read: Sequence[str]) -> dict[str, str]:
     return {kind: units.pop() for kind, units in kinds.items() if len(units) == 1}
 
 
-def _first_guess(loaded: LoadedModel | IdentifiedGeometry) -> Tensor:
-    """Joints from which an arm's first row is looked for where none are given, `n` [SI]."""
-    return torch.from_numpy(loaded.middle)
+def _nearest(mechanism: Mechanism, region: Tensor, pose: Tensor) -> Tensor:
+    """Joints in the region, lowest and highest `n x 2`, whose pose is among the nearest to one, `n` [SI]."""
+    share = torch.rand(_LOOKED_AT, len(region), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    joints = region[:, 0] + (region[:, 1] - region[:, 0]) * share
+    error = mechanism.pose_error(mechanism.forward_kinematics(joints), pose)
+    turned = 0.0 if error.rotation is None else ROTATION_WEIGHT * error.rotation
+    return joints[torch.nan_to_num(error.position + turned, nan=torch.inf).argmin()]
 
 
 def _follow(mechanism: Mechanism, poses: Tensor, guess: Tensor) -> Tensor:

@@ -9,14 +9,18 @@ from typing import Any
 
 import pytest
 import torch
+from fitted import LIMITS, six_axis_arm
 
 from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.config import make_config
 from ccnn_torch.compensation import IdentifiedGeometry, load_compensation
+from ccnn_torch.compensation.wanted_poses import WantedPoses
 from ccnn_torch.effects import Situation, default_gravity, measured_pose, reached
+from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import FiveBar
+from ccnn_torch.records import read_table, write_table
 from ccnn_torch.simulation.job import simulate_records
 from ccnn_torch.simulation.outputs import write_simulated
 
@@ -114,3 +118,18 @@ def test_gravity_of_the_rows_is_that_of_the_machine(found: Path) -> None:
     machine = load_compensation(found)
     assert isinstance(machine, IdentifiedGeometry)
     torch.testing.assert_close(machine.machine.gravity, default_gravity(load_mechanism("five_bar")), rtol=0, atol=0)
+
+
+def test_the_first_pose_is_reached_on_the_branch_that_was_measured(tmp_path: Path) -> None:
+    arm, none = six_axis_arm(), torch.zeros(0, 2, dtype=torch.float64)
+    about = (default_gravity(arm), torch.tensor(LIMITS, dtype=torch.float64), (), none, {}, {})
+    model = IdentifiedGeometry(tmp_path / "diagnosis.json", FoundMachine(arm, arm.nominal, [], *about))
+    joints = arm.sample_joints(100, torch.Generator().manual_seed(4))
+    # From the middle of the region the solver goes to another branch in these.
+    for row in (15, 40, 78):
+        pose = arm.forward_kinematics(joints[row])
+        middle = arm.solve_inverse(pose, guess=torch.from_numpy(model.region.mean(-1)))
+        assert float(arm.wrap(middle - joints[row]).abs().max()) > 0.1
+        write_table(tmp_path / "pose.csv", {c.header: pose[i : i + 1].numpy() for i, c in enumerate(arm.pose)})
+        found, _ = WantedPoses(model).joints(read_table(tmp_path / "pose.csv"))
+        assert float(arm.wrap(torch.from_numpy(found[0]) - joints[row]).abs().max()) < 1e-6

@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
@@ -72,6 +73,16 @@ class IdentifiedGeometry:
             return machine_alone(self.machine.rows(ROWS), *about)
         except (InputError, MethodFailedError) as reason:
             raise ModelFileError(f"{self.path}: {reason}") from None
+
+    @property
+    def region(self) -> Array:
+        """Lowest and highest joints measured, or of the workspace where that is not known, `n x 2` [SI]."""
+        if self._rows is None:
+            measured: Array = self.machine.joints.numpy()
+            return measured
+        joints = self._rows().joints
+        fine = joints[torch.isfinite(joints).all(-1)]
+        return np.stack([fine.amin(0).numpy(), fine.amax(0).numpy()], -1)
 
     @property
     def middle(self) -> Array:

@@ -97,10 +97,16 @@ class LoadedModel:
         return dict(self.card.get("joint_map") or {})
 
     @property
+    def region(self) -> Array:
+        """Lowest and highest joints of the domain, `n x 2` [SI]."""
+        edges = [self.facts["domain"]["inputs"][c.name] for c in self.joints]
+        return np.array([[edge["low"], edge["high"]] for edge in edges])
+
+    @property
     def middle(self) -> Array:
         """Middle of the domain's joints, `n` [SI]; where a search for joints begins."""
-        edges = [self.facts["domain"]["inputs"][c.name] for c in self.joints]
-        return np.array([(edge["low"] + edge["high"]) / 2 for edge in edges])
+        middle: Array = self.region.mean(-1)
+        return middle
 
     def back(self, command: ArrayLike, covariates: ArrayLike | None = None) -> Array:
         """Ideal joints of commands (or of joints fed back), `... x n` [SI]; arguments and errors as a call."""
