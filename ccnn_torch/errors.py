@@ -39,5 +39,11 @@ def out_of_memory(problem: Exception) -> bool:
     return isinstance(problem, MemoryError) or any(words in str(problem) for words in _NO_MEMORY)
 
 
+def raise_if_out_of_memory(problem: Exception) -> None:
+    """Raise MemoryError where an error says that memory could not be had: no fault of the file that was read."""
+    if out_of_memory(problem):
+        raise MemoryError from None
+
+
 class OutsideDomainWarning(UserWarning):
     """A command is outside the domain that a compensator was trained on; the safe correction is used there."""

@@ -112,13 +112,13 @@ def _spread(values: Tensor, groups: Tensor) -> float:
 
 
 def promise_of(model: LoadedModel | IdentifiedGeometry) -> dict[str, Any] | None:
-    """The card's promise, or that of the identified.json beside an identified.yaml."""
+    """The card's promise, or that of the identified.json beside an identified.yaml, which no signature covers."""
     if isinstance(model, LoadedModel):
         metrics = model.card.get("metrics")
         found = metrics.get("promise") if isinstance(metrics, dict) else None
         return found if isinstance(found, dict) else None
     path = Path(model.path).with_name("identified.json")
-    if not path.is_file():
+    if model.signed or not path.is_file():
         return None
     results = read_json(path)
     promise, parameters = results.get("promise"), results.get("parameters")

@@ -457,6 +457,27 @@ def test_a_machine_that_would_compute_for_ever_is_refused(tmp_path: Path, key: s
         load_model(path)
 
 
+@pytest.mark.parametrize("place", [1, 2])
+def test_effects_of_a_thousand_million_numbers_are_refused_before_they_are_made(with_machine: Path, place: int) -> None:
+    facts = facts_of(with_machine)
+    facts["machine"]["effects"]["acting"][0][place] = 10**9
+    path = forge_master(with_machine, facts, lambda tensors: None)
+    with pytest.raises(ModelFileError, match=r"'machine\.effects\.acting\.0\.\d.*' wrong"):
+        load_model(path)
+
+
+def test_memory_that_runs_out_while_a_model_is_read_is_no_fault_of_it(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory")
+
+    for name, where in (("model.safetensors", "_rebuild"), ("model.onnx", "open_onnx")):
+        with monkeypatch.context() as patched, pytest.raises(MemoryError):
+            patched.setattr(f"ccnn_torch.compensation.model_files.master.{where}", full)
+            load_model(copied / name)
+
+
 def test_a_master_that_names_code_does_not_run_it(copied: Path, tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').close()\n")
     spec = f"{tmp_path / 'own.py'}:Own"

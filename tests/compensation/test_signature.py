@@ -18,6 +18,7 @@ from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.files.mechanism_file import mechanism_text
 from ccnn_torch.records import write_table
+from ccnn_torch.verification.promise import promise_of
 
 Cli = Callable[..., tuple[int, str, str]]
 
@@ -124,7 +125,12 @@ def test_an_identified_machine_is_signed_without_a_card(tmp_path: Path, keys: tu
     with pytest.raises(ModelFileError, match="has no signature"):
         load_compensation(path, public_key=public)
     assert sign_model(path, private).name == "identified.yaml.sig"
-    load_compensation(path, public_key=public)
+    signed = load_compensation(path, public_key=public)
+    # No signature covers the identified.json beside it.
+    entries = {name: {"value": value} for name, value in zip("Lr", mechanism.nominal.tolist(), strict=True)}
+    figures = {"promise": {"rows": 7}, "parameters": entries}
+    path.with_suffix(".json").write_text(json.dumps(figures), encoding="utf-8")
+    assert promise_of(load_compensation(path)) == {"rows": 7} and promise_of(signed) is None
     path.write_text(path.read_text().replace("value: 1.0", "value: 1.1"))
     with pytest.raises(ModelFileError, match="one of them was changed"):
         load_compensation(path, public_key=public)

@@ -45,17 +45,25 @@ class IdentifiedGeometry:
         facts: `mechanism`: the nominal one's description.
         columns: the map of columns that its records had: header in a file -> ``name[unit]`` or ``ignore``.
         joint_map: joint -> sum of columns, where its controller counts otherwise.
+        signed: whether a signature was asked for: then what no signature covers is not believed.
     """
 
-    def __init__(self, path: Path, machine: FoundMachine, rows: Callable[[], Situation] | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        machine: FoundMachine,
+        rows: Callable[[], Situation] | None = None,
+        signed: bool = False,
+    ) -> None:
         """Take a machine.
 
         Args:
             path: the file.
             machine: as it was found.
             rows: of geometry alone, that fill its domain; all over the measured region when None.
+            signed: see the class.
         """
-        self.path, self.machine = path, machine
+        self.path, self.machine, self.signed = path, machine, signed
         self._rows = rows
         self.nominal, self.identified = machine.nominal, machine.identified
         self.joints: tuple[Coordinate, ...] = self.nominal.joints
@@ -126,13 +134,13 @@ def load_geometry(
     if public_key is not None:
         check_signature(source, content, b"", public_key)
     if source.suffix == ".json" and (diagnosed := _diagnosed(path, content, allow_code)) is not None:
-        return IdentifiedGeometry(path, diagnosed)
+        return IdentifiedGeometry(path, diagnosed, signed=public_key is not None)
     file = _parsed(path, source, content)
     nominal, identified = (mechanism_of_file(file, what, allow_code) for what in ("nominal", "value"))
     none = torch.zeros(0, 2, dtype=torch.float64)
     about = (default_gravity(nominal), none, (), none, file.columns, file.joint_map)
     machine = FoundMachine(nominal, identified.nominal, [], *about)
-    return IdentifiedGeometry(path, machine, lambda: all_over(nominal))
+    return IdentifiedGeometry(path, machine, lambda: all_over(nominal), public_key is not None)
 
 
 def load_machine(path: str | Path, *, allow_code: bool = False) -> Mechanism:

@@ -20,7 +20,7 @@ from ccnn_torch.compensation.model_files.metadata import coordinates
 from ccnn_torch.compensation.model_files.onnx_session import RUN_ERRORS, TAKE_AGAIN, Array, said
 from ccnn_torch.compensation.model_files.signature import check_signature
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.errors import FallbackWarning, InputError, ModelFileError, out_of_memory
+from ccnn_torch.errors import FallbackWarning, InputError, ModelFileError, raise_if_out_of_memory
 from ccnn_torch.mechanisms import Mechanism, mechanism_from_description
 from ccnn_torch.plugins import code_refused
 
@@ -70,8 +70,7 @@ class LoadedModel:
         try:
             found = self._run(rows, flat)
         except RUN_ERRORS as reason:
-            if out_of_memory(reason):
-                raise MemoryError from None
+            raise_if_out_of_memory(reason)
             # A graph may take one row and no two.
             found = {}
         checked = kept(found, rows, flat, self._promise)
@@ -185,6 +184,7 @@ def load_model(path: str | Path, *, public_key: str | Path | None = None, allow_
     try:
         run(promise.centre[None, :n], promise.centre[None, n:] if model.covariates else None)
     except RUN_ERRORS as reason:
+        raise_if_out_of_memory(reason)
         raise ModelFileError(f"{path}: cannot be run ({said(reason)})" + TAKE_AGAIN) from None
     return model
 

@@ -29,7 +29,7 @@ from ccnn_torch.compensation.model_files.onnx_session import (
     said,
 )
 from ccnn_torch.compensation.networks import network_from_description
-from ccnn_torch.errors import ModelFileError
+from ccnn_torch.errors import ModelFileError, raise_if_out_of_memory
 from ccnn_torch.training import Scaling
 
 Run = Callable[[Array, Array | None], dict[str, Array]]
@@ -73,6 +73,7 @@ def _open_master(content: bytes) -> tuple[dict[str, Any], Compensator]:
         compensator = _rebuild(facts, tensors)
         limits = [compensator.limit.tolist(), compensator.most.tolist()]
     except RUN_ERRORS as reason:
+        raise_if_out_of_memory(reason)
         raise ModelFileError(
             f"its tensors are not those that its metadata lists ({said(reason)})" + TAKE_AGAIN
         ) from None
@@ -99,6 +100,7 @@ def _open_onnx(content: bytes) -> tuple[dict[str, Any], Any]:
     try:
         return facts, open_onnx(content)
     except RUN_ERRORS as reason:
+        raise_if_out_of_memory(reason)
         raise ModelFileError(f"ONNX Runtime does not take its graph ({said(reason)})" + TAKE_AGAIN) from None
 
 

@@ -13,6 +13,8 @@ from ccnn_torch.errors import ModelFileError
 # No model that can be solved for needs as many; a forged one may not compute for ever.
 _MOST_ITERATIONS = 10_000
 _MOST_TERMS = 100
+# Nor has an effect of the library as many numbers on any machine.
+_MOST_NUMBERS = 10_000
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Size = Annotated[float, Field(allow_inf_nan=False, ge=0)]
@@ -62,9 +64,15 @@ class _Domain(_Form):
     principal: _Principal
 
 
+class _Effects(_Form):
+    # Name, number of shapes, number of coefficients of each.
+    acting: list[list[str | Annotated[int, Field(ge=0, le=_MOST_NUMBERS)]]] = []
+
+
 class _Machine(_Form):
     degree: Annotated[int, Field(ge=0, le=_MOST_TERMS)] = 0
     newton: Annotated[int, Field(ge=0, le=_MOST_TERMS)] = 0
+    effects: _Effects | None = None
 
 
 class _Facts(_Form):
@@ -74,7 +82,7 @@ class _Facts(_Form):
     pose: list[_Coordinate]
     network: dict[str, Any]
     geometry: dict[str, Any] = {}
-    effects: dict[str, Any] = {}
+    effects: _Effects | None = None
     machine: _Machine = _Machine()
     domain: _Domain
     limits: dict[str, _Limit]
