@@ -21,7 +21,8 @@ class Pseudoerror:
     Attributes:
         deviation: δ = g(X) - q_c, `[r x] s x n` [SI], revolute joints in [-pi, pi]; 0 where the pose has no joints.
         usable: rows fit to learn from, `[r x] s`, bool.
-        reasons: why rows are not, by "unreachable", "condition" and "deviation"; each `[r x] s`, bool.
+        reasons: why rows are not, by "unreachable", "condition" and "deviation", beside an identified machine also
+            "outlier"; each `[r x] s`, bool.
         condition: condition number of the Jacobian at the commanded joints, `[r x] s` [1].
         remainder_position: what no joint deviation compensates, `[r x] s` [m].
         remainder_rotation: the same of the orientation, `[r x] s` [rad], or None.
@@ -40,6 +41,7 @@ class Pseudoerror:
             "unreachable": "no joints of the nominal mechanism reach the measured pose",
             "condition": "the arm is near a singularity, where a small pose error needs a large joint deviation",
             "deviation": "the joint deviation is larger than max_deviation",
+            "outlier": "the identified machine misses them by more than ten times the usual",
         }
         found = []
         for reason, flagged in self.reasons.items():

@@ -326,3 +326,18 @@ def test_names_beside_something_outside_are_taken_and_the_rest_is_said(played: P
     known, notes = verdict.on(situation)
     assert [k.effect.name for k in known] == told["verdict"]["effects"]
     assert any("left to the network" in note for note in notes)
+
+
+def test_a_gross_outlier_is_not_learned_from_and_is_judged_where_it_is_held_out(played: Path, tmp_path: Path) -> None:
+    table = read_table(played / "rows.csv")
+    first = prepare(make_config(**keys(played)))
+    split = first.dataset.splits[0]
+    wrong = [int(split.train[0]), int(split.test[0])]
+    columns = {f"{n}[{table.units[n]}]": table.raw(n).copy() for n in table.names}
+    columns["x[m]"][wrong] += 5e-3
+    write_table(tmp_path / "rows.csv", columns)
+    rows = prepare(make_config(**keys(played, records=str(tmp_path / "rows.csv"))))
+    flagged = torch.nonzero(rows.pseudoerror.reasons["outlier"][0]).squeeze(-1).tolist()
+    assert flagged == wrong[:1]
+    assert not bool(rows.dataset.usable[0, wrong[0]]) and bool(rows.dataset.usable[0, wrong[1]])
+    assert any("misses them by more than ten times the usual" in note for note in rows.notes)

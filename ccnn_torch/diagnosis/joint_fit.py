@@ -28,8 +28,8 @@ from ccnn_torch.mechanisms import Mechanism
 
 # Gauss-Newton steps, at most.
 _ROUNDS = 4
-# Times an effect that may have any period acts, at most: a gear train errs with several.
-_TIMES = 3
+# Times an effect that may have any period acts, at most: a gear train errs with more than one.
+_TIMES = 2
 _PARAMETERS = "parameters"
 
 

@@ -19,7 +19,7 @@ from types import FrameType
 
 from ccnn_torch.cli import main
 
-__all__ = ["Outcome", "finite_files", "judged"]
+__all__ = ["Outcome", "finite_files", "judged", "limited"]
 
 LONGEST_SECONDS = 60
 LONGEST_SENTENCE = 2100
@@ -49,7 +49,7 @@ def judged(words: Sequence[object], folder: Path) -> Outcome:
     sys.argv = ["ccnn", *map(str, words)]
     os.chdir(folder)
     told = warnings.catch_warnings(record=True)
-    with _limited(), told as warned, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with limited(), told as warned, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         warnings.simplefilter("default")
         try:
             main()
@@ -74,7 +74,9 @@ def judged(words: Sequence[object], folder: Path) -> Outcome:
 
 
 @contextlib.contextmanager
-def _limited() -> Iterator[None]:
+def limited() -> Iterator[None]:
+    """Within it no more than a minute."""
+
     def stop(number: int, frame: FrameType | None) -> None:
         raise TooLongError
 

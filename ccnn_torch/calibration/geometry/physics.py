@@ -12,6 +12,7 @@ from ccnn_torch.calibration.rows.dataset import Dataset
 from ccnn_torch.compensation import machine_parts
 from ccnn_torch.diagnosis.from_file import TRAINING_ROWS, Known, Verdict, read_verdict
 from ccnn_torch.diagnosis.joint_fit import fit_jointly, loose_parameters, on_fitted_frames
+from ccnn_torch.diagnosis.residual.linearisation import remainder
 from ccnn_torch.display import short_path
 from ccnn_torch.effects import (
     Acting,
@@ -27,6 +28,7 @@ from ccnn_torch.effects import (
 )
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
@@ -46,6 +48,7 @@ class Physics:
         values: all parameters of the real machine, `r x 1 x k` [SI].
         acting: effects on joints and pose, of each repeat.
         every: all of the effects, those on the parameters as well, whose change is in `values`.
+        rows: which were fitted to, `r x s` bool.
     """
 
     source: str
@@ -53,6 +56,7 @@ class Physics:
     values: Tensor
     acting: list[list[Acting]]
     every: list[list[Acting]]
+    rows: Tensor
 
     def frames(self, repeat: int, moved: Tensor) -> Tensor:
         """Frame of the pose of all rows at command and what was learned there, `s x n` [SI], as `reached` gives it."""
@@ -66,6 +70,8 @@ class Physics:
 
     def targets(self, joints: Tensor, pose: Tensor, settings: dict[str, Any]) -> Pseudoerror:
         """What is left to be learned: the joints at which this machine has the measured pose, less the command.
+
+        Gross outliers among the rows that were fitted to are not learned from.
 
         Args:
             joints: commanded, `s x n` [SI].
@@ -84,7 +90,11 @@ class Physics:
             for _ in range(_STEPS if own else 0):
                 left = whole - moved_joints(replace(one, joints=joints + left), own)
             parts.append(left)
-        return replace(found, deviation=torch.stack(parts))
+        about = zip(self.situations, self.acting, self.values, strict=True)
+        left = torch.stack([remainder(one, pose, own, values[0])[:, :3].norm(dim=-1) for one, own, values in about])
+        outlier = self.rows & ~inlying(left, self.rows, 3, 0)
+        reasons = found.reasons | {"outlier": outlier}
+        return replace(found, deviation=torch.stack(parts), usable=found.usable & ~outlier, reasons=reasons)
 
     def uses(self, repeat: int) -> list[str]:
         """Names of the covariates without which the effects change."""
@@ -162,7 +172,7 @@ def fit_physics(
         if identify and any(k.effect.kind == "parameters" for k in known):
             known = [k for k in known if k.effect.kind != "parameters"]
             notes.append("The verdict's geometry is left to geometry=identify, which fits all parameters.")
-    situations, every, values = [], [], []
+    situations, every, values, fitted_to = [], [], [], []
     for k, split in enumerate(splits):
         base = None if parameters is None else parameters[k, 0]
         situation = on_fitted_frames(replace(rows, parameters=base))
@@ -176,6 +186,7 @@ def fit_physics(
         situations.append(situation)
         every.append(fitted)
         values.append(own)
+        fitted_to.append(fit)
     acting = [[a for a in one if a.effect.kind != "parameters"] for one in every]
     if identify:
         notes.append(
@@ -189,7 +200,7 @@ def fit_physics(
         seen = "; their periods and other shapes are the file's, which may have seen the held-out rows"
         found = verdict.path == TRAINING_ROWS
         notes.append(f"Effects{'' if found else f' of {source}'}: {named}. {fitted_anew}{'' if found else seen}.")
-    return Physics(source, situations, torch.stack(values).unsqueeze(1), acting, every), notes
+    return Physics(source, situations, torch.stack(values).unsqueeze(1), acting, every, torch.stack(fitted_to)), notes
 
 
 def _refuse_lacking(verdict: Verdict, mechanism: Mechanism, records: Records) -> None:
