@@ -180,8 +180,9 @@ def test_the_real_robot_runs_from_the_shipped_records(cli: Cli, tmp_path: Path) 
     assert code == 0, err
     results = json.loads((out / "results.json").read_text())
     assert results["rows"]["train"] + results["rows"]["validation"] == 350
-    # Damped by default, so that rows near a singularity are learned from like all others.
-    assert results["records"]["rows_set_aside"] == []
+    # Damped by default, so that rows near a singularity are learned from like all others; one is 2 mm off.
+    assert results["records"]["rows_set_aside"] == [252]
+    assert results["records"]["why_set_aside"]["outlier"] == 1
     position = results["pose"]["position"]
     # Frames alone leave about 1.0 mm on this robot; a few refinement steps of three nodes already help.
     assert 0.9e-3 < position["before"]["rms"]["median"] < 1.2e-3
@@ -199,7 +200,8 @@ def test_rows_near_a_singularity_are_set_aside_where_asked_for(cli: Cli, tmp_pat
     results = json.loads((out / "results.json").read_text())
     aside = results["records"]["rows_set_aside"]
     assert 0 < len(aside) < 50
-    assert results["records"]["why_set_aside"]["condition"] == len(aside) == results["rows"]["not_trained_on"]
+    why = results["records"]["why_set_aside"]
+    assert why["condition"] == len(aside) - why["outlier"] > 0 and len(aside) == results["rows"]["not_trained_on"]
     assert any("near a singularity" in note for note in results["notes"])
 
 
