@@ -25,6 +25,7 @@ from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, Whitening, moving_channels, renewed
 from ccnn_torch.effects import Acting, Effect, Situation
 from ccnn_torch.mechanisms import Mechanism
+from ccnn_torch.numerics.outliers import inlying
 
 # Gauss-Newton steps, at most.
 _ROUNDS = 4
@@ -217,9 +218,12 @@ class _Rows:
         return [*self.grouped.values()]
 
     def whitening(self) -> Whitening:
-        """From the richest fit."""
+        """Noise from the richest fit; rows that only all effects together explain count as yet."""
         channels = moving_channels(self.model.situation)
-        return fitted_whitening(self.target, [self.columns[..., g] for g in self.groups], channels, None, self.fine)
+        white = fitted_whitening(self.target, [self.columns[..., g] for g in self.groups], channels, None, self.fine)
+        left = self.left[:, channels] / white.sigma
+        near = inlying(left.norm(dim=-1), self.fine, len(channels), 0)
+        return replace(white, weight=(self.fine & near).to(left.dtype))
 
     def grams(self, white: Whitening) -> Grams:
         return grams_of(white(self.columns), white(self.target))
