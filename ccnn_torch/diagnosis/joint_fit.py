@@ -61,13 +61,15 @@ def fit_jointly(
     model = _Model(situation, known, loose)
     at, white = model.nominal.new_zeros(model.size), None
     before: tuple[Tensor, Tensor] | None = None
-    for _ in range(_ROUNDS):
+    for turn in range(_ROUNDS + 1):
         rows = model.about(at, measured, usable)
         white = rows.whitening() if white is None else white
         white = replace(white, weight=torch.where(rows.fine, white.weight, 0.0))
         if before is not None and white(rows.left).square().sum() > white(before[0]).square().sum():
             # A step that leads away from the rows.
             at = before[1]
+            break
+        if turn == _ROUNDS:
             break
         before = rows.left, at
         fit = fit_sets(rows.grams(white), [rows.groups], 0.0)

@@ -446,36 +446,17 @@ def test_any_fact_of_a_machine_replaced_by_anything(with_machine: Path, draw: An
     refused_or_bounded(with_machine, facts, "most_deviation", np.ones(3))
 
 
-@pytest.mark.parametrize("key", ["newton", "degree"])
-def test_a_machine_that_would_compute_for_ever_is_refused(tmp_path: Path, key: str) -> None:
-    about = fields() | {"mechanism": known("tripod").mechanism.describe()}
-    save_model(tmp_path, compensated("tripod"), about, forms=())
-    facts = facts_of(tmp_path)
-    facts["machine"][key] = 10**9
-    path = forge_master(tmp_path, facts, lambda tensors: None)
-    with pytest.raises(ModelFileError, match=rf"'machine\.{key}' wrong \(Input should be less than or equal to 100\)"):
-        load_model(path)
-
-
-@pytest.mark.parametrize("place", [1, 2])
-def test_effects_of_a_thousand_million_numbers_are_refused_before_they_are_made(with_machine: Path, place: int) -> None:
-    facts = facts_of(with_machine)
-    facts["machine"]["effects"]["acting"][0][place] = 10**9
+@pytest.mark.parametrize("place", [("newton",), ("degree",), ("effects", "acting", 0, 1), ("effects", "acting", 0, 2)])
+def test_a_machine_that_would_compute_for_ever_is_refused(with_machine: Path, place: tuple[str | int, ...]) -> None:
+    facts: Any = facts_of(with_machine)
+    part = facts["machine"]
+    for key in place[:-1]:
+        part = part[key]
+    part[place[-1]] = 10**9
     path = forge_master(with_machine, facts, lambda tensors: None)
-    with pytest.raises(ModelFileError, match=r"'machine\.effects\.acting\.0\.\d.*' wrong"):
+    key = r"\.".join(map(str, place))
+    with pytest.raises(ModelFileError, match=rf"'machine\.{key}.*' wrong \(Input should be "):
         load_model(path)
-
-
-def test_memory_that_runs_out_while_a_model_is_read_is_no_fault_of_it(
-    copied: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: Any) -> None:
-        raise RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory")
-
-    for name, where in (("model.safetensors", "_rebuild"), ("model.onnx", "open_onnx")):
-        with monkeypatch.context() as patched, pytest.raises(MemoryError):
-            patched.setattr(f"ccnn_torch.compensation.model_files.master.{where}", full)
-            load_model(copied / name)
 
 
 def test_a_master_that_names_code_does_not_run_it(copied: Path, tmp_path: Path) -> None:

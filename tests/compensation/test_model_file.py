@@ -377,3 +377,15 @@ def test_wrong_shapes_and_missing_covariates(folder: Path) -> None:
         loaded(np.zeros((3, 3)), np.zeros((3, 2)))
     with pytest.raises(InputError, match=r"got the shape \(3, 1\)"):
         loaded(np.zeros((3, 2)), np.zeros((3, 1)))
+
+
+def test_memory_that_runs_out_while_a_model_is_read_is_no_fault_of_it(
+    copied: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory")
+
+    for name, where in (("model.safetensors", "_rebuild"), ("model.onnx", "open_onnx")):
+        with monkeypatch.context() as patched, pytest.raises(MemoryError):
+            patched.setattr(f"ccnn_torch.compensation.model_files.master.{where}", full)
+            load_model(copied / name)
