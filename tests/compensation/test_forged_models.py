@@ -448,8 +448,7 @@ def test_any_fact_of_a_machine_replaced_by_anything(with_machine: Path, draw: An
 
 @pytest.mark.parametrize("place", [("newton",), ("degree",), ("effects", "acting", 0, 1), ("effects", "acting", 0, 2)])
 def test_a_machine_that_would_compute_for_ever_is_refused(with_machine: Path, place: tuple[str | int, ...]) -> None:
-    facts: Any = facts_of(with_machine)
-    part = facts["machine"]
+    part: Any = (facts := facts_of(with_machine))["machine"]
     for key in place[:-1]:
         part = part[key]
     part[place[-1]] = 10**9
