@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -67,8 +68,11 @@ def compiled(mujoco: Any, path: str | Path, spec: Any) -> Any:
 @contextmanager
 def _taken(mujoco: Any, path: str | Path) -> Iterator[None]:
     try:
-        yield
-    except (ValueError, mujoco.FatalError) as reason:
+        with warnings.catch_warnings():
+            # Of an inertia that no body has: what it then gives is no motion.
+            warnings.filterwarnings("error", ".*Check model")
+            yield
+    except (ValueError, mujoco.FatalError, UserWarning) as reason:
         raise InputError(f"{path}: MuJoCo does not take it: {' '.join(str(reason).split())}") from None
 
 
