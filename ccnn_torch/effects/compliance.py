@@ -16,6 +16,8 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm
 SCALE = {"m": 1e-7, "rad": 2e-6}
 """Plausible compliance of a drive: 1e-7 m/N (10 N/µm), 2e-6 rad/(N·m)."""
 _SECONDARY = 0.3
+# How far from the measured point a load may act [m].
+_AWAY = 0.1
 # What a joint carries, by and large [N], [N·m]: stiffening is given there.
 _TYPICAL = {"m": 100.0, "rad": 30.0}
 
@@ -57,10 +59,12 @@ class Compliance:
             for j in mechanism.joints
         ]
         if isinstance(mechanism, SerialArm):
-            tilt = SCALE["rad"] * _SECONDARY
+            tilt, away = SCALE["rad"] * _SECONDARY, SCALE["rad"] * _AWAY
+            turning = [mechanism.joints[i].name for i in _turning(mechanism)]
             return (
                 *found,
                 *(Coefficient(f"{j.name} tilt", "rad/N/m", tilt, j.name, None, True) for j in mechanism.joints),
+                *(Coefficient(f"{j} load {axis}", "rad/N", away, j, None, True) for j in turning for axis in "xyz"),
             )
         stretch = SCALE["m"] * _SECONDARY
         return (*found, *(Coefficient(m.name, "m/N", stretch, m.joint, m.leg, True) for m in members(mechanism)))
@@ -76,7 +80,7 @@ class Compliance:
         ratio = torque.abs() / typical
         parts = [jacobian * (torque * ratio**k).unsqueeze(-2) for k in range(3)]
         arm = isinstance(situation.mechanism, SerialArm)
-        return torch.cat([*parts, _tilting(situation) if arm else _stretching(situation)], -1)
+        return torch.cat([*parts, *_of_an_arm(situation)] if arm else [*parts, _stretching(situation)], -1)
 
 
 def _stretching(situation: Situation) -> Tensor:
@@ -88,16 +92,29 @@ def _stretching(situation: Situation) -> Tensor:
     return torch.cat(moved, -1) if found else slope[..., :0]
 
 
-def _tilting(situation: Situation) -> Tensor:
-    """Change of the pose by links that tilt at their joints, `... x s x c x n`."""
+def _turning(mechanism: Mechanism) -> list[int]:
+    return [i for i, j in enumerate(mechanism.joints) if j.unit == "rad"]
+
+
+def _of_an_arm(situation: Situation) -> list[Tensor]:
+    """Change of the pose by links that tilt at their joints, `... x s x c x n`, and by joints that give under the
+    moment of a load that acts 1 m away from the measured point along each axis of the tool, `... x s x c x 3t`."""
     arm = situation.mechanism
     assert isinstance(arm, SerialArm)
     points, axes = arm_axes(arm, situation.joints, arm.resolve(situation.parameters))
-    lever = situation.platform[0].unsqueeze(-2) - points
+    place, rotation = situation.platform
+    assert rotation is not None
+    lever = place.unsqueeze(-2) - points
     wrench = situation.wrench.unsqueeze(-2)
-    moment = torch.linalg.cross(*torch.broadcast_tensors(lever, wrench[..., :3]), dim=-1)  # type: ignore[no-untyped-call]
+    force = wrench[..., :3]
+    moment = torch.linalg.cross(*torch.broadcast_tensors(lever, force), dim=-1)  # type: ignore[no-untyped-call]
     if wrench.shape[-1] == 6:
         moment = moment + wrench[..., 3:]
     across = moment - (moment * axes).sum(-1, keepdim=True) * axes
     shift = torch.linalg.cross(across, lever, dim=-1)
-    return (shift if wrench.shape[-1] == 3 else torch.cat([shift, across], -1)).mT
+    tilting = (shift if wrench.shape[-1] == 3 else torch.cat([shift, across], -1)).mT
+    away = torch.linalg.cross(*torch.broadcast_tensors(rotation.mT, force), dim=-1)  # type: ignore[no-untyped-call]
+    turning = _turning(arm)
+    torque = (axes @ away.mT)[..., turning, :]
+    jacobian = torch.nan_to_num(situation.jacobian)[..., turning]
+    return [tilting, (jacobian.unsqueeze(-1) * torque.unsqueeze(-3)).flatten(-2)]
