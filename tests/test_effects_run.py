@@ -341,3 +341,14 @@ def test_a_gross_outlier_is_not_learned_from_and_is_judged_where_it_is_held_out(
     assert flagged == wrong[:1]
     assert not bool(rows.dataset.usable[0, wrong[0]]) and bool(rows.dataset.usable[0, wrong[1]])
     assert any("misses them by more than ten times the usual" in note for note in rows.notes)
+
+
+def test_rows_that_no_machine_takes_are_one_sentence(tmp_path: Path) -> None:
+    """Joints in another unit: the search for effects has no row, either."""
+    tripod = load_mechanism("tripod")
+    pose = tripod.sample_workspace(40, torch.Generator().manual_seed(1))
+    joints = tripod.solve_inverse(pose) * torch.tensor([1e-20, 1.0, 1.0], dtype=torch.float64)
+    told = [*zip(tripod.joints, joints.mT, strict=True), *zip(tripod.pose, pose.mT, strict=True)]
+    write_table(tmp_path / "rows.csv", {c.header: values.numpy() for c, values in told})
+    with pytest.raises(InputError, match="no usable row is left in the train part of the split"):
+        calibrate(records=str(tmp_path / "rows.csv"), mechanism="tripod", methods=["constant"], geometry="none")
