@@ -49,14 +49,14 @@ def test_the_config_says_what_is_free_and_where_poses_may_be(cli: Cli, tmp_path:
     config = tmp_path / "plan.yaml"
     config.write_text(
         "parameters: {free: [leg1.*], fixed: [k1], prior: {A1x: 1e-4}}\n"
-        "limits: {x: [-0.2, 0.3]}\nnoise: {x: 1e-5, y: 2e-5}\nindex: O3\ncandidates: 300\nleast_gain: 0.5\n"
+        "limits: {x: [-0.2, 0.3]}\nnoise: {x: 1e-5, y: 2e-5}\ncandidates: 300\nleast_gain: 0.5\n"
     )
     out = tmp_path / "p.csv"
     code, told, _ = cli("plan", "--mechanism", "five_bar", "--poses", 8, "--out", out, "--config", config)
     assert code == 0 and "8 poses for 5 parameters" in told and "After" in told
     x = np.asarray(read_table(out).raw("x"), dtype=float)
     assert x.min() >= -0.2 and x.max() <= 0.3
-    assert "so that O3 is largest" in out.with_suffix(".md").read_text()
+    assert "so that O1 is largest" in out.with_suffix(".md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_the_config_says_what_is_free_and_where_poses_may_be(cli: Cli, tmp_path:
         (("--poses", "5", "fixed=[k1]"), "there is no key 'fixed'; did you mean 'parameters.fixed'?"),
         (("--poses", "5"), "5 poses of 2 equations cannot determine 12 parameters; plan at least 6"),
         (("--poses", "0"), "--poses: plan at least 1 pose, not 0"),
-        (("--poses", "8", "index=D"), "index: must be 'O1', 'O2', 'O3', 'O4' or 'O5', not D"),
+        (("--poses", "8", "index=O3"), "there is no key 'index'"),
         (("--poses", "8", "noise={x: 1e-4}"), "noise: gives no size of y"),
         (("--poses", "8", "joint_noise={p1: 1e-4}"), "joint_noise.p1: there is no such name"),
         (("--poses", "8", "limits={z: [0, 1]}"), "has no joint or pose coordinate 'z'"),

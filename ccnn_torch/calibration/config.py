@@ -27,9 +27,8 @@ from ccnn_torch.config.tree import (
 )
 from ccnn_torch.effects import EFFECTS
 from ccnn_torch.engine import Engine
-from ccnn_torch.evolution.settings import CCNNSettings
+from ccnn_torch.evolution.settings import CCNNSettings, ENNSettings
 from ccnn_torch.learners.bp_lm import BPLMSettings
-from ccnn_torch.learners.enn import ENNSettings
 from ccnn_torch.learners.gp import GPSettings
 from ccnn_torch.learners.grnn import GRNNSettings
 from ccnn_torch.spelling import nearest

@@ -20,7 +20,6 @@ from ccnn_torch.identification.problems.problem import Fit as Fit
 from ccnn_torch.identification.problems.problem import Problem as Problem
 from ccnn_torch.identification.problems.problem import Progress as Progress
 from ccnn_torch.identification.problems.problem import Solver as Solver
-from ccnn_torch.identification.solvers.legs import solve_per_leg as solve_per_leg
 from ccnn_torch.identification.solvers.legs import split_by_leg as split_by_leg
 from ccnn_torch.identification.solvers.lm import solve_lm as solve_lm
 from ccnn_torch.identification.solvers.registry import SOLVERS as SOLVERS

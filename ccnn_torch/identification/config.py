@@ -24,13 +24,10 @@ from ccnn_torch.config.tree import (
     config_from_options,
     written,
 )
-from ccnn_torch.spelling import nearest
-
-IDENTIFY_METHODS = ("lm", "hga", "tikhonov", "ga", "sa", "pso")
-"""Solvers by name; `NAME_per_leg` identifies each leg from its own equations alone."""
+from ccnn_torch.identification.solvers.registry import SOLVERS, unknown_solver
 
 PER_LEG = "_per_leg"
-
+"""A method with this ending identifies each leg from its own equations alone."""
 
 Size = float | str
 """A number in SI, or a text of number and unit, such as `0.4 mm` or `0.03 deg`."""
@@ -191,7 +188,7 @@ class IdentifyConfig(Section):
     methods: Names = Field(
         default=["lm"],
         min_length=1,
-        description=f"solvers: a list of {', '.join(IDENTIFY_METHODS)}, each also as NAME_per_leg; all = the six",
+        description="solvers: a list of lm, hga and tikhonov, each also as NAME_per_leg; all = the three",
     )
     per_leg: bool = Field(
         default=False, description="identify each leg from its own equations in every method, not only NAME_per_leg"
@@ -200,7 +197,7 @@ class IdentifyConfig(Section):
         default=None, description="loss of lm that outliers cannot pull at: huber or cauchy; null = least squares"
     )
     starts: int = Field(default=1, ge=1, description="starts of lm, the first at the nominal values")
-    hga_machines: int = Field(default=5, ge=1, description="machines that hga, ga, sa and pso are run on, at most")
+    hga_machines: int = Field(default=5, ge=1, description="machines that hga is run on, at most")
     settings: dict[str, dict[str, Any]] = Field(
         default={}, description="settings of a method, e.g. {hga: {generations: 500}}"
     )
@@ -223,13 +220,10 @@ class IdentifyConfig(Section):
     @classmethod
     def _known(cls, methods: list[str]) -> list[str]:
         if methods == ["all"]:
-            return list(IDENTIFY_METHODS)
+            return list(SOLVERS)
         for method in methods:
-            if base_method(method) not in IDENTIFY_METHODS:
-                near = nearest(method, [*IDENTIFY_METHODS, *(m + PER_LEG for m in IDENTIFY_METHODS)])
-                known = ", ".join(IDENTIFY_METHODS)
-                hint = f"did you mean '{near}'?" if near else f"known are {known}, each also as NAME_per_leg, and all"
-                raise ValueError(f"there is no method '{method}'; {hint}")
+            if base_method(method) not in SOLVERS:
+                raise ValueError(unknown_solver(method, PER_LEG))
             if methods.count(method) > 1:
                 raise ValueError(f"'{method}' is given twice")
         return methods
@@ -259,9 +253,9 @@ class IdentifyConfig(Section):
             raise ValueError("residual: measured points are compared by joints; write residual=inverse or auto")
         if self.simulate is not None and self.simulate.as_built and not self.simulate.points:
             raise ValueError("simulate.as_built: such a machine is measured by points; give simulate.points")
-        wrong = [name for name in self.settings if name not in IDENTIFY_METHODS]
+        wrong = [name for name in self.settings if name not in SOLVERS]
         if wrong:
-            raise ValueError(f"settings: '{wrong[0]}' is no method; known are {', '.join(IDENTIFY_METHODS)}")
+            raise ValueError(f"settings: {unknown_solver(wrong[0])}")
         return self
 
     def _constrained(self, constraint: ConstraintConfig) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -17,68 +15,18 @@ from ccnn_torch.evolution.breeding import (
     with_elites,
 )
 from ccnn_torch.evolution.coevolution import density, diversity
-from ccnn_torch.evolution.evaluation import fitness, make_task, network_errors
+from ccnn_torch.evolution.evaluation import EPSILON, fitness, make_task, network_errors
 from ccnn_torch.evolution.genome import Genome, select
 from ccnn_torch.evolution.masked_network import MaskedNetwork
 from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.random import uniform_parts
-from ccnn_torch.evolution.settings import check_evolution
+from ccnn_torch.evolution.settings import ENNSettings
 from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import mean_square, usable_rows
 
 # Streams of random numbers: one for the generations, one for each layer's first individuals.
 _GENERATIONS, _FIRST = 0, 1
-
-
-@dataclass(frozen=True)
-class ENNSettings:
-    """Settings of the ENN, named as those of the CCNN. Paper 000 gives none for its ENN: probabilities are its CCNN's.
-
-    Attributes:
-        hidden: nodes of each hidden layer, those of the paper's CCNN.
-        population: networks. With `generations`, as many are evaluated as joined networks of the paper's CCNN (116,000:
-            80 individuals of three layers, each in four networks, over 120 generations).
-        generations: generations.
-        crossover: probability that a pair of parents is crossed.
-        structural_mutation: probability that a bit of a structural offspring flips.
-        weight_mutation: probability that a weight of a weight offspring mutates; one of each layer always does.
-        tournament: contestants of one tournament.
-        crossover_kind: point (cuts at random places of every layer) or uniform.
-        cuts: cut points of a point crossover in each layer; 1 = single-point.
-        elites: networks that survive unchanged.
-        weight_range: weights start and mutate in -weight_range .. weight_range.
-        density: share of connections that exist at the start. With nothing to learn, 0.2 costs less than 0.5 (1.02 to
-            1.05 of the constant's error), and where there is something it makes no difference.
-        bias: whether nodes have a bias, an input that is always on.
-        epsilon: added to the error in eq. 11, on standardised outputs.
-        nonuniform_exponent: b of eq. 13.
-        target_error: end once the training error of eq. 11 (standardised) of every repeat is at most this; 0 = never.
-
-    Raises:
-        ValueError: a value out of its range, in one sentence with the key.
-    """
-
-    hidden: tuple[int, ...] = (6, 6)
-    population: int = 320
-    generations: int = 360
-    crossover: float = 0.72
-    structural_mutation: float = 0.0015
-    weight_mutation: float = 0.0025
-    tournament: int = 3
-    crossover_kind: Literal["point", "uniform"] = "point"
-    cuts: int = 2
-    elites: int = 2
-    weight_range: float = 2.0
-    density: float = 0.2
-    bias: bool = True
-    epsilon: float = 1e-6
-    nonuniform_exponent: float = 2.0
-    target_error: float = 0.0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hidden", tuple(self.hidden))
-        check_evolution(self)
 
 
 class ENN:
@@ -143,7 +91,7 @@ class ENN:
     def finished(self) -> bool:
         """True after the last generation, or once every repeat has reached the target error."""
         settings = self.settings
-        error = 1 / self._best_fitness - settings.epsilon
+        error = 1 / self._best_fitness - EPSILON
         reached = settings.target_error > 0 and bool((error <= settings.target_error).all())
         return reached or self._generation >= settings.generations
 
@@ -193,7 +141,7 @@ class ENN:
 
     def _judge(self) -> None:
         """Fitness of the population, and the best network where one beats it."""
-        self._fitness = fitness(network_errors(self._layers, self._task), self.settings.epsilon)
+        self._fitness = fitness(network_errors(self._layers, self._task))
         highest, which = self._fitness.max(-1, keepdim=True)
         better = highest > self._best_fitness.unsqueeze(-1)
         take = better[..., None, None]

@@ -50,9 +50,6 @@ class PlanConfig(Section):
     joint_noise: Size | dict[str, Size] = Field(
         default=0.0, description="standard deviation of the recorded joints, in SI or as '0.01 deg', one or by joint"
     )
-    index: Literal["O1", "O2", "O3", "O4", "O5"] = Field(
-        default="O1", description="observability index to make large: O1 (determinant, as in the paper) to O5"
-    )
     candidates: int = Field(default=100_000, ge=10, description="configurations that the poses are chosen from")
     limits: dict[str, tuple[Size, Size]] = Field(
         default={}, description="range of a joint or pose coordinate in SI or with units, {x: [-200 mm, 0.3]}"

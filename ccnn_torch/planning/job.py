@@ -56,7 +56,6 @@ def make_plan(
         pose_noise=_pose_noise(config, machine),
         joint_noise=_joint_noise(config, machine),
         residual=config.residual,
-        index=config.index,
         candidates=config.candidates,
         limits=_limits(config, machine),
         max_condition=config.max_condition,

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from ccnn_torch.evolution.settings import CCNNSettings
+from ccnn_torch.evolution.settings import CCNNSettings, ENNSettings
 from ccnn_torch.learners.bp_lm import BPLM, BPLMSettings
 from ccnn_torch.learners.ccnn import CCNN
-from ccnn_torch.learners.enn import ENN, ENNSettings
+from ccnn_torch.learners.enn import ENN
 from ccnn_torch.learners.grnn import GRNN, GRNNSettings
 from ccnn_torch.sklearn.base import LearnerRegressor, SteppedRegressor
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -43,6 +43,14 @@ class Objective:
     def machines(self) -> int:
         """Number of machines, `r`."""
         return self.problem.start.shape[0]
+
+    def of(self, machine: int) -> Objective:
+        """The objective of one machine alone."""
+        one = slice(machine, machine + 1)
+        data = tuple(d[one] for d in self.data)
+        weights = self.problem.weights.expand(self.machines, -1)[one]
+        problem = replace(self.problem, start=self.problem.start[one], data=data, weights=weights)
+        return Objective(problem, data, self.stiffness)
 
     def values(self, points: Tensor) -> Tensor:
         """From coordinates to parameters: `r x … x k` [1] to the same [SI]."""

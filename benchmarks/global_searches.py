@@ -1,12 +1,17 @@
-"""Global searches of well-kept libraries, for comparison: genetic algorithm, particle swarm, simulated annealing.
+"""`ccnn identify` with three global searches besides its own methods: the comparison of Sun et al. (2018).
 
-The first two are pymoo's (Blank and Deb 2020), asked for their populations, which are evaluated together for all
-machines; the third is SciPy's generalised simulated annealing. All stay in the box of `WIDTH` and spend the
-same number of evaluations by default.
+    pip install 'ccnn-torch[benchmarks]'
+    python -m benchmarks.global_searches experiments/overconstrained_2dof.yaml methods=[lm,hga,tikhonov,ga,sa,pso]
+
+Arguments are those of `ccnn identify`. `ga` and `pso` are pymoo's genetic algorithm and particle swarm with its
+defaults (Blank and Deb 2020), asked for their populations, which are evaluated together for all machines. `sa` is
+SciPy's generalised simulated annealing (Xiang et al. 1997) without its local search. All stay in the box of `WIDTH` and
+spend the same number of evaluations by default.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -21,9 +26,10 @@ from pymoo.core.problem import Problem as Box
 from pymoo.problems.static import StaticProblem
 from scipy.optimize import dual_annealing
 
+from ccnn_torch.cli import main
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
-from ccnn_torch.identification.solvers.lockstep import Array, run_side_by_side
 from ccnn_torch.identification.solvers.objective import FORBIDDEN, WIDTH, Objective, make_objective
+from ccnn_torch.identification.solvers.registry import SOLVERS
 
 
 def solve_ga(
@@ -57,32 +63,27 @@ def solve_pso(
 def solve_sa(problem: Problem, seed: int, progress: Progress | None = None, *, evaluations: int = 30_000) -> Fit:
     """Generalised simulated annealing of SciPy (Xiang et al. 1997) without its local search."""
     objective = make_objective(problem)
-    r, k = objective.machines, len(problem.scale)
-    bounds = [(-WIDTH, WIDTH)] * k
-    done = 0
-
-    def evaluate(points: Array) -> list[float]:
-        nonlocal done
-        done += 1
-        if progress is not None and done % 100 == 0:
-            progress(min(done / evaluations, 1.0))
-        found: list[float] = objective.cost(torch.from_numpy(points)[:, None])[:, 0].tolist()
-        return found
-
-    def search(machine: int, ask: Callable[[Array], float]) -> Array:
+    start = np.zeros(len(problem.scale))
+    best, done = [], 0
+    for machine in range(objective.machines):
+        alone = objective.of(machine)
         found = dual_annealing(
-            ask,
-            bounds,
+            lambda point, alone=alone: float(alone.cost(torch.from_numpy(point)[None, None])),
+            [(-WIDTH, WIDTH)] * len(start),
             maxiter=evaluations,  # never reached: an iteration takes 2 k evaluations
             maxfun=evaluations,
             rng=np.random.default_rng(seed + machine),
             no_local_search=True,
-            x0=np.zeros(k),
+            x0=start,
         )
-        return np.asarray(found.x)
+        best.append(torch.from_numpy(np.asarray(found.x)))
+        done = max(done, int(found.nfev))
+        if progress is not None:
+            progress((machine + 1) / objective.machines)
+    return _fit(objective, torch.stack(best), done)
 
-    best = torch.from_numpy(run_side_by_side(search, evaluate, np.zeros((r, k))))
-    return _fit(objective, best, done)
+
+SEARCHES = {"ga": solve_ga, "sa": solve_sa, "pso": solve_pso}
 
 
 def _ask_and_tell(
@@ -128,3 +129,9 @@ def _fit(objective: Objective, points: torch.Tensor, evaluations: int) -> Fit:
     there = cost < FORBIDDEN
     message = "" if bool(there.all()) else "a machine has no parameters in the box with which all rows can be reached"
     return Fit(objective.values(points), cost, there, evaluations, message)
+
+
+if __name__ == "__main__":
+    SOLVERS.update(SEARCHES)
+    sys.argv[:] = ["ccnn", "identify", *sys.argv[1:]]
+    main()
