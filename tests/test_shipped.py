@@ -41,6 +41,7 @@ FLOORS = [
     ["mechanisms", "pseudoerror"],
     ["learners/protocol", "training", "evolution", "learners", "effects"],
     ["identification/problems", "identification/solvers", "identification/identifiability", "identification/__init__"],
+    ["evidence"],
     ["compensation"],
     ["diagnosis"],
     ["motion"],

@@ -6,19 +6,41 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.candidates.atom import Atom
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams, scaled
-from ccnn_torch.diagnosis.evidence.single_groups import NO_COLUMNS, GroupProducts, fit_single_groups, own_products
+from ccnn_torch.evidence.marginal_likelihood import Grams, scaled
+from ccnn_torch.evidence.single_groups import NO_COLUMNS, GroupProducts, fit_single_groups, own_products
 
 # Columns from which their products with all others are worth a call of their own.
 _NARROW = 128
 CERTAIN = 100.0
 """Weight of a noise that is certain, in multiples of the values."""
+
+
+class Candidate(Protocol):
+    """A candidate cause.
+
+    Attributes:
+        name: no set holds two of one name.
+        log_prior: log prior odds.
+        is_discrepancy: whether it stands for something outside the library; no set holds two of these.
+        plain: whether a discrepancy term has straight lines, planes or gentle curves only.
+        form_error: share φ of its squares by which its form may be wrong in every direction.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def log_prior(self) -> float: ...
+    @property
+    def is_discrepancy(self) -> bool: ...
+    @property
+    def plain(self) -> bool: ...
+    @property
+    def form_error(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -63,7 +85,7 @@ class Dictionary:
         noise_dof: as for `fit_sets`.
     """
 
-    atoms: tuple[Atom, ...]
+    atoms: tuple[Candidate, ...]
     columns: Tensor
     groups: Mapping[int, Tensor]
     grams: Grams
@@ -106,7 +128,7 @@ class Singles(NamedTuple):
     products: list[GroupProducts]
 
 
-def singles_of(atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof: float) -> Singles:
+def singles_of(atoms: Sequence[Candidate], x: Sequence[Tensor], y: Tensor, noise_dof: float) -> Singles:
     """Fit no atom, and each alone.
 
     Args:
@@ -121,7 +143,7 @@ def singles_of(atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof:
 
 
 def _alone(
-    products: Mapping[int, GroupProducts], atoms: Sequence[Atom], yy: Tensor, values: float, noise_dof: float
+    products: Mapping[int, GroupProducts], atoms: Sequence[Candidate], yy: Tensor, values: float, noise_dof: float
 ) -> tuple[dict[tuple[int, ...], FittedSet], dict[int, Tensor]]:
     """No atom, and each alone of those whose products are given; the principal axes of each."""
     fits = fit_single_groups([NO_COLUMNS, *products.values()], yy, values, noise_dof)
@@ -171,7 +193,7 @@ def with_noise(dictionary: Dictionary, variance: float) -> Dictionary:
 
 
 def dictionary_of(
-    atoms: Sequence[Atom],
+    atoms: Sequence[Candidate],
     x: Sequence[Tensor],
     y: Tensor,
     others: Sequence[int],

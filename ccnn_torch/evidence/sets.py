@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.batched_sets import BatchedFits, fit_batched_sets
-from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
-from ccnn_torch.diagnosis.search.initial_scale import added_scale
+from ccnn_torch.evidence.batched_sets import BatchedFits, fit_batched_sets
+from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.evidence.initial_scale import added_scale
 
 # Updates of a fit; after the short one no set that came within 12 of the best in the end was 30 below it, in trials.
 _UPDATES, _SHORT, _HOPELESS = 4, 1, 40.0

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.hyperparameters import FIRST_NOISE, LIMIT, SPREAD, Scales
+from ccnn_torch.evidence.hyperparameters import FIRST_NOISE, LIMIT, SPREAD, Scales
 
 # Columns up to which XᵀX is made as a whole.
 _NARROW = 128

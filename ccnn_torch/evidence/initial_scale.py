@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.batched_sets import column_indices
-from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
-from ccnn_torch.diagnosis.evidence.single_groups import fit_in_axes
+from ccnn_torch.evidence.batched_sets import column_indices
+from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.evidence.single_groups import fit_in_axes
 
 _DIGITS = 1e-13
 # Sets are evaluated in one batch where their widths differ by less than this.

@@ -8,9 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from torch import Tensor
 
-from ccnn_torch.diagnosis.candidates.atom import Atom
-from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet, dictionary_of, singles_of
-from ccnn_torch.diagnosis.search.sets import promising
+from ccnn_torch.evidence.dictionary import Candidate, Dictionary, FittedSet, dictionary_of, singles_of
+from ccnn_torch.evidence.sets import promising
 
 _MOST = 4
 # Pairs that go on to sets of three; in a quick search, which ends with pairs, the atoms that these are made of.
@@ -23,7 +22,7 @@ _ALIKE = 2
 
 
 def search(
-    atoms: Sequence[Atom], x: Sequence[Tensor], y: Tensor, noise_dof: float, quick: bool = False
+    atoms: Sequence[Candidate], x: Sequence[Tensor], y: Tensor, noise_dof: float, quick: bool = False
 ) -> tuple[Dictionary, list[FittedSet]]:
     """Sets by log posterior, best first; no set holds a name twice, or two discrepancy terms.
 
@@ -103,7 +102,7 @@ def _top(found: Iterable[FittedSet]) -> float:
     return max((f.log_posterior for f in found), default=-math.inf)
 
 
-def _of_several_drivers(ranked: Sequence[int], atoms: Sequence[Atom]) -> list[int]:
+def _of_several_drivers(ranked: Sequence[int], atoms: Sequence[Candidate]) -> list[int]:
     """The first few discrepancy terms, no more than some of one driver, and the first of the plain ones."""
     chosen: list[int] = []
     for i in (i for i in ranked if not atoms[i].plain):
@@ -112,7 +111,7 @@ def _of_several_drivers(ranked: Sequence[int], atoms: Sequence[Atom]) -> list[in
     return chosen[:_CATCH_ALLS] + [i for i in ranked if atoms[i].plain][:_PLAIN]
 
 
-def _extended(members: tuple[int, ...], extra: int, atoms: Sequence[Atom]) -> tuple[int, ...]:
+def _extended(members: tuple[int, ...], extra: int, atoms: Sequence[Candidate]) -> tuple[int, ...]:
     """The set with one more, in order; () where that would say something twice."""
     if extra in members or atoms[extra].name in {atoms[i].name for i in members}:
         return ()

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.dictionary import Dictionary, FittedSet
-from ccnn_torch.diagnosis.evidence.single_groups import NO_COLUMNS, GroupProducts, fit_single_groups
+from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
+from ccnn_torch.evidence.single_groups import NO_COLUMNS, GroupProducts, fit_single_groups
 
 
 def gain_beside(dictionary: Dictionary, found: FittedSet, groups: Sequence[Tensor], y: Tensor) -> list[float]:

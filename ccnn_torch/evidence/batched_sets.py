@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.diagnosis.evidence.hyperparameters import Scales
-from ccnn_torch.diagnosis.evidence.marginal_likelihood import Grams
+from ccnn_torch.evidence.hyperparameters import Scales
+from ccnn_torch.evidence.marginal_likelihood import Grams
 
 _DIGITS = 1e-13
 
