@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ccnn_torch.compensation.export.export import DAMPED_TOLERANCE
-from ccnn_torch.compensation.machine.machine import ASTRAY
-from ccnn_torch.compensation.targets.form import Array, Form, Program
+from ccnn_torch.compensation.targets.form import Array, Call, Copy, Form, Program, Routine, Statement
 from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
 from ccnn_torch.compensation.targets.template import filled
@@ -90,7 +89,7 @@ def _header(form: Form) -> str:
         real="double" if form.dtype == "float64" else "float",
         joints=len(form.joints),
         covariates=len(form.covariates),
-        sd=form.spread is not None,
+        sd=form.sd,
     )
 
 
@@ -119,28 +118,44 @@ def c_constants(name: str, values: Array, dialect: Dialect) -> str:
 def c_compensation(form: Form, static: str = "") -> str:
     """The functions of the compensation; `static` comes before each, where they are a part of another file."""
     dialect, tables = c_dialect(form.dtype), dict[bytes, str]()
-    texts = [print_program(program, dialect, tables) for program in form.programs]
-    functions = "\n\n".join(c_function(program, text) for program, text in zip(form.programs, texts, strict=True))
-    numbers = {k: v for text in texts for k, v in text.tables.items()}
-    numbers |= {"ccnn_limit": form.limit * (1 + 1e-9)} | ({} if form.machine else {"ccnn_slack": form.slack})
-    numbers |= {} if form.spread is None else {"ccnn_fallback_sd": form.fallback_sd}
-    return filled(
-        "compensation.c.jinja",
-        static=static,
-        tables=[c_constants(name, values, dialect) for name, values in numbers.items()],
-        smaller={name: sign for name, sign in (("min", "<"), ("max", ">")) if f"ccnn_{name}(" in functions},
-        functions=functions,
-        covariates=form.covariates,
-        secant=form.secant is not None,
-        aims=form.machine.aims if form.machine else 0,
-        astray=dialect.literal(ASTRAY),
-        sd=form.spread is not None,
-        kept=form.kept,
-        steps=form.iterations,
-        rounding=dialect.literal(8 * float(np.finfo(form.dtype).eps)),
-        zero=dialect.literal(0.0),
-        s=_suffix(form),
-    )
+    texts = {name: print_program(program, dialect, tables) for name, program in form.programs.items()}
+    functions = [c_function(program, texts[name]) for name, program in form.programs.items()]
+    functions += [_routine(routine, form, dialect, static) for routine in form.routines.values()]
+    numbers = {k: v for text in texts.values() for k, v in text.tables.items()}
+    parts = [c_constants(name, values, dialect) for name, values in numbers.items()]
+    for name, sign in (("min", "<"), ("max", ">")):
+        if any(f"ccnn_{name}(" in function for function in functions):
+            head = f"static inline ccnn_real ccnn_{name}(ccnn_real a, ccnn_real b)"
+            parts.append(f"{head}\n{{\n    return a {sign} b ? a : b;\n}}")
+    return "\n\n".join([*parts, *functions]) + "\n"
+
+
+def _routine(routine: Routine, form: Form, dialect: Dialect, static: str) -> str:
+    """What a user calls; returns the status."""
+    outputs = [f"ccnn_real {name}[]" for name in routine.returns]
+    inputs = [f"const ccnn_real {name}[]" for name in (routine.given, "covariates")]
+    sizes = {name: size for name, size in routine.sizes.items() if name not in routine.returns}
+    lines = [f"ccnn_real {', '.join(f'{name}[{size}]' for name, size in sizes.items())};"]
+    covariates = "covariates"
+    if form.covariates:
+        covariates = "given"
+        value = "given[j] = covariates == NULL ? (ccnn_real)NAN : covariates[j];"
+        lines += ["ccnn_real given[CCNN_COVARIATES];", *dialect.loop("j", len(form.covariates), [value])]
+    else:
+        lines.append("(void)covariates;")
+
+    def printed(statement: Statement) -> list[str]:
+        if isinstance(statement, Call):
+            names = [covariates if name == "covariates" else name for name in (*statement.inputs, *statement.outputs)]
+            return [f"ccnn_{statement.program.name}({', '.join(names)});"]
+        if isinstance(statement, Copy):
+            source = f"{statement.source}[j]" if statement.source else dialect.literal(0.0)
+            return dialect.loop("j", statement.size, [f"{statement.target}[j] = {source};"])
+        return dialect.loop("k", statement.times, [line for part in statement.statements for line in printed(part)])
+
+    lines += [line for statement in routine.statements for line in printed(statement)]
+    head = f"{static}int ccnn_{routine.name}({', '.join([*inputs, *outputs])})"
+    return "\n".join([head, "{", *(f"    {line}" for line in lines), "    return (int)status[0];", "}"])
 
 
 def _suffix(form: Form) -> str:
@@ -162,7 +177,7 @@ def _selftest(form: Form, golden: Golden) -> str:
         "selftest.c.jinja",
         tables=tables,
         covariates=form.covariates,
-        sd=form.spread is not None,
+        sd=form.sd,
         count=len(golden.joints),
         relative=dialect.literal(golden.relative),
         rounding=dialect.literal(4 * float(np.finfo(form.dtype).eps)),

@@ -77,7 +77,7 @@ def golden_vectors(compensator: Compensator, form: Form) -> Golden:
         sd = compensator.sd(*_split(given, n))
     names = ("command", "deviation", "ideal", "status", "ideal_status")
     outputs = {name: getattr(found, name).numpy() for name in names}
-    if form.spread is not None:
+    if form.sd:
         outputs["sd"] = sd.numpy()
     share = SINGLE_TOLERANCE if form.dtype == "float32" else compensator.export_tolerance
     values = given.numpy()

@@ -193,13 +193,12 @@ def costs(form: Form) -> list[str]:
     """Lines for the head of a file: tables, arrays and operations of one command."""
     count = form.operations()
     width = 8 if form.dtype == "float64" else 4
-    tables = {values.tobytes(): len(values) for program in form.programs for values in program.tables.values()}
-    arrays = max(sum(program.sizes[b] for b in program.buffers) for program in form.programs)
+    tables = {values.tobytes(): len(values) for program in form.programs.values() for values in program.tables.values()}
+    arrays = max(sum(program.sizes[b] for b in program.buffers) for program in form.programs.values())
     parts = {what: sum(count[op] for op in ops) for what, ops in _COUNTED.items()}
-    method = "Broyden's method" if form.secant else "Gauss and Newton's method" if form.machine else "the fixed point"
     return [
         f"Tables: {width * sum(tables.values())} bytes. Arrays at work: {width * arrays} bytes at most.",
-        f"Operations of one command ({form.iterations} steps of {method}), always the same: "
+        f"Operations of one command ({form.iterations} steps of {form.method}), always the same: "
         + ", ".join(f"{times} {what}" for what, times in parts.items() if times)
         + ".",
     ]

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ccnn_torch.compensation.machine.machine import ASTRAY
-from ccnn_torch.compensation.targets.form import Array, Form, Program
+from ccnn_torch.compensation.targets.form import Array, Call, Copy, Form, Program, Routine, Statement
 from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
 from ccnn_torch.compensation.targets.template import filled
@@ -25,22 +24,9 @@ def print_structured_text(form: Form, golden: Golden) -> dict[str, str]:
     """Contents of the files by name."""
     dialect, tables = _dialect(form.dtype), dict[bytes, str]()
     about = [*form.facts, "", *_units(form), "", *costs(form)]
-    text = filled(
-        "compensator.st.jinja",
-        about="\n".join(["(*", *(f"   {line}".rstrip() for line in wrapped(about)), "*)"]),
-        blocks=[_block(program, print_program(program, dialect, tables), form) for program in form.programs],
-        limit=_table("limit", form.limit * (1 + 1e-9), form),
-        slack=_table("slack", form.slack, form),
-        fallback_sd="" if form.spread is None else _table("fallback_sd", form.fallback_sd, form),
-        secant=form.secant is not None,
-        aims=form.machine.aims if form.machine else 0,
-        astray=_literal(ASTRAY, form.dtype),
-        kept=form.kept,
-        steps=form.iterations,
-        rounding=_literal(8 * float(np.finfo(form.dtype).eps), form.dtype),
-        zero=_literal(0.0, form.dtype),
-        **_sizes(form),
-    )
+    comment = "\n".join(["(*", *(f"   {line}".rstrip() for line in wrapped(about)), "*)"])
+    blocks = [_block(program, print_program(program, dialect, tables), form) for program in form.programs.values()]
+    text = "\n\n".join([comment, *blocks, *(_routine(routine, form) for routine in form.routines.values())]) + "\n"
     readme = filled("structured_text.md.jinja", real=_real(form))
     return {"compensator.st": text, "selftest.st": _selftest(form, golden), "README.md": readme}
 
@@ -151,6 +137,60 @@ def _block(program: Program, text: Text, form: Form) -> str:
             *_section("VAR CONSTANT", [_table(name, values, form) for name, values in text.tables.items()]),
             *_section("VAR", variables),
             *text.lines,
+            "END_FUNCTION_BLOCK",
+        ]
+    )
+
+
+def _routine(routine: Routine, form: Form) -> str:
+    """What a user calls, as a function block; the programs are instances in it."""
+    real = _real(form)
+    programs = dict.fromkeys(call.program.name for call, _ in routine.calls)
+    # Where a variable is: an output of an instance, or an array of its own.
+    places = {
+        variable: f"{call.program.name}_block.{name}_out"
+        for call, _ in routine.calls
+        for variable, name in zip(
+            call.outputs, [name for name, ids in call.program.outputs.items() if ids], strict=True
+        )
+    }
+
+    def printed(statement: Statement) -> list[str]:
+        if isinstance(statement, Call):
+            pairs = zip(statement.program.inputs, statement.inputs, strict=True)
+            given = ", ".join(f"{name} := {places.get(variable, variable)}" for name, variable in pairs)
+            return [f"{statement.program.name}_block({given});"]
+        if isinstance(statement, Copy):
+            source = f"{places.get(statement.source, statement.source)}[j]" if statement.source else zero
+            return loop("j", statement.size, [f"{statement.target}[j] := {source};"])
+        return loop("k", statement.times, [line for part in statement.statements for line in printed(part)])
+
+    loop, zero = _dialect(form.dtype).loop, _literal(0.0, form.dtype)
+    own = {name: size for name, size in routine.sizes.items() if name not in places}
+    inputs = {routine.given: len(form.joints), "covariates": len(form.covariates)}
+    lines = [line for statement in routine.statements for line in printed(statement)]
+    for name in routine.returns:
+        lines += loop("j", len(form.joints), [f"{name}[j] := {places[name]}[j];"])
+    name = "".join(part.capitalize() for part in routine.name.split("_"))
+    return "\n".join(
+        [
+            f"(* {routine.about} *)",
+            f"FUNCTION_BLOCK CCNN_{name}",
+            *_section("VAR_INPUT", [_array(name, size, real) for name, size in inputs.items()]),
+            *_section(
+                "VAR_OUTPUT",
+                [*(_array(name, len(form.joints), real) for name in routine.returns), "    status : INT;"],
+            ),
+            *_section(
+                "VAR",
+                [
+                    *(f"    {name}_block : CCNN_{name.capitalize()}_;" for name in programs),
+                    *(_array(name, size, real) for name, size in own.items()),
+                    "    j, k : DINT;",
+                ],
+            ),
+            *lines,
+            f"status := {real}_TO_INT({places['status']}[0]);",
             "END_FUNCTION_BLOCK",
         ]
     )
