@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from ccnn_torch.diagnosis.config import load_diagnose_config
-from ccnn_torch.identification.config import load_identify_config
-from ccnn_torch.planning.config import load_plan_config
+from ccnn_torch.diagnosis.config import DiagnoseConfig
+from ccnn_torch.identification.config import IdentifyConfig
+from ccnn_torch.planning.config import PlanConfig
 from ccnn_torch.records import read_table
-from ccnn_torch.verification.config import load_verify_config
+from ccnn_torch.verification.config import VerifyConfig
 
 Cli = Callable[..., tuple[int, str, str]]
 PLANNED = ("candidates=300", "--quiet", "--poses", 8, "--out")
@@ -73,7 +73,9 @@ def test_options_stand_for_keys(config: Path, tmp_path: Path, cli: Cli) -> None:
         assert code == 2 and sentence in err and err.count("\n") == 1
 
 
-@pytest.mark.parametrize("load", [load_diagnose_config, load_identify_config, load_plan_config, load_verify_config])
+@pytest.mark.parametrize(
+    "load", [DiagnoseConfig.from_file, IdentifyConfig.from_file, PlanConfig.from_file, VerifyConfig.from_file]
+)
 def test_what_no_command_knows_is_refused_with_the_nearest_key(
     load: Callable[..., object], config: Path, tmp_path: Path
 ) -> None:

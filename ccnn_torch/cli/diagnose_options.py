@@ -28,11 +28,11 @@ def configured(
     """The config file, overridden by the options of the command line; `overrides` may begin with the config."""
     from ccnn_torch.config.noise import read_noise
     from ccnn_torch.config.overrides import listed_files
-    from ccnn_torch.diagnosis.config import load_diagnose_config
+    from ccnn_torch.diagnosis.config import DiagnoseConfig
 
     noise_key = [] if noise is None else [f"noise={json.dumps(read_noise(noise))}"]
     file, changes = config_and_changes(overrides or [], config)
-    wanted = load_diagnose_config(file, [*changes, *noise_key], noted(quiet))
+    wanted = DiagnoseConfig.from_file(file, [*changes, *noise_key], noted(quiet))
     names = None if effects is None else [e.strip() for e in effects.split(",") if e.strip()]
     given = {
         "records": None if records is None else listed_files(str(records), Path()),

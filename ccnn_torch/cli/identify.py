@@ -46,11 +46,12 @@ def identify(
 
     ccnn compensate runs/arm/identified.yaml poses.csv commands.csv --pose
     """
-    from ccnn_torch.identification.config import describe_identify_keys, load_identify_config
+    from ccnn_torch.config.keys import list_keys
+    from ccnn_torch.identification.config import IdentifyConfig
     from ccnn_torch.identification.job import resume_identification, start_identification
 
     if keys:
-        for key, default, description in describe_identify_keys():
+        for key, default, description in list_keys(IdentifyConfig):
             typer.echo(f"{key}={default}\n    {description}")
         return
     file, changes = config_and_changes(
@@ -63,4 +64,4 @@ def identify(
         return
     if file is None and not changes:
         raise InputError("name a config, for example: ccnn identify experiments/five_bar.yaml (or --resume DIR)")
-    start_identification(load_identify_config(file, changes, noted(quiet)), quiet=quiet)
+    start_identification(IdentifyConfig.from_file(file, changes, noted(quiet)), quiet=quiet)

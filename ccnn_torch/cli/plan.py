@@ -50,14 +50,14 @@ def plan(
 
     ccnn plan --mechanism my_machine.py:MyMachine --poses 24 --out poses.csv --config plan.yaml
     """
-    from ccnn_torch.planning.config import load_plan_config
+    from ccnn_torch.planning.config import PlanConfig
     from ccnn_torch.planning.job import check_plan_file, make_plan, write_plan
     from ccnn_torch.planning.page import gain_table, left_out_sentence, parameter_table, plan_sentence
     from ccnn_torch.report.screen import progress_bar, say, say_place, stdout
     from ccnn_torch.report.table import print_table
 
     file, changes = config_and_changes(overrides or [], config, mechanism=mechanism, seed=seed)
-    wanted = load_plan_config(file, changes, noted(quiet))
+    wanted = PlanConfig.from_file(file, changes, noted(quiet))
     if wanted.mechanism is None:
         raise InputError("mechanism: is missing; give --mechanism, or the key in a config")
     if records is not None:

@@ -54,7 +54,7 @@ def run(
     if file is not None:
         # Before torch is loaded: a file that is not there need not wait for it.
         read_yaml(file)
-    from ccnn_torch.calibration.config import load_config
+    from ccnn_torch.calibration.config import RunConfig
     from ccnn_torch.calibration.job import resume_run, start_run
 
     if resume is not None:
@@ -64,4 +64,4 @@ def run(
         return
     if file is None and not changes:
         raise InputError("name a config, for example: ccnn run experiments/tripod.yaml (or --resume RUN_DIR)")
-    start_run(load_config(file, changes), quiet=quiet)
+    start_run(RunConfig.from_file(file, changes), quiet=quiet)

@@ -58,12 +58,12 @@ def simulate(
     from ccnn_torch.config.noise import read_noise
     from ccnn_torch.report.screen import say, say_place, stdout
     from ccnn_torch.report.table import print_table
-    from ccnn_torch.simulation.config import load_simulate_config
+    from ccnn_torch.simulation.config import SimulateConfig
     from ccnn_torch.simulation.job import simulate_records
     from ccnn_torch.simulation.outputs import injected_table, write_simulated
 
     with if_stopped(NOTHING_WRITTEN):
-        wanted = load_simulate_config(config, overrides or [])
+        wanted = SimulateConfig.from_file(config, overrides or [])
         made = simulate_records(mechanism, effect or [], rows, read_noise(noise), wanted, seed)
     write_simulated(out, made)
     if quiet:

@@ -61,12 +61,12 @@ def verify(
     """
     with if_stopped(NOTHING_WRITTEN):
         from ccnn_torch.compensation import load_compensation
-        from ccnn_torch.verification.config import load_verify_config
+        from ccnn_torch.verification.config import VerifyConfig
         from ccnn_torch.verification.job import verify_model
         from ccnn_torch.verification.page import write_verify_report
 
         file, changes = config_and_changes([], config, records=records or records_option, mechanism=mechanism)
-        wanted = load_verify_config(file, changes, noted(quiet))
+        wanted = VerifyConfig.from_file(file, changes, noted(quiet))
         if wanted.records is None:
             raise InputError("records: are missing; give RECORDS.csv, --records, or the key in a config")
         loaded = load_compensation(model, public_key=public_key, allow_code=allow_code)
