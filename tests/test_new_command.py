@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.cli.completion import MECHANISMS, complete_mechanism
+from ccnn_torch.cli.options import MECHANISMS, complete_mechanism
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.registry import REGISTRY
