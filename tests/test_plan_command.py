@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from ccnn_torch.config.keys import list_keys
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.planning.config import PlanConfig, describe_plan_keys, load_plan_config
+from ccnn_torch.planning.config import PlanConfig
 from ccnn_torch.planning.job import make_plan
 from ccnn_torch.records import load_records, read_table
 
@@ -95,17 +96,17 @@ def test_a_file_that_is_no_csv_or_cannot_be_written_is_said(cli: Cli, tmp_path: 
 
 
 def test_every_key_is_described_and_an_empty_config_is_the_defaults(tmp_path: Path) -> None:
-    keys = describe_plan_keys()
+    keys = [*list_keys(PlanConfig)]
     assert all(description for _, _, description in keys)
     empty = tmp_path / "empty.yaml"
     empty.write_text("")
-    assert load_plan_config(empty) == load_plan_config(None)
+    assert PlanConfig.from_file(empty) == PlanConfig.from_file(None)
     assert {key.partition(".")[0] for key, _, _ in keys} == set(PlanConfig.model_fields)
 
 
 def test_a_mechanism_that_is_at_hand_needs_no_name() -> None:
     told: list[float] = []
-    config = load_plan_config(None, ["candidates=200"])
+    config = PlanConfig.from_file(None, ["candidates=200"])
     mechanism, plans = make_plan(load_mechanism("tripod"), 6, config, told.append)
     assert mechanism.name == "tripod" and len(plans) == 1 and told == sorted(told)
     with pytest.raises(InputError, match="unknown mechanism 'tripot'"):
@@ -114,7 +115,7 @@ def test_a_mechanism_that_is_at_hand_needs_no_name() -> None:
 
 def test_the_page_on_planning_lists_every_key_as_it_is() -> None:
     page = (Path(__file__).parent.parent / "docs" / "how_to" / "planning.md").read_text()
-    for key, default, description in describe_plan_keys():
+    for key, default, description in list_keys(PlanConfig):
         assert f"| `{key}` | `{default}` | {description} |" in page
 
 

@@ -12,7 +12,6 @@ import jsonschema
 import pytest
 from rich.console import Console
 
-from ccnn_torch.calibration.config import dump_config
 from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.json_files import load_schema
@@ -53,7 +52,7 @@ def test_a_suite_runs_its_cases_and_goes_on_where_it_was_stopped(tmp_path: Path)
     before = stamps(kept)
     # As a run that was killed before its first checkpoint leaves it.
     stopped.mkdir()
-    (stopped / "config.yaml").write_text(dump_config(suite.cases["reach"]))
+    (stopped / "config.yaml").write_text(suite.cases["reach"].to_yaml())
     path = run_suite(suite, quiet=True)
     assert stamps(kept) == before
     comparison = json.loads(path.read_text())

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ccnn_torch.calibration.config import RunConfig, dump_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.page.tables import write_tables
 from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError
@@ -125,9 +125,7 @@ def _export(block: Block, again: Callable[[Block], object]) -> None:
     """Write the model files of a finished block; its training is in its checkpoints."""
     if (block.folder.path / "card.json").is_file():
         return
-    block.folder.write(
-        "config.yaml", dump_config(block.config.model_copy(update={"save_models": True}), block.folder.path)
-    )
+    block.folder.write("config.yaml", block.config.model_copy(update={"save_models": True}).to_yaml(block.folder.path))
     block.folder.results.unlink()
     again(block)
 

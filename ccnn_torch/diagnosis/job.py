@@ -93,7 +93,7 @@ def _complete(config: DiagnoseConfig, folder: Path, found: Diagnosis, quiet: boo
         path = write_diagnosis(folder, found, about, config.seed)
     if not quiet:
         print_diagnosis(found.to_json(), stdout, about_of(load_labels(folder)), verdict=False, details=details)
-        say_place(f"Written: {path} and report.html beside it")
+        say_place(f"Written: {typed_path(str(path))} and report.html beside it")
 
 
 def _noise(config: DiagnoseConfig, records: Records) -> dict[str, float] | None:

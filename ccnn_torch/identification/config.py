@@ -5,24 +5,18 @@ Relative paths in a config file start from the file's folder, those on the comma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from ccnn_torch.config.keys import list_keys
 from ccnn_torch.config.split import HeldOutConfig
 from ccnn_torch.config.tree import (
     Columns,
     Files,
+    JobConfig,
     JointMap,
     Names,
     Section,
-    config_from_file,
-    config_from_keys,
-    config_from_options,
-    written,
 )
 from ccnn_torch.identification.solvers.registry import SOLVERS, unknown_solver
 
@@ -133,7 +127,7 @@ class SimulateConfig(Section):
     map: int = Field(default=0, ge=0, description="points across a map of the pose error over the workspace; 0 = none")
 
 
-class IdentifyConfig(Section):
+class IdentifyConfig(JobConfig):
     """An identification: mechanism, data, parameters, methods."""
 
     of_a_run = ("name", "seed", "records", "columns", "joint_map", "mechanism", "mechanism_keys", "split")
@@ -285,38 +279,3 @@ class IdentifyConfig(Section):
 def base_method(method: str) -> str:
     """`lm` of `lm` and of `lm_per_leg`."""
     return method.removesuffix(PER_LEG)
-
-
-def load_identify_config(
-    path: str | Path | None, overrides: Iterable[str] = (), note: Callable[[str], None] | None = None
-) -> IdentifyConfig:
-    """Read a config file and put overrides ``key.sub=value`` over it; without a file these are all.
-
-    A config for `ccnn run`, as `ccnn new` writes it, gives its records, machine and split; `note` is called with a
-    sentence on the others.
-
-    Raises:
-        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
-    """
-    if path is None:
-        return config_from_options(IdentifyConfig, None, overrides)
-    return config_from_file(IdentifyConfig, path, overrides, note)
-
-
-def make_identify_config(**keys: Any) -> IdentifyConfig:
-    """A config from keys; relative paths start from the current folder.
-
-    Raises:
-        InputError: keys are wrong: one line that names them all.
-    """
-    return config_from_keys(IdentifyConfig, keys)
-
-
-def dump_identify_config(config: IdentifyConfig, folder: Path | None = None) -> str:
-    """The resolved config as YAML, paths relative to `folder` if given; `load_identify_config` gives an equal one."""
-    return written(config, folder)
-
-
-def describe_identify_keys() -> list[tuple[str, str, str]]:
-    """Every key, dotted, with its default and what it means."""
-    return list(list_keys(IdentifyConfig))

@@ -15,7 +15,7 @@ from ccnn_torch.config.held_out import Given
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Fit, Progress
-from ccnn_torch.identification.config import IdentifyConfig, base_method, dump_identify_config
+from ccnn_torch.identification.config import IdentifyConfig, base_method
 from ccnn_torch.identification.constrained.identify import identify_by_constraint
 from ccnn_torch.identification.identifiability.bootstrap import bootstrap
 from ccnn_torch.identification.measured.measured import Measured
@@ -81,7 +81,7 @@ class Identification:
             table = read_source(self.given)
             write_table(folder / "records.csv", {table.header(name): table.raw(name) for name in table.names})
             config = config.model_copy(update={"records": str(folder / "records.csv")})
-        write_whole(folder / "config.yaml", dump_identify_config(config, folder))
+        write_whole(folder / "config.yaml", config.to_yaml(folder))
         write_outputs(self, folder)
 
     def nominal(self) -> dict[str, float]:

@@ -65,7 +65,9 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
             _report(config, folder, results, found)
             if not quiet:
                 print_diagnosis(results, stdout, about_of(load_labels(folder)), verdict=False, details=details)
-                say_place(f"Written: {folder / RESULT}, and beside it report.html, {', '.join(written)}")
+                say_place(
+                    f"Written: {typed_path(str(folder / RESULT))}, and beside it report.html, {', '.join(written)}"
+                )
     return folder
 
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
 
-from ccnn_torch.config.keys import list_keys
-from ccnn_torch.config.tree import Columns, JointMap, Names, Section, config_from_options
+from ccnn_torch.config.tree import Columns, JobConfig, JointMap, Names, Section
 
 Size = float | str
 """A number in SI, or a text of number and unit, such as `0.1 mm` or `0.03 deg`."""
@@ -27,7 +24,7 @@ class PlannedParameters(Section):
     )
 
 
-class PlanConfig(Section):
+class PlanConfig(JobConfig):
     """What `ccnn plan` accepts."""
 
     of_a_run = ("columns", "joint_map", "mechanism", "mechanism_keys", "seed")
@@ -71,21 +68,3 @@ class PlanConfig(Section):
         description="poses stay in reach of machines whose parameters are off by so many plausible errors",
     )
     seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the candidates")
-
-
-def load_plan_config(
-    path: Path | None, overrides: Iterable[str] = (), note: Callable[[str], None] | None = None
-) -> PlanConfig:
-    """Read a config file (defaults where there is none) and put overrides ``key.sub=value`` over it.
-
-    A config for `ccnn run`, as `ccnn new` writes it, gives its machine; `note` is called with a sentence on the others.
-
-    Raises:
-        InputError: the file or an override cannot be read, or keys are wrong: one line that names them all.
-    """
-    return config_from_options(PlanConfig, path, overrides, note)
-
-
-def describe_plan_keys() -> list[tuple[str, str, str]]:
-    """Every key, dotted, with its default and what it means."""
-    return list(list_keys(PlanConfig))

@@ -18,7 +18,7 @@ from ccnn_torch.identification import ParameterChoice
 from ccnn_torch.identification.problems.problem import Progress
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.planning import Plan, plan_poses
-from ccnn_torch.planning.config import PlanConfig, load_plan_config
+from ccnn_torch.planning.config import PlanConfig
 from ccnn_torch.planning.figure import plan_plot
 from ccnn_torch.planning.page import plan_markdown
 from ccnn_torch.records import write_table
@@ -43,7 +43,7 @@ def make_plan(
     Raises:
         InputError: as `load_mechanism` and `plan_poses`; a size that is invalid, or of an unknown name.
     """
-    config = config or load_plan_config(None)
+    config = config or PlanConfig.from_file(None)
     if poses < 1:
         raise InputError(f"--poses: plan at least 1 pose, not {poses}")
     machine = load_mechanism(mechanism, **config.mechanism_keys) if isinstance(mechanism, str) else mechanism
@@ -98,7 +98,7 @@ def write_plan(
     for coordinates, part in ((mechanism.joints, "joints"), (mechanism.pose, "pose")):
         values = torch.cat([getattr(plan, part) for plan in plans])
         columns |= {c.header: values[:, i].numpy() for i, c in enumerate(coordinates)}
-    columns |= _commands(columns, mechanism, config or load_plan_config(None))
+    columns |= _commands(columns, mechanism, config or PlanConfig.from_file(None))
     make_folder(path.parent)
     write_table(path, columns)
     plot = plan_plot(mechanism.pose, plans, least_gain)

@@ -71,18 +71,6 @@ class Records:
         return len(self.lines)
 
     @property
-    def joint_units(self) -> dict[str, str]:
-        """Unit of each joint as written in the file."""
-        return {joint.name: self.units[joint.name] for joint in self.joint_coordinates}
-
-    @property
-    def pose_units(self) -> dict[str, str]:
-        """Unit of each pose coordinate as written in the file (rad for a quaternion's rotation vector)."""
-        return {
-            coordinate.name: self.units.get(coordinate.name, coordinate.unit) for coordinate in self.pose_coordinates
-        }
-
-    @property
     def positions(self) -> Tensor:
         """The pose coordinates that are lengths, `rows x d` [m]."""
         return self.pose[:, [k for k, coordinate in enumerate(self.pose_coordinates) if coordinate.unit == "m"]]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ccnn_torch.calibration.calibrate import makers
-from ccnn_torch.calibration.config import RunConfig, load_config
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.job import resume_run, start_run
 from ccnn_torch.engine import Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError
@@ -100,7 +100,7 @@ def check_folder(config: RunConfig) -> None:
     folder = RunFolder(Path(config.out))
     if not folder.config.is_file():
         return
-    there, wanted = (_comparable(c) for c in (load_config(folder.config), config))
+    there, wanted = (_comparable(c) for c in (RunConfig.from_file(folder.config), config))
     other = sorted(key for key in wanted if there[key] != wanted[key])
     if other:
         raise InputError(

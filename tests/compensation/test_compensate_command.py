@@ -11,7 +11,7 @@ import typer
 from stand_ins import fields, tripod_joints
 from typer.testing import CliRunner
 
-from ccnn_torch.cli.compensate import compensate
+from ccnn_torch.cli.with_model import compensate
 from ccnn_torch.compensation import Compensator, fit_compensator, load_model, save_model
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, ModelFileError

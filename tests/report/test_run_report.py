@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from ccnn_torch.calibration.page.report import html_text, make_picture, write_report
 from ccnn_torch.calibration.page.tables import markdown_text, print_tables, result_tables, verdict, worse_text
 from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback, tags_of
-from ccnn_torch.cli.picture import picture
+from ccnn_torch.cli.with_model import picture
 from ccnn_torch.errors import InputError
 from ccnn_torch.report.csv_file import tidy_rows
 from ccnn_torch.report.event_file import EventFile
