@@ -337,6 +337,10 @@ def test_cards(copied: Path) -> None:
     (copied / "ccnn.card.json").write_text(json.dumps(card | {"limits": {}}))
     with pytest.raises(ModelFileError, match="its card says something else about 'limits'"):
         load_model(path)
+    for key, value in (("columns", " "), ("columns", {"A1": 1}), ("joint_map", [["q1", "J1"]])):
+        (copied / "ccnn.card.json").write_text(json.dumps(card | {key: value}))
+        with pytest.raises(ModelFileError, match=f"{key} is no table of names and texts"):
+            load_model(path)
     (copied / "ccnn.card.json").write_text("{")
     with pytest.raises(ModelFileError, match="this card is damaged"):
         load_model(path)
