@@ -23,9 +23,9 @@ def compare(
 
     ccnn compare runs/* --out runs.csv
     """
-    from ccnn_torch.comparison.table import read_runs, runs_table, write_runs
     from ccnn_torch.report.screen import stdout
     from ccnn_torch.report.table import print_table
+    from ccnn_torch.study.compare import read_runs, runs_table, write_runs
 
     found = read_runs(runs)
     if out is not None:

@@ -29,8 +29,8 @@ def suite(
 
     ccnn suite experiments/realistic.yaml realistic.noise=1e-6 --out runs/quiet_tracker --seed 100
     """
-    from ccnn_torch.suite.config import load_suite
-    from ccnn_torch.suite.job import run_suite
+    from ccnn_torch.study.suite import run_suite
+    from ccnn_torch.study.suite_config import load_suite
 
     changes = list(overrides or [])
     changes += [f"out={out}"] if out is not None else []

@@ -32,8 +32,8 @@ def sweep(
 
     ccnn sweep experiments/tripod.yaml seed=0,10,20 repeats=10 --out runs/seeds --engine tcp://10.0.0.5:8786
     """
-    from ccnn_torch.sweep.config import load_sweep
-    from ccnn_torch.sweep.job import run_sweep
+    from ccnn_torch.study.sweep import run_sweep
+    from ccnn_torch.study.sweep_config import load_sweep
 
     words = [*(changes or []), *([] if engine is None else [f"engine={engine}"])]
     run_sweep(load_sweep(config, words, out), quiet=quiet)
