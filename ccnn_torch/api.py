@@ -17,8 +17,9 @@ from ccnn_torch.identification.identify import Identification
 from ccnn_torch.identification.identify import identify as _identify
 from ccnn_torch.motion import MotionDiagnosis
 from ccnn_torch.motion.job import diagnosed
-from ccnn_torch.sweep.config import load_sweep
-from ccnn_torch.sweep.job import Row, run_sweep
+from ccnn_torch.report.results.verify import VerifyResults
+from ccnn_torch.study.sweep import Row, run_sweep
+from ccnn_torch.study.sweep_config import load_sweep
 from ccnn_torch.verification.job import verify_model
 
 
@@ -109,7 +110,7 @@ def verify(
     refit_frames: bool = False,
     allow_code: bool = False,
     public_key: str | Path | None = None,
-) -> dict[str, Any]:
+) -> VerifyResults:
     """Test a model on new rows, against the error promised by its held-out rows; nothing is written.
 
     Args:

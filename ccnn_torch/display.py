@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import PurePath
-from typing import Any
 
 # All but letters, digits and signs that open, close or continue nothing in C, Structured Text, HAL, CSV and Markdown;
 # `*` and `/` stand within a unit, and no sign at the beginning makes a formula of a cell or a request of a manual page.
@@ -102,29 +101,3 @@ def is_shown(character: str) -> bool:
 def short_path(path: str) -> str:
     """A file's folder and name: enough to know it by, and nothing of the machine on which a page was made."""
     return "/".join(PurePath(path).parts[-2:])
-
-
-def interval_text(spread: Mapping[str, Any] | None, scale: float = 1.0, digits: int = 4) -> str:
-    """A spread as `median [low, high]`, or as one number when all repeats agree; says how many repeats have none.
-
-    Args:
-        spread: a block of `results.json`, or None.
-        scale: the unit shown [SI].
-        digits: significant digits of the median; the interval has one less.
-    """
-    if spread is None or spread["median"] is None:
-        return "–"
-    text = number_text(spread["median"] / scale, digits)
-    values = spread["values"]
-    if spread["low"] != spread["high"]:
-        low, high = (number_text(spread[k] / scale, digits - 1) for k in ("low", "high"))
-        text += f" [{low}, {high}]"
-    there = sum(v is not None for v in values)
-    return text if there == len(values) else f"{text} ({there} of {len(values)})"
-
-
-def removed_percent(before: Mapping[str, Any], after: Mapping[str, Any]) -> float | None:
-    """Share of an error that was removed, from the medians [percent]; None where the error before is unknown or 0."""
-    if not before["median"] or after["median"] is None:
-        return None
-    return 100.0 * (1.0 - float(after["median"]) / float(before["median"]))

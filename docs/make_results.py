@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from ccnn_torch.calibration.page.paper_tables import PAPER
-from ccnn_torch.display import interval_text, number_text
+from ccnn_torch.display import number_text
+from ccnn_torch.report.results.base import Spread, interval_text
 
 Results = dict[str, Any]
 Rows = list[list[str]]
@@ -128,6 +129,10 @@ def _cell(table: str, row: str, column: str | int) -> str:
     return found[column if isinstance(column, int) else head.index(column)]
 
 
+def _interval(block: Results | None, scale: float, digits: int) -> str:
+    return interval_text(None if block is None else Spread.model_validate(block), scale, digits)
+
+
 def case_rows(rows: Rows, runs: Sequence[Results]) -> Rows:
     """Mean squared error on held-out rows of a case study [1e-10 m²], beside the paper's for all joints."""
     (results,) = runs
@@ -139,9 +144,9 @@ def case_rows(rows: Rows, runs: Sequence[Results]) -> Rows:
         lines.append(
             [
                 name,
-                *(interval_text(block["test"][joint]["mse"], 1e-10, 3) for joint in joints),
-                interval_text(block["ratio_to_floor"], 1, 3),
-                interval_text(block["coverage"], 1, 3),
+                *(_interval(block["test"][joint]["mse"], 1e-10, 3) for joint in joints),
+                _interval(block["ratio_to_floor"], 1, 3),
+                _interval(block["coverage"], 1, 3),
                 number_text(block["seconds"]["median"], 2),
                 ("–" if results["reach"] is None else "never")
                 if effort is None
@@ -150,7 +155,7 @@ def case_rows(rows: Rows, runs: Sequence[Results]) -> Rows:
             ]
         )
     floor = results["floor"]["realised"]
-    lines.append(["floor", *(interval_text(floor[joint]["mse"], 1e-10, 3) for joint in joints), *["–"] * 5])
+    lines.append(["floor", *(_interval(floor[joint]["mse"], 1e-10, 3) for joint in joints), *["–"] * 5])
     return [rows[0], *lines]
 
 

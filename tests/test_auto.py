@@ -10,6 +10,7 @@ from typing import Any
 import jsonschema
 import pytest
 import torch
+from frozen import frozen
 from safetensors.torch import load_file
 from test_run import short
 from test_uncertainty import linear_dataset
@@ -18,12 +19,12 @@ from toy import Descent
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.learning.early_stop import Plan
 from ccnn_torch.calibration.learning.method_choice import Comparison, compare
-from ccnn_torch.calibration.page.tables import markdown_text
+from ccnn_torch.calibration.page.tables import run_page
 from ccnn_torch.calibration.rows.dataset import Dataset
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner
 from ccnn_torch.learners.constant import Constant
-from ccnn_torch.report.json_files import load_schema, plain
+from ccnn_torch.report.json_files import plain
 from ccnn_torch.run_folder.folder import RunFolder
 
 # The package has a function of the module's name.
@@ -154,11 +155,11 @@ def test_a_run_killed_on_its_way_resumes_to_the_same_result(
     chosen = config(tmp_path)
     whole = RunFolder(tmp_path / "whole")
     results = calibrate(chosen, whole).results
-    jsonschema.validate(plain(results), load_schema("results"))
+    jsonschema.validate(plain(results), frozen("results"))
     auto = results["auto"]
     assert auto["chosen"] == "Descent" == results["best_method"] and list(results["methods"]) == ["Descent"]
     assert set(auto["compared"]) == {"constant", "Descent"} and auto["folds"] == 5 and auto["skipped"] == {}
-    assert results["rows"] == {"train": 100, "validation": 0, "test": 25, "not_trained_on": 0}
+    assert plain(results["rows"]) == {"train": 100, "validation": 0, "test": 25, "not_trained_on": 0}
 
     def kill(*_: Any, **__: Any) -> None:
         raise Killed
@@ -173,11 +174,11 @@ def test_a_run_killed_on_its_way_resumes_to_the_same_result(
     killed = RunFolder(tmp_path / "killed")
     assert killed.auto.is_file() == (moment == "between")
     other = calibrate(chosen, killed).results
-    text = markdown_text(other)
+    text = run_page(other).markdown()
     assert "## Methods compared by cross-validation" in text and "Descent is chosen" in text
     for found in (results, other):
         for entry in (*found["auto"]["compared"].values(), *found["methods"].values()):
-            del entry["seconds"]
+            entry.seconds = None
     assert results == other
     for path in (whole.path / "checkpoints").iterdir():
         again = load_file(killed.path / "checkpoints" / path.name)
@@ -196,5 +197,5 @@ def test_where_the_refit_fails_the_next_best_is_taken(monkeypatch: pytest.Monkey
     results = calibrate(config(Path("unused"))).results
     assert results["best_method"] == results["auto"]["chosen"] == "constant"
     assert results["methods"]["Descent"]["failed"] == "the refit is not finite"
-    jsonschema.validate(plain(results), load_schema("results"))
-    assert "the refit is not finite" in markdown_text(results)
+    jsonschema.validate(plain(results), frozen("results"))
+    assert "the refit is not finite" in run_page(results).markdown()

@@ -57,7 +57,7 @@ def test_what_cannot_be_compared(tmp_path: Path, cli: Cli) -> None:
     assert code == 2 and "results.json" in err
     (tmp_path / "results.json").write_text("{}")
     code, _, err = cli("compare", tmp_path)
-    assert code == 2 and "not the result of a run" in err
+    assert code == 2 and "is no results.json of this version" in err
 
 
 def test_keys_stand_by_section(cli: Cli) -> None:

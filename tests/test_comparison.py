@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import io
-import json
 from pathlib import Path
-from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
+from frozen import frozen
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_run import short
 
 from ccnn_torch.calibration.job import start_run
 from ccnn_torch.calibration.page.figure_progress import progress_plot
+from ccnn_torch.calibration.page.long_table import long_table
 from ccnn_torch.calibration.page.reach import reach_block
-from ccnn_torch.calibration.page.tables import print_tables, result_tables
+from ccnn_torch.calibration.page.tables import result_tables, run_page
 from ccnn_torch.report.arrays import load_history
-from ccnn_torch.report.csv_file import tidy_rows
-from ccnn_torch.report.json_files import load_schema
+from ccnn_torch.report.json_files import plain
+from ccnn_torch.report.results.run import RunResults
 from ccnn_torch.report.table import fitting_columns
 
 COUNTING = """
@@ -53,9 +53,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def results(run: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((run / "results.json").read_text())
-    return found
+def results(run: Path) -> RunResults:
+    return RunResults.read(run / "results.json")
 
 
 def test_every_methods_folder_has_the_same_tags_for_what_is_compared(run: Path) -> None:
@@ -78,8 +77,8 @@ def test_every_methods_folder_has_the_same_tags_for_what_is_compared(run: Path) 
     assert {"heldout/mse_all", "by_time/heldout_mse_all", "training/seconds"} <= set(constant)
 
 
-def test_results_hold_the_schema_and_tell_the_effort(run: Path, results: dict[str, Any]) -> None:
-    jsonschema.validate(results, load_schema("results"))
+def test_results_hold_the_schema_and_tell_the_effort(run: Path, results: RunResults) -> None:
+    jsonschema.validate(plain(results), frozen("results"))
     reach = results["reach"]
     assert set(reach["methods"]) == {"ccnn", "Line", "constant"} and reach["set_by"] in ("ccnn", "Line")
     # The lowest point of the worse of the two, found again in its curve.
@@ -121,20 +120,20 @@ def test_the_effort_of_made_up_curves() -> None:
         }
     )
     assert found is not None and (found["level"], found["set_by"]) == (2.5, "worst")
-    assert found["methods"]["quick"] == {"step": 3, "seconds": pytest.approx(0.3), "evaluations": 30}
-    assert found["methods"]["good"] == {"step": 4, "seconds": 4.0, "evaluations": 400}
-    assert found["methods"]["worst"] == {"step": 4, "seconds": 8.0, "evaluations": None}
+    assert plain(found["methods"]["quick"]) == {"step": 3, "seconds": pytest.approx(0.3), "evaluations": 30}
+    assert plain(found["methods"]["good"]) == {"step": 4, "seconds": 4.0, "evaluations": 400}
+    assert plain(found["methods"]["worst"]) == {"step": 4, "seconds": 8.0, "evaluations": None}
     assert found["methods"]["constant"] is None
     assert reach_block({"constant": history([1], 1, 1)}) is None
     assert reach_block({"ccnn": history([1], 1, 1)}) is None
     assert reach_block({"ccnn": {"seconds": np.ones((1, 1))}, "enn": {"seconds": np.ones((1, 1))}}) is None
 
 
-def test_the_effort_of_made_up_curves_as_a_table(results: dict[str, Any]) -> None:
+def test_the_effort_of_made_up_curves_as_a_table(results: RunResults) -> None:
     made = reach_block(
         {"ccnn": history([9, 3], 0.25, 10), "Line": history([5, 4], 2.0, None), "constant": history([6], 1, 1)}
     )
-    table = next(t for t in result_tables(results | {"reach": made}) if t.title.startswith("Effort"))
+    table = next(t for t in result_tables(results.model_copy(update={"reach": made})) if t.title.startswith("Effort"))
     assert table.rows == (("ccnn", "2", "0.500", "20"), ("Line", "2", "4.00", "–"), ("constant", *["never"] * 3))
     assert "4.000 m² or less, the lowest that Line reaches" in table.note
 
@@ -150,9 +149,9 @@ def test_what_is_plotted_needs_two_methods() -> None:
 
 
 @pytest.mark.parametrize("width", [80, 110])
-def test_tables_fit_the_terminal_without_folding_numbers(results: dict[str, Any], width: int) -> None:
+def test_tables_fit_the_terminal_without_folding_numbers(results: RunResults, width: int) -> None:
     screen = io.StringIO()
-    print_tables(results, Console(file=screen, width=width, force_terminal=True, color_system=None))
+    run_page(results).show(Console(file=screen, width=width, force_terminal=True, color_system=None))
     lines = screen.getvalue().splitlines()
     assert max(len(line) for line in lines) <= width
     mse = next(table for table in result_tables(results) if table.title.startswith("Mean squared"))
@@ -165,12 +164,12 @@ def test_tables_fit_the_terminal_without_folding_numbers(results: dict[str, Any]
                 assert part in text, part
 
 
-def test_the_main_table_has_papers_figures_beside_and_one_constant(results: dict[str, Any]) -> None:
+def test_the_main_table_has_papers_figures_beside_and_one_constant(results: RunResults) -> None:
     mse = next(table for table in result_tables(results) if table.title.startswith("Mean squared"))
     names = [row[0] for row in mse.rows]
     assert names[:2] == ["ccnn", "ccnn, paper's Table II"] and names.count("constant") == 1
     assert mse.columns[-3:] == ("ratio to floor [1]", "coverage of 95 % [1]", "time [s]")
-    rows = {(row[0], row[2], row[3]) for row in tidy_rows(results)}
+    rows = {(row[0], row[2], row[3]) for row in long_table(results)}
     assert {("Line", "sd", "q1"), ("Line", "coverage", ""), ("constant", "seconds", "")} <= rows
-    keys = [row[:4] for row in tidy_rows(results)]
+    keys = [row[:4] for row in long_table(results)]
     assert len(set(keys)) == len(keys)

@@ -17,6 +17,7 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
+from frozen import frozen
 from rich.console import Console
 
 from ccnn_torch import diagnose, load_mechanism, load_records
@@ -24,7 +25,6 @@ from ccnn_torch.diagnosis.progress import TO_VERDICT, watched
 from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, reached
 from ccnn_torch.errors import InputError
 from ccnn_torch.records import read_table, write_table
-from ccnn_torch.report.json_files import load_schema
 from ccnn_torch.report.screen import step_bar
 from ccnn_torch.simulation.job import simulate_records
 from ccnn_torch.simulation.outputs import write_simulated
@@ -59,7 +59,7 @@ def test_a_config_beside_its_records_gives_verdict_and_report(
     code, shown, told = cli("diagnose", "--config", rows.parent / "config.yaml", "--out", "found", "--details")
     assert code == 0 and told == ""
     results = json.loads(Path("found/diagnosis.json").read_text(encoding="utf-8"))
-    jsonschema.validate(results, load_schema("diagnosis"))
+    jsonschema.validate(results, frozen("diagnosis"))
     assert results["verdict"]["effects"] == ["backlash"]
     assert "acklash" in shown and " SI " not in shown
     network = results["network"]

@@ -12,6 +12,7 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
+from frozen import frozen
 from torch import Tensor
 from typer.testing import CliRunner
 
@@ -29,7 +30,7 @@ from ccnn_torch.effects.covariates import draw_covariates
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
-from ccnn_torch.report.json_files import load_schema
+from ccnn_torch.report.json_files import plain
 
 Cli = Callable[..., tuple[int, str, str]]
 ARM = str(Path(__file__).parent / "effects" / "arm.yaml")
@@ -77,7 +78,7 @@ def keys(played: Path, **more: Any) -> dict[str, Any]:
 
 def test_held_out_rows_come_near_the_noise(played: Path) -> None:
     told = json.loads((played / "found" / "diagnosis.json").read_text(encoding="utf-8"))
-    jsonschema.validate(told, load_schema("diagnosis"))
+    jsonschema.validate(told, frozen("diagnosis"))
     assert sorted(told["verdict"]["effects"]) == ["compliance", "joint_gain"]
     found = calibrate(**keys(played, repeats=2))
     pose = found.results["pose"]["position"]
@@ -92,7 +93,7 @@ def test_held_out_rows_come_near_the_noise(played: Path) -> None:
     given = next(e for e in told["effects"] if e["name"] == "joint_gain")["parameters"]["q1"]["value"]
     assert gain[0] != gain[1] and gain == pytest.approx([given] * 2, rel=0.02)
     assert any("fitted anew to the training rows" in note for note in found.results["notes"])
-    jsonschema.validate(json.loads(json.dumps(found.results)), load_schema("results"))
+    jsonschema.validate(json.loads(json.dumps(plain(found.results))), frozen("results"))
     # The compensator, effects and network in it, does so on held-out rows inside its domain.
     prepared, made = found.prepared, found.compensator()
     k = found.repeat()

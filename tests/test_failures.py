@@ -8,13 +8,15 @@ from typing import Any
 
 import jsonschema
 import pytest
+from frozen import frozen
 from test_run import short
 
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.job import start_run
-from ccnn_torch.calibration.page.tables import failures, markdown_text
+from ccnn_torch.calibration.page.tables import failures, run_page
 from ccnn_torch.errors import MethodFailedError
-from ccnn_torch.report.json_files import load_schema, plain
+from ccnn_torch.report.json_files import plain
+from ccnn_torch.report.results.run import ModelFiles, RunResults
 
 LEARNERS = '''
 import torch
@@ -68,7 +70,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def run(file: Path, *names: str, **keys: Any) -> dict[str, Any]:
+def run(file: Path, *names: str, **keys: Any) -> RunResults:
     return calibrate(short(methods=[f"{file}:{name}" for name in names] + ["constant"], repeats=3, **keys)).results
 
 
@@ -79,12 +81,12 @@ def run(file: Path, *names: str, **keys: Any) -> dict[str, Any]:
 def test_what_fails_is_told_and_the_others_go_on(file: Path, keys: dict[str, Any]) -> None:
     results = run(file, "GivesUp", "Singular", "NotANumber", **keys)
     methods = results["methods"]
-    assert methods["GivesUp"] == {"test": None, "failed": "the curvature is not finite"}
+    assert plain(methods["GivesUp"]) == {"test": None, "failed": "the curvature is not finite"}
     assert methods["Singular"]["failed"].startswith("constant met a matrix that cannot be factorised in step 1 (inv: ")
     assert "not finite" in methods["NotANumber"]["failed"]
     assert methods["constant"]["test"]["all"]["mse"]["median"] > 0
     assert len(failures(results)) == 3
-    jsonschema.validate(plain(results), load_schema("results"))
+    jsonschema.validate(plain(results), frozen("results"))
 
 
 def test_when_all_fail_the_run_says_why(file: Path) -> None:
@@ -101,7 +103,7 @@ def test_what_did_not_converge_is_marked_in_the_tables(file: Path) -> None:
     results = run(file, "Descending")
     assert results["methods"]["Descending"]["converged"]["values"] == [0.0, 0.0, 1.0]
     assert results["methods"]["constant"]["converged"] is None
-    text = markdown_text(results)
+    text = run_page(results).markdown()
     assert "| Descending (2 of 3 repeats not converged) |" in text and "| constant |" in text
 
 
@@ -144,7 +146,7 @@ def test_model_files_are_those_of_the_best_method_that_has_some(tmp_path: Path) 
     config = short(methods=[f"{path}:Steep", "constant"], out=str(tmp_path / "run"), save_models=True, save_report=True)
     folder = start_run(config, quiet=True).path
     results = json.loads((folder / "results.json").read_text())
-    jsonschema.validate(results, load_schema("results"))
+    jsonschema.validate(results, frozen("results"))
     assert results["best_method"] == "Steep" and results["model"]["method"] == "constant"
     assert {"model.safetensors", "model.onnx", "card.json"} <= {p.name for p in folder.iterdir()}
     assert json.loads((folder / "card.json").read_text())["method"] == "constant"
@@ -154,7 +156,7 @@ def test_model_files_are_those_of_the_best_method_that_has_some(tmp_path: Path) 
     assert page.index(sentence) < page.index("<table>")
 
 
-def test_no_method_with_a_model_file_is_said() -> None:
-    model = {"method": None, "without": {"gp": "too steep", "ccnn": "not finite"}}
-    said = failures({"best_method": "gp", "methods": {}, "model": model})
-    assert said == ["No model file of gp: too steep.", "No model file of ccnn: not finite."]
+def test_no_method_with_a_model_file_is_said(file: Path) -> None:
+    results = run(file, "Descending")
+    results.model = ModelFiles(method=None, without={"gp": "too steep", "ccnn": "not finite"})
+    assert failures(results) == ["No model file of gp: too steep.", "No model file of ccnn: not finite."]

@@ -17,6 +17,7 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
+from frozen import frozen
 from safetensors.torch import load_file
 from test_cli import tripod_records
 
@@ -26,9 +27,9 @@ from ccnn_torch.calibration.job import resume_run, start_run
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import read_yaml
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.report.json_files import load_schema
+from ccnn_torch.report.json_files import plain
 from ccnn_torch.run_folder.folder import RunFolder
-from ccnn_torch.suite.config import load_suite
+from ccnn_torch.study.suite_config import load_suite
 
 Cli = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parent.parent
@@ -83,8 +84,8 @@ def test_the_folder_of_a_run_holds_what_others_rely_on(finished: RunFolder) -> N
     assert list((folder.path / "tensorboard").rglob("events.*"))
     assert len(list((folder.path / "plots").glob("*.svg"))) >= 4
     results = json.loads(folder.results.read_text())
-    jsonschema.validate(results, load_schema("results"))
-    jsonschema.validate(json.loads((folder.path / "card.json").read_text()), load_schema("card"))
+    jsonschema.validate(results, frozen("results"))
+    jsonschema.validate(json.loads((folder.path / "card.json").read_text()), frozen("card"))
     assert results["rows"]["train"] == 100 and results["rows"]["test"] == 25
     assert results["repeats"] == 3
     for method in ("ccnn", "constant"):
@@ -118,7 +119,7 @@ def test_early_stopping_holds_validation_rows_out_and_refits_on_all() -> None:
     config = short(split={"test": 0.2, "validation": 0.2}, training={"early_stop": True})
     calibration = calibrate(config)
     fitted = calibration.outcomes["ccnn"].fitted
-    assert calibration.results["rows"] == {"train": 80, "validation": 20, "test": 25, "not_trained_on": 0}
+    assert plain(calibration.results.rows) == {"train": 80, "validation": 20, "test": 25, "not_trained_on": 0}
     assert fitted.choice is not None
     assert torch.equal(fitted.training.best_step, fitted.choice.best_step)
     assert torch.equal(fitted.score, fitted.choice.best_validation)

@@ -12,10 +12,10 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
+from frozen import frozen
 
 from ccnn_torch.compensation import load_model
 from ccnn_torch.mechanisms import load_mechanism
-from ccnn_torch.report.json_files import load_schema
 from ccnn_torch.simulation.cases import build_case
 
 ROOT = Path(__file__).parent.parent
@@ -49,7 +49,7 @@ FLOORS = [
     ["simulation", "planning", "verification/promise", "identification"],
     ["diagnosis/config", "diagnosis/page", "diagnosis/outputs", "diagnosis/job"],
     ["motion/identified", "motion/compensate", "motion/job", "motion/__init__"],
-    ["calibration", "sklearn", "suite", "sweep", "comparison", "verification", "starter"],
+    ["calibration", "sklearn", "study", "verification", "starter"],
     ["api", "cli", "__init__", "__main__"],
 ]
 
@@ -71,7 +71,7 @@ def test_the_readme_shows_the_quickstart_and_it_runs(
 @pytest.mark.parametrize("name", ["model.safetensors", "model.onnx"])
 def test_the_shipped_compensator_halves_the_error_of_the_machine_it_was_trained_on(name: str) -> None:
     card = json.loads((SHIPPED / "card.json").read_text())
-    jsonschema.validate(card, load_schema("card"))
+    jsonschema.validate(card, frozen("card"))
     for file, digest in card["files"].items():
         assert hashlib.sha256((SHIPPED / file).read_bytes()).hexdigest() == digest
     model = load_model(SHIPPED / name)

@@ -10,15 +10,17 @@ from typing import Any
 
 import jsonschema
 import pytest
+from frozen import frozen
 from rich.console import Console
 
+from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError
-from ccnn_torch.report.json_files import load_schema
-from ccnn_torch.suite.config import load_suite
-from ccnn_torch.suite.job import run_suite
-from ccnn_torch.suite.page import compare, write_suite
-from ccnn_torch.suite.tables import print_suite, suite_markdown
+from ccnn_torch.report.json_files import plain
+from ccnn_torch.report.results.run import RunResults
+from ccnn_torch.study.suite import compare, run_suite, write_suite
+from ccnn_torch.study.suite_config import load_suite
+from ccnn_torch.study.suite_page import suite_page
 
 ROOT = Path(__file__).parent.parent
 TINY = """
@@ -48,20 +50,20 @@ def test_a_suite_runs_its_cases_and_goes_on_where_it_was_stopped(tmp_path: Path)
     keys = [f"out={tmp_path / 'out'}", "seed=2"]
     suite = load_suite(written(tmp_path), keys)
     kept, stopped = tmp_path / "out" / "platform", tmp_path / "out" / "reach"
-    run_suite(replace(suite, cases={"platform": suite.cases["platform"]}), quiet=True)
+    run_suite(replace(suite, runs={"platform": suite.runs["platform"]}), quiet=True)
     before = stamps(kept)
     # As a run that was killed before its first checkpoint leaves it.
     stopped.mkdir()
-    (stopped / "config.yaml").write_text(suite.cases["reach"].to_yaml())
+    (stopped / "config.yaml").write_text(suite.runs["reach"].to_yaml())
     path = run_suite(suite, quiet=True)
     assert stamps(kept) == before
     comparison = json.loads(path.read_text())
-    jsonschema.validate(comparison, load_schema("suite"))
+    jsonschema.validate(comparison, frozen("suite"))
     assert [case["name"] for case in comparison["cases"]] == ["platform", "reach"]
     assert [case["split"] for case in comparison["cases"]] == ["random", "block"]
     for case in comparison["cases"]:
         results = json.loads((tmp_path / "out" / case["name"] / "results.json").read_text())
-        jsonschema.validate(results, load_schema("results"))
+        jsonschema.validate(results, frozen("results"))
         assert results["case"].startswith("realistic:") and results["seed"] == 2
         # The machine under the compensated command is solved again: less is left of its error.
         position = results["pose"]["position"]
@@ -79,11 +81,11 @@ def test_a_suite_runs_its_cases_and_goes_on_where_it_was_stopped(tmp_path: Path)
 def test_overrides_reach_every_case_and_sections_are_merged(tmp_path: Path) -> None:
     suite = load_suite(written(tmp_path), ["realistic.noise=1e-6", "repeats=4", "name=short"])
     assert suite.name == "short" and suite.out == Path("runs/short")
-    assert [c.realistic.noise for c in suite.cases.values()] == [1e-6, 1e-6]
-    assert [c.realistic.rows for c in suite.cases.values()] == [40, 40]
-    assert [c.realistic.machine for c in suite.cases.values()] == ["tripod", "arm"]
-    assert all(c.repeats == 4 and not c.save_models for c in suite.cases.values())
-    assert suite.cases["reach"].split.kind == "block" and suite.cases["reach"].split.test == 0.3
+    assert [c.realistic.noise for c in suite.runs.values()] == [1e-6, 1e-6]
+    assert [c.realistic.rows for c in suite.runs.values()] == [40, 40]
+    assert [c.realistic.machine for c in suite.runs.values()] == ["tripod", "arm"]
+    assert all(c.repeats == 4 and not c.save_models for c in suite.runs.values())
+    assert suite.runs["reach"].split.kind == "block" and suite.runs["reach"].split.test == 0.3
 
 
 @pytest.mark.parametrize(
@@ -109,7 +111,7 @@ def test_a_bad_suite_is_refused_in_one_sentence(tmp_path: Path, text: str, part:
 
 def test_the_shipped_suite_is_broad() -> None:
     suite = load_suite(ROOT / "experiments" / "realistic.yaml")
-    cases = list(suite.cases.values())
+    cases = list(suite.runs.values())
     assert len(cases) >= 24
     assert len({(c.realistic.machine, c.realistic.cause) for c in cases}) == 18
     assert {c.realistic.rows for c in cases} >= {60, 100, 200, 400, 1000, 2000}
@@ -119,34 +121,47 @@ def test_the_shipped_suite_is_broad() -> None:
     assert len(cases) / 4 < blocks < len(cases) / 2
 
 
-def results(floor: list[float] | None, **errors: list[float] | None) -> dict[str, Any]:
-    """What `compare` reads of a results.json; None = the method failed."""
+def results(floor: list[float] | None, **errors: list[float] | None) -> RunResults:
+    """What `compare` reads of a run; None = the method failed."""
 
     def block(values: list[float]) -> dict[str, Any]:
+        return {"all": {measure: spread(values) for measure in ("mse", "mae", "sse")}}
+
+    def mse(values: list[float]) -> dict[str, Any]:
         return {"all": {"mse": spread(values)}}
 
     methods = {
         name: {"test": None, "failed": "singular"} if values is None else {"test": block(values), "seconds": None}
         for name, values in errors.items()
     }
-    return {
-        "case": None,
-        "seed": 0,
-        "repeats": 3,
-        "joints": [{"name": "q1", "unit": "m"}],
-        "rows": {"train": 10, "validation": 2, "test": 4},
-        "floor": None if floor is None else {"realised": block(floor)},
-        "constant": {"test": block([9.0, 9.0, 9.0])},
-        "methods": methods,
-    }
+    one = spread([1.0])
+    position = {"unit": "m", "before": {"rms": one, "max": one}, "after": {"rms": one, "max": one}}
+    return RunResults.model_validate(
+        {
+            "name": "made up",
+            "seed": 0,
+            "repeats": 3,
+            "joints": [{"name": "q1", "unit": "m"}],
+            "rows": {"train": 10, "validation": 2, "test": 4},
+            "before": {},
+            "floor": None if floor is None else {"realised": mse(floor), "expected": mse(floor)},
+            "constant": {"test": block([9.0, 9.0, 9.0])},
+            "methods": methods,
+            "pose": {"position": position, "rotation": None},
+        }
+    )
+
+
+def split(kind: str) -> RunConfig:
+    return RunConfig.from_keys(case="tripod", split={"kind": kind})
 
 
 def test_best_tied_and_close_are_what_their_definitions_say(tmp_path: Path) -> None:
     first = results([1.0, 2.0, 4.0], gp=[2.0, 4.0, 8.0], ccnn=[1.9, 4.1, 8.4], grnn=[2.1, 4.2, 8.2])
     second = results([1.0, 1.0, 1.0], gp=None, ccnn=[2.0, 2.0, 2.0], grnn=[3.0, 3.0, 3.0])
-    about = {name: {"split": "random"} for name in ("a", "b")}
+    about = dict.fromkeys(("a", "b"), split("random"))
     found = compare("two", {"a": first, "b": second}, about, {"c": "nothing was measured"})
-    jsonschema.validate(found, load_schema("suite"))
+    jsonschema.validate(plain(found), frozen("suite"))
     a, b = found["cases"]
     assert a["best"] == "gp" and b["best"] == "ccnn"
     # Ratios by repeat: 0.95, 1.025, 1.05 hold 1; 1.05, 1.05, 1.025 do not, but are close.
@@ -168,16 +183,16 @@ def test_best_tied_and_close_are_what_their_definitions_say(tmp_path: Path) -> N
         rows = list(csv.DictReader(file))
     ratio = [r for r in rows if (r["case"], r["method"], r["quantity"]) == ("a", "ccnn", "ratio_to_best")]
     assert [float(v) for v in ratio[0]["values"].split()] == pytest.approx([0.95, 1.025, 1.05])
-    text = suite_markdown(found)
+    text = suite_page(found).markdown()
     assert "ccnn is the best method or tied with it in 2 of 2 cases (100 %)" in text
     assert "gp; ccnn tied and close (1.02)" in text
     assert "gp failed in 1 case ('b'): singular" in text and "case 'c' failed: nothing was measured" in text
     console = Console(record=True, width=80)
-    print_suite(found, console)
+    suite_page(found).show(console)
     assert "How often a method is the best" in console.export_text()
 
 
 def test_cases_without_a_floor_are_compared_with_the_best() -> None:
-    found = compare("one", {"a": results(None, gp=[1.0, 1.0, 1.0])}, {"a": {"split": "group"}}, {})
+    found = compare("one", {"a": results(None, gp=[1.0, 1.0, 1.0])}, {"a": split("block")}, {})
     assert found["cases"][0]["methods"]["constant"]["ratio_to_floor"] is None
-    assert "ratio to that of the best method" in suite_markdown(found)
+    assert "ratio to that of the best method" in suite_page(found).markdown()

@@ -11,6 +11,7 @@ from typing import Any
 
 import jsonschema
 import pytest
+from frozen import frozen
 
 from ccnn_torch import api
 from ccnn_torch.calibration.config import RunConfig
@@ -18,8 +19,7 @@ from ccnn_torch.calibration.job import resume_run, start_run
 from ccnn_torch.calibration.rows import memory
 from ccnn_torch.compensation import load_model
 from ccnn_torch.errors import InputError
-from ccnn_torch.report.json_files import load_schema
-from ccnn_torch.sweep.config import load_sweep
+from ccnn_torch.study.sweep_config import load_sweep
 
 Cli = Callable[..., tuple[int, str, str]]
 QUICK = {"hidden": [3], "restarts": 1, "iterations": 4}
@@ -101,9 +101,9 @@ def test_what_is_wrong_is_one_sentence(tmp_path: Path, changes: list[str], sente
 
 def test_lists_are_one_value(tmp_path: Path) -> None:
     sweep = load_sweep(config_file(tmp_path), ["ccnn.hidden=[4],[6,6]", "methods=[gp,ccnn],'constant'"], tmp_path)
-    assert [job.ccnn.hidden for job in sweep.jobs.values()] == [(4,), (4,), (6, 6), (6, 6)]
-    assert [job.methods for job in sweep.jobs.values()][:2] == [["gp", "ccnn"], ["constant"]]
-    assert list(sweep.jobs)[3] == "ccnn.hidden-6-6_methods-constant"
+    assert [job.ccnn.hidden for job in sweep.runs.values()] == [(4,), (4,), (6, 6), (6, 6)]
+    assert [job.methods for job in sweep.runs.values()][:2] == [["gp", "ccnn"], ["constant"]]
+    assert list(sweep.runs)[3] == "ccnn.hidden-6-6_methods-constant"
 
 
 def without_times(path: Path) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def test_blocks_of_repeats_give_the_figures_of_all_at_once(tmp_path: Path) -> No
     whole = start_run(RunConfig.from_keys(**keys, save_models=False, out=str(tmp_path / "whole")), quiet=True)
     parts = start_run(RunConfig.from_keys(**keys, block=2, out=str(tmp_path / "parts")), quiet=True)
     one, other = without_times(whole.results), without_times(parts.results)
-    jsonschema.validate(json.loads(parts.results.read_text()), load_schema("results"))
+    jsonschema.validate(json.loads(parts.results.read_text()), frozen("results"))
     assert {p.name for p in (parts.path / "blocks").iterdir()} == {"0", "2", "4"}
     for results in (one, other):
         del results["data_sha256"], results["name"]

@@ -11,6 +11,7 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
+from frozen import frozen
 
 import ccnn_torch
 from ccnn_torch import calibrate
@@ -19,7 +20,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import PoseError, load_mechanism
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
 from ccnn_torch.records import write_table
-from ccnn_torch.report.json_files import load_schema
+from ccnn_torch.report.json_files import plain
 from ccnn_torch.verification.promise import configurations, paired_gain, promise_block, promised
 
 Cli = Callable[..., tuple[int, str, str]]
@@ -75,7 +76,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def read(folder: Path) -> dict:
     found = json.loads((folder / "verify.json").read_text())
-    jsonschema.validate(found, load_schema("verify"))
+    jsonschema.validate(found, frozen("verify"))
     return found
 
 
@@ -94,7 +95,7 @@ def test_a_promise_is_kept_on_rows_of_the_same_machine(model: Path, tmp_path: Pa
     page = (tmp_path / "v" / "verify.html").read_text()
     assert found["text"] in page and page.count("<svg") == 4 and "<script" not in page
     assert "The promise is kept" in out
-    assert ccnn_torch.verify(model, tmp_path / "new.csv")["position"] == position
+    assert plain(ccnn_torch.verify(model, tmp_path / "new.csv").position) == position
 
 
 def test_a_public_key_takes_signed_models_alone(model: Path, tmp_path: Path, cli: Cli) -> None:

@@ -18,7 +18,8 @@ from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.page.tables import write_tables
 from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError
-from ccnn_torch.report.json_files import read_json, write_json
+from ccnn_torch.report.json_files import plain, read_json, write_json
+from ccnn_torch.report.results.run import RmsMax, RunResults
 from ccnn_torch.run_folder.folder import RunFolder
 
 _SPREAD = {"median", "low", "high", "values"}
@@ -74,21 +75,23 @@ def write_blocks(
                 f"the blocks of repeats differ in {key}, which their rows chose ({chosen}); write {key}=… to have the "
                 "same in all"
             )
-    results = merged(found)
-    scores = {name: block["score"]["values"] for name, block in results["methods"].items() if block["test"] is not None}
+    whole = merged(found)
+    scores = {name: block["score"]["values"] for name, block in whole["methods"].items() if block["test"] is not None}
     best = min(scores, key=lambda name: float(np.median(scores[name])))
-    results |= {"name": config.name, "seed": config.seed, "repeats": config.repeats, "best_method": best}
-    for kind, left in results["methods"][best]["pose"].items():
-        if left is not None:
-            results["pose"][kind]["after"] = {key: left[key] for key in ("rms", "max")}
     if any(part["best_method"] != best for part in found):
         # Of other methods in some blocks, and not known of this one.
-        results["pose"].pop("energy", None)
+        whole["pose"].pop("energy", None)
+    results = RunResults.model_validate(
+        whole | {"name": config.name, "seed": config.seed, "repeats": config.repeats, "best_method": best}
+    )
+    for kind, left in results.methods[best].pose.items():
+        if left is not None:
+            results.pose[kind].after = RmsMax(rms=left.rms, max=left.max)
     first = int(np.argmin(scores[best]))
     exported = next(block for block in blocks if first < block.config.seed - config.seed + block.config.repeats)
     if config.save_models:
         _export(exported, again)
-        results["model"] = read_json(exported.folder.results).get("model")
+        results.model = RunResults.read(exported.folder.results).model
     for pattern in _KEPT:
         for path in exported.folder.path.glob(pattern):
             if path.is_dir():
@@ -109,7 +112,7 @@ def merged(parts: Sequence[Any]) -> Any:
     first run's."""
     first = parts[0]
     if isinstance(first, dict) and set(first) == _SPREAD:
-        return spread([np.nan if v is None else v for part in parts for v in part["values"]])
+        return plain(spread([np.nan if v is None else v for part in parts for v in part["values"]]))
     if isinstance(first, dict):
         common = {key: merged([part[key] for part in parts]) for key in first if all(key in part for part in parts)}
         if "spread" in common:

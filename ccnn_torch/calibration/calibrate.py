@@ -15,13 +15,15 @@ from ccnn_torch.calibration.config import METHODS, RunConfig, method_names
 from ccnn_torch.calibration.evaluate import Outcome, evaluate, pose_before
 from ccnn_torch.calibration.learning.fitting import Fitted, fit_method, on_other_rows, refit
 from ccnn_torch.calibration.learning.method_choice import Comparison, compare
-from ccnn_torch.calibration.result import assemble, best_method, chosen_by, plan_of
+from ccnn_torch.calibration.result import best_method, chosen_by, plan_of, run_results
 from ccnn_torch.calibration.rows.prepare import Prepared, damping_of, over_all_rows, prepare
 from ccnn_torch.compensation import FORMS, Compensator, UncertainNetwork, default_limit, fit_compensator, save_model
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import LEARNERS, Learner, make_learner
 from ccnn_torch.mechanisms import Mechanism, PoseError
 from ccnn_torch.numerics.blocks import memory_budget
+from ccnn_torch.report.json_files import plain
+from ccnn_torch.report.results.run import RunResults
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Callback, Scaling
 from ccnn_torch.verification.promise import configurations, promise_block
@@ -45,7 +47,7 @@ class Calibration:
     before: PoseError
     outcomes: dict[str, Outcome]
     failed: dict[str, str]
-    results: dict[str, Any]
+    results: RunResults
     frames: Prepared | None = field(default=None, repr=False)
 
     @property
@@ -129,7 +131,7 @@ class Calibration:
         """
         method = method or self.method
         repeat = self.repeat(method)
-        metrics = _of_repeat(self.results["methods"][method], repeat)
+        metrics = _of_repeat(plain(self.results.methods[method]), repeat)
         # Seconds differ from run to run, and the model file of one config and seed may not.
         del metrics["seconds"]
         compensator = self.compensator(method)
@@ -214,7 +216,7 @@ def _calibrate(config: RunConfig, folder: RunFolder | None, watch: Watch, prepar
             break
     if not outcomes:
         raise MethodFailedError("; ".join(f"{name}: {sentence}" for name, sentence in failed.items()))
-    results = assemble(config, prepared, before, outcomes, failed, comparison)
+    results = run_results(config, prepared, before, outcomes, failed, comparison)
     return Calibration(config, prepared, before, outcomes, failed, results)
 
 

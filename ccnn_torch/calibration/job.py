@@ -12,7 +12,7 @@ from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.learning.fitting import check_storable
 from ccnn_torch.calibration.learning.progress import HeldOut, ProgressBar
 from ccnn_torch.calibration.outputs import write_outputs
-from ccnn_torch.calibration.page.tables import print_tables
+from ccnn_torch.calibration.page.tables import run_page
 from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback
 from ccnn_torch.calibration.result import plan_of
 from ccnn_torch.calibration.rows.memory import TooManyRepeatsError
@@ -21,7 +21,7 @@ from ccnn_torch.calibration.statistics import share_unit
 from ccnn_torch.engine import Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError, WriteError
 from ccnn_torch.plugins import is_plugin
-from ccnn_torch.report.json_files import read_json
+from ccnn_torch.report.results.run import RunResults
 from ccnn_torch.report.screen import note, say_place, stdout
 from ccnn_torch.run_folder.folder import RunFolder, kept_for
 from ccnn_torch.run_folder.resume import facts_of, refuse_changes
@@ -83,13 +83,16 @@ def _prepared(config: RunConfig) -> tuple[RunConfig, Prepared | None]:
         return config.model_copy(update={"block": found.block, "max_bytes": found.limit}), None
 
 
-def _run_block(config: RunConfig) -> str:
-    """Start or resume the run of a block."""
+def finish_run(config: RunConfig, quiet: bool) -> RunFolder:
+    """Start or resume a run among others, without its tables; raises as `start_run` and `resume_run`."""
     folder = RunFolder(Path(str(config.out)))
     if folder.config.is_file():
-        resume_run(folder.path, quiet=True, tables=False)
-    else:
-        start_run(config, quiet=True, tables=False)
+        return resume_run(folder.path, quiet, tables=False)
+    return start_run(config, quiet, tables=False)
+
+
+def _run_block(config: RunConfig) -> str:
+    finish_run(config, quiet=True)
     return f"repeats of seeds {config.seed} to {config.seed + config.repeats - 1}"
 
 
@@ -107,7 +110,7 @@ def _run_blocks(config: RunConfig, folder: RunFolder, quiet: bool, tables: bool)
             )
         write_blocks(config, folder, blocks, lambda block: resume_run(block.folder.path, quiet=True, tables=False))
     if tables and not quiet:
-        print_tables(read_json(folder.results), stdout)
+        run_page(RunResults.read(folder.results)).show(stdout)
         say_place(f"Everything is in {folder.path}")
 
 
@@ -143,8 +146,8 @@ def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet:
         try:
             write_outputs(calibration, folder)
         except WriteError:
-            print_tables(calibration.results, stdout)
+            run_page(calibration.results).show(stdout)
             raise
     if tables and not quiet:
-        print_tables(calibration.results, stdout)
+        run_page(calibration.results).show(stdout)
         say_place(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")

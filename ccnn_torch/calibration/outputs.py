@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,6 +16,7 @@ from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
 from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.results.run import ModelFiles
 from ccnn_torch.run_folder.folder import RunFolder
 from ccnn_torch.training import Training
 
@@ -26,9 +25,9 @@ def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
     """Model files, arrays, curves, plots, tables, report, and at last `results.json`."""
     path, results = folder.path, calibration.results
     curves = {name: _history(outcome.fitted.training) for name, outcome in calibration.outcomes.items()}
-    results["reach"] = reach_block(curves)
+    results.reach = reach_block(curves)
     if calibration.config.save_models:
-        results["model"] = _save_models(calibration, folder)
+        results.model = _save_models(calibration, folder)
     save_arrays(path, _arrays(calibration))
     for method, history in curves.items():
         save_history(path, method, history)
@@ -42,13 +41,8 @@ def write_outputs(calibration: Calibration, folder: RunFolder) -> None:
     write_json(folder.results, results)
 
 
-def _save_models(calibration: Calibration, folder: RunFolder) -> dict[str, Any]:
-    """Write every method's model files: `model.*` are those of the best method that can be written.
-
-    Returns:
-        `method`, whose `model.*` are (None where no method has any), `without`: why a method has none, by method, and
-        `damped`: the share of what was learned that is applied, of each method with which all of it was too steep.
-    """
+def _save_models(calibration: Calibration, folder: RunFolder) -> ModelFiles:
+    """Write every method's model files: `model.*` are those of the best method that can be written."""
     chosen: str | None = None
     without: dict[str, str] = {}
     damped: dict[str, float] = {}
@@ -62,7 +56,7 @@ def _save_models(calibration: Calibration, folder: RunFolder) -> dict[str, Any]:
         chosen = chosen or method
         if share < 1:
             damped[method] = share
-    return {"method": chosen, "without": without, "damped": damped}
+    return ModelFiles(method=chosen, without=without, damped=damped)
 
 
 def _arrays(calibration: Calibration) -> RunArrays:

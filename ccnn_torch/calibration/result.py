@@ -1,16 +1,17 @@
-"""Assemble the content of `results.json`."""
+"""From the outcomes of all methods to the results of a run."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import version
-from typing import Any
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.evaluate import Outcome, pose_with_effects, pose_with_geometry
+from ccnn_torch.calibration.geometry.physics import Physics
 from ccnn_torch.calibration.learning.early_stop import Plan
 from ccnn_torch.calibration.learning.method_choice import Comparison
 from ccnn_torch.calibration.learning.uncertainty import coverage, inside_domain
@@ -27,11 +28,23 @@ from ccnn_torch.calibration.statistics import (
 )
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
+from ccnn_torch.report.results.base import Axis, Spread
+from ccnn_torch.report.results.run import (
+    Floor,
+    Geometry,
+    KnownEffects,
+    Method,
+    MethodPose,
+    Pose,
+    RecordRows,
+    RowCounts,
+    RunResults,
+)
 from ccnn_torch.simulation.case_study import Simulation
 
 # Above so many times what the model explains a sentence says why.
 _REACHED = 1.1
-_NO_GEOMETRY = {"chosen": "none", "why": "A simulated case compares learners."}
+_NO_GEOMETRY = Geometry(chosen="none", why="A simulated case compares learners.")
 _PACKAGES = ("ccnn-torch", "torch", "numpy", "scipy", "onnx", "onnxruntime", "safetensors")
 
 
@@ -63,15 +76,15 @@ def by_score(outcomes: Mapping[str, Outcome]) -> list[str]:
     return sorted(outcomes, key=lambda name: float(outcomes[name].score.median()))
 
 
-def assemble(
+def run_results(
     config: RunConfig,
     prepared: Prepared,
     before: PoseError,
     outcomes: dict[str, Outcome],
     failed: dict[str, str],
     comparison: Comparison | None = None,
-) -> dict[str, Any]:
-    """The content of `results.json`.
+) -> RunResults:
+    """The results of a run.
 
     Args:
         before: pose error without compensation, `r x s`.
@@ -83,50 +96,54 @@ def assemble(
     test, fit = dataset.usable_rows("test"), dataset.usable_rows("fit")
     measured, learned = test.take(dataset.deviation), fit.take(dataset.deviation)
     floor = None if prepared.simulation is None else _floor(prepared.simulation, test, joints)
-    methods: dict[str, Any] = {name: {"test": None, "failed": sentence} for name, sentence in failed.items()}
     inside = inside_domain(dataset, config.compensation.margin)
+    methods = {}
     for name, outcome in outcomes.items():
         errors = joint_errors(test.take(outcome.deviation), measured, test.weights, joints)
         each = outcome.fitted.seconds / len(dataset.seeds)
-        methods[name] = {
-            "test": errors,
-            "ratio_to_floor": ratio_to_floor(errors, floor),
-            "score": spread(outcome.score),
-            "seconds": spread([each] * len(dataset.seeds)),
-            **_certainty(outcome, dataset, test, inside, joints),
-            "converged": _spread_or_none(outcome.fitted.converged),
-            "evaluations": _spread_or_none(outcome.fitted.evaluations),
-            "pose": _pose_of(prepared, outcome),
-        }
+        certainty, sd = _certainty(outcome, dataset, test, inside, joints)
+        methods[name] = Method(
+            test=errors,
+            ratio_to_floor=ratio_to_floor(errors, floor),
+            score=spread(outcome.score),
+            seconds=spread([each] * len(dataset.seeds)),
+            coverage=certainty,
+            sd=sd,
+            converged=_spread_or_none(outcome.fitted.converged),
+            evaluations=_spread_or_none(outcome.fitted.evaluations),
+            pose=_pose_of(prepared, outcome),
+        )
     constant = constant_errors(learned, measured, fit.weights, test.weights, joints)
     best = best_method(outcomes)
     pose = _pose(config, prepared, before, outcomes[best])
-    return {
-        "name": config.name,
-        "seed": config.seed,
-        "repeats": config.repeats,
-        "case": None if config.case is None else case_label(config),
-        "joints": [{"name": joint.name, "unit": joint.unit} for joint in joints],
-        "best_method": best,
-        "chosen_by": chosen_by(config, prepared, outcomes[best]),
-        "rows": row_counts(config, dataset),
-        "before": before_block(test.take(prepared.total), test.weights, joints),
-        "before_train": before_block(fit.take(prepared.total), fit.weights, joints),
-        "methods": {name: methods[name] for name in [*outcomes, *failed]},
-        "constant": {"test": constant, "ratio_to_floor": ratio_to_floor(constant, floor)},
-        "floor": floor,
-        "auto": None if comparison is None else comparison.block(best),
-        "pose": pose,
-        "records": None if prepared.simulated else _records(prepared),
-        **_effects(prepared, test),
-        "data_sha256": prepared.data_hash,
-        "geometry": _NO_GEOMETRY if prepared.choice is None else prepared.choice.block,
-        "notes": [*prepared.notes, *_notes(plan_of(config)), *_not_reached(pose, outcomes[best].damped)],
-        "versions": versions(),
-    }
+    results = RunResults(
+        name=config.name,
+        seed=config.seed,
+        repeats=config.repeats,
+        case=None if config.case is None else case_label(config),
+        joints=[Axis(name=joint.name, unit=joint.unit) for joint in joints],
+        best_method=best,
+        chosen_by=chosen_by(config, prepared, outcomes[best]),
+        rows=row_counts(config, dataset),
+        before=before_block(test.take(prepared.total), test.weights, joints),
+        before_train=before_block(fit.take(prepared.total), fit.weights, joints),
+        methods=methods | {name: Method(test=None, failed=sentence) for name, sentence in failed.items()},
+        constant=Method(test=constant, ratio_to_floor=ratio_to_floor(constant, floor)),
+        floor=floor,
+        auto=None if comparison is None else comparison.block(best),
+        pose=pose,
+        records=None if prepared.simulated else _records(prepared),
+        data_sha256=prepared.data_hash,
+        geometry=_NO_GEOMETRY if prepared.choice is None else prepared.choice.block,
+        notes=[*prepared.notes, *_notes(plan_of(config)), *_not_reached(pose, outcomes[best].damped)],
+        versions=versions(),
+    )
+    if prepared.physics is not None and prepared.physics.source:
+        results.effects = _effects(prepared, prepared.physics, test)
+    return results
 
 
-def chosen_by(config: RunConfig, prepared: Prepared, outcome: Outcome) -> str:
+def chosen_by(config: RunConfig, prepared: Prepared, outcome: Outcome) -> Literal["folds", "validation", "test"]:
     """What chose the model: `folds`, `validation` rows or `test` rows; never the rows that it was trained on."""
     folds = prepared.choice is not None and prepared.choice.by == "folds" and config.methods is None
     if folds or plan_of(config).folds > 1:
@@ -146,14 +163,15 @@ def _notes(plan: Plan) -> list[str]:
     return []
 
 
-def _not_reached(pose: Mapping[str, Any], damped: float) -> list[str]:
+def _not_reached(pose: Pose, damped: float) -> list[str]:
     """A sentence where the commands leave clearly more than what the model does not explain."""
     found = []
-    for kind, unit in (("position", "mm"), ("rotation", "mrad")):
-        after, explained = ((pose[kind] or {}).get(key) for key in ("after", "explained"))
-        sizes = [1e3 * (block["rms"]["median"] or 0.0) for block in (after, explained) if block is not None]
-        if len(sizes) == 2 and sizes[0] > _REACHED * sizes[1]:
-            found.append(f"{sizes[0]:.3g} {unit} of {kind} where the model leaves {sizes[1]:.3g} unexplained")
+    for kind, unit, block in (("position", "mm", pose.position), ("rotation", "mrad", pose.rotation)):
+        if block is None or block.explained is None:
+            continue
+        after, explained = (1e3 * (figures.rms.median or 0.0) for figures in (block.after, block.explained))
+        if after > _REACHED * explained:
+            found.append(f"{after:.3g} {unit} of {kind} where the model leaves {explained:.3g} unexplained")
     if not found:
         return []
     return [
@@ -164,32 +182,32 @@ def _not_reached(pose: Mapping[str, Any], damped: float) -> list[str]:
 
 def _certainty(
     outcome: Outcome, dataset: Dataset, test: Rows, inside: Tensor, joints: tuple[Coordinate, ...]
-) -> dict[str, Any]:
-    """How wide the predictive sd is, and how often what was measured is within its 95 % interval."""
+) -> tuple[Spread, dict[str, Spread]]:
+    """How often what was measured is within the 95 % interval, and how wide the predictive sd is."""
     sd = outcome.fitted.sd(test.take(dataset.inputs))
     residuals = test.take(dataset.deviation) - test.take(outcome.deviation)
     there = (test.weights > 0).unsqueeze(-1)
     typical = sd.masked_fill(~there, torch.nan).nanmedian(1).values
-    return {
-        "coverage": spread(coverage(residuals, sd, test.weights * test.take(inside))),
-        "sd": {joint.name: spread(typical[:, j]) for j, joint in enumerate(joints)},
-    }
+    covered = coverage(residuals, sd, test.weights * test.take(inside))
+    return spread(covered), {joint.name: spread(typical[:, j]) for j, joint in enumerate(joints)}
 
 
-def _spread_or_none(values: Tensor | None) -> dict[str, Any] | None:
+def _spread_or_none(values: Tensor | None) -> Spread | None:
     return None if values is None else spread(values)
 
 
-def _pose_of(prepared: Prepared, outcome: Outcome) -> dict[str, Any]:
+def _pose_of(prepared: Prepared, outcome: Outcome) -> dict[str, MethodPose | None]:
     """The pose error that a method leaves, over all test rows."""
     left, weights = _held_out(prepared, outcome.after)
     explained = None if prepared.simulated else _held_out(prepared, outcome.explained)[0]
-    block = pose_block(left, left, weights, explained=explained)
-    kept = [] if explained is None else ["explained"]
-    return {
-        name: part and {"unit": part["unit"], **part["after"], **{key: part[key] for key in kept}}
-        for name, part in block.items()
-    }
+    pose = pose_block(left, left, weights, explained=explained)
+    found: dict[str, MethodPose | None] = {}
+    for kind, block in (("position", pose.position), ("rotation", pose.rotation)):
+        found[kind] = None
+        if block is not None:
+            kept = {} if explained is None else {"explained": block.explained}
+            found[kind] = MethodPose(unit=block.unit, rms=block.after.rms, max=block.after.max, **kept)
+    return found
 
 
 def _held_out(prepared: Prepared, error: PoseError) -> tuple[PoseError, Tensor]:
@@ -207,7 +225,7 @@ def case_label(config: RunConfig) -> str:
     return f"{config.case}:{config.variant}" if config.case == "machine_tool" else str(config.case)
 
 
-def _floor(simulation: Simulation, test: Rows, joints: tuple[Coordinate, ...]) -> dict[str, Any]:
+def _floor(simulation: Simulation, test: Rows, joints: tuple[Coordinate, ...]) -> Floor:
     variance = test.take(simulation.noise_variance) * test.weights.unsqueeze(-1)
     unlearnable = simulation.unlearnable
     return floor_block(
@@ -219,20 +237,20 @@ def _floor(simulation: Simulation, test: Rows, joints: tuple[Coordinate, ...]) -
     )
 
 
-def row_counts(config: RunConfig, dataset: Dataset) -> dict[str, int]:
+def row_counts(config: RunConfig, dataset: Dataset) -> RowCounts:
     """Rows of the first repeat's split; without early stopping, and with folds, the validation rows are trained on."""
     split = dataset.splits[0]
     plan = plan_of(config)
     held = len(split.validation) if plan.holds_out and plan.folds == 1 else 0
-    return {
-        "train": len(split.train) + len(split.validation) - held,
-        "validation": held,
-        "test": len(split.test),
-        "not_trained_on": int((~dataset.usable[0]).sum()),
-    }
+    return RowCounts(
+        train=len(split.train) + len(split.validation) - held,
+        validation=held,
+        test=len(split.test),
+        not_trained_on=int((~dataset.usable[0]).sum()),
+    )
 
 
-def _pose(config: RunConfig, prepared: Prepared, before: PoseError, outcome: Outcome) -> dict[str, Any]:
+def _pose(config: RunConfig, prepared: Prepared, before: PoseError, outcome: Outcome) -> Pose:
     place, turn = prepared.pseudoerror.remainder_position, prepared.pseudoerror.remainder_rotation
     errors = {
         "before": before,
@@ -250,20 +268,15 @@ def _pose(config: RunConfig, prepared: Prepared, before: PoseError, outcome: Out
     )
 
 
-def _effects(prepared: Prepared, test: Rows) -> dict[str, Any]:
+def _effects(prepared: Prepared, physics: Physics, test: Rows) -> KnownEffects:
     """What known effects do by themselves, where they are a part of the compensator."""
-    if prepared.physics is None or not prepared.physics.source:
-        return {}
     left = test.take(prepared.dataset.deviation)
     errors = joint_errors(torch.zeros_like(left), left, test.weights, prepared.mechanism.joints)
-    return {"effects": {"from": prepared.physics.source, "test": errors, "coefficients": prepared.physics.block()}}
+    return KnownEffects(source=physics.source, test=errors, coefficients=physics.block())
 
 
-def _records(prepared: Prepared) -> dict[str, Any]:
-    """What measured records have beside: rows set aside and the frames that were fitted."""
+def _records(prepared: Prepared) -> RecordRows:
+    """Which of the measured rows were set aside, and why."""
     usable = prepared.dataset.usable[0]
-    return {
-        "rows": len(usable),
-        "rows_set_aside": torch.nonzero(~usable).squeeze(-1).tolist(),
-        "why_set_aside": prepared.set_aside(),
-    }
+    aside = torch.nonzero(~usable).squeeze(-1).tolist()
+    return RecordRows(rows=len(usable), rows_set_aside=aside, why_set_aside=prepared.set_aside())

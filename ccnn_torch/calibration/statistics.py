@@ -1,8 +1,7 @@
-"""The blocks of `results.json`: error measures per joint, noise floor, pose error, each with its spread over repeats.
+"""Figures of `results.json`: error measures per joint, noise floor, pose error, each with its spread over repeats.
 
-Every number is in SI (m, rad and their squares). A spread is `{"median", "low", "high", "values"}`: the median and
-the 5 % and 95 % quantiles over the repeats, and one value a repeat in the order of the seeds. A value that is not
-finite is written as null and left out of the median and the quantiles, so that a reader sees which repeat failed.
+Every number is in SI (m, rad and their squares). A value that is not finite is written as null and left out of the
+median and the quantiles of its spread, so that a reader sees which repeat failed.
 """
 
 from __future__ import annotations
@@ -16,12 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
+from ccnn_torch.report.results.base import Length, Spread
+from ccnn_torch.report.results.run import Before, Energy, Errors, Floor, Mse, Pose, PoseFigures, RmsMax
 
-Block = dict[str, Any]
 Error = tuple[ArrayLike, ArrayLike | None]
 
 
-def spread(values: ArrayLike) -> Block:
+def spread(values: ArrayLike) -> Spread:
     """Median, 5 % and 95 % quantile over repeats, and the values themselves.
 
     Args:
@@ -32,12 +32,7 @@ def spread(values: ArrayLike) -> Block:
     low, median, high = (
         (float(q) for q in np.quantile(finite, [0.05, 0.5, 0.95])) if finite.size else (None, None, None)
     )
-    return {
-        "median": median,
-        "low": low,
-        "high": high,
-        "values": [float(v) if np.isfinite(v) else None for v in array],
-    }
+    return Spread(median=median, low=low, high=high, values=[float(v) if np.isfinite(v) else None for v in array])
 
 
 def share_unit(joints: Sequence[Coordinate]) -> bool:
@@ -47,7 +42,7 @@ def share_unit(joints: Sequence[Coordinate]) -> bool:
 
 def joint_errors(
     predicted: ArrayLike, measured: ArrayLike, weights: ArrayLike | None, joints: Sequence[Coordinate]
-) -> Block:
+) -> dict[str, Errors]:
     """Mean squared, mean absolute and summed squared error, as in Tables II and IV of paper 000.
 
     A joint's mse and mae are means over the rows and its sse the sum. `all` holds the mean over rows and joints (mse,
@@ -60,22 +55,18 @@ def joint_errors(
         weights: row weights, `r x s` [1]; rows of weight 0 are ignored (padding). None = every row counts once.
 
     Returns:
-        `{"all": {"mse": S, "mae": S, "sse": S}, JOINT: {…}}` with S a spread.
+        By joint, and `all`.
     """
     error, weight = _rows(_array(predicted) - _array(measured), weights, joints)
     total = weight.sum(1)
     square = (np.square(error) * weight[..., None]).sum(1)
     absolute = (np.abs(error) * weight[..., None]).sum(1)
 
-    def measures(squares: NDArray[np.float64], absolutes: NDArray[np.float64], count: NDArray[np.float64]) -> Block:
-        return {"mse": spread(squares / count), "mae": spread(absolutes / count), "sse": spread(squares)}
+    def measures(squares: NDArray[np.float64], absolutes: NDArray[np.float64], count: NDArray[np.float64]) -> Errors:
+        return Errors(mse=spread(squares / count), mae=spread(absolutes / count), sse=spread(squares))
 
-    block: Block = {}
-    if share_unit(joints):
-        block["all"] = measures(square.sum(1), absolute.sum(1), total * len(joints))
-    for i, joint in enumerate(joints):
-        block[joint.name] = measures(square[:, i], absolute[:, i], total)
-    return block
+    errors = {"all": measures(square.sum(1), absolute.sum(1), total * len(joints))} if share_unit(joints) else {}
+    return errors | {joint.name: measures(square[:, i], absolute[:, i], total) for i, joint in enumerate(joints)}
 
 
 def constant_errors(
@@ -84,7 +75,7 @@ def constant_errors(
     train_weights: ArrayLike | None,
     test_weights: ArrayLike | None,
     joints: Sequence[Coordinate],
-) -> Block:
+) -> dict[str, Errors]:
     """Errors on the test rows of the constant predictor: the mean deviation of each joint over the training rows.
 
     Args:
@@ -96,7 +87,7 @@ def constant_errors(
     return joint_errors(mean, test, test_weights, joints)
 
 
-def before_block(deviations: ArrayLike, weights: ArrayLike | None, joints: Sequence[Coordinate]) -> Block:
+def before_block(deviations: ArrayLike, weights: ArrayLike | None, joints: Sequence[Coordinate]) -> dict[str, Before]:
     """Mean and maximum of each joint's error before calibration (Tables I and III of paper 000).
 
     Both are of the *signed* error: the paper's ρ3 has mean -9.36e-5 and maximum -6.68e-5, which only the algebraically
@@ -105,10 +96,6 @@ def before_block(deviations: ArrayLike, weights: ArrayLike | None, joints: Seque
     Args:
         deviations: pseudoerrors, `r x s x n` [the joint's SI unit].
         weights: `r x s` [1] or None.
-
-    Returns:
-        `{JOINT: {"mean", "max", "max_abs", "spread": {"mean": S, "max": S, "max_abs": S}}}`; the plain numbers are the
-        medians over the repeats.
     """
     values, weight = _rows(_array(deviations), weights, joints)
     there = weight[..., None] > 0
@@ -117,11 +104,10 @@ def before_block(deviations: ArrayLike, weights: ArrayLike | None, joints: Seque
         "max": np.where(there, values, -np.inf).max(1),
         "max_abs": np.where(there, np.abs(values), -np.inf).max(1),
     }
-    block: Block = {}
-    for i, joint in enumerate(joints):
-        spreads = {name: spread(value[:, i]) for name, value in found.items()}
-        block[joint.name] = {name: s["median"] for name, s in spreads.items()} | {"spread": spreads}
-    return block
+    spreads = {joint.name: {name: spread(v[:, i]) for name, v in found.items()} for i, joint in enumerate(joints)}
+    return {
+        joint: Before(**{name: s.median for name, s in each.items()}, spread=each) for joint, each in spreads.items()
+    }
 
 
 def floor_block(
@@ -130,7 +116,7 @@ def floor_block(
     joints: Sequence[Coordinate],
     variance: ArrayLike,
     unlearnable: ArrayLike | None = None,
-) -> Block:
+) -> Floor:
     """The error that no model can go below: the noise actually drawn in the test rows, and what is expected of it.
 
     Args:
@@ -139,36 +125,37 @@ def floor_block(
         variance: variance of the noise, `n` [the square of it].
         unlearnable: the part of the signal that the inputs do not determine, like `noise` (the chirp of eq. 19), or
             None. It counts as signal in `realised` and as noise in `with_unlearnable`.
-
-    Returns:
-        `{"realised": {"all": {"mse": S}, JOINT: …}, "expected": …, "with_unlearnable": … or null}`.
     """
     drawn = _array(noise)
     repeats = drawn.shape[0] if drawn.ndim == 3 else 1
     expected = np.broadcast_to(np.sqrt(_array(variance)), (repeats, 1, len(joints)))
 
-    def only_mse(error: NDArray[np.float64], weight: ArrayLike | None) -> Block:
+    def only_mse(error: NDArray[np.float64], weight: ArrayLike | None) -> dict[str, Mse]:
         errors = joint_errors(error, np.zeros_like(error), weight, joints)
-        return {name: {"mse": measures["mse"]} for name, measures in errors.items()}
+        return {name: Mse(mse=measures.mse) for name, measures in errors.items()}
 
-    return {
-        "realised": only_mse(drawn, weights),
-        "expected": only_mse(expected, None),
-        "with_unlearnable": None if unlearnable is None else only_mse(drawn + _array(unlearnable), weights),
-    }
+    return Floor(
+        realised=only_mse(drawn, weights),
+        expected=only_mse(expected, None),
+        with_unlearnable=None if unlearnable is None else only_mse(drawn + _array(unlearnable), weights),
+    )
 
 
-def ratio_to_floor(errors: Mapping[str, Any] | None, floor: Mapping[str, Any] | None) -> Block | None:
+def ratio(above: Spread, below: Spread) -> Spread:
+    """Ratio of two figures, repeat by repeat."""
+    top, bottom = (np.array(s.values, dtype=float) for s in (above, below))
+    return spread(np.divide(top, bottom, out=np.full_like(top, np.nan), where=bottom > 0))
+
+
+def ratio_to_floor(errors: Mapping[str, Mse], floor: Floor | None) -> Spread | None:
     """Ratio of the `all` mse to the realised floor, repeat by repeat.
 
     Returns:
         A spread; None where one of the two is unknown or has no `all`.
     """
-    if errors is None or floor is None or "all" not in errors or "all" not in floor["realised"]:
+    if floor is None or "all" not in errors or "all" not in floor.realised:
         return None
-    mse = np.array(errors["all"]["mse"]["values"], dtype=float)
-    noise = np.array(floor["realised"]["all"]["mse"]["values"], dtype=float)
-    return spread(np.divide(mse, noise, out=np.full_like(mse, np.nan), where=noise > 0))
+    return ratio(errors["all"].mse, floor.realised["all"].mse)
 
 
 def pose_block(
@@ -177,7 +164,7 @@ def pose_block(
     weights: ArrayLike | None = None,
     rotation_weight: float | None = None,
     **beside: Error | None,
-) -> Block:
+) -> Pose:
     """Root mean square and maximum of the pose error over the held-out rows, before and after.
 
     Args:
@@ -186,33 +173,28 @@ def pose_block(
         weights: `r x s` [1], or None.
         rotation_weight: η of eq. 5 [m/rad]; adds `energy`, E = position error + η · rotation error, row by row [m].
         beside: what else is reported with `before` and `after`, under its name; None is left out.
-
-    Returns:
-        `{"position": {"unit": "m", "before": {"rms": S, "max": S}, "after": …}, "rotation": {…} or null}`, and `energy`
-        where asked for.
     """
     errors = {"before": before, "after": after} | {name: error for name, error in beside.items() if error is not None}
 
-    def quantity(unit: str, values: Mapping[str, ArrayLike | None]) -> Block:
+    def figures(unit: Length, values: Mapping[str, ArrayLike | None]) -> dict[str, Any]:
         return {"unit": unit} | {k: _rms_and_max(_array(v), weights) for k, v in values.items() if v is not None}
 
-    block: Block = {"position": quantity("m", {name: error[0] for name, error in errors.items()}), "rotation": None}
+    position = PoseFigures(**figures("m", {name: error[0] for name, error in errors.items()}))
     if before[1] is None or after[1] is None:
-        return block
-    block["rotation"] = quantity("rad", {name: error[1] for name, error in errors.items()})
-    if rotation_weight is not None:
-        first, last = (
-            _array(p) + rotation_weight * _array(r) for p, r in ((before[0], before[1]), (after[0], after[1]))
-        )
-        block["energy"] = quantity("m", {"before": first, "after": last}) | {"rotation_weight": rotation_weight}
-    return block
+        return Pose(position=position, rotation=None)
+    rotation = PoseFigures(**figures("rad", {name: error[1] for name, error in errors.items()}))
+    if rotation_weight is None:
+        return Pose(position=position, rotation=rotation)
+    first, last = (_array(p) + rotation_weight * _array(r) for p, r in ((before[0], before[1]), (after[0], after[1])))
+    energy = Energy(**figures("m", {"before": first, "after": last}), rotation_weight=rotation_weight)
+    return Pose(position=position, rotation=rotation, energy=energy)
 
 
-def _rms_and_max(errors: NDArray[np.float64], weights: ArrayLike | None) -> Block:
+def _rms_and_max(errors: NDArray[np.float64], weights: ArrayLike | None) -> RmsMax:
     values, weight = _rows(errors[..., None], weights, (Coordinate("error", "1"),))
     values = values[..., 0]
     rms = np.sqrt((np.square(values) * weight).sum(1) / weight.sum(1))
-    return {"rms": spread(rms), "max": spread(np.where(weight > 0, values, -np.inf).max(1))}
+    return RmsMax(rms=spread(rms), max=spread(np.where(weight > 0, values, -np.inf).max(1)))
 
 
 def _rows(

@@ -245,11 +245,11 @@ def verify(
         write_verify_report(out, found.results, found.arrays)
     results = found.results
     if not quiet:
-        typer.echo(results["text"])
-        for note in results["notes"]:
+        typer.echo(results.text)
+        for note in results.notes:
             typer.echo(note)
         typer.echo(f"Everything is in {out}; open {out / 'verify.html'}")
-    if not results["kept"]:
+    if not results.kept:
         raise typer.Exit(1)
 
 

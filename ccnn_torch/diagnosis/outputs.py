@@ -21,6 +21,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Framed, SerialArm, fit_frames
 from ccnn_torch.mechanisms.files.write_machine import write_machine
 from ccnn_torch.report.json_files import plain, write_json
+from ccnn_torch.report.results.diagnosis import DiagnosisResults
 
 
 def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
@@ -30,7 +31,7 @@ def write_result(folder: Path, diagnosis: Diagnosis) -> Path:
         InputError: the folder cannot be written.
     """
     path = folder / RESULT
-    write_json(path, plain(diagnosis.to_json()))
+    write_json(path, DiagnosisResults.model_validate(diagnosis.to_json()))
     return path
 
 

@@ -70,7 +70,7 @@ class Diagnosis:
     machine: dict[str, Any] | None = field(default=None, repr=False)
 
     def to_json(self) -> Mapping[str, Any]:
-        """The form of `diagnosis.json` (schema `diagnosis`)."""
+        """The content of `diagnosis.json` (`DiagnosisResults`)."""
         situation = self.analysis.situation
         machine = {
             "name": situation.mechanism.name,

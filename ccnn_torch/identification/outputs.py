@@ -10,6 +10,7 @@ from ccnn_torch.identification.page.report import save_identified_arrays, write_
 from ccnn_torch.identification.page.tables import identified_markdown, write_identified_csv
 from ccnn_torch.mechanisms.files.write_machine import write_machine
 from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.results.identified import IdentifiedResults
 
 RESULTS = "identified.json"
 
@@ -25,4 +26,4 @@ def write_outputs(found: Identification, folder: Path) -> None:
     write_machine(found.mechanism(), found.nominal(), folder, "identified", config.columns, config.joint_map)
     if found.config.save_report:
         write_identified_report(folder, results)
-    write_json(folder / RESULTS, results)
+    write_json(folder / RESULTS, IdentifiedResults.model_validate(results))

@@ -50,7 +50,7 @@ class MotionDiagnosis:
     proposed: Sequence[Motion] = field(repr=False)
 
     def to_json(self) -> Mapping[str, Any]:
-        """The form of `diagnosis.json` (schema `diagnosis`)."""
+        """The content of `diagnosis.json` (`DiagnosisResults`)."""
         return self.content
 
 

@@ -24,6 +24,7 @@ from ccnn_torch.motion.nominal import Nominal
 from ccnn_torch.motion.phases import phases_of
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.json_files import plain, write_json
+from ccnn_torch.report.results.diagnosis import DiagnosisResults
 from ccnn_torch.report.screen import say_place, stdout, step_bar
 from ccnn_torch.report.table import print_text
 from ccnn_torch.run_folder.interrupt import if_stopped
@@ -53,7 +54,7 @@ def run_motion(config: DiagnoseConfig, quiet: bool = False, details: bool = Fals
     stopped = if_stopped("interrupted before there was a verdict; nothing was written")
     with stopped, step_bar(_STEPS, quiet) as tell, watched(tell):
         found, nominal = diagnosed(config)
-    results = dict(plain(found.to_json()))
+    results = plain(DiagnosisResults.model_validate(found.to_json()))
     with locked(folder):
         sweep(folder)
         write_json(folder / RESULT, results)
@@ -107,4 +108,4 @@ def _report(config: DiagnoseConfig, folder: Path, results: Mapping[str, Any], fo
     }
     drawn = {n: getattr(data, n).double() for n in ("time", "command", "position", "judged", "run")}
     drawn |= {"before": found.before, "after": found.after, "phase": phases_of(data).double()}
-    write_diagnosis_report(folder, results, drawn, {"about": about}, tensorboard=False)
+    write_diagnosis_report(folder, results, drawn, {"about": about})

@@ -1,4 +1,4 @@
-"""JSON result files: written atomically, without NaN, and each with a JSON Schema."""
+"""JSON result files: written atomically, without NaN."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from pydantic import BaseModel
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.read import parse_json, read_text
@@ -22,11 +22,13 @@ _LARGEST = 500_000_000
 
 
 def plain(value: Any) -> Any:
-    """The same value in JSON's types: arrays and tensors become lists, numbers that are not finite become None.
+    """The same value in JSON's types: models become objects, arrays and tensors lists, infinite numbers and NaN None.
 
     Raises:
         TypeError: a value that JSON has no form for.
     """
+    if isinstance(value, BaseModel):
+        value = value.model_dump(exclude_unset=True, by_alias=True)
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -44,7 +46,7 @@ def plain(value: Any) -> Any:
     raise TypeError(f"JSON has no form for a {type(value).__name__}.")
 
 
-def write_json(path: str | Path, value: Mapping[str, Any]) -> None:
+def write_json(path: str | Path, value: Mapping[str, Any] | BaseModel) -> None:
     """Write a JSON file; a reader sees the old file or the new one, never half of one."""
     text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
     write_whole(path, text + "\n")
@@ -60,14 +62,3 @@ def read_json(path: str | Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise InputError(f"{path} must hold one JSON object, not a {type(value).__name__}.")
     return value
-
-
-def load_schema(name: str) -> dict[str, Any]:
-    """A JSON Schema (draft 2020-12) of this package.
-
-    Args:
-        name: `results`, `identified`, `suite`, `diagnosis`, `card` or `verify`.
-    """
-    text = files("ccnn_torch.report").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
-    schema: dict[str, Any] = json.loads(text)
-    return schema

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
 from ccnn_torch.display import count_text
-from ccnn_torch.mechanisms import PoseError, SerialArm
+from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.records import check_rows, load_records
+from ccnn_torch.report.results.base import Length
+from ccnn_torch.report.results.verify import Error, JointError, VerifyResults
 from ccnn_torch.verification.moved_frame import Motion, fit_motion
 from ccnn_torch.verification.prediction import (
     Rows,
@@ -22,7 +24,7 @@ from ccnn_torch.verification.prediction import (
     pseudoerror_settings,
 )
 from ccnn_torch.verification.promise import configurations, paired_gain, promise_of, promised
-from ccnn_torch.verification.result import Verified, error_block, figure_arrays, rms
+from ccnn_torch.verification.result import Verified, error_of, figure_arrays, rms_of
 from ccnn_torch.verification.tables import verify_text
 
 # A moved measuring frame is suspected if correcting it halves the remaining RMS error at least.
@@ -79,59 +81,56 @@ def verify_model(
     groups = configurations(rows.joints, machine.joints)
     promise = promise_of(model)
     count = int(groups.max()) + 1
-    blocks = {
-        kind: error_block(unit, first, last, promise and promised(promise, kind, count))
-        for kind, unit, first, last in (
-            ("position", "m", before.position, after.position),
-            ("rotation", "rad", before.rotation, after.rotation),
-        )
-    }
-    results: dict[str, Any] = {
-        "model": Path(model.path).name,
-        "records": Path(loaded.path).name,
-        "mechanism": machine.name,
-        "rows": len(loaded),
-        "configurations": count,
-        "outside_domain": int((~rows.inside).sum()),
-        "compensated": compensated,
-        "frames": "fitted again" if refit_frames else "the model's",
-        **blocks,
-        "joints": {
-            c.name: {"unit": c.unit, "before": rms(measured[usable, k]), "after": rms(left[usable, k])}
+
+    def error(kind: str, unit: Length, first: Tensor | None, last: Tensor | None) -> Error | None:
+        return error_of(unit, first, last, promised(promise, kind, count) if promise else None)
+
+    position = error("position", "m", before.position, after.position)
+    rotation = error("rotation", "rad", before.rotation, after.rotation)
+    assert position is not None
+    limited = [block for block in (position, rotation) if block is not None and block.promised is not None]
+    kept = [block.promised is None or block.after.rms <= block.promised.high for block in limited]
+    results = VerifyResults(
+        model=Path(model.path).name,
+        records=Path(loaded.path).name,
+        mechanism=machine.name,
+        rows=len(loaded),
+        configurations=count,
+        outside_domain=int((~rows.inside).sum()),
+        compensated=compensated,
+        frames="fitted again" if refit_frames else "the model's",
+        position=position,
+        rotation=rotation,
+        joints={
+            c.name: JointError(unit=c.unit, before=rms_of(measured[usable, k]), after=rms_of(left[usable, k]))
             for k, c in enumerate(machine.joints)
         },
-        "kept": _kept(blocks, before, after, groups),
-        "notes": [],
-    }
-    if results["outside_domain"]:
-        results["notes"].append(
-            f"{count_text(results['outside_domain'], 'row')} outside the model's domain, where its correction fades: "
+        # Without a promise the position error has to fall at 95 %.
+        kept=all(kept) if limited else paired_gain(before.position, after.position, groups),
+        notes=[],
+        text="",
+    )
+    if results.outside_domain:
+        results.notes.append(
+            f"{count_text(results.outside_domain, 'row')} outside the model's domain, where its correction fades: "
             "the promise is not made for such rows."
         )
     if not refit_frames:
-        results["notes"] += _moved(rows, results, compensated)
-    results["text"] = verify_text(results)
+        results.notes += _moved(rows, results)
+    results.text = verify_text(results)
     if loaded.data_hash == model.facts.get("data_sha256"):
-        results["text"] = f"These are the rows that the model was made from, so this is no test. {results['text']}"
+        results.text = f"These are the rows that the model was made from, so this is no test. {results.text}"
     return Verified(results, figure_arrays(rows, measured, left, before, after))
 
 
-def _kept(blocks: Mapping[str, dict[str, Any] | None], before: PoseError, after: PoseError, groups: Tensor) -> bool:
-    """Whether no RMS is above its upper limit; without a promise, whether the position error fell at 95 %."""
-    judged = [block for block in blocks.values() if block is not None and block["promised"] is not None]
-    if not judged:
-        return paired_gain(before.position, after.position, groups)
-    return all(block["after"]["rms"] <= block["promised"]["high"] for block in judged)
-
-
-def _moved(rows: Rows, results: Mapping[str, Any], compensated: bool) -> list[str]:
+def _moved(rows: Rows, results: VerifyResults) -> list[str]:
     """A sentence if a moved measuring frame explains at least half of the remaining error."""
-    if results["kept"] or not Motion.fits(rows.mechanism) or results["configurations"] < 4:
+    if results.kept or not Motion.fits(rows.mechanism) or results.configurations < 4:
         return []
-    at = rows.nominal if compensated else rows.predicted
+    at = rows.nominal if results.compensated else rows.predicted
     motion = fit_motion(rows.mechanism, at, rows.pose)
-    left = rms(rows.mechanism.pose_error(motion.undone(rows.mechanism, rows.pose), at).position)
-    if left is None or left > _SUSPECT * results["position"]["after"]["rms"]:
+    left = rms_of(rows.mechanism.pose_error(motion.undone(rows.mechanism, rows.pose), at).position)
+    if left is None or left > _SUSPECT * results.position.after.rms:
         return []
     return [
         f"The measuring device seems to have moved since the model was made: a rigid motion of its frame by "

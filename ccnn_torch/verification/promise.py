@@ -15,6 +15,7 @@ from ccnn_torch.compensation import IdentifiedGeometry, LoadedModel
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.report.json_files import read_json
+from ccnn_torch.report.results.verify import Promised
 
 # Rows whose commanded joints round to the same cell are one configuration, measured several times [SI].
 _CELL = {"m": 1e-4, "rad": 1e-3}
@@ -64,7 +65,7 @@ def promise_block(before: PoseError, after: PoseError, groups: Tensor) -> dict[s
     }
 
 
-def promised(promise: Mapping[str, Any], kind: str, count: int) -> dict[str, float] | None:
+def promised(promise: Mapping[str, Any], kind: str, count: int) -> Promised | None:
     """RMS that new rows should have, and the limits that it passes once in twenty on either side; None = no promise.
 
     The mean of squared errors over C configurations is taken as a scaled chi-square with 2 C / spread degrees of
@@ -86,7 +87,7 @@ def promised(promise: Mapping[str, Any], kind: str, count: int) -> dict[str, flo
 
     freedom = [2 * n / block["spread"] for n in (count, promise["configurations"])]
     low, high = (block["rms"] * math.sqrt(float(f.ppf(share, *freedom))) for share in (1 - _SHARE, _SHARE))
-    return {"rms": block["rms"], "low": low, "high": high}
+    return Promised(rms=block["rms"], low=low, high=high)
 
 
 def paired_gain(before: Tensor, after: Tensor, groups: Tensor) -> bool:

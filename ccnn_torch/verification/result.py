@@ -1,39 +1,36 @@
-"""The result of a verification: the content of verify.json, and the arrays of its figures."""
+"""The result of a verification, and the arrays of its figures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from ccnn_torch.mechanisms import PoseError
 from ccnn_torch.report.arrays import RunArrays
+from ccnn_torch.report.results.base import Length
+from ccnn_torch.report.results.verify import Error, Promised, Size, VerifyResults
 from ccnn_torch.verification.prediction import Rows
 
 
 @dataclass(frozen=True)
 class Verified:
-    """`results`: the content of verify.json; `arrays`: what its pictures need, all rows held out."""
+    """What was found, and the arrays that its pictures need, all rows held out."""
 
-    results: dict[str, Any]
+    results: VerifyResults
     arrays: RunArrays
 
 
-def error_block(
-    unit: str, before: Tensor | None, after: Tensor | None, promise: Mapping[str, float] | None
-) -> dict[str, Any] | None:
+def error_of(unit: Length, before: Tensor | None, after: Tensor | None, promise: Promised | None) -> Error | None:
+    """The errors of all rows before and after, `s` [unit]; None where there are none."""
     if before is None or after is None:
         return None
-    figures = {
-        when: {"rms": rms(error), "max": float(error.max())} for when, error in (("before", before), ("after", after))
-    }
-    return {"unit": unit, **figures, "promised": promise}
+    first, last = (Size(rms=float(e.square().mean().sqrt()), max=float(e.max())) for e in (before, after))
+    return Error(unit=unit, before=first, after=last, promised=promise)
 
 
-def rms(values: Tensor) -> float | None:
+def rms_of(values: Tensor) -> float | None:
     return float(values.square().mean().sqrt()) if values.numel() else None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -12,10 +13,10 @@ import typer
 
 from ccnn_torch.cli.application import app
 from ccnn_torch.config.commands import keys_by_section
-from ccnn_torch.report.json_files import load_schema
 
 __all__ = ["write_reference"]
 
+CONTRACTS = Path(__file__).parents[2] / "tests" / "contracts"
 SCHEMAS = {
     "results": "`results.json` of `ccnn run`",
     "card": "`card.json` beside every model file",
@@ -96,9 +97,13 @@ def _keys() -> str:
 
 
 def _formats() -> str:
-    parts = ["# File formats\n", "The JSON Schemas are in the package, in `ccnn_torch/report/*.schema.json`.\n"]
+    parts = [
+        "# File formats\n",
+        "The JSON Schemas are in `tests/contracts/`; the models of `ccnn_torch.report.results` give them, such as "
+        "`RunResults.model_json_schema()`.\n",
+    ]
     for name, title in SCHEMAS.items():
-        schema = load_schema(name)
+        schema: dict[str, Any] = json.loads((CONTRACTS / f"{name}.json").read_text(encoding="utf-8"))
         parts += [
             f"## {title}\n",
             f"{schema.get('description', '')}\n",
@@ -127,10 +132,16 @@ def _properties(schema: Mapping[str, Any], node: Mapping[str, Any]) -> Iterator[
 
 
 def _resolved(schema: Mapping[str, Any], node: Any) -> Mapping[str, Any]:
-    if isinstance(node, Mapping) and "$ref" in node:
-        found: Mapping[str, Any] = schema["$defs"][node["$ref"].rpartition("/")[2]]
-        return found | {key: text for key, text in node.items() if key == "description"}
-    return node if isinstance(node, Mapping) else {}
+    """A node with what it refers to; of alternatives the first, with the types of all."""
+    if not isinstance(node, Mapping):
+        return {}
+    own = {key: text for key, text in node.items() if key == "description"}
+    if "$ref" in node:
+        return _resolved(schema, schema["$defs"][node["$ref"].rpartition("/")[2]]) | own
+    if "anyOf" in node:
+        options = [_resolved(schema, option) for option in node["anyOf"]]
+        return {**options[0], "type": [option.get("type", "any") for option in options]} | own
+    return node
 
 
 def _cell(text: str) -> str:

@@ -20,10 +20,11 @@ from ccnn_validation.blind.judge import judged
 from ccnn_validation.blind.report import share, summary
 from ccnn_validation.blind.simulate import simulate
 from ccnn_validation.blind.tables import blind_markdown
+from frozen import frozen
 
 from ccnn_torch.cli import main
 from ccnn_torch.errors import InputError
-from ccnn_torch.report.json_files import load_schema, read_json, write_json
+from ccnn_torch.report.json_files import read_json, write_json
 
 TRUE_SHRINK = (1.0, 0.9, 1.0)
 
@@ -44,7 +45,7 @@ def test_who_knows_the_truth_is_right_and_who_does_not_is_not(tmp_path: Path) ->
     ignorant = StandIn(otherwise=Said(("drift",)))
     path = check(tmp_path / "a", ignorant)
     found = read_json(path)
-    jsonschema.validate(found, load_schema("blind"))
+    jsonschema.validate(found, frozen("blind"))
     assert found["targets"]["none, false alarms"]["share"] == 1.0
     truth = read_json(BlindFolder(tmp_path / "a").truth)["cases"]
     lucky = sum("drift" in c["causes"] for c in truth if c["kind"] == "single")

@@ -18,6 +18,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from frozen import frozen
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
@@ -37,7 +38,6 @@ from ccnn_torch.compensation.model_files.onnx_session import OUTPUTS
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError
 from ccnn_torch.mechanisms import Tripod, load_mechanism
-from ccnn_torch.report.json_files import load_schema
 from ccnn_torch.training import Scaling
 
 FORMS = ("safetensors", "onnx")
@@ -160,7 +160,7 @@ def test_metadata_is_one_key_of_sorted_json(folder: Path) -> None:
 def test_the_card_holds_to_its_schema(folder: Path) -> None:
     for name in ("card.json", "arm.card.json"):
         card = json.loads((folder / name).read_text())
-        jsonschema.validate(card, load_schema("card"))
+        jsonschema.validate(card, frozen("card"))
         for file, digest in card["files"].items():
             assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == digest
         assert card["iterations"] == 5 and card["lipschitz"] < 0.01 and card["notes"] == []

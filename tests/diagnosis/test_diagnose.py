@@ -9,6 +9,7 @@ import jsonschema
 import pytest
 import torch
 from diagnosis._machines import NOISE, acting, measured, reached_with, rows_of
+from frozen import frozen
 
 from ccnn_torch.diagnosis import Diagnosis, diagnose, diagnose_rows
 from ccnn_torch.diagnosis.checks.identifiable import check_rows
@@ -17,7 +18,7 @@ from ccnn_torch.effects import EFFECTS, Situation, default_gravity, make_effect
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import load_records
-from ccnn_torch.report.json_files import load_schema, plain
+from ccnn_torch.report.json_files import plain
 from ccnn_torch.simulation.job import simulate_records
 from ccnn_torch.simulation.outputs import write_simulated
 
@@ -45,7 +46,7 @@ def test_it_names_the_causes(machine: str, causes: list[str]) -> None:
     assert verdict["shrink"] > 0.95 and verdict["shrink_ci95"][1] == 1.0
     assert said.gap["after"] == pytest.approx(said.gap["noise_floor"], rel=0.25)
     assert {a.effect.name for a in said.acting} == set(causes)
-    jsonschema.validate(plain(said.to_json()), load_schema("diagnosis"))
+    jsonschema.validate(plain(said.to_json()), frozen("diagnosis"))
 
 
 def near_singular(said: Diagnosis) -> list[int]:

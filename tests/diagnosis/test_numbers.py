@@ -9,6 +9,7 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
+from frozen import frozen
 
 from ccnn_torch import diagnose, load_mechanism, load_records
 from ccnn_torch.diagnosis import Diagnosis
@@ -18,7 +19,7 @@ from ccnn_torch.diagnosis.page.numbers import numbers_table
 from ccnn_torch.diagnosis.page.place_words import where_words
 from ccnn_torch.mechanisms import SerialArm
 from ccnn_torch.records import write_table
-from ccnn_torch.report.json_files import load_schema, plain
+from ccnn_torch.report.json_files import plain
 
 NOISE = 1e-5
 
@@ -46,7 +47,7 @@ def test_a_gain_says_from_where_it_counts(tmp_path: Path) -> None:
     error = np.zeros_like(commands)
     error[:, 2] = 2e-3 * (commands[:, 2] + 0.2)
     found = plain(_found(_gantry(), tmp_path, error, commands).to_json())
-    jsonschema.validate(found, load_schema("diagnosis"))
+    jsonschema.validate(found, frozen("diagnosis"))
     assert found["verdict"]["effects"] == ["joint_gain"]
     numbers = next(e for e in found["effects"] if e["name"] == "joint_gain")["parameters"]
     about = numbers["q3"]["about"]

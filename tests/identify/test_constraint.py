@@ -9,6 +9,7 @@ import jsonschema
 import numpy as np
 import pytest
 import torch
+from frozen import frozen
 
 from ccnn_torch.cli import main
 from ccnn_torch.compensation import load_compensation
@@ -19,7 +20,6 @@ from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.identify import Identification, identify
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
-from ccnn_torch.report.json_files import load_schema
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 SOCKETS, DATA, ARM = (EXPERIMENTS / n for n in ("sockets.yaml", "data/sockets.csv", "data/sockets_arm.yaml"))
@@ -48,7 +48,7 @@ def test_the_folder_has_everything(folder: Path) -> None:
     assert names >= {"identified.json", "identified.csv", "identified.md", "identified.yaml", "report.html"}
     assert {p.stem for p in (folder / "plots").glob("*.png")} >= {"pose_error", "parameters"}
     results = json.loads((folder / "identified.json").read_text())
-    jsonschema.validate(results, load_schema("identified"))
+    jsonschema.validate(results, frozen("identified"))
     assert results["rows"] == {"train": 84, "per_leg": {}, "test": 36}
     assert [p["rows"] for p in results["constraint"]["placements"]] == [40, 40, 40]
     assert {"plate0_x", "plate2_turn2", "plate_scale"} <= set(results["constraint"]["unknowns"])
@@ -151,7 +151,7 @@ def simulated(kind: str, folder: Path) -> Identification:
 @pytest.mark.parametrize("kind", ["distances", "plane"])
 def test_distances_and_planes_identify_too(kind: str, tmp_path: Path) -> None:
     found = simulated(kind, tmp_path)
-    jsonschema.validate(json.loads(json.dumps(found.results)), load_schema("identified"))
+    jsonschema.validate(json.loads(json.dumps(found.results)), frozen("identified"))
     test, constraint = found.results["test"]["position"], found.results["constraint"]
     assert found.results["rows"] == {"train": 56, "per_leg": {}, "test": 24}
     assert [place["rows"] for place in constraint["placements"]] == [40, 40]

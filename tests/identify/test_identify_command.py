@@ -9,6 +9,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 import torch
+from frozen import frozen
 
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.errors import InputError, ModelFileError
@@ -17,7 +18,6 @@ from ccnn_torch.identification.job import resume_identification, start_identific
 from ccnn_torch.identification.page.report import write_identified_report
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
-from ccnn_torch.report.json_files import load_schema
 
 CONFIG = """\
 mechanism: five_bar
@@ -41,7 +41,7 @@ def test_the_folder_has_everything(folder: Path) -> None:
     assert names >= {"config.yaml", "identified.json", "identified.csv", "identified.md", "identified.yaml"}
     assert names >= {"report.html", "plots", "arrays.safetensors", "methods"}
     results = json.loads((folder / "identified.json").read_text())
-    jsonschema.validate(results, load_schema("identified"))
+    jsonschema.validate(results, frozen("identified"))
     assert list(results["methods"]) == ["lm", "lm_per_leg", "tikhonov"]
     assert set(results["parameters"]["l1"]["spread"]) >= {"value", "sd"}
     assert [c["poses"] for c in results["counts"]] == [16]

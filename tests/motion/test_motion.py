@@ -9,6 +9,7 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+from frozen import frozen
 from motion.servo import GAIN, INERTIA, KEYS, LENGTH, LOAD, MASS, VISCOUS, command, moved, moved_on_a_spring, write_log
 
 from ccnn_torch.diagnosis.verdict.findings import findings
@@ -22,7 +23,6 @@ from ccnn_torch.motion import (
 )
 from ccnn_torch.motion.servo import axis_keys
 from ccnn_torch.records import read_table
-from ccnn_torch.report.json_files import load_schema
 
 Cli = Callable[..., tuple[int, str, str]]
 DATA = Path(__file__).parents[2] / "experiments" / "data"
@@ -64,7 +64,7 @@ def test_the_command_on_a_real_servo(tmp_path: Path, cli: Cli) -> None:
     code, said, error = cli("diagnose", *logs, "--mechanism", "servo", "--effects", effects, "--out", out)
     assert code == 0 and not error
     results = json.loads((out / "diagnosis.json").read_text())
-    jsonschema.validate(results, load_schema("diagnosis"))
+    jsonschema.validate(results, frozen("diagnosis"))
     assert results["motion"] and results["gap"]["unit"] == "rad"
     # A pendulum of 0.49 kg at 0.1 m sags: that carries most of the gap, and the joint is the only one.
     assert "gravity" in results["verdict"]["effects"] and results["where"]["joints"] == {"q1": 1.0}

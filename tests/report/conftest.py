@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +10,11 @@ from report_runs import fill, tripod_run
 
 from ccnn_torch.calibration.page.report import write_report
 from ccnn_torch.report.arrays import RunArrays
+from ccnn_torch.report.results.run import RunResults
 
 
 @pytest.fixture
-def results() -> dict[str, Any]:
+def results() -> RunResults:
     return tripod_run()[0]
 
 

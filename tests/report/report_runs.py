@@ -19,9 +19,10 @@ from ccnn_torch.calibration.statistics import (
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.report.arrays import RunArrays, save_arrays, save_history
 from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.results.run import RunResults
 
 
-def tripod_run(repeats: int = 5) -> tuple[dict[str, Any], RunArrays, dict[str, np.ndarray]]:
+def tripod_run(repeats: int = 5) -> tuple[RunResults, RunArrays, dict[str, np.ndarray]]:
     """Results, arrays and training curves of a tripod-like run: eq. 17's errors, a model near the noise floor."""
     generator = np.random.default_rng(7)
     joints = tuple(Coordinate(f"q{i}", "m") for i in (1, 2, 3))
@@ -119,10 +120,10 @@ def tripod_run(repeats: int = 5) -> tuple[dict[str, Any], RunArrays, dict[str, n
         "density": np.clip(0.55 + 0.2 * decay[..., None] * generator.normal(1, 0.2, (1, repeats, 3)), 0, 1),
         "diversity": np.clip(0.9 * decay[..., None] * generator.normal(1, 0.1, (1, repeats, 3)), 0, 1),
     }
-    return results, arrays, history
+    return RunResults.model_validate(results), arrays, history
 
 
-def arm_run(rows: int = 500) -> tuple[dict[str, Any], RunArrays]:
+def arm_run(rows: int = 500) -> tuple[RunResults, RunArrays]:
     """Results and arrays of a run on records of a six-joint arm: no floor known, orientation in mrad, one repeat."""
     generator = np.random.default_rng(11)
     joints = tuple(Coordinate(f"q{i}", "rad") for i in range(1, 7))
@@ -144,7 +145,7 @@ def arm_run(rows: int = 500) -> tuple[dict[str, Any], RunArrays]:
         "case": None,
         "joints": [{"name": j.name, "unit": j.unit} for j in joints],
         "best_method": "ccnn",
-        "rows": {"train": int((~held).sum()), "validation": 70, "test": int(held.sum()), "not_usable": 4},
+        "rows": {"train": int((~held).sum()), "validation": 70, "test": int(held.sum()), "not_trained_on": 4},
         "before": before_block(measured[None, held], None, joints),
         "methods": {"ccnn": {"test": errors, "ratio_to_floor": None, "seconds": spread([3.4])}},
         "constant": {"test": constant_errors(measured[None, ~held], measured[None, held], None, None, joints)},
@@ -164,7 +165,7 @@ def arm_run(rows: int = 500) -> tuple[dict[str, Any], RunArrays]:
         rotation_after=after,
         labels={"method": "ccnn", "repeat": "0", "mechanism": "ur10"},
     )
-    return results, arrays
+    return RunResults.model_validate(results), arrays
 
 
 def fill(folder: Path) -> Path:

@@ -16,7 +16,6 @@ from browser import find_browser, measured
 from diagnosis_cases import CASES, indistinguishable, none, one_effect, two_effects, with_rotation
 from matplotlib.figure import Figure
 from rich.console import Console
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_run_report import Page
 
 from ccnn_torch.diagnosis.page.data import About, about_of, load_diagnosis_arrays, signatures_of
@@ -31,7 +30,7 @@ from ccnn_torch.diagnosis.page.localisation import (
     shares,
     where_table,
 )
-from ccnn_torch.diagnosis.page.report import diagnosis_markdown, print_diagnosis, write_diagnosis_report
+from ccnn_torch.diagnosis.page.report import diagnosis_page, print_diagnosis, write_diagnosis_report
 from ccnn_torch.diagnosis.page.tables import (
     confusable_table,
     effect_table,
@@ -145,7 +144,7 @@ def test_what_a_network_would_still_gain_is_one_sentence() -> None:
 
 def test_what_is_not_seen_is_a_table_and_no_note_as_well() -> None:
     results = one_effect()[0]
-    text = diagnosis_markdown(results)
+    text = diagnosis_page(results).markdown()
     assert "latency cannot be seen" not in text and "a note of its own." in text
     assert "| latency | needs time[s] |" in text and "| speed1[rad/s] | latency | 42.0 |" in text
 
@@ -218,7 +217,7 @@ def test_a_machine_of_many_joints_and_conditions_has_its_next_measurements_on_th
     assert table is not None and table.columns == ("number", *map(str, range(1, 9)))
     assert [row[0] for row in table.rows] == [*joints, *conditions, "separates", "gain [nat]"]
     assert table.rows[0][1:] == ("654.3 mm",) * 8 and table.rows[-2][1] == "joint_offset or geometry"
-    page = write_diagnosis_report(tmp_path, results, arrays, labels, tensorboard=False)
+    page = write_diagnosis_report(tmp_path, results, arrays, labels)
     browser = find_browser()
     # The narrower ones: what does not fit scrolls in its box, nothing else does.
     for width in (1100, 420) if browser else ():
@@ -235,23 +234,11 @@ def test_the_same_files_give_the_same_page_and_text_is_escaped(folder: Path, tmp
     labels = {"about": {"name": "<b>a & b</b>", "notes": ["x < y"]}}
     arrays["held_out"].fill_(1)
     write_json(tmp_path / "diagnosis.json", results)
-    first = write_diagnosis_report(tmp_path, results, arrays, labels, tensorboard=False).read_text()
-    again = write_diagnosis_report(tmp_path, tensorboard=False).read_text()
-    assert first == again and not (tmp_path / "tensorboard").exists()
+    first = write_diagnosis_report(tmp_path, results, arrays, labels).read_text()
+    again = write_diagnosis_report(tmp_path).read_text()
+    assert first == again
     assert "200 rows · each judged by a fit to other rows" in first
     assert "&lt;b&gt;a &amp; b&lt;/b&gt;" in first and "x &lt; y" in first and "<b>a" not in first
-
-
-def test_tensorboard_gets_the_same_figures_once(folder: Path) -> None:
-    events = EventAccumulator(str(folder / "tensorboard")).Reload()
-    stems = ("machine", "gap", "probabilities", "signatures", "map", "where")
-    assert [e.value for e in events.Scalars("gap/in_order")] == pytest.approx([1.13e-4])
-    assert events.Scalars("gap/by_block_after")[0].value == pytest.approx(1.31e-4)
-    assert events.Scalars("gap/after_network")[0].value == pytest.approx(6e-5)
-    assert set(events.Tags()["images"]) == {f"diagnosis/{stem}" for stem in stems}
-    assert events.Scalars("gap/before")[0].value == pytest.approx(4.2e-4)
-    assert events.Scalars("probability/geometry")[0].value == pytest.approx(0.31)
-    assert len(list((folder / "tensorboard").iterdir())) == 1
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -266,7 +253,7 @@ def test_terminal_and_markdown_of_every_case(name: str) -> None:
     assert verdict_text(results) in " ".join(first.getvalue().split())
     assert "How large is the gap?" not in first.getvalue() and "--details" in first.getvalue()
     assert len(first.getvalue().splitlines()) < 40
-    text = diagnosis_markdown(results, about_of(labels))
+    text = diagnosis_page(results, about_of(labels)).markdown()
     assert all(f"{note}." in text for note in results["notes"] if "cannot be seen" not in note)
     blocks = text.split("## ")[1:]
     for block in blocks:

@@ -18,11 +18,12 @@ from report_runs import arm_run
 from ccnn_torch.calibration.page.figure_learning import convergence_plot, population_plot
 from ccnn_torch.calibration.page.figure_network import alive_nodes, network_plot
 from ccnn_torch.coordinates import Coordinate
-from ccnn_torch.display import display_unit, interval_text, number_text
+from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.report.arrays import RunArrays
 from ccnn_torch.report.figures.errors import joint_error_plot, pose_error_plot
 from ccnn_torch.report.figures.style import Plot, inline_svg, save_figure
 from ccnn_torch.report.figures.workspace import overview_plot, workspace_plot
+from ccnn_torch.report.results.base import Spread, interval_text
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -238,6 +239,6 @@ def test_number_and_interval_texts() -> None:
         "1.200e-10",
         "1.235e+05",
     ]
-    block = {"median": 2e-6, "low": 1e-6, "high": 3e-6, "values": [1e-6, None, 3e-6]}
+    block = Spread(median=2e-6, low=1e-6, high=3e-6, values=[1e-6, None, 3e-6])
     assert interval_text(block, 1e-6) == "2.000 [1.00, 3.00] (2 of 3)"
     assert interval_text(None) == "–"

@@ -8,7 +8,6 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,14 +19,20 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from typer.testing import CliRunner
 
-from ccnn_torch.calibration.page.report import html_text, make_picture, write_report
-from ccnn_torch.calibration.page.tables import markdown_text, print_tables, result_tables, verdict, worse_text
+from ccnn_torch.calibration.page.long_table import long_table
+from ccnn_torch.calibration.page.report import make_picture, write_report
+from ccnn_torch.calibration.page.tables import result_tables, run_page, verdict, worse_text
 from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback, tags_of
+from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.cli.with_model import picture
 from ccnn_torch.errors import InputError
-from ccnn_torch.report.csv_file import tidy_rows
 from ccnn_torch.report.event_file import EventFile
 from ccnn_torch.report.json_files import write_json
+from ccnn_torch.report.results.run import RmsMax, RunResults
+
+
+def renamed(results: RunResults, name: str, **changes: object) -> RunResults:
+    return results.model_copy(update={"name": name, **changes})
 
 
 def test_the_report_folder(report_folder: Path) -> None:
@@ -41,7 +46,7 @@ def test_the_report_folder(report_folder: Path) -> None:
 def test_a_folder_with_numbers_only_still_gets_its_tables(tmp_path: Path) -> None:
     write_json(tmp_path / "results.json", arm_run()[0])
     page = write_report(tmp_path).read_text()
-    assert "<svg" not in page and "µrad" in page and "held-out rows, 4 not usable" in page
+    assert "<svg" not in page and "µrad" in page and "held-out rows, 4 not trained on" in page
     with pytest.raises(InputError, match=r"results\.json: there is no such file"):
         write_report(tmp_path / "plots")
 
@@ -89,50 +94,52 @@ def test_the_page_is_whole_and_fetches_nothing(report_folder: Path) -> None:
     assert "@import" not in text and not re.search(r"url\((?!#)", text)
 
 
-def test_text_from_outside_is_escaped(results: dict[str, Any]) -> None:
-    text = html_text(results | {"name": "<script>alert(1)</script>", "notes": ["a & b"]}, config="x: <b>")
+def test_text_from_outside_is_escaped(results: RunResults) -> None:
+    text = run_page(renamed(results, "<script>alert(1)</script>", notes=["a & b"])).html(config="x: <b>")
     assert "<script>" not in text and "&lt;script&gt;" in text and "a &amp; b" in text and "x: &lt;b&gt;" in text
 
 
-def test_a_network_that_makes_it_worse_is_said_with_the_remedy(results: dict[str, Any]) -> None:
-    position = results["pose"]["position"]
-    after = position["after"]["rms"]["median"]
-    assert worse_text(results) == "" and "makes it worse" not in html_text(results)
-    assert '<p class="verdict">' in html_text(results)
-    best = results["best_method"]
+def test_a_network_that_makes_it_worse_is_said_with_the_remedy(results: RunResults) -> None:
+    position = results.pose.position
+    after = position.after.rms.median
+    assert after is not None
+    assert worse_text(results) == "" and "makes it worse" not in run_page(results).html()
+    assert '<p class="verdict">' in run_page(results).html()
+    best = results.best_method
     for alone, share, said in (("geometry", 0.995, ""), ("geometry", 0.5, "geometry"), ("effects", 0.7, "geometry + ")):
-        position[alone] = {"rms": {"median": share * after, "low": 0.0, "high": 1.0, "values": [share * after]}}
-        position[alone]["max"] = position[alone]["rms"]
+        alike = spread([share * after])
+        setattr(position, alone, RmsMax(rms=alike, max=alike))
         told = worse_text(results)
         assert told.startswith(f"On held-out rows {best} makes it worse than {said}") if said else told == ""
     left, right = (float(x) for x in re.findall(r"\(([\d.]+) → ([\d.]+) ", told)[0])
     assert left / right == pytest.approx(0.7, rel=0.01) and "than geometry + effects alone (" in told
     assert told.endswith("methods=constant leaves the network out, methods=auto chooses by cross-validation.")
-    assert told in markdown_text(results) and told in html_text(results)
-    assert '<p class="verdict worse">' in html_text(results)
+    assert told in run_page(results).markdown() and told in run_page(results).html()
+    assert '<p class="verdict worse">' in run_page(results).html()
     screen = io.StringIO()
-    print_tables(results, Console(file=screen, width=500))
+    run_page(results).show(Console(file=screen, width=500))
     assert told in screen.getvalue()
-    results["best_method"] = "constant"
+    results.best_method = "constant"
     assert "methods=constant" not in worse_text(results)
-    del position["geometry"], position["effects"]
-    position["before"]["rms"]["median"] = 0.9 * after
+    position.geometry = position.effects = None
+    position.before.rms.median = 0.9 * after
     assert "than no correction at all (" in worse_text(results)
 
 
-def test_verdict(results: dict[str, Any]) -> None:
-    position = results["pose"]["position"]
-    removed = 100 * (1 - position["after"]["rms"]["median"] / position["before"]["rms"]["median"])
+def test_verdict(results: RunResults) -> None:
+    position = results.pose.position
+    before, after = position.before, position.after
+    removed = 100 * (1 - after.rms.median / before.rms.median)
     text = verdict(results)
     assert text.startswith(f"On 25 held-out rows ccnn removes {removed:.1f} %")
     assert "times the noise floor" in text
-    with_geometry = {"position": {**position, "geometry": position["after"]}, "rotation": None}
-    assert " geometry + ccnn removes " in verdict(results | {"pose": with_geometry})
-    swapped = {"unit": "m", "before": position["after"], "after": position["before"]}
-    assert "ccnn adds" in verdict(results | {"pose": {"position": swapped, "rotation": None}})
+    position.geometry = after
+    assert " geometry + ccnn removes " in verdict(results)
+    position.before, position.after = after, before
+    assert "ccnn adds" in verdict(results)
 
 
-def test_tables_hold_the_numbers_and_the_papers(results: dict[str, Any]) -> None:
+def test_tables_hold_the_numbers_and_the_papers(results: RunResults) -> None:
     before, mse, mae, _, pose = result_tables(results)
     assert before.rows[0][0] == "q1 [µm]" and before.rows[0][-2:] == ("150.5", "168.5")
     assert mse.columns[1] == "q1 [1e-10 m²]"
@@ -153,8 +160,8 @@ def test_real_data_tables_have_no_floor_and_no_paper() -> None:
     assert not any("paper" in column for table in tables for column in table.columns)
 
 
-def test_markdown_has_whole_tables(results: dict[str, Any]) -> None:
-    lines = markdown_text(results | {"name": "a|b"}).splitlines()
+def test_markdown_has_whole_tables(results: RunResults) -> None:
+    lines = run_page(renamed(results, "a|b")).markdown().splitlines()
     tables = "\n".join(lines).split("## ")[1:]
     for table in tables:
         widths = {line.count("|") for line in table.splitlines() if line.startswith("|")}
@@ -162,9 +169,9 @@ def test_markdown_has_whole_tables(results: dict[str, Any]) -> None:
     assert any("enn failed: ENN ran out" in line for line in lines)
 
 
-def test_the_screen_shows_title_and_failure(results: dict[str, Any]) -> None:
+def test_the_screen_shows_title_and_failure(results: RunResults) -> None:
     screen = io.StringIO()
-    print_tables(results, Console(file=screen, width=120))
+    run_page(results).show(Console(file=screen, width=120))
     text = screen.getvalue()
     assert (
         "Joint error before calibration" in text and "[1e-10 m²]" in text and "enn failed" in text and "goal_x" in text
@@ -184,7 +191,7 @@ def test_csv_is_tidy_and_exact(report_folder: Path) -> None:
     pose, floor = results["pose"]["position"]["before"], results["floor"]["realised"]
     assert float(found["before", "test", "position_rms", ""]["median"]) == pose["rms"]["median"]
     assert float(found["floor_realised", "test", "mse", "q2"]["high"]) == floor["q2"]["mse"]["high"]
-    assert not [r for r in tidy_rows(arm_run()[0]) if r[0].startswith("floor")]
+    assert not [r for r in long_table(arm_run()[0]) if r[0].startswith("floor")]
 
 
 def test_tags() -> None:

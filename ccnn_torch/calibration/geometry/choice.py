@@ -23,6 +23,7 @@ from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import joint_deviations
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split, fold_splits
+from ccnn_torch.report.results.run import Geometry
 
 _FOLDS = 5
 # Rows that the comparison uses: enough to see what helps, few enough to take seconds.
@@ -71,9 +72,9 @@ class ModelChoice:
     by: str = "config"
 
     @property
-    def block(self) -> dict[str, str]:
+    def block(self) -> Geometry:
         """For `results.json`."""
-        return {"chosen": "identify" if self.identify else "none", "why": self.why}
+        return Geometry(chosen="identify" if self.identify else "none", why=self.why)
 
 
 def choose_model(

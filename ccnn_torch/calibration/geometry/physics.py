@@ -32,6 +32,7 @@ from ccnn_torch.numerics.outliers import inlying
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records
 from ccnn_torch.records.splits import Split
+from ccnn_torch.report.results.run import Values
 
 _FROM = "from:"
 # Steps of r <- δ - e(q + r); each gains a factor of e's slope, at most 0.1.
@@ -114,18 +115,17 @@ class Physics:
         there = _rows(self.situations[repeat], rows)
         return machine_parts(there, self.acting[repeat], self.values[repeat, 0], covariates, margin)
 
-    def block(self) -> dict[str, Any]:
+    def block(self) -> dict[str, dict[str, Values]]:
         """For results.json: each coefficient's value in every repeat, by effect and name."""
-        found: dict[str, Any] = {}
+        found: dict[str, dict[str, Values]] = {}
         for i, (label, one) in enumerate(labelled(self.every[0])):
-            named: dict[str, Any] = {}
+            found[label] = {}
             for j, c in enumerate(one.effect.coefficients(self.situations[0])):
                 values = [float(repeat[i].coefficients[j]) for repeat in self.every]
                 if any(values):
-                    named[c.name] = {"unit": c.unit, "values": values}
+                    found[label][c.name] = Values(unit=c.unit, values=values)
             for j, s in enumerate(one.effect.shapes(self.situations[0])):
-                named[s.name] = {"unit": s.unit, "values": [float(repeat[i].shape[j]) for repeat in self.every]}
-            found[label] = named
+                found[label][s.name] = Values(unit=s.unit, values=[float(repeat[i].shape[j]) for repeat in self.every])
         return found
 
 

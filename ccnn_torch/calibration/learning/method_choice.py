@@ -18,6 +18,7 @@ from ccnn_torch.calibration.statistics import spread
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.learners import Learner
 from ccnn_torch.report.json_files import plain, read_json, write_json
+from ccnn_torch.report.results.run import Auto, Compared
 from ccnn_torch.run_folder.folder import RunFolder
 
 _SIMPLEST = "constant"
@@ -73,25 +74,27 @@ class Comparison:
             )
         return f"{best} is chosen: its cross-validation error is the lowest ({error})."
 
-    def block(self, chosen: str) -> dict[str, Any]:
+    def block(self, chosen: str) -> Auto:
         """For `results.json`."""
-        return {
-            "budget": self.budget,
-            "folds": self.folds,
-            "compared": {
-                name: {
-                    "cv": spread(choice.best_validation),
-                    "standard_error": self.standard_error(name),
-                    "seconds": choice.seconds,
-                    "steps": choice.step,
-                    "stopped": not choice.ended,
-                }
-                for name, choice in self.compared.items()
-            },
-            "skipped": dict(self.skipped),
-            "chosen": chosen,
-            "why": self.why() + f" It could not be refitted, so {chosen} is taken." * (chosen != self.order[0]),
+        compared = {
+            name: Compared(
+                cv=spread(choice.best_validation),
+                standard_error=self.standard_error(name),
+                seconds=choice.seconds,
+                steps=choice.step,
+                stopped=not choice.ended,
+            )
+            for name, choice in self.compared.items()
         }
+        why = self.why() + f" It could not be refitted, so {chosen} is taken." * (chosen != self.order[0])
+        return Auto(
+            budget=self.budget,
+            folds=self.folds,
+            compared=compared,
+            skipped=dict(self.skipped),
+            chosen=chosen,
+            why=why,
+        )
 
     def _constant_will_do(self, best: str) -> bool:
         if _SIMPLEST not in self.compared or best == _SIMPLEST:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from ccnn_torch.report.results.run import Reach, Reached
 
 CURVE = "heldout_mse_all"
 """The metric that methods are compared by: held-out mean squared error over all joints [SI²]."""
 _BASELINE = "constant"
 
 
-def reach_block(histories: Mapping[str, Mapping[str, ArrayLike]]) -> dict[str, Any] | None:
+def reach_block(histories: Mapping[str, Mapping[str, ArrayLike]]) -> Reach | None:
     """Seconds and evaluations until the median curve is at or below the level that every trained method reaches.
 
     The level is the lowest point of the median curve (over the repeats) of the method whose lowest point is highest,
@@ -24,8 +25,7 @@ def reach_block(histories: Mapping[str, Mapping[str, ArrayLike]]) -> dict[str, A
             `t x r` where the learner counts.
 
     Returns:
-        `{"level", "set_by", "methods": {METHOD: {"step", "seconds", "evaluations"} or null}}`, null = never; None where
-        fewer than two methods have such a curve, or none but the constant.
+        None where fewer than two methods have such a curve, or none but the constant.
     """
     curves = {name: _median(found[CURVE]) for name, found in histories.items() if CURVE in found}
     trained = {name: float(np.nanmin(curve)) for name, curve in curves.items() if name != _BASELINE}
@@ -33,7 +33,7 @@ def reach_block(histories: Mapping[str, Mapping[str, ArrayLike]]) -> dict[str, A
         return None
     worst = max(trained, key=lambda name: trained[name])
     level = trained[worst]
-    methods: dict[str, Any] = {}
+    methods: dict[str, Reached | None] = {}
     for name, curve in curves.items():
         there = np.flatnonzero(curve <= level)
         if len(there) == 0:
@@ -41,12 +41,12 @@ def reach_block(histories: Mapping[str, Mapping[str, ArrayLike]]) -> dict[str, A
             continue
         first = int(there[0])
         counted = histories[name].get("evaluations")
-        methods[name] = {
-            "step": first + 1,
-            "seconds": float(_median(histories[name]["seconds"])[first]),
-            "evaluations": None if counted is None else float(_median(counted)[first]),
-        }
-    return {"level": level, "set_by": worst, "methods": methods}
+        methods[name] = Reached(
+            step=first + 1,
+            seconds=float(_median(histories[name]["seconds"])[first]),
+            evaluations=None if counted is None else float(_median(counted)[first]),
+        )
+    return Reach(level=level, set_by=worst, methods=methods)
 
 
 def _median(values: ArrayLike) -> NDArray[np.float64]:

@@ -2,46 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from ccnn_torch.calibration.page.figure_learning import convergence_plot, population_plot
 from ccnn_torch.calibration.page.figure_network import network_plot
 from ccnn_torch.calibration.page.figure_progress import progress_plot
-from ccnn_torch.calibration.page.tables import cautions, result_tables, verdict, worse_text, write_tables
+from ccnn_torch.calibration.page.tables import run_page, write_tables
 from ccnn_torch.errors import InputError
-from ccnn_torch.files.write import write_whole
 from ccnn_torch.report.arrays import ARRAYS_FILE, load_arrays, load_history
 from ccnn_torch.report.figures.errors import joint_error_plot, pose_error_plot
 from ccnn_torch.report.figures.style import Plot, inline_figures, save_figure
 from ccnn_torch.report.figures.workspace import overview_plot, workspace_plot
-from ccnn_torch.report.html import InlineFigure, page_text
-from ccnn_torch.report.json_files import read_json
+from ccnn_torch.report.results.run import RunResults
 
 _LINKED = ("results.json", "results.csv", "card.json", "model.safetensors", "model.onnx", "config.yaml")
 
 
-def html_text(
-    results: Mapping[str, Any], figures: Sequence[InlineFigure] = (), config: str = "", files: Sequence[str] = ()
-) -> str:
-    """The report of a run."""
-    optional: dict[str, Any] = {"case": None, "best_method": None, "notes": [], "versions": {}}
-    return page_text(
-        "report",
-        optional | dict(results),
-        verdict(results),
-        result_tables(results),
-        cautions(results),
-        figures,
-        config,
-        files,
-        results.get("best_method"),
-        worse=bool(worse_text(results)),
-    )
-
-
-def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -> Path:
+def write_report(folder: str | Path, results: RunResults | None = None) -> Path:
     """Write `results.csv`, `results.md`, `plots/` and `report.html` of a run folder.
 
     Reads, as far as they are there, `arrays.safetensors`, `history-METHOD.safetensors` and `config.yaml`; the same
@@ -54,22 +31,13 @@ def write_report(folder: str | Path, results: Mapping[str, Any] | None = None) -
         The path of `report.html`.
     """
     folder = Path(folder)
-    results = read_json(folder / "results.json") if results is None else results
+    results = RunResults.read(folder / "results.json") if results is None else results
     write_tables(folder, results)
     figures = inline_figures(run_plots(folder, results), folder / "plots")
-    config = folder / "config.yaml"
-    page = html_text(
-        results,
-        figures,
-        config.read_text(encoding="utf-8") if config.is_file() else "",
-        [name for name in _LINKED if (folder / name).is_file()],
-    )
-    path = folder / "report.html"
-    write_whole(path, page)
-    return path
+    return run_page(results, figures).write_html(folder / "report.html", _LINKED)
 
 
-def run_plots(folder: str | Path, results: Mapping[str, Any]) -> list[Plot]:
+def run_plots(folder: str | Path, results: RunResults) -> list[Plot]:
     """All pictures of a run folder, in reading order; a picture whose data is not there is left out."""
     folder = Path(folder)
     plots: list[Plot | None] = []
@@ -80,11 +48,11 @@ def run_plots(folder: str | Path, results: Mapping[str, Any]) -> list[Plot]:
             names = [joint.name for joint in arrays.joints]
             method = arrays.labels.get("method", "model")
             plots.append(network_plot(arrays.masks, arrays.weights, method, names))
-    levels = {"floor": (results["floor"] or {}).get("realised"), "constant": results["constant"]["test"]}
-    lines = {name: block["all"]["mse"]["median"] for name, block in levels.items() if block and "all" in block}
-    paths = {method: folder / f"history-{method}.safetensors" for method in results["methods"]}
+    levels = {"floor": results.floor and results.floor.realised, "constant": results.constant.test}
+    lines = {name: block["all"].mse.median for name, block in levels.items() if block and "all" in block}
+    paths = {method: folder / f"history-{method}.safetensors" for method in results.methods}
     histories = {method: load_history(path) for method, path in paths.items() if path.is_file()}
-    unit = results["joints"][0]["unit"]
+    unit = results.joints[0].unit
     plots.append(progress_plot(histories, unit=unit, **lines))
     for method, history in histories.items():
         plots.append(convergence_plot(history, method, unit=unit, **lines))

@@ -7,11 +7,9 @@ the paper's cases its printed figures are listed beside ours. All numbers are me
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-from rich.console import Console
 
 from ccnn_torch.calibration.page.comparison_tables import (
     comparison_table,
@@ -19,45 +17,74 @@ from ccnn_torch.calibration.page.comparison_tables import (
     pose_by_method_table,
     reach_table,
 )
+from ccnn_torch.calibration.page.long_table import HEADER, long_table
 from ccnn_torch.calibration.page.paper_tables import PAPER, PaperCase
-from ccnn_torch.display import count_text, display_unit, interval_text, number_text, removed_percent
+from ccnn_torch.display import count_text, display_unit, number_text
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.report.csv_file import write_csv
-from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
+from ccnn_torch.report.csv_file import write_rows
+from ccnn_torch.report.page import InlineFigure, Page, sections_of
+from ccnn_torch.report.results.base import interval_text, removed_percent
+from ccnn_torch.report.results.run import Method, ModelFiles, Mse, RunResults
+from ccnn_torch.report.table import Table
 
-Results = Mapping[str, Any]
 # By less a learned part may be worse on other rows by chance.
 _WORSE = 1.01
 
 
-def verdict(results: Results) -> str:
+def run_page(results: RunResults, figures: Sequence[InlineFigure] = ()) -> Page:
+    """All that a run shows."""
+    rows = results.rows
+    facts = f"{rows.train} training, {rows.validation} validation and {rows.test} held-out rows"
+    facts += f", {rows.not_trained_on} not trained on" if rows.not_trained_on else ""
+    facts += f" · {count_text(results.repeats, 'repeat')} · seed {results.seed}"
+    worse = worse_text(results)
+    return Page(
+        name=results.name,
+        kind="calibration report",
+        verdict=verdict(results),
+        sections=sections_of(result_tables(results), figures),
+        facts=facts + f" · case {results.case} of the paper" if results.case else facts,
+        cautions=[*([worse] if worse else []), *failures(results)],
+        notes=results.notes,
+        versions=results.versions,
+        best=results.best_method,
+        worse=bool(worse),
+    )
+
+
+def verdict(results: RunResults) -> str:
     """One sentence: what the best method does to the error on held-out rows."""
-    position = results["pose"]["position"]
-    best = results.get("best_method") or next(iter(results["methods"]), "the model")
+    position, methods = results.pose.position, results.methods
+    best = results.best_method or next(iter(methods), "the model")
     # What is left is left of both: the identified geometry, and what the method learned of the rest.
-    parts = [part for part in ("geometry", "effects") if part in position]
-    whose = " + ".join([*parts, best])
-    rows = count_text(results["rows"]["test"], "held-out row")
-    before, after = position["before"]["rms"], position["after"]["rms"]
+    whose = " + ".join([*results.pose.parts, best])
+    rows = count_text(results.rows.test, "held-out row")
+    before, after = position.before.rms, position.after.rms
     removed = removed_percent(before, after)
     if removed is None:
         return f"On {rows} the pose error of {whose} could not be measured."
-    scale, unit = display_unit("m", before["median"])
-    left, right = (number_text(s["median"] / scale, 3) for s in (before, after))
+    left, right, unit = _both(before.median, after.median)
     did = f"removes {removed:.1f} %" if removed >= 0 else f"adds {-removed:.1f} %"
     text = f"On {rows} {whose} {did} of the RMS position error ({left} → {right} {unit})"
-    ratio = (results["methods"].get(best) or {}).get("ratio_to_floor")
-    if ratio and ratio["median"] is not None:
-        text += f"; its mean squared joint error is {number_text(ratio['median'], 3)} times the noise floor"
-        constant = results["constant"].get("ratio_to_floor")
-        if constant and constant["median"] is not None:
-            text += f" (a constant correction: {number_text(constant['median'], 3)})"
+    ratio = methods[best].ratio_to_floor if best in methods else None
+    if ratio is not None and ratio.median is not None:
+        text += f"; its mean squared joint error is {number_text(ratio.median, 3)} times the noise floor"
+        constant = results.constant.ratio_to_floor
+        if constant is not None and constant.median is not None:
+            text += f" (a constant correction: {number_text(constant.median, 3)})"
     return text + "."
 
 
-def result_tables(results: Results) -> list[Table]:
+def _both(before: float | None, after: float | None) -> tuple[str, str, str]:
+    """Two position errors [m] in the unit of the first, and the unit."""
+    scale, unit = display_unit("m", before)
+    left, right = (number_text(None if value is None else value / scale, 3) for value in (before, after))
+    return left, right, unit
+
+
+def result_tables(results: RunResults) -> list[Table]:
     """All tables of a run, in reading order."""
-    paper = PAPER.get(results.get("case") or "")
+    paper = PAPER.get(results.case or "")
     tables = [
         _before_table(results, paper),
         comparison_table(results),
@@ -69,50 +96,24 @@ def result_tables(results: Results) -> list[Table]:
     return [table for table in tables if table is not None]
 
 
-def print_tables(results: Results, console: Console) -> None:
-    """Show the verdict and the tables on a terminal."""
-    for table in result_tables(results):
-        print_table(table, console)
-    for sentence in cautions(results):
-        print_text(sentence, console, "yellow")
-    for note in results.get("notes", []):
-        print_text(note, console, "dim")
-    print_text(verdict(results), console, "bold")
-
-
-def markdown_text(results: Results) -> str:
-    """The verdict and the tables as Markdown (`results.md`)."""
-    parts = [f"# {results['name']}", verdict(results), *cautions(results)]
-    parts += map(markdown_table, result_tables(results))
-    return "\n\n".join(parts) + "\n"
-
-
-def write_tables(folder: Path, results: Results) -> None:
+def write_tables(folder: Path, results: RunResults) -> None:
     """Write `results.csv` and `results.md`."""
-    write_csv(folder / "results.csv", results)
-    write_whole(folder / "results.md", markdown_text(results))
+    write_rows(folder / "results.csv", HEADER, long_table(results))
+    write_whole(folder / "results.md", replace(run_page(results), notes=()).markdown())
 
 
-def cautions(results: Results) -> list[str]:
-    """What a user must know before using the model: `worse_text` and `failures`."""
-    worse = worse_text(results)
-    return [*([worse] if worse else []), *failures(results)]
-
-
-def worse_text(results: Results) -> str:
+def worse_text(results: RunResults) -> str:
     """One sentence where the best method's RMS position error on held-out rows is larger than without it; else empty.
 
     Without it: what identified geometry and known effects leave by themselves where these are a part, else no
     correction at all.
     """
-    position, best = results["pose"]["position"], results.get("best_method")
-    without = next((part for part in ("effects", "geometry") if part in position), "before")
-    alone, after = position[without]["rms"]["median"], position["after"]["rms"]["median"]
+    position, best, parts = results.pose.position, results.best_method, results.pose.parts
+    without = position[parts[-1]] if parts else position.before
+    alone, after = without.rms.median, position.after.rms.median
     if best is None or not alone or after is None or after <= _WORSE * alone:
         return ""
-    parts = [part for part in ("geometry", "effects") if part in position]
-    scale, unit = display_unit("m", alone)
-    left, right = (number_text(value / scale, 3) for value in (alone, after))
+    left, right, unit = _both(alone, after)
     instead = " + ".join(parts) + " alone" if parts else "no correction at all"
     text = f"On held-out rows {best} makes it worse than {instead} ({left} → {right} {unit} RMS position error)"
     if best == "constant":
@@ -120,45 +121,45 @@ def worse_text(results: Results) -> str:
     return f"{text}: methods=constant leaves the network out, methods=auto chooses by cross-validation."
 
 
-def failures(results: Results) -> list[str]:
+def failures(results: RunResults) -> list[str]:
     """One sentence for each method that failed, and for each that has no model file; first whose `model.*` are."""
     said = []
-    model = results.get("model") or {"method": None, "without": {}}
-    without, best = dict(model["without"]), results.get("best_method")
-    if best in without and model["method"] is not None:
+    model, best = results.model or ModelFiles(method=None, without={}), results.best_method
+    without = dict(model.without)
+    if best in without and model.method is not None:
         why = without.pop(best)
-        said.append(f"The model files model.* and card.json are of {model['method']}, not of {best}: {why}.")
+        said.append(f"The model files model.* and card.json are of {model.method}, not of {best}: {why}.")
     said += [f"No model file of {name}: {why}." for name, why in without.items()]
     said += [
         f"The model files of {name} apply {share:.0%} of what it learned: all of it changes too fast for a command to "
         "be solved for; the promise in their card is of what they apply, the figures here of all that was learned."
-        for name, share in model.get("damped", {}).items()
+        for name, share in model.damped.items()
     ]
-    return said + [f"{name} failed: {m['failed']}" for name, m in results["methods"].items() if m["test"] is None]
+    return said + [f"{name} failed: {m.failed}" for name, m in results.methods.items() if m.test is None]
 
 
-def _units(results: Results) -> dict[str, str]:
-    return {joint["name"]: joint["unit"] for joint in results["joints"]}
+def _units(results: RunResults) -> dict[str, str]:
+    return {joint.name: joint.unit for joint in results.joints}
 
 
-def _repeats(results: Results) -> str:
-    count = results["repeats"]
+def _repeats(results: RunResults) -> str:
+    count = results.repeats
     return f"Medians [5 %, 95 %] over {count} repeats." if count > 1 else ""
 
 
-def _before_table(results: Results, paper: PaperCase | None) -> Table:
-    units, train = _units(results), results.get("before_train")
+def _before_table(results: RunResults, paper: PaperCase | None) -> Table:
+    units, train = _units(results), results.before_train
     columns = ["joint"] + ["mean, training rows", "maximum, training rows"] * (train is not None)
     columns += ["mean, held-out rows", "maximum, held-out rows", "largest by absolute value"]
     if paper:
         columns += ["mean, paper", "maximum, paper"]
     rows = []
     for i, (name, unit) in enumerate(units.items()):
-        scale, shown = display_unit(unit, results["before"][name]["max_abs"] or 0.0)
+        scale, shown = display_unit(unit, results.before[name].max_abs or 0.0)
         row = [f"{name} [{shown}]"]
         if train is not None:
-            row += [interval_text(train[name]["spread"][key], scale) for key in ("mean", "max")]
-        row += [interval_text(results["before"][name]["spread"][key], scale) for key in ("mean", "max", "max_abs")]
+            row += [interval_text(train[name].spread[key], scale) for key in ("mean", "max")]
+        row += [interval_text(results.before[name].spread[key], scale) for key in ("mean", "max", "max_abs")]
         if paper:
             row += [number_text(value / scale) for value in paper.before_test[i]]
         rows.append(tuple(row))
@@ -168,16 +169,16 @@ def _before_table(results: Results, paper: PaperCase | None) -> Table:
     return Table("Joint error before calibration", tuple(columns), tuple(rows), note.strip())
 
 
-def _after_table(results: Results, paper: PaperCase | None, measure: str) -> Table:
+def _after_table(results: RunResults, paper: PaperCase | None, measure: str) -> Table:
     titles = {"mse": "Mean squared error", "mae": "Mean absolute error", "sse": "Sum of squared errors"}
-    floor = results["floor"]
-    keys = list(_units(results)) + ["all"] * ("all" in results["constant"]["test"])
+    floor = results.floor
+    keys = list(_units(results)) + ["all"] * ("all" in (results.constant.test or {}))
     # Joints of one unit share a scale, so that columns can be compared at a glance.
     shared = "all" if "all" in keys else None
     scales = {key: _scale(results, shared or key, measure) for key in keys}
     beside = measure == "mse"
     columns = ["method", *(f"{'all joints' if key == 'all' else key} [{scales[key][1]}]" for key in keys)]
-    blocks = [*results["methods"].values(), results["constant"]]
+    blocks = [*results.methods.values(), results.constant]
     extras = [
         (key, column, digits)
         for key, column, digits in (
@@ -185,15 +186,16 @@ def _after_table(results: Results, paper: PaperCase | None, measure: str) -> Tab
             ("coverage", "coverage of 95 % [1]", 3),
             ("seconds", "time [s]", 3),
         )
-        if beside and (key == "seconds" or any(block.get(key) for block in blocks))
+        if beside and (key == "seconds" or any(block[key] for block in blocks))
     ]
     columns += [column for _, column, _ in extras]
     printed = dict(paper.methods) if paper and len(keys) == len(paper.symbols) + 1 else {}
     rows: list[tuple[str, ...]] = []
 
-    def add(label: str, errors: Mapping[str, Any] | None, method: Mapping[str, Any]) -> None:
+    def add(label: str, errors: Mapping[str, Mse] | None, method: Method | None = None) -> None:
         cells = [interval_text(errors[key][measure] if errors else None, scales[key][0]) for key in keys]
-        rows.append((label, *cells, *(interval_text(method.get(key), digits=digits) for key, _, digits in extras)))
+        beside = ((None if method is None else method[key], digits) for key, _, digits in extras)
+        rows.append((label, *cells, *(interval_text(spread, digits=digits) for spread, digits in beside)))
 
     def add_printed(name: str) -> None:
         assert paper is not None
@@ -201,17 +203,17 @@ def _after_table(results: Results, paper: PaperCase | None, measure: str) -> Tab
         cells = [number_text(value / scales[key][0]) for key, value in zip(keys, values, strict=True)]
         rows.append((f"{name}, paper's Table {paper.after}", *cells, *["–"] * len(extras)))
 
-    for name, method in results["methods"].items():
-        add(method_label(results, name), method["test"], method)
+    for name, method in results.methods.items():
+        add(method_label(results, name), method.test, method)
         if name in printed:
             add_printed(name)
-    if not (results["methods"].get("constant") or {}).get("test"):
-        add("constant", results["constant"]["test"], results["constant"])
+    if "constant" not in results.methods or not results.methods["constant"].test:
+        add("constant", results.constant.test, results.constant)
     if floor and beside:
-        add("noise floor, realised", floor["realised"], {})
-        add("noise floor, expected", floor["expected"], {})
-        if floor.get("with_unlearnable"):
-            add("noise floor with what cannot be learned", floor["with_unlearnable"], {})
+        add("noise floor, realised", floor.realised)
+        add("noise floor, expected", floor.expected)
+        if floor.with_unlearnable:
+            add("noise floor with what cannot be learned", floor.with_unlearnable)
     for name in list(printed):
         add_printed(name)
     note = _repeats(results)
@@ -225,12 +227,12 @@ def _after_table(results: Results, paper: PaperCase | None, measure: str) -> Tab
     return Table(title, tuple(columns), tuple(rows), note.strip(), details=details, page_only=not beside)
 
 
-def _scale(results: Results, key: str, measure: str) -> tuple[float, str]:
+def _scale(results: RunResults, key: str, measure: str) -> tuple[float, str]:
     """One unit for a column: a prefixed one for absolute errors, a power of ten of the SI unit for squares."""
     units = _units(results)
     unit = units[key] if key != "all" else next(iter(units.values()))
-    block = [m["test"] for m in results["methods"].values() if m["test"]] or [results["constant"]["test"]]
-    medians = [errors[key][measure]["median"] for errors in block]
+    block = [m.test for m in results.methods.values() if m.test] or [results.constant.test or {}]
+    medians = [errors[key][measure].median for errors in block]
     typical = min((m for m in medians if m), default=1.0)
     if measure == "mae":
         return display_unit(unit, typical)
@@ -239,9 +241,9 @@ def _scale(results: Results, key: str, measure: str) -> tuple[float, str]:
     return (1.0, square) if power == 0 else (10.0**power, f"1e{power} {square}")
 
 
-def _pose_table(results: Results) -> Table:
+def _pose_table(results: RunResults) -> Table:
     names = {"position": "position", "rotation": "rotation", "energy": "energy E (eq. 5)"}
-    blocks = {name: results["pose"][key] for key, name in names.items() if results["pose"].get(key)}
+    blocks = {name: results.pose[key] for key, name in names.items() if results.pose[key] is not None}
     # Beside before and after, where the run has them: block key, column, and the sentence that explains it.
     extras = [
         extra
@@ -260,17 +262,17 @@ def _pose_table(results: Results) -> Table:
                 "Not compensable: the part of the measured error that the (damped) joint deviations do not explain.",
             ),
         )
-        if any(extra[0] in block for block in blocks.values())
+        if any(block[extra[0]] is not None for block in blocks.values())
     ]
     rows = []
     for name, block in blocks.items():
-        scale, unit = display_unit(block["unit"], block["before"]["rms"]["median"] or 0.0)
+        scale, unit = display_unit(block.unit, block.before.rms.median or 0.0)
         cells = [f"{name} [{unit}]"]
         for measure in ("rms", "max"):
-            removed = removed_percent(block["before"][measure], block["after"][measure])
+            removed = removed_percent(block.before[measure], block.after[measure])
             cells += [interval_text(block[when][measure], scale) for when in ("before", "after")]
             cells.append("–" if removed is None else f"{removed:.1f}")
-        cells += [interval_text(block.get(key, {}).get("rms"), scale) for key, _, _ in extras]
+        cells += [interval_text(None if block[key] is None else block[key].rms, scale) for key, _, _ in extras]
         rows.append(tuple(cells))
     columns = ["pose error"]
     for measure in ("RMS", "max"):

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
-
-from rich.console import Console
+from typing import Any
 
 from ccnn_torch.diagnosis.page.data import NEXT, About
 from ccnn_torch.diagnosis.page.numbers import numbers_table
@@ -23,27 +21,20 @@ from ccnn_torch.diagnosis.verdict.text import (
     undetermined,
 )
 from ccnn_torch.effects import OUTLIER
-from ccnn_torch.report.table import markdown_table, print_labelled, print_table, print_text
+from ccnn_torch.report.page import Answer
 
 Block = Mapping[str, Any]
 # Numbers of all effects on a screen; a page has room for more.
-_ON_SCREEN, ON_PAGE = 6, 16
+ON_SCREEN, ON_PAGE = 6, 16
 
 
-class Answer(NamedTuple):
-    """What is asked, sentences that answer it, and the command lines that go with it."""
-
-    label: str
-    text: str
-    commands: tuple[str, ...] = ()
-
-
-def first_screen(results: Block, about: About) -> list[Answer]:
+def first_screen(results: Block, about: About, most: int = ON_PAGE) -> list[Answer]:
     """The answers in reading order.
 
     Args:
         results: as in `diagnosis.json`.
         about: with the folder and the command of a compensator, where they are known.
+        most: about so many numbers to enter are given.
     """
     said = [Answer("What is wrong", _wrong(results))]
     if where := where_words(results, about):
@@ -52,32 +43,12 @@ def first_screen(results: Block, about: About) -> list[Answer]:
     if removed := _removed(results):
         said.append(Answer("What it removes", removed))
     if look := " ".join(f.look for f in findings(results)):
-        said.append(Answer("Look at", look))
+        said.append(Answer("Look at", look, table=numbers_table(results, most)))
     if about.compensate:
         said.append(Answer("Compensate", about.compensate[0], tuple(about.compensate[1:])))
     if measure := _measure(results, about):
         said.append(Answer("Measure next", measure))
     return said
-
-
-def print_first_screen(results: Block, console: Console, about: About) -> None:
-    """Show the answers, the numbers to enter after the part to look at; a command line is never wrapped."""
-    for answer in first_screen(results, about):
-        print_labelled(answer.label, answer.text, console)
-        for command in answer.commands:
-            print_text(f"  {command}", console, wrap=False)
-        if answer.label == "Look at" and (table := numbers_table(results, _ON_SCREEN)):
-            print_table(table, console)
-
-
-def first_screen_markdown(results: Block, about: About) -> list[str]:
-    """The same as paragraphs of Markdown."""
-    parts = []
-    for answer in first_screen(results, about):
-        code = "".join(f"\n\n    {command}" for command in answer.commands)
-        parts.append(f"**{answer.label}:** {answer.text}{code}")
-    table = numbers_table(results, ON_PAGE)
-    return [*parts, *([markdown_table(table)] if table else [])]
 
 
 def _wrong(results: Block) -> str:

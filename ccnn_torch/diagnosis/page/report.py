@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,8 @@ from ccnn_torch.diagnosis.page.data import (
     signatures_of,
     used_rows,
 )
-from ccnn_torch.diagnosis.page.first_screen import ON_PAGE, first_screen, first_screen_markdown, print_first_screen
+from ccnn_torch.diagnosis.page.first_screen import ON_SCREEN, first_screen
 from ccnn_torch.diagnosis.page.localisation import aside_table, next_table, region_table, where_table, write_next_csv
-from ccnn_torch.diagnosis.page.numbers import numbers_table
 from ccnn_torch.diagnosis.page.tables import (
     confusable_table,
     effect_table,
@@ -37,13 +36,12 @@ from ccnn_torch.diagnosis.page.tables import (
     record_table,
     unseen_table,
 )
-from ccnn_torch.diagnosis.page.tensorboard import write_diagnosis_events
 from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, unseen_text, verdict_text
 from ccnn_torch.display import count_text
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.report.html import InlineFigure, render, trusted
 from ccnn_torch.report.json_files import read_json
-from ccnn_torch.report.table import Table, markdown_table, print_table, print_text
+from ccnn_torch.report.page import InlineFigure, Page, Section
+from ccnn_torch.report.table import Table, print_text
 
 if TYPE_CHECKING:
     from ccnn_torch.report.figures.style import Plot
@@ -56,23 +54,13 @@ _FILES = (RESULT, _MARKDOWN, NEXT, *CORRECTED, ARRAYS, LABELS)
 _LEAST = 0.01
 
 
-class Section(NamedTuple):
-    """A heading of the page with the pictures and the tables that answer it."""
-
-    title: str
-    figures: list[InlineFigure]
-    tables: list[Table]
-
-
 def write_diagnosis_report(
     folder: str | Path,
     results: Block | None = None,
     arrays: Mapping[str, Tensor] | None = None,
     labels: Block | None = None,
-    *,
-    tensorboard: bool = True,
 ) -> Path:
-    """Write `report.html`, `diagnosis.md`, `next_measurements.csv`, `plots/` and the events for TensorBoard.
+    """Write `report.html`, `diagnosis.md`, `next_measurements.csv` and `plots/`.
 
     The same files give the same report, so it can be written again at any time. A picture or a table whose numbers are
     not there is left out.
@@ -86,7 +74,6 @@ def write_diagnosis_report(
             the folder first, or read from it when None. Of a motion what `course_plot` takes.
         labels: names and units of the signatures' axes, `{EFFECT: {"x": {"name", "unit"}, "y": …}}`, and under `about`
             what `About` holds; written or read like the arrays.
-        tensorboard: whether to write event files, which cost a second.
 
     Returns:
         The path of `report.html`.
@@ -102,19 +89,35 @@ def write_diagnosis_report(
     about = about_of(labels)
     if not results.get("motion"):
         write_next_csv(folder / NEXT, results, about)
-    write_whole(folder / _MARKDOWN, diagnosis_markdown(results, about))
-    pictures = _write_page(folder, results, numbers, labels, about)
-    if tensorboard:
-        write_diagnosis_events(folder / "tensorboard", results, verdict_text(results), pictures)
-    return folder / "report.html"
+    # Here, so that `ccnn check` and the verdict on the terminal do not wait for matplotlib.
+    from ccnn_torch.report.figures.style import inline_figures
+
+    write_whole(folder / _MARKDOWN, diagnosis_page(results, about).markdown())
+    figures = inline_figures(_plots(results, numbers, labels, about), folder / "plots")
+    return diagnosis_page(results, about, numbers, figures).write_html(folder / "report.html", _FILES)
 
 
-def diagnosis_markdown(results: Block, about: About | None = None) -> str:
-    """Verdict and tables as Markdown (`diagnosis.md`)."""
-    about = about or About()
-    tables = [markdown_table(table) for section in _sections(results, {}, about, {}) for table in section.tables]
-    first = [verdict_text(results), *first_screen_markdown(results, about)]
-    return "\n\n".join([f"# {about.name}", *first, *tables, *_notes(results, about)]) + "\n"
+def diagnosis_page(
+    results: Block,
+    about: About | None = None,
+    arrays: Arrays | None = None,
+    figures: Sequence[InlineFigure] = (),
+) -> Page:
+    """All that a diagnosis shows in files."""
+    about, arrays = about or About(), arrays or {}
+    named = {figure.name: figure for figure in figures}
+    machine = [named["machine"]] if "machine" in named else []
+    return Page(
+        name=about.name,
+        kind="diagnosis of the gap",
+        verdict=verdict_text(results),
+        sections=[
+            Section(figures=machine, answers=first_screen(results, about)),
+            *_sections(results, arrays, about, named),
+        ],
+        facts=_facts(results, arrays, about),
+        notes=_notes(results, about),
+    )
 
 
 def print_diagnosis(
@@ -130,16 +133,15 @@ def print_diagnosis(
         details: show the tables as well.
     """
     about = about or About()
+    if verdict:
+        print_text(verdict_text(results), console, "bold")
+    Section(answers=first_screen(results, about, ON_SCREEN)).show(console)
+    if details:
+        _print_tables(results, console, about)
     aside = results["rows_set_aside"]
     why = results.get("why_set_aside") or ["for an unknown reason"] * len(aside)
     sentence = aside_text(aside, why, about.lines)
-    if verdict:
-        print_text(verdict_text(results), console, "bold")
-    print_first_screen(results, console, about)
-    if details:
-        _print_tables(results, console, about)
-    for text in ([sentence] if sentence else []) + _notes(results, about):
-        print_text(text, console, "yellow")
+    Section(sentences=[*filter(None, [sentence]), *_notes(results, about)]).show(console)
     if not details:
         said = "All tables are in report.html, diagnosis.md and diagnosis.json; --details shows them here."
         print_text(said, console, "dim")
@@ -150,33 +152,6 @@ def _notes(results: Block, about: About) -> list[str]:
     shown = {unseen_text(name, why) for name, why in results.get("not_seen", {}).items()}
     notes = (note for note in (*results["notes"], *about.notes) if note not in shown)
     return [note if note.endswith(".") else f"{note}." for note in notes]
-
-
-def _write_page(folder: Path, results: Block, numbers: Arrays, labels: Block, about: About) -> dict[str, Path]:
-    """Write `report.html` and `plots/`; the pictures by name."""
-    from ccnn_torch.report.figures.style import inline_svg, save_figure
-
-    figures, pictures = {}, {}
-    for plot in _plots(results, numbers, labels, about):
-        png, svg = save_figure(plot.figure, folder / "plots" / plot.name)
-        text = inline_svg(svg.read_text(encoding="utf-8"), plot.name)
-        figures[plot.name], pictures[plot.name] = InlineFigure(plot.name, plot.caption, text), png
-    page = render(
-        "diagnosis",
-        results={"name": about.name, "notes": _notes(results, about), "versions": {}},
-        facts=_facts(results, numbers, about),
-        verdict=verdict_text(results),
-        failures=[],
-        answers=first_screen(results, about),
-        numbers=numbers_table(results, ON_PAGE),
-        machine=trusted([figures[name] for name in ("machine",) if name in figures]),
-        sections=_sections(results, numbers, about, figures),
-        files=[f for f in _FILES if f == RESULT or (folder / f).is_file()],
-        config="",
-        best=None,
-    )
-    write_whole(folder / "report.html", page)
-    return pictures
 
 
 def _print_tables(results: Block, console: Console, about: About) -> None:
@@ -190,15 +165,12 @@ def _print_tables(results: Block, console: Console, about: About) -> None:
         unseen_table(results),
         record_table(results),
     )
-    for table in shown:
-        if table is not None:
-            print_table(table, console)
+    Section(tables=[table for table in shown if table is not None]).show(console)
     if order_table(results) is None and (text := network_text(results)):
         print_text(text, console)
 
 
 def _plots(results: Block, arrays: Arrays, labels: Block, about: About) -> list[Plot]:
-    # Here, so that `ccnn check` and the verdict on the terminal do not wait for matplotlib.
     from ccnn_torch.diagnosis.page.figure_course import course_plot
     from ccnn_torch.diagnosis.page.figure_localisation import remainder_map, where_plot
     from ccnn_torch.diagnosis.page.figure_machine import machine_plot
@@ -239,7 +211,7 @@ def _sections(results: Block, arrays: Arrays, about: About, figures: Mapping[str
         shown = [figures[name] for name in names if name in figures]
         there = [table for table in tables if table is not None]
         if shown or there:
-            sections.append(Section(title, trusted(shown), there))
+            sections.append(Section(title, there, shown))
     return sections
 
 

@@ -13,11 +13,12 @@ from safetensors.numpy import load_file
 from safetensors.torch import save
 from torch import Tensor
 
+from ccnn_torch.display import count_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification.page.tables import identified_tables, identified_verdict, unknown_sentences
-from ccnn_torch.report.html import page_text
 from ccnn_torch.report.json_files import read_json
+from ccnn_torch.report.page import Page, sections_of
 
 ARRAYS = "arrays.safetensors"
 _LINKED = (
@@ -53,18 +54,18 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
     except (OSError, SafetensorError):
         raise InputError(f"{folder / ARRAYS}: is not there or damaged; identify again into another folder") from None
     figures = inline_figures(identified_plots(results, arrays), folder / "plots")
-    config = folder / "config.yaml"
-    page = page_text(
-        "identified",
-        results,
-        identified_verdict(results),
-        identified_tables(results),
-        unknown_sentences(results),
-        figures,
-        config.read_text(encoding="utf-8") if config.is_file() else "",
-        # The result itself is written last, behind this page.
-        [name for name in _LINKED if name == "identified.json" or (folder / name).is_file()],
+    rows, machines = results["rows"], results["machines"]
+    legs = "".join(f", {count} for leg {leg}" for leg, count in sorted(rows["per_leg"].items()))
+    how = f"{count_text(machines, 'machine')} {'simulated' if results['simulated'] else 'measured'}"
+    page = Page(
+        name=results["name"],
+        kind="identification report",
+        verdict=identified_verdict(results),
+        sections=sections_of(identified_tables(results), figures),
+        facts=f"{results['mechanism']} · {rows['train']} poses to identify from{legs}, {rows['test']} held-out poses · "
+        f"{how} · seed {results['seed']}",
+        cautions=unknown_sentences(results),
+        notes=results["notes"],
+        versions=results["versions"],
     )
-    path = folder / "report.html"
-    write_whole(path, page)
-    return path
+    return page.write_html(folder / "report.html", _LINKED)

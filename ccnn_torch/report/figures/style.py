@@ -20,7 +20,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.report.html import InlineFigure
+from ccnn_torch.report.page import InlineFigure
 
 # Okabe and Ito's palette: distinguishable with every common form of colour blindness, and in grey print.
 BEFORE = "#D55E00"

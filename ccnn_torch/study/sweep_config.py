@@ -7,36 +7,19 @@ import itertools
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.engine import check_engine
 from ccnn_torch.errors import InputError
+from ccnn_torch.study.runs import Study
 
 _LONGEST = 80
 # Each job is checked before the first one starts, in some milliseconds.
 _MOST = 2000
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """A sweep, checked.
-
-    Attributes:
-        keys: the keys that vary, in order.
-        values: values of these keys as they were written, by the job's name.
-        jobs: configs by name; each writes `out / name`.
-    """
-
-    out: Path
-    engine: str
-    keys: tuple[str, ...]
-    values: dict[str, tuple[str, ...]]
-    jobs: dict[str, RunConfig]
-
-
-def load_sweep(path: str | Path | None, changes: Iterable[str], out: str | Path) -> Sweep:
+def load_sweep(path: str | Path | None, changes: Iterable[str], out: str | Path) -> Study:
     """Read a config and make a job of every combination of values.
 
     Args:
@@ -85,7 +68,7 @@ def load_sweep(path: str | Path | None, changes: Iterable[str], out: str | Path)
         if name in jobs:
             raise InputError(f"job {' '.join(words)} is there twice; give each value once")
         values[name], jobs[name] = combination, config
-    return Sweep(Path(out), engine, tuple(varied), values, jobs)
+    return Study("sweep", Path(out), jobs, engine, tuple(varied), values)
 
 
 def _split(text: str) -> list[str]:

@@ -6,7 +6,6 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from ccnn_torch.config.tree import validated
 from ccnn_torch.engine import Engine
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import read_yaml
+from ccnn_torch.study.runs import Study
 
 # Keys of the suite itself, where they come from the command line.
 _OWN = ("name", "out", "engine")
@@ -45,21 +45,7 @@ class SuiteFile(BaseModel):
     )
 
 
-@dataclass(frozen=True)
-class Suite:
-    """A suite, checked.
-
-    Attributes:
-        cases: configs by name, in order; each writes `out / name`.
-    """
-
-    name: str
-    out: Path
-    cases: dict[str, RunConfig]
-    engine: str = "local"
-
-
-def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
+def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Study:
     """Read a suite's file and put overrides over every case.
 
     A case is `base` with the case's keys over it (sections are merged, lists replaced), then the overrides. `name=…`
@@ -86,7 +72,7 @@ def load_suite(path: str | Path, overrides: Iterable[str] = ()) -> Suite:
         resolve_paths(case, Path(os.path.realpath(path.parent)))
         changed = apply_overrides(case, others, Path.cwd())
         cases[name] = validated(RunConfig, case | {"out": str(out / name)}, f"{path}, case '{name}'", changed)
-    return Suite(file.name, out, cases, file.engine)
+    return Study(file.name, out, cases, file.engine)
 
 
 def _name(keys: Mapping[str, Any], where: str, taken: Iterable[str]) -> str:

@@ -6,54 +6,48 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.display import display_unit, interval_text, number_text
+from ccnn_torch.display import display_unit, number_text
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.csv_text import csv_text
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.report.json_files import read_json
+from ccnn_torch.report.results.base import Spread, interval_text
+from ccnn_torch.report.results.run import Method, RunResults
 from ccnn_torch.report.table import Table, markdown_table
 
-Results = Mapping[str, Any]
 _CSV = ("run", "name", "case", "seed", "repeats", "train", "validation", "test", "data_sha256", "method", "best",
         "quantity", "unit", "before", "after", "ratio_to_floor", "seconds")  # fmt: skip
 
 
-def read_runs(folders: Sequence[Path]) -> dict[str, dict[str, Any]]:
-    """Content of `results.json` of finished run folders, by folder.
+def read_runs(folders: Sequence[Path]) -> dict[str, RunResults]:
+    """Results of finished run folders, by folder.
 
     Raises:
         InputError: a folder holds no finished run.
     """
-    found = {}
-    for folder in folders:
-        results = read_json(folder / "results.json")
-        if not all(isinstance(results.get(key), dict) for key in ("methods", "pose", "rows", "before")):
-            raise InputError(f"{folder / 'results.json'}: is not the result of a run; give folders of ccnn run")
-        found[str(folder)] = results
-    return found
+    return {str(folder): RunResults.read(folder / "results.json") for folder in folders}
 
 
-def runs_table(runs: Mapping[str, Results]) -> Table:
+def runs_table(runs: Mapping[str, RunResults]) -> Table:
     """One row a run: its best method, pose error before and after, ratio to the floor, seconds.
 
     Runs are marked by a letter for the rows that they were judged on: only those of one letter are comparable.
     """
     marks = _marks(runs)
-    largest = max(results["pose"]["position"]["before"]["rms"]["median"] or 0.0 for results in runs.values())
+    largest = max(results.pose.position.before.rms.median or 0.0 for results in runs.values())
     scale, unit = display_unit("m", largest)
     rows = []
     for folder, results in runs.items():
-        best, position, counts = results.get("best_method"), results["pose"]["position"], results["rows"]
-        block = results["methods"].get(best) or {}
+        best, position, counts = results.best_method, results.pose.position, results.rows
+        block = results.methods.get(best or "") or Method(test=None)
         rows.append(
             (
-                f"{results['name']} ({Path(folder).name})" if Path(folder).name != results["name"] else results["name"],
+                f"{results.name} ({Path(folder).name})" if Path(folder).name != results.name else results.name,
                 marks[folder],
-                f"{counts['train'] + counts['validation']} + {counts['test']}",
+                f"{counts.train + counts.validation} + {counts.test}",
                 _method_text(results),
-                *(interval_text(position[when]["rms"], scale, 3) for when in ("before", "after")),
-                interval_text(block.get("ratio_to_floor"), digits=3),
-                interval_text(block.get("seconds"), digits=3),
+                *(interval_text(position[when].rms, scale, 3) for when in ("before", "after")),
+                interval_text(block.ratio_to_floor, digits=3),
+                interval_text(block.seconds, digits=3),
             )
         )
     columns = ("run", "test rows", "rows", "method", f"before [{unit}]", f"after [{unit}]", "to floor", "time [s]")
@@ -63,25 +57,25 @@ def runs_table(runs: Mapping[str, Results]) -> Table:
     return Table("Runs", columns, tuple(rows), note, words=("test rows", "method"), details=("rows",))
 
 
-def runs_csv(runs: Mapping[str, Results]) -> str:
+def runs_csv(runs: Mapping[str, RunResults]) -> str:
     """Every method of every run as one row, in SI, with 17 significant digits."""
     rows: list[Sequence[object]] = [_CSV]
     for folder, results in runs.items():
-        about = [folder, results["name"], results.get("case") or "", results["seed"], results["repeats"]]
-        about += [results["rows"][part] for part in ("train", "validation", "test")]
-        about.append(results.get("data_sha256") or "")
-        for method, block in results["methods"].items():
-            for kind, pose in results["pose"].items():
-                left = (block.get("pose") or {}).get(kind)
+        about = [folder, results.name, results.case or "", results.seed, results.repeats]
+        about += [results.rows[part] for part in ("train", "validation", "test")]
+        about.append(results.data_sha256 or "")
+        for method, block in results.methods.items():
+            for kind, pose in results.pose:
+                left = block.pose.get(kind)
                 if pose is None or left is None:
                     continue
-                figures = [pose["before"]["rms"], left["rms"], block.get("ratio_to_floor"), block.get("seconds")]
-                best = int(method == results.get("best_method"))
-                rows.append([*about, method, best, f"{kind}_rms", pose["unit"], *map(_median, figures)])
+                figures = [pose.before.rms, left.rms, block.ratio_to_floor, block.seconds]
+                best = int(method == results.best_method)
+                rows.append([*about, method, best, f"{kind}_rms", pose.unit, *map(_median, figures)])
     return csv_text(rows)
 
 
-def write_runs(path: Path, runs: Mapping[str, Results]) -> None:
+def write_runs(path: Path, runs: Mapping[str, RunResults]) -> None:
     """Write the table as .csv or .md, by what the name ends in.
 
     Raises:
@@ -94,7 +88,7 @@ def write_runs(path: Path, runs: Mapping[str, Results]) -> None:
     write_whole(path, text.encode())
 
 
-def _marks(runs: Mapping[str, Results]) -> dict[str, str]:
+def _marks(runs: Mapping[str, RunResults]) -> dict[str, str]:
     """A letter for each set of test rows: data, seed and repeats, split, and how many rows are in each part.
 
     The figures before compensation identify the split, which `results.json` does not name: they are those of the test
@@ -103,13 +97,13 @@ def _marks(runs: Mapping[str, Results]) -> dict[str, str]:
     keys: dict[tuple[Any, ...], str] = {}
     found = {}
     for folder, results in runs.items():
-        before = {name: block["spread"] for name, block in results["before"].items()}
-        key = (results.get("data_sha256"), results["rows"]["test"], _number_key(before))
+        before = {name: block.spread for name, block in results.before.items()}
+        key = (results.data_sha256, results.rows.test, _number_key(before))
         found[folder] = keys.setdefault(key, _letter(len(keys)))
     return found
 
 
-def _number_key(before: Mapping[str, Any]) -> str:
+def _number_key(before: Mapping[str, Mapping[str, Spread]]) -> str:
     """Figures as text with 9 digits, so that sums in another order compare equal."""
     return " ".join(
         f"{joint} {quantity} {number_text(spread['median'], 9)}"
@@ -122,14 +116,14 @@ def _letter(number: int) -> str:
     return chr(ord("A") + number) if number < 26 else str(number + 1)
 
 
-def _method_text(results: Results) -> str:
+def _method_text(results: RunResults) -> str:
     """The best method, of how many, and with what beside it."""
-    trained = sum(block.get("test") is not None for block in results["methods"].values())
+    trained = sum(block.test is not None for block in results.methods.values())
     of = f" (best of {trained})" if trained > 1 else ""
-    chosen = (results.get("geometry") or {}).get("chosen")
-    geometry = "geometry + " if chosen == "identify" else ""
-    return f"{geometry}{results.get('best_method')}{of}"
+    identified = results.geometry is not None and results.geometry.chosen == "identify"
+    geometry = "geometry + " if identified else ""
+    return f"{geometry}{results.best_method}{of}"
 
 
-def _median(spread: Mapping[str, Any] | None) -> float | str:
-    return "" if spread is None or spread["median"] is None else float(spread["median"])
+def _median(spread: Spread | None) -> float | str:
+    return "" if spread is None or spread.median is None else spread.median

@@ -1,1 +1,0 @@
-"""`ccnn sweep`: one config with some keys varied, a run for every combination of their values."""
