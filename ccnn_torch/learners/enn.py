@@ -17,11 +17,9 @@ from ccnn_torch.evolution.breeding import (
 from ccnn_torch.evolution.coevolution import density, diversity
 from ccnn_torch.evolution.evaluation import EPSILON, fitness, make_task, network_errors
 from ccnn_torch.evolution.genome import Genome, select
-from ccnn_torch.evolution.masked_network import MaskedNetwork
-from ccnn_torch.evolution.network import forward
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import ENNSettings
-from ccnn_torch.evolution.spread import Spread, readout_spread, spread_variance
+from ccnn_torch.learners.one_network import OneNetwork
 from ccnn_torch.learners.protocol import TrainingData
 from ccnn_torch.learners.rows import mean_square, usable_rows
 
@@ -29,7 +27,7 @@ from ccnn_torch.learners.rows import mean_square, usable_rows
 _GENERATIONS, _FIRST = 0, 1
 
 
-class ENN:
+class ENN(OneNetwork):
     """The CCNN's genomes, operators and fitness (eq. 11) without its cooperation; a step is one generation.
 
     An individual is a whole network: its layers have the same parents, and one number is its fitness. The model is the
@@ -100,26 +98,6 @@ class ENN:
         """Generations."""
         return self.settings.generations
 
-    def predict(self, inputs: Tensor) -> Tensor:
-        """Output of the model of each repeat. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
-        masks, weights = self._model()
-        return forward(masks, weights, inputs.unsqueeze(1)).squeeze(1)
-
-    def variance(self, inputs: Tensor) -> Tensor:
-        """Predictive variance of newly measured outputs. inputs: `r x s x i` [1]; returns `r x s x o` [1]."""
-        masks, weights = self._model()
-        return spread_variance([m[:, 0] for m in masks], [w[:, 0] for w in weights], self._spread(), inputs)
-
-    def genome(self, repeat: int) -> tuple[list[Tensor], list[Tensor]]:
-        """Masks and weights of one repeat's model, dead nodes included: `out x in` and `out x (in or in + 1)`."""
-        masks, weights = self._model()
-        return [mask[repeat, 0] for mask in masks], [weight[repeat, 0] for weight in weights]
-
-    def network(self, repeat: int) -> MaskedNetwork:
-        """The model of one repeat, pruned of its dead nodes."""
-        spread = self._spread()
-        return MaskedNetwork(*self.genome(repeat), spread.factors[repeat], spread.noise[repeat])
-
     def state_dict(self) -> dict[str, Tensor]:
         """The population with its fitness, and the fittest network so far."""
         tensors = {"fitness": self._fitness, "best_fitness": self._best_fitness}
@@ -155,6 +133,3 @@ class ENN:
     def _model(self) -> tuple[list[Tensor], list[Tensor]]:
         """Masks and weights of the model, one a layer, `r x 1 x ...`."""
         return [layer.mask for layer in self._best], [layer.weight for layer in self._best]
-
-    def _spread(self) -> Spread:
-        return readout_spread(*self._model(), self._data.inputs, self._data.targets, self._data.weights)
