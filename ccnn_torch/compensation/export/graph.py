@@ -70,6 +70,8 @@ class Graph:
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
             self._constants[key] = numpy_helper.from_array(array, f"c{len(self._constants)}")
+            if array.dtype.kind == "i":
+                self._integers.add(self._constants[key].name)
         return str(self._constants[key].name)
 
     def node(
@@ -80,7 +82,7 @@ class Graph:
         if key not in self._known:
             self._known[key] = name = f"v{len(self._known)}"
             self._nodes.append(helper.make_node(op, [*inputs], [name], **attributes))
-            if op == "Cast" or (op in _MOVES and inputs[0] in self._integers):
+            if (op in _MOVES and inputs[0] in self._integers) or (op == "Where" and inputs[-1] in self._integers):
                 self._integers.add(name)
             if op in _TRUTHS or (op in _MOVES and inputs[0] in self._truths):
                 self._truths.add(name)
@@ -115,10 +117,11 @@ class Graph:
             last = self.node("Gemm", inputs, shape, shape).name
         return Value(shape, last, shape)
 
-    def whole(self, value: Value) -> Value:
-        """The same as 64-bit integers."""
-        value = self.solid(value)
-        return self.node("Cast", [value.name], value.shape, value.real, to=TensorProto.INT64)
+    def is_whole(self, value: Any) -> bool:
+        """Whether it is one of 64-bit integers."""
+        if isinstance(value, Value):
+            return value.name in self._integers
+        return isinstance(value, int) or (isinstance(value, Tensor) and value.dtype == torch.int64)
 
     def full(self, value: Value) -> Value:
         """The same, not broadcast."""

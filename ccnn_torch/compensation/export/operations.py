@@ -25,7 +25,7 @@ _UNARY = {
 _BINARY = {
     "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "maximum": "Max", "minimum": "Min", "lt": "Less",
     "le": "LessOrEqual", "gt": "Greater", "ge": "GreaterOrEqual", "eq": "Equal", "logical_and": "And",
-    "bitwise_and": "And", "logical_or": "Or", "bitwise_or": "Or",
+    "bitwise_and": "And", "__and__": "And", "logical_or": "Or", "bitwise_or": "Or", "__or__": "Or",
 }  # fmt: skip
 _REDUCTIONS = {"sum": "ReduceSum", "mean": "ReduceMean", "amax": "ReduceMax", "amin": "ReduceMin"}
 _FILLS = {"zeros_like": 0.0, "ones_like": 1.0, "new_zeros": 0.0, "new_ones": 1.0}
@@ -69,21 +69,21 @@ def _shape(value: Any) -> tuple[int, ...]:
     return tuple(value.shape) if isinstance(value, Value | Tensor) else ()
 
 
-def _operand(graph: Graph, value: Any) -> tuple[str, tuple[int, ...]]:
-    """Name and real shape of a value or a constant."""
+def _operand(graph: Graph, value: Any, whole: bool = False) -> tuple[str, tuple[int, ...]]:
+    """Name and real shape of a value or a constant, a whole number if `whole`."""
     if isinstance(value, Value):
         solid = graph.solid(value)
         return solid.name, solid.real
     thin = graph.thin(value if isinstance(value, Tensor) else torch.tensor(float(value), dtype=torch.float64))
-    thin = thin if thin.dtype == torch.bool else thin.to(torch.float64)
+    thin = thin if thin.dtype == torch.bool else thin.to(torch.int64 if whole else torch.float64)
     while thin.dim() and thin.shape[0] == 1:
         thin = thin[0]
     return graph.constant(thin), tuple(thin.shape)
 
 
-def _each(graph: Graph, op: str, *operands: Any) -> Value:
-    """An operation on operands that broadcast."""
-    found = [_operand(graph, v) for v in operands]
+def _each(graph: Graph, op: str, *operands: Any, whole: bool = False) -> Value:
+    """An operation on operands that broadcast; constants among them are whole numbers if `whole`."""
+    found = [_operand(graph, v, whole) for v in operands]
     shape = np.broadcast_shapes(*map(_shape, operands))
     real = np.broadcast_shapes(*(real for _, real in found))
     return graph.node(op, [name for name, _ in found], shape, (1,) * (len(shape) - len(real)) + tuple(real))
@@ -295,7 +295,9 @@ def _clamped(graph: Graph, value: Value, low: Any = None, high: Any = None, **na
 
 
 def _where(graph: Graph, condition: Any, a: Any, b: Any) -> Value:
-    return _each(graph, "Where", condition, a, b)
+    if isinstance(condition, Tensor) and bool(condition.all()) and isinstance(a, Value) and condition.dim() == _rank(a):
+        return a
+    return _each(graph, "Where", condition, a, b, whole=graph.is_whole(a) and graph.is_whole(b))
 
 
 def _not_equal(graph: Graph, a: Any, b: Any) -> Value:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ccnn_torch.compensation.export.export import DAMPED_TOLERANCE
-from ccnn_torch.compensation.targets.form import Array, Call, Copy, Form, Program, Routine, Statement
+from ccnn_torch.compensation.routines import Copy, Routine, Statement
+from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
 from ccnn_torch.compensation.targets.template import filled
@@ -132,29 +133,29 @@ def c_compensation(form: Form, static: str = "") -> str:
 
 def _routine(routine: Routine, form: Form, dialect: Dialect, static: str) -> str:
     """What a user calls; returns the status."""
+    sizes = form.sizes
     outputs = [f"ccnn_real {name}[]" for name in routine.returns]
-    inputs = [f"const ccnn_real {name}[]" for name in (routine.given, "covariates")]
-    sizes = {name: size for name, size in routine.sizes.items() if name not in routine.returns}
-    lines = [f"ccnn_real {', '.join(f'{name}[{size}]' for name, size in sizes.items())};"]
-    covariates = "covariates"
+    own = [name for name in form.variables(routine) if name not in routine.returns]
+    lines = [f"ccnn_real {', '.join(f'{name}[{sizes[name]}]' for name in own)};"]
     if form.covariates:
-        covariates = "given"
-        value = "given[j] = covariates == NULL ? (ccnn_real)NAN : covariates[j];"
-        lines += ["ccnn_real given[CCNN_COVARIATES];", *dialect.loop("j", len(form.covariates), [value])]
+        value = "more[j] = covariates == NULL ? (ccnn_real)NAN : covariates[j];"
+        lines += ["ccnn_real more[CCNN_COVARIATES];", *dialect.loop("j", len(form.covariates), [value])]
     else:
         lines.append("(void)covariates;")
 
     def printed(statement: Statement) -> list[str]:
-        if isinstance(statement, Call):
-            names = [covariates if name == "covariates" else name for name in (*statement.inputs, *statement.outputs)]
-            return [f"ccnn_{statement.program.name}({', '.join(names)});"]
+        if isinstance(statement, str):
+            program = form.programs[statement]
+            names = ["more" if name == "covariates" else name for name in program.inputs]
+            return [f"ccnn_{statement}({', '.join([*names, *program.outputs])});"]
         if isinstance(statement, Copy):
             source = f"{statement.source}[j]" if statement.source else dialect.literal(0.0)
-            return dialect.loop("j", statement.size, [f"{statement.target}[j] = {source};"])
+            return dialect.loop("j", sizes[statement.target], [f"{statement.target}[j] = {source};"])
         return dialect.loop("k", statement.times, [line for part in statement.statements for line in printed(part)])
 
     lines += [line for statement in routine.statements for line in printed(statement)]
-    head = f"{static}int ccnn_{routine.name}({', '.join([*inputs, *outputs])})"
+    arguments = ", ".join(["const ccnn_real given[]", "const ccnn_real covariates[]", *outputs])
+    head = f"{static}int ccnn_{routine.name}({arguments})"
     return "\n".join([head, "{", *(f"    {line}" for line in lines), "    return (int)status[0];", "}"])
 
 

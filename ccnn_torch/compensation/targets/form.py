@@ -1,7 +1,7 @@
 """The form of a model that every target prints: typed operations on numbers, loops over arrays, constant tables.
 
-A `Form` has the programs of one model (inputs made finite, a step towards the command, its end) and the routines that
-call them. A program is a list of steps in an order in which they can be computed. Each value is assigned once, all
+A `Form` has the functions of one model (inputs made finite, a step towards the command, its end) as programs, and the
+routines that call them. A program is a list of steps in an order in which they can be computed. Each value is assigned once, all
 sizes are constants, and there is no branch: a program always does the same operations.
 """
 
@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ccnn_torch.compensation.routines import Copy, Routine
 
 Array = NDArray[Any]
 
@@ -139,67 +141,6 @@ class Program:
         return count
 
 
-class Call(NamedTuple):
-    """A program of variables into variables, named in the order of its own inputs and outputs."""
-
-    program: Program
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-
-
-class Copy(NamedTuple):
-    """A variable gets the numbers of another one, or zeros where `source` is ""."""
-
-    target: str
-    source: str
-    size: int
-
-
-class Repeat(NamedTuple):
-    """Statements, so many times."""
-
-    times: int
-    statements: tuple[Any, ...]
-
-
-# A `Call`, `Copy` or `Repeat`.
-Statement = Any
-
-
-@dataclass
-class Routine:
-    """What a controller calls: statements on variables, each an array, of which one is `status`.
-
-    Attributes:
-        name: of the routine.
-        about: what it gives, for a reader.
-        given: the variable with the joints that are given; the other one is `covariates`.
-        returns: variables that it gives beside `status`.
-        statements: in order.
-    """
-
-    name: str
-    about: str
-    given: str
-    returns: tuple[str, ...]
-    statements: tuple[Statement, ...]
-
-    @property
-    def calls(self) -> list[tuple[Call, int]]:
-        """Calls of programs, and how often each is done."""
-        return [*_calls(self.statements)]
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Of every variable that the statements make."""
-        sizes = {}
-        for call, _ in self.calls:
-            found = [len(ids) for ids in call.program.outputs.values() if ids]
-            sizes |= dict(zip(call.outputs, found, strict=True))
-        copies = {copy.target: copy.size for copy in self.statements if isinstance(copy, Copy)}
-        return sizes | copies
-
-
 @dataclass
 class Form:
     """One model: programs, and the routines that call them.
@@ -232,21 +173,27 @@ class Form:
         """Whether there is a routine for the standard deviation."""
         return "deviation_sd" in self.routines
 
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Of every variable of the routines."""
+        sizes: dict[str, int] = {}
+        for program in self.programs.values():
+            sizes |= {name: program.sizes[buffer] for name, buffer in program.inputs.items()}
+            sizes |= {name: len(ids) for name, ids in program.outputs.items()}
+        return sizes
+
+    def variables(self, routine: Routine) -> list[str]:
+        """Variables that a routine makes."""
+        made = [name for call, _ in routine.calls for name in self.programs[call].outputs]
+        return [*dict.fromkeys([*made, *(part.target for part in routine.statements if isinstance(part, Copy))])]
+
     def operations(self) -> Counter[str]:
         """Of one command."""
         count: Counter[str] = Counter()
-        for call, times in self.routines["compensate"].calls:
-            for op, each in call.program.operations().items():
+        for name, times in self.routines["compensate"].calls:
+            for op, each in self.programs[name].operations().items():
                 count[op] += each * times
         return count
-
-
-def _calls(statements: tuple[Statement, ...], times: int = 1) -> Iterator[tuple[Call, int]]:
-    for statement in statements:
-        if isinstance(statement, Call):
-            yield statement, times
-        elif isinstance(statement, Repeat):
-            yield from _calls(statement.statements, times * statement.times)
 
 
 def leaves(expression: Expression) -> Iterator[Leaf | int]:

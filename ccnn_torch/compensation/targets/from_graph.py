@@ -48,12 +48,12 @@ class Value:
         self.ids = ids
 
 
-def program_of(traced: GraphModule, name: str, inputs: Sequence[str], outputs: Sequence[str | None]) -> Program:
+def program_of(traced: GraphModule, name: str, inputs: Sequence[str], outputs: Sequence[str]) -> Program:
     """A program of a traced function whose inputs and outputs are tensors of fixed shapes.
 
     Args:
         traced: with its operations decomposed.
-        outputs: names of its outputs; None for one that is left out.
+        outputs: names of its outputs; one without numbers is left out.
 
     Raises:
         MethodFailedError: there is an operation that no form has.
@@ -75,7 +75,7 @@ def program_of(traced: GraphModule, name: str, inputs: Sequence[str], outputs: S
             known[node] = lowering.call(node, args, kwargs)
     found = torch.fx.node.map_arg(graph.output_node().args[0], lambda n: known[n])
     found = found if isinstance(found, list | tuple) else [found]
-    wanted = {key: lowering.ids(value) for key, value in zip(outputs, found, strict=True) if key is not None}
+    wanted = {key: lowering.ids(v) for key, v in zip(outputs, found, strict=True) if _shape(v).numel()}
     return lowering.builder.program(name, given, wanted)
 
 

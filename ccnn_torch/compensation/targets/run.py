@@ -7,18 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccnn_torch.compensation.targets.form import (
-    OPERATIONS,
-    Array,
-    Call,
-    Copy,
-    Expression,
-    Form,
-    Leaf,
-    Let,
-    Program,
-    Statement,
-)
+from ccnn_torch.compensation.routines import Copy, Statement
+from ccnn_torch.compensation.targets.form import OPERATIONS, Array, Expression, Form, Leaf, Let, Program
 
 # Numbers at a time: a loop over a large table holds all its products of every row.
 _AT_ONCE = 1 << 18
@@ -101,17 +91,15 @@ def run_form(form: Form, joints: Array, covariates: Array | None) -> dict[str, A
 def run_routine(form: Form, name: str, joints: Array, covariates: Array) -> dict[str, Array]:
     """What one routine gives: `s x n` each, and `status` `s`."""
     routine = form.routines[name]
-    values = {routine.given: joints, "covariates": covariates}
+    values = {"given": joints, "covariates": covariates}
 
     def run(statements: Sequence[Statement]) -> None:
         for statement in statements:
-            if isinstance(statement, Call):
-                own = zip(statement.program.inputs, statement.inputs, strict=True)
-                found = run_program(statement.program, {key: values[variable] for key, variable in own}, form.dtype)
-                made = [value for value in found.values() if value.shape[-1]]
-                values.update(zip(statement.outputs, made, strict=True))
+            if isinstance(statement, str):
+                program = form.programs[statement]
+                values.update(run_program(program, {key: values[key] for key in program.inputs}, form.dtype))
             elif isinstance(statement, Copy):
-                zeros = np.zeros((len(joints), statement.size), form.dtype)
+                zeros = np.zeros((len(joints), form.sizes[statement.target]), form.dtype)
                 values[statement.target] = values[statement.source] if statement.source else zeros
             else:
                 for _ in range(statement.times):

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ccnn_torch.compensation.targets.form import Array, Call, Copy, Form, Program, Routine, Statement
+from ccnn_torch.compensation.routines import Copy, Routine, Statement
+from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
 from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
 from ccnn_torch.compensation.targets.template import filled
@@ -144,51 +145,36 @@ def _block(program: Program, text: Text, form: Form) -> str:
 
 def _routine(routine: Routine, form: Form) -> str:
     """What a user calls, as a function block; the programs are instances in it."""
-    real = _real(form)
-    programs = dict.fromkeys(call.program.name for call, _ in routine.calls)
+    real, sizes, loop = _real(form), form.sizes, _dialect(form.dtype).loop
+    programs = dict.fromkeys(name for name, _ in routine.calls)
     # Where a variable is: an output of an instance, or an array of its own.
-    places = {
-        variable: f"{call.program.name}_block.{name}_out"
-        for call, _ in routine.calls
-        for variable, name in zip(
-            call.outputs, [name for name, ids in call.program.outputs.items() if ids], strict=True
-        )
-    }
+    places = {variable: f"{name}_block.{variable}_out" for name in programs for variable in form.programs[name].outputs}
+    own = [name for name in form.variables(routine) if name not in places]
+    places = {name: name for name in (*own, "covariates")} | {"given": routine.given} | places
 
     def printed(statement: Statement) -> list[str]:
-        if isinstance(statement, Call):
-            pairs = zip(statement.program.inputs, statement.inputs, strict=True)
-            given = ", ".join(f"{name} := {places.get(variable, variable)}" for name, variable in pairs)
-            return [f"{statement.program.name}_block({given});"]
+        if isinstance(statement, str):
+            given = ", ".join(f"{name} := {places[name]}" for name in form.programs[statement].inputs)
+            return [f"{statement}_block({given});"]
         if isinstance(statement, Copy):
-            source = f"{places.get(statement.source, statement.source)}[j]" if statement.source else zero
-            return loop("j", statement.size, [f"{statement.target}[j] := {source};"])
+            source = f"{places[statement.source]}[j]" if statement.source else _literal(0.0, form.dtype)
+            return loop("j", sizes[statement.target], [f"{statement.target}[j] := {source};"])
         return loop("k", statement.times, [line for part in statement.statements for line in printed(part)])
 
-    loop, zero = _dialect(form.dtype).loop, _literal(0.0, form.dtype)
-    own = {name: size for name, size in routine.sizes.items() if name not in places}
-    inputs = {routine.given: len(form.joints), "covariates": len(form.covariates)}
     lines = [line for statement in routine.statements for line in printed(statement)]
     for name in routine.returns:
-        lines += loop("j", len(form.joints), [f"{name}[j] := {places[name]}[j];"])
-    name = "".join(part.capitalize() for part in routine.name.split("_"))
+        lines += loop("j", sizes[name], [f"{name}[j] := {places[name]}[j];"])
+    inputs = {routine.given: len(form.joints), "covariates": len(form.covariates)}
+    outputs = [_array(name, sizes[name], real) for name in routine.returns]
+    variables = [f"    {name}_block : CCNN_{name.capitalize()}_;" for name in programs]
+    variables += [*(_array(name, sizes[name], real) for name in own), "    j, k : DINT;"]
     return "\n".join(
         [
             f"(* {routine.about} *)",
-            f"FUNCTION_BLOCK CCNN_{name}",
+            f"FUNCTION_BLOCK CCNN_{''.join(part.capitalize() for part in routine.name.split('_'))}",
             *_section("VAR_INPUT", [_array(name, size, real) for name, size in inputs.items()]),
-            *_section(
-                "VAR_OUTPUT",
-                [*(_array(name, len(form.joints), real) for name in routine.returns), "    status : INT;"],
-            ),
-            *_section(
-                "VAR",
-                [
-                    *(f"    {name}_block : CCNN_{name.capitalize()}_;" for name in programs),
-                    *(_array(name, size, real) for name, size in own.items()),
-                    "    j, k : DINT;",
-                ],
-            ),
+            *_section("VAR_OUTPUT", [*outputs, "    status : INT;"]),
+            *_section("VAR", variables),
             *lines,
             f"status := {real}_TO_INT({places['status']}[0]);",
             "END_FUNCTION_BLOCK",
