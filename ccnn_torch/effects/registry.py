@@ -6,23 +6,12 @@ import difflib
 from collections.abc import Callable
 from pathlib import Path
 
-from ccnn_torch.effects.backlash import Backlash
-from ccnn_torch.effects.compliance import Compliance
-from ccnn_torch.effects.coupling import Coupling
-from ccnn_torch.effects.drift import Drift
-from ccnn_torch.effects.frame import Frame
-from ccnn_torch.effects.friction import Friction
-from ccnn_torch.effects.geometry import Geometry
-from ccnn_torch.effects.gravity import Gravity
-from ccnn_torch.effects.instrument import Instrument
-from ccnn_torch.effects.joint_gain import JointGain
-from ccnn_torch.effects.joint_offset import JointOffset
-from ccnn_torch.effects.latency import Latency
-from ccnn_torch.effects.parameter import parameter_causes
+from ccnn_torch.effects.backlash import Backlash, Friction
+from ccnn_torch.effects.constant import Frame, Geometry, Instrument, Tool, parameter_causes
+from ccnn_torch.effects.joints import Coupling, JointGain, JointOffset, Transmission
+from ccnn_torch.effects.loads import Compliance, Gravity
 from ccnn_torch.effects.protocol import Effect
-from ccnn_torch.effects.thermal import Thermal
-from ccnn_torch.effects.tool import Tool
-from ccnn_torch.effects.transmission import Transmission
+from ccnn_torch.effects.time import Drift, Latency, Thermal
 from ccnn_torch.effects.user_effect import owned
 from ccnn_torch.errors import CcnnError, InputError
 from ccnn_torch.mechanisms import Mechanism
