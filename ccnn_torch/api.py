@@ -10,7 +10,7 @@ from ccnn_torch.calibration.calibrate import calibrate as _calibrate
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.compensation import load_compensation
-from ccnn_torch.config.held_out import given_records, name_given
+from ccnn_torch.config.split import given_records, name_given
 from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.identify import Identification

@@ -16,7 +16,7 @@ import torch
 from ccnn_torch.compensation import load_model
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.report.json_files import load_schema
-from ccnn_torch.simulation.cases import build_case
+from ccnn_torch.simulation.case_study import build_case
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "ccnn_torch"
@@ -29,7 +29,6 @@ FLOORS = [
         "version",
         "errors",
         "coordinates",
-        "unit_words",
         "units",
         "display",
         "spelling",

@@ -21,7 +21,7 @@ from ccnn_torch.cli.options import (
     noted,
 )
 from ccnn_torch.errors import InputError
-from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
+from ccnn_torch.run_folder.folder import NOTHING_WRITTEN, if_stopped
 
 _FRAME = "X,Y,Z,RX,RY,RZ"
 

@@ -17,10 +17,9 @@ from ccnn_torch.compensation.model_files.load import LoadedModel
 from ccnn_torch.compensation.wanted_poses import WantedPoses
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import FallbackWarning, InputError
-from ccnn_torch.records.headers import columns_there
+from ccnn_torch.records.headers import columns_there, stack_columns
 from ccnn_torch.records.joint_map import JointMap, read_joint_map
 from ccnn_torch.records.load import JOINT_LIMIT
-from ccnn_torch.records.pose_columns import stack_columns
 from ccnn_torch.records.read_table import mapped, read_parts
 from ccnn_torch.records.table import Table, writing_table
 from ccnn_torch.units import from_si

@@ -18,9 +18,9 @@ from ccnn_torch.effects.registry import EXACT as EXACT
 from ccnn_torch.effects.registry import OUTLIER as OUTLIER
 from ccnn_torch.effects.registry import effect_names as effect_names
 from ccnn_torch.effects.registry import make_effect as make_effect
+from ccnn_torch.effects.registry import owned as owned
+from ccnn_torch.effects.registry import refuse_one_name as refuse_one_name
+from ccnn_torch.effects.registry import tried as tried
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT as PLATFORM_WEIGHT
 from ccnn_torch.effects.situation import Situation as Situation
 from ccnn_torch.effects.situation import default_gravity as default_gravity
-from ccnn_torch.effects.trial import refuse_one_name as refuse_one_name
-from ccnn_torch.effects.trial import tried as tried
-from ccnn_torch.effects.user_effect import owned as owned

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.files.csv_text import csv_text
-from ccnn_torch.files.write import write_whole
+from ccnn_torch.files.write import csv_text, write_whole
 
 HEADER = ("method", "split", "quantity", "joint", "unit", "median", "low", "high")
 Row = tuple[str, str, str, str, str, float | None, float | None, float | None]

@@ -16,8 +16,7 @@ from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.screen import note, say_place, stdout
-from ccnn_torch.run_folder.folder import RunFolder, kept_for
-from ccnn_torch.run_folder.lock import locked
+from ccnn_torch.run_folder.folder import RunFolder, kept_for, locked
 from ccnn_torch.suite.config import Suite
 from ccnn_torch.suite.page import compare, write_suite
 from ccnn_torch.suite.tables import case_line, print_suite

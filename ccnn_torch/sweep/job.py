@@ -13,8 +13,7 @@ from ccnn_torch.files.write import sweep as clean
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.screen import note, say_place, stdout
 from ccnn_torch.report.table import Table, print_table
-from ccnn_torch.run_folder.folder import kept_for
-from ccnn_torch.run_folder.lock import locked
+from ccnn_torch.run_folder.folder import kept_for, locked
 from ccnn_torch.suite.job import check_folder, finish_cases
 from ccnn_torch.sweep.config import Sweep
 

@@ -11,7 +11,7 @@ from typing import Any
 import typer
 
 from ccnn_torch.cli.application import app
-from ccnn_torch.config.commands import keys_by_section
+from ccnn_torch.config.keys import keys_by_section
 from ccnn_torch.report.json_files import load_schema
 
 __all__ = ["write_reference"]
