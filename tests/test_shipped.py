@@ -26,6 +26,7 @@ SHIPPED = ROOT / "checkpoints" / "tripod"
 # A module may import those that stand before it; a folder stands where its longest entry is.
 FLOORS = [
     [
+        "doors",
         "version",
         "errors",
         "coordinates",

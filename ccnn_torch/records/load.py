@@ -14,17 +14,18 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
-from ccnn_torch.records.covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES
-from ccnn_torch.records.covariates import choose_covariates
-from ccnn_torch.records.headers import HasCoordinates, check_joints, refuse_lost_orientation, unused_joints
-from ccnn_torch.records.headers import read_pose as read_pose
-from ccnn_torch.records.headers import stack_columns as stack_columns
+from ccnn_torch.records.covariates import DEFAULT_COVARIATES as DEFAULT_COVARIATES, choose_covariates
+from ccnn_torch.records.headers import (
+    HasCoordinates,
+    check_joints,
+    read_pose as read_pose,
+    refuse_lost_orientation,
+    stack_columns as stack_columns,
+    unused_joints,
+)
 from ccnn_torch.records.joint_map import read_joint_map, with_joints
 from ccnn_torch.records.read_table import Frame, read_frame, read_table
-from ccnn_torch.records.table import FILE as FILE
-from ccnn_torch.records.table import Table
-from ccnn_torch.records.table import name_lines as name_lines
-from ccnn_torch.records.table import write_table as write_table
+from ccnn_torch.records.table import FILE as FILE, Table, name_lines as name_lines, write_table as write_table
 from ccnn_torch.units import to_si
 
 Source = str | Path | Frame | Sequence[str | Path | Frame]
