@@ -5,16 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ccnn_torch.calibration.calibrate import Calibration
-from ccnn_torch.calibration.calibrate import calibrate as _calibrate
+from ccnn_torch.calibration.calibrate import Calibration, calibrate as _calibrate
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.compensation import load_compensation
-from ccnn_torch.config.held_out import given_records, name_given
+from ccnn_torch.config.split import given_records, name_given
 from ccnn_torch.diagnosis.config import DiagnoseConfig
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.identify import Identification
-from ccnn_torch.identification.identify import identify as _identify
+from ccnn_torch.identification.identify import Identification, identify as _identify
 from ccnn_torch.motion import MotionDiagnosis
 from ccnn_torch.motion.job import diagnosed
 from ccnn_torch.report.results.verify import VerifyResults

@@ -6,8 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, example, given, settings, strategies as st
 
 from ccnn_torch.calibration.config import METHODS, RunConfig, method_names
 from ccnn_torch.config.keys import list_keys

@@ -26,8 +26,7 @@ from ccnn_torch.effects import Acting, Situation, default_gravity, make_effect, 
 from ccnn_torch.errors import InputError
 from ccnn_torch.records import read_table, write_table
 from ccnn_torch.report.screen import step_bar
-from ccnn_torch.simulation.job import simulate_records
-from ccnn_torch.simulation.outputs import write_simulated
+from ccnn_torch.simulation.job import simulate_records, write_simulated
 
 Cli = Callable[..., tuple[int, str, str]]
 

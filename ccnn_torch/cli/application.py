@@ -15,7 +15,7 @@ from ccnn_torch.cli.studies import blind_check, compare, keys, plan, simulate, s
 from ccnn_torch.cli.with_model import compensate, export, picture, sign, verify
 from ccnn_torch.display import visible
 from ccnn_torch.errors import InputError, MethodFailedError, out_of_memory
-from ccnn_torch.run_folder.interrupt import Stopped
+from ccnn_torch.run_folder.folder import Stopped
 from ccnn_torch.version import __version__
 
 # Maximum characters of a message. The longest of this package, which lists wrong keys, has some hundreds.

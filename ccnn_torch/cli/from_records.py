@@ -28,7 +28,7 @@ from ccnn_torch.cli.options import (
 )
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import read_yaml
-from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
+from ccnn_torch.run_folder.folder import NOTHING_WRITTEN, if_stopped
 
 if TYPE_CHECKING:
     from ccnn_torch.config.tree import JobConfig
@@ -277,7 +277,7 @@ def _diagnose_config(
     words: list[str] | None, config: Path | None, noise: str | None, effects: str | None, quiet: bool, **given: object
 ) -> DiagnoseConfig:
     """The config, under the options of the command line; `words` may begin with the config."""
-    from ccnn_torch.config.noise import read_noise
+    from ccnn_torch.config.sizes import read_noise
     from ccnn_torch.diagnosis.config import DiagnoseConfig
 
     names = None if effects is None else [e.strip() for e in effects.split(",") if e.strip()]

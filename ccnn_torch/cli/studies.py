@@ -23,7 +23,7 @@ from ccnn_torch.cli.options import (
     noted,
 )
 from ccnn_torch.errors import InputError
-from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
+from ccnn_torch.run_folder.folder import NOTHING_WRITTEN, if_stopped
 
 
 def suite(
@@ -204,12 +204,11 @@ def simulate(
     ccnn simulate --mechanism my_simulator.py:PRESS --effect "parameter spring1:spring1=-6000" --rows 200 --noise 1e-5
     --out r.csv
     """
-    from ccnn_torch.config.noise import read_noise
+    from ccnn_torch.config.sizes import read_noise
     from ccnn_torch.report.screen import say, say_place, stdout
     from ccnn_torch.report.table import print_table
     from ccnn_torch.simulation.config import SimulateConfig
-    from ccnn_torch.simulation.job import simulate_records
-    from ccnn_torch.simulation.outputs import injected_table, write_simulated
+    from ccnn_torch.simulation.job import injected_table, simulate_records, write_simulated
 
     with if_stopped(NOTHING_WRITTEN):
         wanted = SimulateConfig.from_file(config, overrides or [])
@@ -320,7 +319,7 @@ def keys(
 
     ccnn keys --schema > ccnn.schema.json
     """
-    from ccnn_torch.config.commands import config_schema, keys_by_section
+    from ccnn_torch.config.keys import config_schema, keys_by_section
 
     if schema:
         typer.echo(json.dumps(config_schema(command.value), indent=2, ensure_ascii=False))

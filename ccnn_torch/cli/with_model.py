@@ -21,7 +21,7 @@ from ccnn_torch.cli.options import (
     noted,
 )
 from ccnn_torch.errors import InputError
-from ccnn_torch.run_folder.interrupt import NOTHING_WRITTEN, if_stopped
+from ccnn_torch.run_folder.folder import NOTHING_WRITTEN, if_stopped
 
 _FRAME = "X,Y,Z,RX,RY,RZ"
 
@@ -103,18 +103,16 @@ def compensate(
         if os.path.realpath(output) == os.path.realpath(file):
             raise InputError(f"{output}: OUT.csv is {what} itself, which would be overwritten; name another file")
     with if_stopped(NOTHING_WRITTEN):
-        from ccnn_torch.motion.identified import is_identified
+        from ccnn_torch.compensation.job import compensate_table, is_of_motion
 
         refused = ""
-        if is_identified(model):
+        if is_of_motion(model):
             from ccnn_torch.motion.compensate import compensate_motion
 
             if pose or back or sd or public_key:
                 raise InputError(f"{model}: a model of a motion takes none of --pose, --back, --sd and --public-key")
             said = [f"{sentence}." for sentence in compensate_motion(model, input, output, allow_code)]
         else:
-            from ccnn_torch.compensation.job import compensate_table
-
             frames = [
                 None if text is None else _numbers(text, f"--{o}") for o, text in (("tool", tool), ("base", base))
             ]

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from ccnn_torch.config.noise import Noise
-from ccnn_torch.config.sizes import size
+from ccnn_torch.config.sizes import Noise, size
 from ccnn_torch.config.tree import Columns, Files, JobConfig, JointMap, Names
 from ccnn_torch.errors import InputError
 from ccnn_torch.run_folder.folder import refuse_foreign

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.config.held_out import Given
+from ccnn_torch.config.split import Given
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification import Fit, Progress
@@ -39,7 +39,7 @@ from ccnn_torch.identification.store import load_outcome, save_outcome
 from ccnn_torch.identification.transfer import read_elsewhere, transferred
 from ccnn_torch.mechanisms import Framed, Mechanism
 from ccnn_torch.records import Records, write_table
-from ccnn_torch.records.sources import read_source
+from ccnn_torch.records.load import read_source
 from ccnn_torch.run_folder.resume import facts_of, refuse_changes
 
 Watch = Callable[[str], Progress]

@@ -27,8 +27,7 @@ from ccnn_torch.report.json_files import plain, write_json
 from ccnn_torch.report.results.diagnosis import DiagnosisResults
 from ccnn_torch.report.screen import say_place, stdout, step_bar
 from ccnn_torch.report.table import print_text
-from ccnn_torch.run_folder.interrupt import if_stopped
-from ccnn_torch.run_folder.lock import locked
+from ccnn_torch.run_folder.folder import if_stopped, locked
 
 _STEPS = {
     "reading the records": 1.0,

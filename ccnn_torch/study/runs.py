@@ -18,8 +18,7 @@ from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.report.results.run import RunResults
 from ccnn_torch.report.screen import note
-from ccnn_torch.run_folder.folder import RunFolder, kept_for
-from ccnn_torch.run_folder.lock import locked
+from ccnn_torch.run_folder.folder import RunFolder, kept_for, locked
 
 _Written = TypeVar("_Written")
 

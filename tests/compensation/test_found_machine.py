@@ -21,8 +21,7 @@ from ccnn_torch.effects.found_machine import FoundMachine
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import FiveBar
 from ccnn_torch.records import read_table, write_table
-from ccnn_torch.simulation.job import simulate_records
-from ccnn_torch.simulation.outputs import write_simulated
+from ccnn_torch.simulation.job import simulate_records, write_simulated
 
 Block = dict[str, Any]
 

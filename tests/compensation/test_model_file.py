@@ -19,8 +19,7 @@ import onnxruntime
 import pytest
 import torch
 from frozen import frozen
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from stand_ins import Sigmoids, fields, tripod_compensator

@@ -7,8 +7,7 @@ import math
 import naive_network as naive
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from ccnn_torch.evolution.evaluation import fitness, joined_errors, make_task
 

@@ -7,8 +7,7 @@ import math
 import pytest
 import reference_operators as reference
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from torch import Tensor
 
 from ccnn_torch.evolution import Genome, decode, encode

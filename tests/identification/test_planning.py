@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import torch
 from five_bar_leg import leg_problem
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from torch import Tensor
 
 from ccnn_torch.errors import InputError

@@ -9,7 +9,7 @@ import pytest
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import mujoco_simulator
-from ccnn_torch.mechanisms.simulators.mujoco_file import compiled, mujoco_spec
+from ccnn_torch.mechanisms.simulators.mujoco_model import compiled, mujoco_spec
 from ccnn_torch.motion.mujoco_model import mujoco_nominal
 
 pytest.importorskip("mujoco", reason="needs pip install 'ccnn-torch[mujoco]'")

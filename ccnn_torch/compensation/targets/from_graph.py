@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.fx import GraphModule
-from torch.fx import Node as GraphNode
+from torch.fx import GraphModule, Node as GraphNode
 
 from ccnn_torch.compensation.targets.build import Builder
 from ccnn_torch.compensation.targets.form import BOOLEAN, Program

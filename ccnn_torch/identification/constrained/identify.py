@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ccnn_torch.config.held_out import Given, held_out_notes
+from ccnn_torch.config.split import Given, held_out_notes
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Progress
 from ccnn_torch.identification.config import IdentifyConfig

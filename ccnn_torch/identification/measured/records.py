@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ccnn_torch.config.held_out import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
+from ccnn_torch.config.split import Given, held_out_notes, rows_of_test_file, split_by, with_test_file
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.measured.kinematics import Kinematics
