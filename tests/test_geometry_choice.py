@@ -12,6 +12,7 @@ from mechanisms.catalogue import make
 
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import RunConfig
+from ccnn_torch.calibration.geometry.choice import Candidate, simplest_of_best
 from ccnn_torch.calibration.rows.prepare import Prepared, prepare
 from ccnn_torch.mechanisms import fit_frames, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, nearest_rotation
@@ -98,3 +99,12 @@ def test_positions_alone_turn_no_joint_that_they_do_not_show(name: str, tmp_path
         return math.sqrt(float(left.square().sum(-1).mean()))
 
     assert turned(links) < 1.1 * turned(frames)
+
+
+@pytest.mark.parametrize(("gains", "learner"), [((1, 3, -1, 2, 0), False), ((2, 3, 1, 2, 2), True)])
+def test_a_larger_model_has_to_be_better_by_two_standard_errors(gains: tuple[float, ...], learner: bool) -> None:
+    """Gains of 1.4 and 6 standard errors of the five folds' differences."""
+    simple, larger = Candidate(True, False, False), Candidate(True, False, True)
+    before = torch.full((5,), 100.0, dtype=torch.float64)
+    found = simplest_of_best({simple: before, larger: before - torch.tensor(gains)}, "")
+    assert found.identify and (found.method == "gp") is learner

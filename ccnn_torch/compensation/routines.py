@@ -183,9 +183,7 @@ class ControllerFunctions(Functions):
         good = torch.logical_and(sd >= 0, sd < torch.inf).all(-1, keepdim=True) & (strange <= 0)
         return torch.where(good, sd, self.own.fallback_sd), status_of(strange, good & (learned.excess <= 0))
 
-    def finish(
-        self, q: Tensor, strange: Tensor, correction: Tensor, found: Tensor, excess: Tensor
-    ) -> Sequence[Tensor]:
+    def finish(self, q: Tensor, strange: Tensor, correction: Tensor, found: Tensor, excess: Tensor) -> Sequence[Tensor]:
         command = q - correction
         rounding = self.slack + self.eps * (q.abs() + found.abs())
         # Written so that what is no number is not good.
