@@ -166,7 +166,7 @@ def _before_table(results: RunResults, paper: PaperCase | None) -> Table:
     note = "Mean and maximum are of the signed error. " + _repeats(results)
     if paper:
         note += f" Paper: Table {paper.before}, verification set. {paper.remark}"
-    return Table("Joint error before calibration", tuple(columns), tuple(rows), note.strip())
+    return Table("Joint error before calibration", tuple(columns), rows, note.strip())
 
 
 def _after_table(results: RunResults, paper: PaperCase | None, measure: str) -> Table:
@@ -224,7 +224,7 @@ def _after_table(results: RunResults, paper: PaperCase | None, measure: str) -> 
         )
     details = tuple(columns[1 : len(keys)]) if shared else ()
     title = f"{titles[measure]} on held-out rows, after calibration"
-    return Table(title, tuple(columns), tuple(rows), note.strip(), details=details, page_only=not beside)
+    return Table(title, tuple(columns), rows, note.strip(), details=details, page_only=not beside)
 
 
 def _scale(results: RunResults, key: str, measure: str) -> tuple[float, str]:
@@ -280,4 +280,4 @@ def _pose_table(results: RunResults) -> Table:
     columns += [column for _, column, _ in extras]
     note = " ".join([*(sentence for _, _, sentence in extras), _repeats(results)]).strip()
     details = ("max before", "max after", "max removed [%]", "RMS not explained", "RMS not compensable")
-    return Table("Pose error on held-out rows", tuple(columns), tuple(rows), note, details=details)
+    return Table("Pose error on held-out rows", tuple(columns), rows, note, details=details)
