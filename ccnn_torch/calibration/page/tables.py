@@ -82,6 +82,16 @@ def _both(before: float | None, after: float | None) -> tuple[str, str, str]:
     return left, right, unit
 
 
+def errors_line(results: RunResults) -> str:
+    """One line while many runs are at work: each method's median ratio to the floor, or its error."""
+    texts = []
+    for name, block in results.methods.items():
+        spread = block.ratio_to_floor or block.mse
+        text = number_text(None if spread is None else spread.median, 3)
+        texts.append(f"{name} {'failed' if block.test is None else text}")
+    return f"{'ratio to the floor' if results.floor else 'mean squared error'}: {', '.join(texts)}"
+
+
 def result_tables(results: RunResults) -> list[Table]:
     """All tables of a run, in reading order."""
     paper = PAPER.get(results.case or "")
