@@ -134,7 +134,7 @@ def test_the_effort_of_made_up_curves_as_a_table(results: RunResults) -> None:
         {"ccnn": history([9, 3], 0.25, 10), "Line": history([5, 4], 2.0, None), "constant": history([6], 1, 1)}
     )
     table = next(t for t in result_tables(results.model_copy(update={"reach": made})) if t.title.startswith("Effort"))
-    assert table.rows == (("ccnn", "2", "0.500", "20"), ("Line", "2", "4.00", "–"), ("constant", *["never"] * 3))
+    assert tuple(table.rows) == (("ccnn", "2", "0.500", "20"), ("Line", "2", "4.00", "–"), ("constant", *["never"] * 3))
     assert "4.000 m² or less, the lowest that Line reaches" in table.note
 
 

@@ -20,6 +20,7 @@ from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.job import resume_identification
 from ccnn_torch.records import read_table, write_table
+from ccnn_torch.report.json_files import plain
 
 Cli = Callable[..., tuple[int, str, str]]
 NAMES = {"J1": "q1[m]", "J2": "q2[m]", "J3": "q3[m]", "Y": "y[m]", "Z": "z[m]", "Winkel": "phi[rad]"}
@@ -61,7 +62,7 @@ def test_a_file_of_test_rows_from_config_to_results_and_resumed(folder: Path, cl
     # The same rows held out by their column, in one file; the test rows are those of every repeat.
     column = {"kind": "column", "by": "set", "test_values": 2}
     found = calibrate(records=str(folder / "whole.csv"), split=column, repeats=2, covariates=[], **QUICK)
-    assert found.results["methods"]["constant"]["test"] == results["methods"]["constant"]["test"]
+    assert plain(found.results.methods["constant"].test) == results["methods"]["constant"]["test"]
     assert "Held out: the 40 rows whose set is 2." in found.results["notes"]
     assert all(torch.equal(s.test, torch.arange(120, 160)) for s in found.prepared.dataset.splits)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,24 +26,15 @@ _SPREAD = {"median", "low", "high", "values"}
 _KEPT = ("arrays.safetensors", "history-*.safetensors", "model.*", "card.json", "models")
 
 
-@dataclass(frozen=True)
-class Block:
-    """Some repeats of a run, as a run of their own."""
-
-    name: str
-    config: RunConfig
-    folder: RunFolder
-
-
-def blocks_of(config: RunConfig, folder: RunFolder) -> list[Block]:
-    """The blocks of a run, in the order of their seeds."""
+def blocks_of(config: RunConfig, folder: RunFolder) -> dict[str, RunConfig]:
+    """The blocks of a run by name, in the order of their seeds."""
     if config.methods == ["auto"]:
         raise InputError(
             "methods=auto chooses a method for all repeats together; name the methods, or write block=null"
         )
     assert config.block is not None
     size, digits = config.block, len(str(config.repeats - 1))
-    found = []
+    found = {}
     for first in range(0, config.repeats, size):
         name = f"{first:0{digits}}"
         path = Path(os.path.abspath(folder.path)) / "blocks" / name
@@ -59,15 +49,15 @@ def blocks_of(config: RunConfig, folder: RunFolder) -> list[Block]:
             "save_models": False,
             "save_report": False,
         }
-        found.append(Block(name, config.model_copy(update=own), RunFolder(path)))
+        found[name] = config.model_copy(update=own)
     return found
 
 
 def write_blocks(
-    config: RunConfig, folder: RunFolder, blocks: Sequence[Block], again: Callable[[Block], object]
+    config: RunConfig, folder: RunFolder, blocks: Sequence[RunConfig], again: Callable[[Path], object]
 ) -> None:
     """Put the figures of finished blocks together, and export the best repeat of all."""
-    found = [read_json(block.folder.results) for block in blocks]
+    found = [read_json(RunFolder(Path(str(block.out))).results) for block in blocks]
     for key, of in (("methods", _methods), ("geometry", _geometry)):
         if len({of(results) for results in found}) > 1:
             chosen = ", ".join(sorted({of(results) for results in found}))
@@ -88,12 +78,13 @@ def write_blocks(
         if left is not None:
             results.pose[kind].after = RmsMax(rms=left.rms, max=left.max)
     first = int(np.argmin(scores[best]))
-    exported = next(block for block in blocks if first < block.config.seed - config.seed + block.config.repeats)
+    exported = next(block for block in blocks if first < block.seed - config.seed + block.repeats)
+    there = RunFolder(Path(str(exported.out)))
     if config.save_models:
-        _export(exported, again)
-        results.model = RunResults.read(exported.folder.results).model
+        _export(exported, there, again)
+        results.model = RunResults.read(there.results).model
     for pattern in _KEPT:
-        for path in exported.folder.path.glob(pattern):
+        for path in there.path.glob(pattern):
             if path.is_dir():
                 shutil.copytree(path, folder.path / path.name, dirs_exist_ok=True)
             else:
@@ -124,13 +115,13 @@ def merged(parts: Sequence[Any]) -> Any:
     return first
 
 
-def _export(block: Block, again: Callable[[Block], object]) -> None:
+def _export(config: RunConfig, folder: RunFolder, again: Callable[[Path], object]) -> None:
     """Write the model files of a finished block; its training is in its checkpoints."""
-    if (block.folder.path / "card.json").is_file():
+    if (folder.path / "card.json").is_file():
         return
-    block.folder.write("config.yaml", block.config.model_copy(update={"save_models": True}).to_yaml(block.folder.path))
-    block.folder.results.unlink()
-    again(block)
+    folder.write("config.yaml", config.model_copy(update={"save_models": True}).to_yaml(folder.path))
+    folder.results.unlink()
+    again(folder.path)
 
 
 def _methods(results: Mapping[str, Any]) -> str:

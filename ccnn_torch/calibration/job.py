@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,13 +14,13 @@ from ccnn_torch.calibration.config import RunConfig, method_names
 from ccnn_torch.calibration.learning.fitting import check_storable
 from ccnn_torch.calibration.learning.progress import HeldOut, ProgressBar
 from ccnn_torch.calibration.outputs import write_outputs
-from ccnn_torch.calibration.page.tables import run_page
+from ccnn_torch.calibration.page.tables import errors_line, run_page
 from ccnn_torch.calibration.page.tensorboard import TensorBoardCallback
 from ccnn_torch.calibration.result import plan_of
 from ccnn_torch.calibration.rows.memory import TooManyRepeatsError
 from ccnn_torch.calibration.rows.prepare import Prepared, prepare
 from ccnn_torch.calibration.statistics import share_unit
-from ccnn_torch.engine import Job, run_jobs
+from ccnn_torch.engine import Failure, Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError, WriteError
 from ccnn_torch.plugins import is_plugin
 from ccnn_torch.report.results.run import RunResults
@@ -83,32 +85,40 @@ def _prepared(config: RunConfig) -> tuple[RunConfig, Prepared | None]:
         return config.model_copy(update={"block": found.block, "max_bytes": found.limit}), None
 
 
-def finish_run(config: RunConfig, quiet: bool) -> RunFolder:
-    """Start or resume a run among others, without its tables; raises as `start_run` and `resume_run`."""
+def finish_runs(runs: Mapping[str, RunConfig], engine: str, quiet: bool) -> dict[str, Failure]:
+    """Start or resume many runs, each an ordinary run folder; those that failed, by name."""
+    # Of several processes only one may draw bars. On a cluster paths that start here mean nothing.
+    alone = quiet or engine != "local"
+    jobs = []
+    for name, config in runs.items():
+        folder = RunFolder(Path(os.path.abspath(str(config.out))))
+        call = partial(_finish, config.model_copy(update={"out": str(folder.path)}), alone)
+        jobs.append(Job(name, folder.results, call))
+    return run_jobs(jobs, engine, partial(note, quiet=quiet))
+
+
+def _finish(config: RunConfig, quiet: bool) -> str:
+    """Start or resume a run without its tables; returns a line about the errors of its methods."""
     folder = RunFolder(Path(str(config.out)))
     if folder.config.is_file():
-        return resume_run(folder.path, quiet, tables=False)
-    return start_run(config, quiet, tables=False)
-
-
-def _run_block(config: RunConfig) -> str:
-    finish_run(config, quiet=True)
-    return f"repeats of seeds {config.seed} to {config.seed + config.repeats - 1}"
+        folder = resume_run(folder.path, quiet, tables=False)
+    else:
+        folder = start_run(config, quiet, tables=False)
+    return errors_line(RunResults.read(folder.results))
 
 
 def _run_blocks(config: RunConfig, folder: RunFolder, quiet: bool, tables: bool) -> None:
     """Run the blocks that are not finished yet, and put their figures together."""
     with kept_for(f"ccnn run --resume {folder.path}"):
         blocks = blocks_of(config, folder)
-        jobs = [Job(block.name, block.folder.results, partial(_run_block, block.config)) for block in blocks]
-        failed = run_jobs(jobs, config.engine, partial(note, quiet=quiet))
+        failed = finish_runs(blocks, config.engine, quiet)
         for name, problem in failed.items():
             kind = InputError if problem.input else MethodFailedError
             raise kind(
                 f"block {name}: {problem.text}; {len(blocks) - len(failed)} of {len(blocks)} blocks are finished and "
                 f"kept, and ccnn run --resume {folder.path} resumes from them"
             )
-        write_blocks(config, folder, blocks, lambda block: resume_run(block.folder.path, quiet=True, tables=False))
+        write_blocks(config, folder, list(blocks.values()), lambda path: resume_run(path, quiet=True, tables=False))
     if tables and not quiet:
         run_page(RunResults.read(folder.results)).show(stdout)
         say_place(f"Everything is in {folder.path}")

@@ -100,7 +100,7 @@ def save_arrays(folder: str | Path, arrays: RunArrays) -> Path:
         "labels": arrays.labels,
     }
     path = Path(folder) / ARRAYS_FILE
-    _save(path, tensors, about)
+    save_tensors(path, tensors, about)
     return path
 
 
@@ -111,7 +111,7 @@ def load_arrays(folder: str | Path) -> RunArrays:
         InputError: the file is not there, is damaged, or lacks an array.
     """
     path = Path(folder) / ARRAYS_FILE
-    tensors, about = _load(path)
+    tensors, about = load_tensors(path)
     layers = range(sum(name.startswith("mask_") for name in tensors))
     values: dict[str, NDArray[np.generic]] = {
         name: value for name, value in tensors.items() if not name.startswith(("mask_", "weight_"))
@@ -145,7 +145,7 @@ def save_history(folder: str | Path, method: str, history: Mapping[str, ArrayLik
         history: `step`: `t`, and each metric `t x r` or `t x r x k`.
     """
     path = Path(folder) / f"history-{method}.safetensors"
-    _save(path, history, {})
+    save_tensors(path, history)
     return path
 
 
@@ -155,23 +155,29 @@ def load_history(path: str | Path) -> dict[str, NDArray[np.float64]]:
     Raises:
         InputError: the file is not there or is damaged, or has no `step`.
     """
-    tensors, _ = _load(Path(path))
+    tensors, _ = load_tensors(Path(path))
     if "step" not in tensors:
         raise InputError(f"{path} holds no training curves: it lacks the array 'step'.")
     return {name: value.astype(np.float64) for name, value in tensors.items()}
 
 
-def _save(path: Path, tensors: Mapping[str, ArrayLike], about: Mapping[str, object]) -> None:
+def save_tensors(path: Path, tensors: Mapping[str, ArrayLike], about: Mapping[str, object] | None = None) -> None:
+    """Write arrays by name, and what is to be said about them."""
     arrays = {}
     for name in sorted(tensors):
         value = tensors[name]
         if isinstance(value, torch.Tensor):
             value = value.detach().cpu().numpy()
         arrays[name] = np.ascontiguousarray(value)
-    write_whole(path, save(arrays, metadata={"about": json.dumps(about, sort_keys=True)}))
+    write_whole(path, save(arrays, metadata={"about": json.dumps(about or {}, sort_keys=True)}))
 
 
-def _load(path: Path) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
+def load_tensors(path: Path) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
+    """Read back what `save_tensors` wrote: arrays by name, and what is said about them.
+
+    Raises:
+        InputError: the file is not there or damaged.
+    """
     if not path.is_file():
         raise InputError(f"{path} is not there; give the folder of a finished run.")
     try:

@@ -29,13 +29,11 @@ class EventFile:
             purge_step: TensorBoard ignores the records of older files of this folder from this step on.
         """
         # Only runs that write curves should pay for the import; torch's own `summary` costs more than all of these.
-        from tensorboard.compat.proto import event_pb2, summary_pb2, tensor_pb2
+        from tensorboard.compat.proto import event_pb2, summary_pb2
         from tensorboard.summary.writer.record_writer import RecordWriter
 
         self._event: Any = event_pb2.Event
         self._summary: Any = summary_pb2.Summary
-        self._metadata: Any = summary_pb2.SummaryMetadata
-        self._tensor: Any = tensor_pb2.TensorProto
         self._pending = io.BytesIO()
         self._records = RecordWriter(self._pending)
         self._file: io.FileIO | None = None
@@ -60,11 +58,6 @@ class EventFile:
         """png: content of a PNG file, whose header has the size."""
         width, height = struct.unpack(">II", png[16:24])
         self._add_value(step, tag=tag, image={"width": width, "height": height, "encoded_image_string": png})
-
-    def add_text(self, tag: str, text: str, step: int) -> None:
-        tensor = self._tensor(dtype="DT_STRING", string_val=[text.encode()], tensor_shape={"dim": [{"size": 1}]})
-        metadata = self._metadata(plugin_data={"plugin_name": "text"})
-        self._add_value(step, tag=f"{tag}/text_summary", metadata=metadata, tensor=tensor)
 
     def flush(self) -> None:
         """Write the added records to the file, so that TensorBoard sees them."""

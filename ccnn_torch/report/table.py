@@ -37,7 +37,7 @@ class Table:
 
     title: str
     columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    rows: Sequence[Sequence[str]]
     note: str = ""
     words: tuple[str, ...] = ()
     details: tuple[str, ...] = ()
@@ -46,7 +46,7 @@ class Table:
 
 def table_of(title: str, columns: Mapping[str, Sequence[str]], note: str = "", details: Sequence[str] = ()) -> Table:
     """A table out of its columns, header -> cells."""
-    return Table(title, tuple(columns), tuple(zip(*columns.values(), strict=True)), note, details=tuple(details))
+    return Table(title, tuple(columns), list(zip(*columns.values(), strict=True)), note, details=tuple(details))
 
 
 def markdown_table(table: Table) -> str:

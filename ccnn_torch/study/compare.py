@@ -53,7 +53,7 @@ def runs_table(runs: Mapping[str, RunResults]) -> Table:
     note = "Before and after: RMS position error on the test rows. Rows: trained on + tested on."
     if len(set(marks.values())) > 1:
         note += " Runs with different letters were judged on different test rows: their figures are not comparable."
-    return Table("Runs", columns, tuple(rows), note, words=("test rows", "method"), details=("rows",))
+    return Table("Runs", columns, rows, note, words=("test rows", "method"), details=("rows",))
 
 
 def runs_csv(runs: Mapping[str, RunResults]) -> str:

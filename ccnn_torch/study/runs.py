@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from ccnn_torch.calibration.calibrate import makers
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.job import finish_run
-from ccnn_torch.display import number_text
-from ccnn_torch.engine import Job, run_jobs
+from ccnn_torch.calibration.job import finish_runs
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.report.results.run import RunResults
-from ccnn_torch.report.screen import note
 from ccnn_torch.run_folder.folder import RunFolder, kept_for, locked
 
 _Written = TypeVar("_Written")
@@ -58,39 +53,19 @@ def run_study(study: Study, write: Write[_Written], quiet: bool = False) -> _Wri
     with locked(study.out):
         # The runs have locks of their own.
         sweep(study.out, below=False)
-        here = study.engine == "local"
-        # On a cluster, and in another process, paths that start here mean nothing.
-        jobs = {name: RunFolder(Path(os.path.abspath(str(c.out)))) for name, c in study.runs.items()}
-        failed = run_jobs(
-            [
-                Job(name, folder.results, partial(_finish, study.runs[name], folder.path, quiet or not here))
-                for name, folder in jobs.items()
-            ],
-            study.engine,
-            partial(note, quiet=quiet),
-        )
+        failed = finish_runs(study.runs, study.engine, quiet)
         for name, problem in failed.items():
             if problem.input:
                 raise InputError(f"case '{name}': {problem.text}")
-        if len(failed) == len(jobs):
+        if len(failed) == len(study.runs):
             raise MethodFailedError("; ".join(f"case '{name}': {problem.text}" for name, problem in failed.items()))
-        results = {name: RunResults.read(folder.results) for name, folder in jobs.items() if name not in failed}
+        results = {
+            name: RunResults.read(RunFolder(Path(str(config.out))).results)
+            for name, config in study.runs.items()
+            if name not in failed
+        }
         with kept_for("the same command"):
             return write(study, results, {name: problem.text for name, problem in failed.items()})
-
-
-def _finish(config: RunConfig, path: Path, quiet: bool) -> str:
-    """Resume or start a run; returns a line about the errors of its methods, relative to the floor if it is known."""
-    folder = finish_run(config.model_copy(update={"out": str(path)}), quiet)
-    results = RunResults.read(folder.results)
-    texts = []
-    for name, block in results.methods.items():
-        if block.test is None:
-            texts.append(f"{name} failed")
-            continue
-        told = block.ratio_to_floor or block.mse
-        texts.append(f"{name} {number_text(None if told is None else told.median, 3)}")
-    return f"{'ratio to the floor' if results.floor else 'mean squared error'}: {', '.join(texts)}"
 
 
 def _check_folder(config: RunConfig) -> None:

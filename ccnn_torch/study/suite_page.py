@@ -55,7 +55,7 @@ def _cases_table(comparison: SuiteResults) -> Table:
         "In brackets: split, training rows, and the root of the mean squared noise of the held-out rows."
     )
     title = f"Held-out mean squared joint error over all joints, ratio to {versus}"
-    return Table(title, ("case", *methods, "best"), tuple(rows), note)
+    return Table(title, ("case", *methods, "best"), rows, note)
 
 
 def _case_text(case: Case) -> str:
@@ -89,7 +89,7 @@ def _methods_table(comparison: SuiteResults) -> Table:
         "Number of cases. Ratio: its error to the best method's, geometric mean over the cases of the median. Time: of "
         "one repeat, median."
     )
-    return Table("How often a method is the best", columns, tuple(rows), note)
+    return Table("How often a method is the best", columns, rows, note)
 
 
 def _failures(comparison: SuiteResults) -> list[str]:

@@ -45,14 +45,14 @@ def verify_tables(results: VerifyResults) -> list[Table]:
         f"in twenty. {frames}"
     )
     columns = ("", "RMS", "maximum", "promised RMS", "limit at 95 %")
-    pose = Table("Pose error of the new rows", columns, tuple(rows), note)
+    pose = Table("Pose error of the new rows", columns, rows, note)
     joints = []
     for name, block in results.joints.items():
         scale, unit = display_unit(block.unit, block.before or 0.0)
         cells = [number_text(None if block[w] is None else block[w] / scale) for w in ("before", "after")]
         joints.append((f"{name} [{unit}]", *cells))
     about = "RMS, at the commanded joints; rows near singular poses or out of reach are left out."
-    return [pose, Table("Deviation of each joint", ("joint", "before", "after"), tuple(joints), about)]
+    return [pose, Table("Deviation of each joint", ("joint", "before", "after"), joints, about)]
 
 
 def _left(block: Error, kind: str) -> str:

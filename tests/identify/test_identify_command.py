@@ -57,7 +57,7 @@ def test_the_folder_has_everything(folder: Path) -> None:
 
 def test_a_report_needs_its_arrays(folder: Path, tmp_path: Path) -> None:
     shutil.copy(folder / "identified.json", tmp_path)
-    with pytest.raises(InputError, match=r"arrays\.safetensors: is not there or damaged"):
+    with pytest.raises(InputError, match=r"arrays\.safetensors is "):
         write_identified_report(tmp_path)
 
 

@@ -34,7 +34,7 @@ def comparison_table(results: RunResults) -> Table | None:
         f"of what was to be learned (a constant has about 1). {auto.why}"
     )
     note += "".join(f" Not compared: {name} ({sentence})." for name, sentence in auto.skipped.items())
-    return Table("Methods compared by cross-validation", columns, tuple(rows), note)
+    return Table("Methods compared by cross-validation", columns, rows, note)
 
 
 def reach_table(results: RunResults) -> Table | None:
@@ -61,7 +61,7 @@ def reach_table(results: RunResults) -> Table | None:
         "training rows through one model; seconds are one repeat's share."
     )
     columns = ("method", "steps", "time [s]", "evaluations")
-    return Table("Effort to reach the same held-out error", columns, tuple(rows), note, page_only=True)
+    return Table("Effort to reach the same held-out error", columns, rows, note, page_only=True)
 
 
 def pose_by_method_table(results: RunResults) -> Table | None:

@@ -82,6 +82,16 @@ def _both(before: float | None, after: float | None) -> tuple[str, str, str]:
     return left, right, unit
 
 
+def errors_line(results: RunResults) -> str:
+    """One line while many runs are at work: each method's median ratio to the floor, or its error."""
+    texts = []
+    for name, block in results.methods.items():
+        spread = block.ratio_to_floor or block.mse
+        text = number_text(None if spread is None else spread.median, 3)
+        texts.append(f"{name} {'failed' if block.test is None else text}")
+    return f"{'ratio to the floor' if results.floor else 'mean squared error'}: {', '.join(texts)}"
+
+
 def result_tables(results: RunResults) -> list[Table]:
     """All tables of a run, in reading order."""
     paper = PAPER.get(results.case or "")
@@ -166,7 +176,7 @@ def _before_table(results: RunResults, paper: PaperCase | None) -> Table:
     note = "Mean and maximum are of the signed error. " + _repeats(results)
     if paper:
         note += f" Paper: Table {paper.before}, verification set. {paper.remark}"
-    return Table("Joint error before calibration", tuple(columns), tuple(rows), note.strip())
+    return Table("Joint error before calibration", tuple(columns), rows, note.strip())
 
 
 def _after_table(results: RunResults, paper: PaperCase | None, measure: str) -> Table:
@@ -224,7 +234,7 @@ def _after_table(results: RunResults, paper: PaperCase | None, measure: str) -> 
         )
     details = tuple(columns[1 : len(keys)]) if shared else ()
     title = f"{titles[measure]} on held-out rows, after calibration"
-    return Table(title, tuple(columns), tuple(rows), note.strip(), details=details, page_only=not beside)
+    return Table(title, tuple(columns), rows, note.strip(), details=details, page_only=not beside)
 
 
 def _scale(results: RunResults, key: str, measure: str) -> tuple[float, str]:
@@ -280,4 +290,4 @@ def _pose_table(results: RunResults) -> Table:
     columns += [column for _, column, _ in extras]
     note = " ".join([*(sentence for _, _, sentence in extras), _repeats(results)]).strip()
     details = ("max before", "max after", "max removed [%]", "RMS not explained", "RMS not compensable")
-    return Table("Pose error on held-out rows", tuple(columns), tuple(rows), note, details=details)
+    return Table("Pose error on held-out rows", tuple(columns), rows, note, details=details)

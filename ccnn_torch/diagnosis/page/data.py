@@ -9,15 +9,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load_file
-from safetensors.torch import save
-from torch import Tensor
 
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError
-from ccnn_torch.files.write import write_whole
-from ccnn_torch.report.json_files import read_json, write_json
+from ccnn_torch.report.json_files import read_json
 
 Array = NDArray[np.float64]
 ARRAYS = "diagnosis.safetensors"
@@ -132,27 +127,6 @@ def used_rows(arrays: Mapping[str, Array], count: int) -> tuple[NDArray[np.bool_
     """Which of `count` rows were held out, and which set aside; none where the arrays do not say."""
     none = np.zeros(count)
     return np.asarray(arrays.get("held_out", none)) > 0.5, np.asarray(arrays.get("set_aside", none)) > 0.5
-
-
-def save_diagnosis_arrays(folder: Path, arrays: Mapping[str, Tensor], labels: Mapping[str, Any]) -> None:
-    """Write the tensors behind the pictures and the names of their axes."""
-    # Copies: without effects the remainder is the residual itself, and one memory is not written twice.
-    whole = {name: value.detach().cpu().contiguous().clone() for name, value in arrays.items()}
-    write_whole(folder / ARRAYS, save(whole))
-    write_json(folder / LABELS, labels)
-
-
-def load_diagnosis_arrays(folder: Path) -> dict[str, Array]:
-    """Read back what `save_diagnosis_arrays` wrote.
-
-    Raises:
-        InputError: the file is not there or damaged.
-    """
-    try:
-        arrays: dict[str, Array] = load_file(folder / ARRAYS)
-    except (OSError, SafetensorError):
-        raise InputError(f"{folder / ARRAYS}: is not there or damaged; diagnose again into another folder") from None
-    return arrays
 
 
 def load_labels(folder: Path) -> dict[str, Any]:

@@ -96,7 +96,7 @@ def where_table(results: Block, about: About, *, telling: bool = False) -> Table
     note = _share_note(results)
     if hidden:
         note += f" Not shown: {', '.join(hidden)}, over which these rows show no difference in the gap."
-    return Table("Where is the gap?", ("part", *_SHARES), tuple(rows), note)
+    return Table("Where is the gap?", ("part", *_SHARES), rows, note)
 
 
 def region_table(results: Block, about: About) -> Table | None:
@@ -115,7 +115,7 @@ def region_table(results: Block, about: About) -> Table | None:
             cells.append(f"{low} to {high}")
         rows.append((*cells, percent(region["share"]), percent_interval(interval), str(region["rows"])))
     columns = (*names, *_SHARES, "rows")
-    return Table("In which region?", columns, tuple(rows), "Largest share first. " + _share_note(results))
+    return Table("In which region?", columns, rows, "Largest share first. " + _share_note(results))
 
 
 def next_table(results: Block, about: About) -> Table | None:
@@ -140,7 +140,7 @@ def next_table(results: Block, about: About) -> Table | None:
     note = f"Gain: expected information on {aim}. The same as a file: next_measurements.csv."
     if len(joints) + len(covariates) > _MOST_COLUMNS:
         columns, *rows = zip(columns, *rows, strict=True)
-    return Table("What should be measured next?", columns, tuple(rows), note, ("separates",))
+    return Table("What should be measured next?", columns, rows, note, ("separates",))
 
 
 def _next_motion_table(wanted: Sequence[Block]) -> Table:
@@ -159,7 +159,7 @@ def _next_motion_table(wanted: Sequence[Block]) -> Table:
         f"on the numbers of the only model. The first as commands to play: {NEXT}."
     )
     columns = ("number", "joint", "motion", "separates", "gain [nat]")
-    return Table("What should be recorded next?", columns, tuple(rows), note, ("motion", "separates"))
+    return Table("What should be recorded next?", columns, rows, note, ("motion", "separates"))
 
 
 def write_next_csv(path: Path, results: Block, about: About) -> None:
@@ -212,4 +212,4 @@ def aside_table(results: Block, arrays: Mapping[str, NDArray[np.float64]], about
         for row, reason in zip(cells, reasons, strict=True):
             row.append(reason)
     note = f"They are evidence neither for nor against any effect and count in no figure above. {note}"
-    return Table("Which rows were set aside?", tuple(columns), tuple(map(tuple, cells)), note, ("why",))
+    return Table("Which rows were set aside?", tuple(columns), [tuple(cell) for cell in cells], note, ("why",))

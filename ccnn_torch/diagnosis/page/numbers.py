@@ -55,7 +55,7 @@ def numbers_table(results: Block, most: int) -> Table | None:
     if left_out:
         notes.append(f"{left_out} more that are clearly not 0 are in diagnosis.json.")
     notes.append("The intervals hold if nothing else acts and the rest of the model is right.")
-    return Table("Numbers to enter", columns, tuple(cells), " ".join(notes))
+    return Table("Numbers to enter", columns, cells, " ".join(notes))
 
 
 def _named(name: str, part: str) -> str:

@@ -19,9 +19,7 @@ from ccnn_torch.diagnosis.page.data import (
     RESULT,
     About,
     about_of,
-    load_diagnosis_arrays,
     load_labels,
-    save_diagnosis_arrays,
     signatures_of,
     used_rows,
 )
@@ -39,7 +37,8 @@ from ccnn_torch.diagnosis.page.tables import (
 from ccnn_torch.diagnosis.verdict.text import aside_text, network_text, unseen_text, verdict_text
 from ccnn_torch.display import count_text
 from ccnn_torch.files.write import write_whole
-from ccnn_torch.report.json_files import read_json
+from ccnn_torch.report.arrays import load_tensors, save_tensors
+from ccnn_torch.report.json_files import read_json, write_json
 from ccnn_torch.report.page import InlineFigure, Page, Section
 from ccnn_torch.report.table import Table, print_text
 
@@ -84,8 +83,9 @@ def write_diagnosis_report(
     folder = Path(folder)
     results = read_json(folder / RESULT) if results is None else results
     if arrays is not None:
-        save_diagnosis_arrays(folder, arrays, labels or {})
-    numbers, labels = load_diagnosis_arrays(folder), load_labels(folder)
+        save_tensors(folder / ARRAYS, arrays)
+        write_json(folder / LABELS, labels or {})
+    numbers, labels = load_tensors(folder / ARRAYS)[0], load_labels(folder)
     about = about_of(labels)
     if not results.get("motion"):
         write_next_csv(folder / NEXT, results, about)

@@ -57,7 +57,7 @@ def gap_table(results: Block, about: About) -> Table:
     )
     if results.get("motion"):
         note = note.replace("pose;", "position;")
-    return Table("How large is the gap?", columns, tuple(rows), f"{note} {about.noise}".rstrip())
+    return Table("How large is the gap?", columns, rows, f"{note} {about.noise}".rstrip())
 
 
 def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
@@ -100,7 +100,7 @@ def effect_table(results: Block, *, least: float = 0.0) -> Table | None:
     if hidden := len(results["effects"]) - len(shown):
         note += f" Not shown: {hidden} with a probability below {least:g}."
     words = ("what it is", "indistinguishable from")
-    return Table("Which effect?", columns, tuple(rows), note, words, details=("what it is", alone))
+    return Table("Which effect?", columns, rows, note, words, details=("what it is", alone))
 
 
 def order_table(results: Block) -> Table | None:
@@ -124,7 +124,7 @@ def order_table(results: Block) -> Table | None:
     rows.append((floor_words(results), number_text(_over(gap["noise_floor"], scale), 4), "–", "–"))
     columns = ("added to the model", f"gap on held-out rows [{unit}]", "removed in all [%]", "95 % interval [%]")
     notes = (_REMOVED, block_text(results), network_text(results))
-    return Table("How far does it shrink?", columns, tuple(rows), " ".join(n for n in notes if n))
+    return Table("How far does it shrink?", columns, rows, " ".join(n for n in notes if n))
 
 
 def parameter_table(results: Block, most: int = 24) -> Table | None:
@@ -153,7 +153,7 @@ def parameter_table(results: Block, most: int = 24) -> Table | None:
         least = sorted(sizes, reverse=True)[most - 1]
         rows = [row for row, size in zip(rows, sizes, strict=True) if size >= least]
         note += f" The {hidden} that differ least from 0 are in diagnosis.json only."
-    return Table("How large is the effect?", columns, tuple(rows), note, ("unit",))
+    return Table("How large is the effect?", columns, rows, note, ("unit",))
 
 
 def confusable_table(results: Block) -> Table | None:
@@ -188,7 +188,7 @@ def confusable_table(results: Block) -> Table | None:
         "hidden. Separated by: the first of the next measurements that does."
     )
     columns = ("pair", "probability", "angle [°]", "difference / noise [1]", "separated by")
-    return Table("Which effects do these rows not distinguish?", columns, tuple(rows), note, ("separated by",))
+    return Table("Which effects do these rows not distinguish?", columns, rows, note, ("separated by",))
 
 
 def unseen_table(results: Block) -> Table | None:

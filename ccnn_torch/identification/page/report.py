@@ -6,21 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load_file
-from safetensors.torch import save
-from torch import Tensor
-
 from ccnn_torch.display import count_text
-from ccnn_torch.errors import InputError
-from ccnn_torch.files.write import write_whole
 from ccnn_torch.identification.page.tables import identified_tables, identified_verdict, unknown_sentences
+from ccnn_torch.report.arrays import ARRAYS_FILE, load_tensors
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.page import Page, sections_of
 
-ARRAYS = "arrays.safetensors"
 _LINKED = (
     "identified.json",
     "identified.csv",
@@ -30,11 +21,6 @@ _LINKED = (
     "identified.urdf",
     "config.yaml",
 )
-
-
-def save_identified_arrays(folder: Path, arrays: Mapping[str, Tensor]) -> None:
-    """Write the tensors behind the pictures."""
-    write_whole(folder / ARRAYS, save({name: value.contiguous() for name, value in arrays.items()}))
 
 
 def write_identified_report(folder: str | Path, results: Mapping[str, Any] | None = None) -> Path:
@@ -49,10 +35,7 @@ def write_identified_report(folder: str | Path, results: Mapping[str, Any] | Non
 
     folder = Path(folder)
     results = read_json(folder / "identified.json") if results is None else results
-    try:
-        arrays: dict[str, NDArray[np.float64]] = load_file(folder / ARRAYS)
-    except (OSError, SafetensorError):
-        raise InputError(f"{folder / ARRAYS}: is not there or damaged; identify again into another folder") from None
+    arrays = load_tensors(folder / ARRAYS_FILE)[0]
     figures = inline_figures(identified_plots(results, arrays), folder / "plots")
     rows, machines = results["rows"], results["machines"]
     legs = "".join(f", {count} for leg {leg}" for leg, count in sorted(rows["per_leg"].items()))
