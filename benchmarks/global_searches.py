@@ -28,7 +28,7 @@ from scipy.optimize import dual_annealing
 
 from ccnn_torch.cli import main
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
-from ccnn_torch.identification.solvers.objective import FORBIDDEN, WIDTH, Objective, make_objective
+from ccnn_torch.identification.solvers.objective import FORBIDDEN, WIDTH, Objective
 from ccnn_torch.identification.solvers.registry import SOLVERS
 
 
@@ -62,7 +62,7 @@ def solve_pso(
 
 def solve_sa(problem: Problem, seed: int, progress: Progress | None = None, *, evaluations: int = 30_000) -> Fit:
     """Generalised simulated annealing of SciPy (Xiang et al. 1997) without its local search."""
-    objective = make_objective(problem)
+    objective = Objective(problem)
     start = np.zeros(len(problem.scale))
     best, done = [], 0
     for machine in range(objective.machines):
@@ -95,7 +95,7 @@ def _ask_and_tell(
     progress: Progress | None,
 ) -> Fit:
     """Run one pymoo algorithm each machine, all populations evaluated in one call a generation."""
-    objective = make_objective(problem)
+    objective = Objective(problem)
     r, k = objective.machines, len(problem.scale)
     generations = max(1, evaluations // population)
     searches = []

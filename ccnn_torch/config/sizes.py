@@ -80,6 +80,17 @@ def sizes_of_pose(given: Size | Mapping[str, Size], coordinates: Sequence[Coordi
     return torch.tensor([base / ANGLE_ARM if c.unit == "rad" else base for c in coordinates], dtype=torch.float64)
 
 
+def sizes_of_joints(given: Size | Mapping[str, Size], coordinates: Sequence[Coordinate], key: str) -> Tensor:
+    """Standard deviation of each joint, one for all or by name, pattern or unit; `n` [SI], 0 of what is not named.
+
+    Raises:
+        InputError: as `sizes_by_name`.
+    """
+    if isinstance(given, Mapping):
+        return sizes_by_name(given, coordinates, key, [0.0] * len(coordinates))
+    return torch.tensor([size(given, c.unit, key) for c in coordinates], dtype=torch.float64)
+
+
 Noise = Size | dict[str, Size]
 
 

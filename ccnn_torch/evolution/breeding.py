@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ccnn_torch.evolution.genome import Genome, active, select
+from ccnn_torch.evolution.genome import Genome, kept, select
 from ccnn_torch.evolution.operators import (
     crossover,
     flip_connections,
@@ -71,7 +71,7 @@ def initial_population(outputs: int, inputs: int, settings: EvolutionSettings, s
     draws = uniform(seeds, stream, 0, (size, outputs, 2 * inputs + settings.bias))
     mask = draws[..., :inputs] < settings.density
     weight = (draws[..., inputs:] * 2 - 1) * settings.weight_range
-    return Genome(mask, torch.where(active(Genome(mask, weight)), weight, torch.zeros_like(weight)))
+    return Genome(mask, kept(mask, weight))
 
 
 def breed(

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ccnn_torch.evolution.breeding import BreedingDraws, breed, breeding_shapes, initial_population, with_elites
 from ccnn_torch.evolution.evaluation import Task, fitness, joined_errors
-from ccnn_torch.evolution.genome import Genome, active, select
+from ccnn_torch.evolution.genome import Genome, kept, select
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.evolution.settings import CCNNSettings
 
@@ -137,7 +137,7 @@ def keep_refined(state: Coevolution, refined: Sequence[Genome], scores: Tensor) 
         refined: parts of complete networks, `r x 1 x ...`; weights without a connection are dropped.
         scores: their fitness, `r`.
     """
-    return _keep_best(state, [Genome(g.mask, torch.where(active(g), g.weight, 0.0)) for g in refined], scores)
+    return _keep_best(state, [Genome(g.mask, kept(*g)) for g in refined], scores)
 
 
 def _keep_best(state: Coevolution, joined: Sequence[Genome], scores: Tensor) -> Coevolution:

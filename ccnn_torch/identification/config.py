@@ -19,6 +19,7 @@ from ccnn_torch.config.tree import (
     Section,
 )
 from ccnn_torch.identification.solvers.registry import SOLVERS, unknown_solver
+from ccnn_torch.planning.config import ParameterConfig
 
 PER_LEG = "_per_leg"
 """A method with this ending identifies each leg from its own equations alone."""
@@ -26,19 +27,6 @@ PER_LEG = "_per_leg"
 Size = float | str
 """A number in SI, or a text of number and unit, such as `0.4 mm` or `0.03 deg`."""
 _LINK_TOLERANCE: dict[str, Size] = {"m": 1e-3, "rad": 1e-2}
-
-
-class ParameterConfig(Section):
-    """Which parameters are identified, by name or pattern (`A*`, `leg1.*`)."""
-
-    free: Names | None = Field(default=None, description="parameters to identify, names or patterns; null = all")
-    fixed: Names = Field(default=[], description="parameters that keep their nominal value, names or patterns")
-    tied: list[list[str]] = Field(default=[], description="groups of parameters with one common value")
-    prior: dict[str, Size] = Field(
-        default={},
-        description="standard deviation of a Gaussian prior around the nominal value, by name or pattern, in SI or "
-        "as '0.5 mm'",
-    )
 
 
 class FrameConfig(Section):

@@ -12,15 +12,16 @@ Size = float | str
 """A number in SI, or a text of number and unit, such as `0.1 mm` or `0.03 deg`."""
 
 
-class PlannedParameters(Section):
-    """Which parameters are to be identified, by name or pattern (`A*`, `leg1.*`)."""
+class ParameterConfig(Section):
+    """Which parameters are identified, by name or pattern (`A*`, `leg1.*`)."""
 
     free: Names | None = Field(default=None, description="parameters to identify, names or patterns; null = all")
     fixed: Names = Field(default=[], description="parameters that keep their nominal value, names or patterns")
     tied: list[list[str]] = Field(default=[], description="groups of parameters with one common value")
     prior: dict[str, Size] = Field(
         default={},
-        description="standard deviation of what is known already, by name or pattern, in SI or as '0.5 mm'",
+        description="standard deviation of a Gaussian prior around the nominal value, by name or pattern, in SI or as "
+        "'0.5 mm'",
     )
 
 
@@ -33,7 +34,7 @@ class PlanConfig(JobConfig):
     mechanism_keys: dict[str, Any] = Field(default={}, description="keys of the mechanism's constructor")
     columns: Columns
     joint_map: JointMap
-    parameters: PlannedParameters = Field(default_factory=PlannedParameters)
+    parameters: ParameterConfig = Field(default_factory=ParameterConfig)
     residual: Literal["auto", "inverse", "forward"] = Field(
         default="auto",
         description="how the parameters will be identified: from joints (inverse) or poses (forward); auto = poses "

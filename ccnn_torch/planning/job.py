@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ccnn_torch.config.prior_sizes import prior_sizes
-from ccnn_torch.config.sizes import size, sizes_by_name, sizes_of_pose
+from ccnn_torch.config.sizes import size, sizes_of_joints, sizes_of_pose
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.write import make_folder, write_whole
 from ccnn_torch.identification import ParameterChoice
@@ -141,11 +141,7 @@ def _pose_noise(config: PlanConfig, machine: Mechanism) -> Tensor:
 
 def _joint_noise(config: PlanConfig, machine: Mechanism) -> Tensor | None:
     """None where there is none."""
-    given, none = config.joint_noise, [0.0] * len(machine.joints)
-    if isinstance(given, dict):
-        found = sizes_by_name(given, machine.joints, "joint_noise", none)
-    else:
-        found = torch.tensor([size(given, j.unit, "joint_noise") for j in machine.joints], dtype=torch.float64)
+    found = sizes_of_joints(config.joint_noise, machine.joints, "joint_noise")
     if bool((found < 0).any()):
         raise InputError("joint_noise: a standard deviation is not negative; write e.g. joint_noise='0.01 deg', or 0")
     return found if bool((found > 0).any()) else None

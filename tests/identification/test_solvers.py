@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification import Problem
-from ccnn_torch.identification.solvers.objective import FORBIDDEN, make_objective
+from ccnn_torch.identification.solvers.objective import FORBIDDEN, Objective
 from ccnn_torch.identification.solvers.registry import SOLVERS, get_solver
 
 SHORT = {"generations": 40}
@@ -56,7 +56,7 @@ def test_the_genetic_algorithm_comes_near_and_quadratic_programming_goes_the_res
     problem, _ = leg_problem(machines=2)
     plain = get_solver("hga", generations=150, sqp=False)(problem, 0)
     whole = get_solver("hga", generations=150)(problem, 0)
-    start = make_objective(problem).cost(torch.zeros(2, 1, 6, dtype=torch.float64))[:, 0]
+    start = Objective(problem).cost(torch.zeros(2, 1, 6, dtype=torch.float64))[:, 0]
     assert bool((plain.cost < 0.05 * start).all())
     assert bool((whole.cost < plain.cost).all())
     assert plain.evaluations < whole.evaluations
@@ -71,7 +71,7 @@ def test_a_solver_lowers_the_cost_and_gives_the_same_numbers_again() -> None:
     assert torch.equal(torch.get_rng_state(), before[0])
     assert (np.random.get_state()[1] == before[1]).all()  # noqa: NPY002
     assert torch.equal(fit.values, again.values) and torch.equal(fit.cost, again.cost)
-    objective = make_objective(problem)
+    objective = Objective(problem)
     assert bool((fit.cost < 0.8 * objective.cost(torch.zeros(2, 1, 6, dtype=torch.float64))[:, 0]).all())
     assert torch.allclose(
         objective.cost(((fit.values - problem.start) / problem.scale)[:, None])[:, 0], fit.cost, rtol=1e-9
@@ -120,12 +120,12 @@ def test_a_weight_of_two_is_a_row_that_stands_twice() -> None:
     )
     points = torch.rand(1, 7, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 0.5
     heavy = dataclasses.replace(problem, weights=weights)
-    assert torch.allclose(make_objective(heavy).cost(points), make_objective(twice).cost(points), rtol=1e-12)
+    assert torch.allclose(Objective(heavy).cost(points), Objective(twice).cost(points), rtol=1e-12)
 
 
 def test_the_gradient_is_that_of_finite_differences_and_zero_outside_the_reach() -> None:
     problem, _ = leg_problem()
-    objective = make_objective(problem)
+    objective = Objective(problem)
     point = torch.full((1, 6), 0.3, dtype=torch.float64)
     cost, gradient = objective.cost_and_gradient(point)
     steps = 1e-5 * torch.eye(6, dtype=torch.float64)

@@ -19,7 +19,7 @@ from torch import Tensor
 from ccnn_torch.evolution.operators import tournament
 from ccnn_torch.evolution.random import uniform_parts
 from ccnn_torch.identification.problems.problem import Fit, Problem, Progress
-from ccnn_torch.identification.solvers.objective import WIDTH, Objective, make_objective
+from ccnn_torch.identification.solvers.objective import WIDTH, Objective
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class HybridGenetic:
 
     def __call__(self, problem: Problem, seed: int, progress: Progress | None = None) -> Fit:
         """Minimise; machine i draws its numbers from seed + i alone."""
-        objective = make_objective(problem)
+        objective = Objective(problem)
         tell = progress or _silent
         share = _GENETIC_SHARE if self.sqp else 1.0
         best, cost, generations, settled = self._evolve(objective, seed, lambda done: tell(share * done))
