@@ -123,6 +123,10 @@ class Graph:
             return value.name in self._integers
         return isinstance(value, int) or (isinstance(value, Tensor) and value.dtype == torch.int64)
 
+    def is_truth(self, value: Value) -> bool:
+        """Whether it is one of truth values."""
+        return value.name in self._truths
+
     def full(self, value: Value) -> Value:
         """The same, not broadcast."""
         value = self.solid(value)
