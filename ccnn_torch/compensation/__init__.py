@@ -10,12 +10,11 @@ from ccnn_torch.compensation.effects.effects import effect_deviation as effect_d
 from ccnn_torch.compensation.effects.effects import expand_effects as expand_effects
 from ccnn_torch.compensation.effects.effects import gains as gains
 from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
-from ccnn_torch.compensation.geometry.expanded import expand_geometry as expand_geometry
-from ccnn_torch.compensation.geometry.identified import Geometry as Geometry
-from ccnn_torch.compensation.geometry.identified import geometric_deviation as geometric_deviation
+from ccnn_torch.compensation.geometry.chebyshev import expand as expand
 from ccnn_torch.compensation.machine.inverse import build_machine as build_machine
 from ccnn_torch.compensation.machine.machine import Machine as Machine
 from ccnn_torch.compensation.machine.machine import Rule as Rule
+from ccnn_torch.compensation.machine.parts import geometric_deviation as geometric_deviation
 from ccnn_torch.compensation.machine.parts import machine_parts as machine_parts
 from ccnn_torch.compensation.model_files.identified import IdentifiedGeometry as IdentifiedGeometry
 from ccnn_torch.compensation.model_files.identified import load_compensation as load_compensation
