@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ccnn_torch.compensation.export.export import DAMPED_TOLERANCE
+from ccnn_torch.compensation.agreement import DAMPED_TOLERANCE
 from ccnn_torch.compensation.routines import Routine
 from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
