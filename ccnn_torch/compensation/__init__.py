@@ -18,14 +18,13 @@ if TYPE_CHECKING:
         gains as gains,
     )
     from ccnn_torch.compensation.fit import fit_compensator as fit_compensator
-    from ccnn_torch.compensation.geometry.expanded import expand_geometry as expand_geometry
-    from ccnn_torch.compensation.geometry.identified import (
-        Geometry as Geometry,
-        geometric_deviation as geometric_deviation,
-    )
+    from ccnn_torch.compensation.geometry.chebyshev import expand as expand
     from ccnn_torch.compensation.machine.inverse import build_machine as build_machine
     from ccnn_torch.compensation.machine.machine import Machine as Machine, Rule as Rule
-    from ccnn_torch.compensation.machine.parts import machine_parts as machine_parts
+    from ccnn_torch.compensation.machine.parts import (
+        geometric_deviation as geometric_deviation,
+        machine_parts as machine_parts,
+    )
     from ccnn_torch.compensation.model_files.identified import (
         IdentifiedGeometry as IdentifiedGeometry,
         load_compensation as load_compensation,
@@ -52,11 +51,10 @@ else:
             "domain": "Domain",
             "effects.effects": "Care PhysicalEffects effect_deviation expand_effects gains",
             "fit": "fit_compensator",
-            "geometry.expanded": "expand_geometry",
-            "geometry.identified": "Geometry geometric_deviation",
+            "geometry.chebyshev": "expand",
             "machine.inverse": "build_machine",
             "machine.machine": "Machine Rule",
-            "machine.parts": "machine_parts",
+            "machine.parts": "geometric_deviation machine_parts",
             "model_files.identified": "IdentifiedGeometry load_compensation sign_model",
             "model_files.load": "LoadedModel load_model",
             "model_files.save": "FORMS card_name save_model",

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ccnn_torch.compensation.contraction import TOLERANCE
 from ccnn_torch.compensation.domain import Domain
 from ccnn_torch.compensation.effects.effects import PhysicalEffects
-from ccnn_torch.compensation.geometry.identified import Geometry
+from ccnn_torch.compensation.geometry.chebyshev import ChebyshevExpansion
 from ccnn_torch.compensation.machine.machine import ASTRAY, SETTLED, Machine
 from ccnn_torch.compensation.networks import UncertainNetwork
 from ccnn_torch.compensation.secant import Step, next_correction
@@ -110,7 +110,8 @@ class Compensator(nn.Module):
         share: of what the network learned beside its mean that is applied [1]; below 1 where all of it was too steep.
             The scaling has it already, and a model file does not store it.
         unsettled: share of regular points in and around the domain at which the machine's command does not settle.
-        geometry: commanded joints `... x n` -> γ `... x n` [SI], bounded for finite joints; None without one.
+        geometry: commanded joints `... x n` -> γ(q) = g(f(q)) - q, `... x n` [SI], f the identified forward and g the
+            nominal inverse kinematics; None without one.
         effects: commanded joints and covariates -> ε `... x n` [SI]; None without one.
         machine: the one that was identified; None without one.
     """
@@ -134,7 +135,7 @@ class Compensator(nn.Module):
         iterations: int,
         sd_scale: Tensor | None = None,
         safe_sd: Tensor | None = None,
-        geometry: Geometry | None = None,
+        geometry: ChebyshevExpansion | None = None,
         effects: PhysicalEffects | None = None,
         secant: bool = False,
         machine: Machine | None = None,

@@ -18,7 +18,7 @@ _KINDS: dict[str, str | type[DescribedNetwork]] = {
     "forward": "ccnn_torch.compensation.machine.machine:Machine",
     "inverse": "ccnn_torch.compensation.machine.inverse:InverseMachine",
     "physical_effects": "ccnn_torch.compensation.effects.effects:PhysicalEffects",
-    "expanded_geometry": "ccnn_torch.compensation.geometry.expanded:ExpandedGeometry",
+    "expanded_geometry": "ccnn_torch.compensation.geometry.chebyshev:ChebyshevExpansion",
 }
 
 

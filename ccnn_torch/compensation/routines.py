@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from inspect import signature
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -80,18 +80,19 @@ def routines_of(own: Compensator, kept: Sequence[Copy] = ()) -> list[Routine]:
     start: tuple[Statement, ...] = ("clean", Copy("correction"))
     if own.secant:
         following, start = ("following", Copy("correction", "next"), Copy("steps", "done")), (*start, Copy("steps"))
-    command: tuple[Statement, ...] = ("step",)
-    back: tuple[Statement, ...] = ("step",)
+    again = Repeat(own.iterations, (*following, "step"))
+    command: tuple[Statement, ...] = ("step", again, "finish")
+    back: tuple[Statement, ...] = ("step", "finish_back")
     if own.machine is not None:
-        command = "aim", "step", Copy("first", "found"), Copy("near", "excess"), *kept
+        # The first step is taken where the last one goes astray.
+        command = "aim", "step", Copy("first", "found"), Copy("near", "excess"), *kept, again, "choose"
         again = Repeat(own.iterations, (Copy("correction", "found"), "back"))
-        back = "aim_back", "back", Copy("first", "found"), again
-    command = *start, *command, Repeat(own.iterations, (*following, "step")), "finish"
+        back = "aim_back", "back", Copy("first", "found"), again, "choose_back"
     about = "Command for ideal joints: command + deviation = joints."
     about_back = "The way back: ideal joints of a command, or of joints fed back."
     return [
-        Routine("compensate", about, "joints", ("command", "deviation"), command),
-        Routine("ideal", about_back, "command", ("joints",), (*start[:2], *back, "finish_back")),
+        Routine("compensate", about, "joints", ("command", "deviation"), (*start, *command)),
+        Routine("ideal", about_back, "command", ("joints",), (*start[:2], *back)),
     ]
 
 
@@ -108,7 +109,7 @@ class Functions:
         examples: of every variable, `rows x …`.
     """
 
-    outputs = {"aim": "aim", "step": "found excess doubt", "following": "next done", "back": "found doubt"}
+    outputs: ClassVar[dict[str, str]] = {"aim": "aim", "following": "next done", "back": "found doubt"}
 
     def __init__(self, own: Compensator, rows: int = 1) -> None:
         self.own, self.joints = own, len(own.joints)
@@ -147,11 +148,14 @@ class ControllerFunctions(Functions):
     above its limit.
     """
 
-    outputs = Functions.outputs | {
+    outputs: ClassVar[dict[str, str]] = Functions.outputs | {
         "clean": "q x strange",
+        "step": "found excess doubt",
         "aim_back": "aim excess",
         "finish": "command deviation status",
+        "choose": "command deviation status",
         "finish_back": "joints status",
+        "choose_back": "joints status",
         "spread": "sd status",
     }
 
@@ -162,8 +166,6 @@ class ControllerFunctions(Functions):
         # The rounding of a joint.
         self.eps = 8 * float(np.finfo(dtype).eps)
         self.examples["steps"] = torch.zeros(1, 2 * self.joints * self.room, dtype=torch.float64)
-        if own.machine is not None:
-            self.finish, self.finish_back = self.choose, self.choose_back
 
     def clean(self, given: Tensor, covariates: Tensor) -> Sequence[Tensor]:
         return self.own._inputs(given, covariates)
@@ -206,7 +208,6 @@ class ControllerFunctions(Functions):
         excess: Tensor,
         doubt: Tensor,
     ) -> Sequence[Tensor]:
-        """The end of a machine's command."""
         good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
         deviation = torch.where(strange <= 0, torch.where(good, correction, first), 0.0)
         return q - deviation, deviation, status_of(strange, torch.where(good, excess, near) <= 0, doubt)

@@ -32,7 +32,8 @@ from ccnn_torch.compensation import (
     load_model,
     save_model,
 )
-from ccnn_torch.compensation.export.export import probe_points, verify
+from ccnn_torch.compensation.agreement import probe_points
+from ccnn_torch.compensation.export.export import verify
 from ccnn_torch.compensation.model_files.onnx_session import OUTPUTS
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.errors import InputError, MethodFailedError, ModelFileError

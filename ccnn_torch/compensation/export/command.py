@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import onnx
 import torch
@@ -29,12 +29,15 @@ class GraphFunctions(Functions):
     else 0; guard's `weight` and network's `features`, of the first step `near_weight` and `near_features`.
     """
 
-    outputs = Functions.outputs | {
+    outputs: ClassVar[dict[str, str]] = {
+        **Functions.outputs,
         "clean": "ideal q x strange known",
         "step": "found excess weight features doubt",
         "aim_back": "aim excess weight",
-        "finish": "command deviation inside_domain guard status deviation_sd",
-        "finish_back": "ideal back_deviation ideal_inside_domain back_guard ideal_status",
+        **dict.fromkeys(("finish", "choose"), "command deviation inside_domain guard status deviation_sd"),
+        **dict.fromkeys(
+            ("finish_back", "choose_back"), "ideal back_deviation ideal_inside_domain back_guard ideal_status"
+        ),
     }
 
     def __init__(self, own: Compensator, rows: int) -> None:
@@ -76,11 +79,6 @@ class GraphFunctions(Functions):
         self,
         ideal: Tensor,
         strange: Tensor,
-        known: Tensor,
-        first: Tensor,
-        near: Tensor,
-        near_weight: Tensor,
-        near_features: Tensor,
         correction: Tensor,
         found: Tensor,
         excess: Tensor,
@@ -88,30 +86,48 @@ class GraphFunctions(Functions):
         features: Tensor,
         doubt: Tensor,
     ) -> Sequence[Tensor]:
-        if self.own.machine is not None:
-            good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
-            both = zip((correction, excess, weight, features), (first, near, near_weight, near_features), strict=True)
-            correction, excess, weight, features = (torch.where(good, *pair) for pair in both)
-            correction = found = known * correction
         sd = torch.where(strange <= 0, self.own.sd_of(weight, features), self.own.fallback_sd)
         return ideal - correction, found, *self._flags(strange, excess, weight, doubt), sd
 
+    def choose(
+        self,
+        ideal: Tensor,
+        strange: Tensor,
+        known: Tensor,
+        first: Tensor,
+        near: Tensor,
+        near_weight: Tensor,
+        near_features: Tensor,
+        correction: Tensor,
+        excess: Tensor,
+        weight: Tensor,
+        features: Tensor,
+        doubt: Tensor,
+    ) -> Sequence[Tensor]:
+        good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
+        both = zip((correction, excess, weight, features), (first, near, near_weight, near_features), strict=True)
+        taken, excess, weight, features = (torch.where(good, *pair) for pair in both)
+        return self.finish(ideal, strange, known * taken, known * taken, excess, weight, features, doubt)
+
     def finish_back(
+        self, ideal: Tensor, strange: Tensor, found: Tensor, excess: Tensor, weight: Tensor, doubt: Tensor
+    ) -> Sequence[Tensor]:
+        return ideal + found, found, *self._flags(strange, excess, weight, doubt)
+
+    def choose_back(
         self,
         ideal: Tensor,
         strange: Tensor,
         known: Tensor,
         first: Tensor,
         correction: Tensor,
-        found: Tensor,
         excess: Tensor,
         weight: Tensor,
         doubt: Tensor,
     ) -> Sequence[Tensor]:
-        if self.own.machine is not None:
-            good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
-            found = -known * torch.where(good, correction, first)
-        return ideal + found, found, *self._flags(strange, excess, weight, doubt)
+        good = self.own.is_allowed(correction) & (doubt <= ASTRAY)
+        deviation = -known * torch.where(good, correction, first)
+        return self.finish_back(ideal, strange, deviation, excess, weight, doubt)
 
     def _flags(self, strange: Tensor, excess: Tensor, weight: Tensor, doubt: Tensor) -> Sequence[Tensor]:
         """Whether inside the domain, the guard's weight, and the status."""

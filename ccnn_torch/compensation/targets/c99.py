@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 
-from ccnn_torch.compensation.export.export import DAMPED_TOLERANCE
-from ccnn_torch.compensation.routines import Copy, Routine, Statement
+from ccnn_torch.compensation.agreement import DAMPED_TOLERANCE
+from ccnn_torch.compensation.routines import Routine
 from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
-from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
+from ccnn_torch.compensation.targets.printing import (
+    ARITHMETIC,
+    Dialect,
+    Text,
+    costs,
+    print_program,
+    routine_lines,
+    within,
+    wrapped,
+)
 from ccnn_torch.compensation.targets.template import filled
 
 _NAMES = ("sqrt", "exp", "log", "sin", "cos", "tan", "tanh", "asin", "acos", "atan", "floor")
 _FUNCTIONS = {name: f"{name}{{s}}({{{{0}}}})" for name in _NAMES}
 _FUNCTIONS |= {"abs": "fabs{s}({{0}})", "atan2": "atan2{s}({{0}}, {{1}})", "pow": "pow{s}({{0}}, {{1}})"}
-_OPERATIONS = {
-    "add": "({0} + {1})",
-    "sub": "({0} - {1})",
-    "mul": "({0} * {1})",
-    "div": "({0} / {1})",
-    "neg": "(-{0})",
+_OPERATIONS = ARITHMETIC | {
     "min": "ccnn_min({0}, {1})",
     "max": "ccnn_max({0}, {1})",
-    "lt": "({0} < {1})",
-    "le": "({0} <= {1})",
     "eq": "({0} == {1})",
     "and": "({0} && {1})",
     "or": "({0} || {1})",
@@ -143,17 +145,12 @@ def _routine(routine: Routine, form: Form, dialect: Dialect, static: str) -> str
     else:
         lines.append("(void)covariates;")
 
-    def printed(statement: Statement) -> list[str]:
-        if isinstance(statement, str):
-            program = form.programs[statement]
-            names = ["more" if name == "covariates" else name for name in program.inputs]
-            return [f"ccnn_{statement}({', '.join([*names, *program.outputs])});"]
-        if isinstance(statement, Copy):
-            source = f"{statement.source}[j]" if statement.source else dialect.literal(0.0)
-            return dialect.loop("j", sizes[statement.target], [f"{statement.target}[j] = {source};"])
-        return dialect.loop("k", statement.times, [line for part in statement.statements for line in printed(part)])
+    def call(name: str) -> str:
+        program = form.programs[name]
+        names = ["more" if i == "covariates" else i for i in program.inputs]
+        return f"ccnn_{name}({', '.join([*names, *program.outputs])});"
 
-    lines += [line for statement in routine.statements for line in printed(statement)]
+    lines += routine_lines(routine, form, dialect, call, {})
     arguments = ", ".join(["const ccnn_real given[]", "const ccnn_real covariates[]", *outputs])
     head = f"{static}int ccnn_{routine.name}({arguments})"
     return "\n".join([head, "{", *(f"    {line}" for line in lines), "    return (int)status[0];", "}"])

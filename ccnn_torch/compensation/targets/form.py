@@ -1,8 +1,8 @@
 """The form of a model that every target prints: typed operations on numbers, loops over arrays, constant tables.
 
 A `Form` has the functions of one model (inputs made finite, a step towards the command, its end) as programs, and the
-routines that call them. A program is a list of steps in an order in which they can be computed. Each value is assigned once, all
-sizes are constants, and there is no branch: a program always does the same operations.
+routines that call them. A program is a list of steps in an order in which they can be computed. Each value is assigned
+once, all sizes are constants, and there is no branch: a program always does the same operations.
 """
 
 from __future__ import annotations

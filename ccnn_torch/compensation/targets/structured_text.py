@@ -7,10 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from ccnn_torch.compensation.routines import Copy, Routine, Statement
+from ccnn_torch.compensation.routines import Routine
 from ccnn_torch.compensation.targets.form import Array, Form, Program
 from ccnn_torch.compensation.targets.golden import Golden
-from ccnn_torch.compensation.targets.printing import Dialect, Text, costs, print_program, within, wrapped
+from ccnn_torch.compensation.targets.printing import (
+    ARITHMETIC,
+    Dialect,
+    Text,
+    costs,
+    print_program,
+    routine_lines,
+    within,
+    wrapped,
+)
 from ccnn_torch.compensation.targets.template import filled
 from ccnn_torch.errors import MethodFailedError
 
@@ -60,20 +69,15 @@ def _dialect(dtype: str) -> Dialect:
     exp = f"EXP(LIMIT({literal(-_EXP[dtype])}, {{0}}, {most}))"
     one, two = literal(1.0), literal(2.0)
     twice = exp.format(f"{two} * {{0}}")
-    operations = {name: f"{name.upper()}({{0}})" for name in _NAMES} | {
-        "add": "({0} + {1})",
-        "sub": "({0} - {1})",
-        "mul": "({0} * {1})",
-        "div": "({0} / {1})",
-        "neg": "(-{0})",
+    operations = {name: f"{name.upper()}({{0}})" for name in _NAMES}
+    operations |= ARITHMETIC
+    operations |= {
         "min": "MIN({0}, {1})",
         "max": "MAX({0}, {1})",
         "exp": exp,
         "log": "LN({0})",
         "pow": "EXPT({0}, {1})",
         "tanh": f"({one} - {two} / ({one} + {twice}))",
-        "lt": "({0} < {1})",
-        "le": "({0} <= {1})",
         "eq": "({0} = {1})",
         "and": "({0} AND {1})",
         "or": "({0} OR {1})",
@@ -145,25 +149,20 @@ def _block(program: Program, text: Text, form: Form) -> str:
 
 def _routine(routine: Routine, form: Form) -> str:
     """What a user calls, as a function block; the programs are instances in it."""
-    real, sizes, loop = _real(form), form.sizes, _dialect(form.dtype).loop
+    real, sizes, dialect = _real(form), form.sizes, _dialect(form.dtype)
     programs = dict.fromkeys(name for name, _ in routine.calls)
     # Where a variable is: an output of an instance, or an array of its own.
     places = {variable: f"{name}_block.{variable}_out" for name in programs for variable in form.programs[name].outputs}
     own = [name for name in form.variables(routine) if name not in places]
     places = {name: name for name in (*own, "covariates")} | {"given": routine.given} | places
 
-    def printed(statement: Statement) -> list[str]:
-        if isinstance(statement, str):
-            given = ", ".join(f"{name} := {places[name]}" for name in form.programs[statement].inputs)
-            return [f"{statement}_block({given});"]
-        if isinstance(statement, Copy):
-            source = f"{places[statement.source]}[j]" if statement.source else _literal(0.0, form.dtype)
-            return loop("j", sizes[statement.target], [f"{statement.target}[j] := {source};"])
-        return loop("k", statement.times, [line for part in statement.statements for line in printed(part)])
+    def call(name: str) -> str:
+        given = ", ".join(f"{i} := {places[i]}" for i in form.programs[name].inputs)
+        return f"{name}_block({given});"
 
-    lines = [line for statement in routine.statements for line in printed(statement)]
+    lines = routine_lines(routine, form, dialect, call, places)
     for name in routine.returns:
-        lines += loop("j", sizes[name], [f"{name}[j] := {places[name]}[j];"])
+        lines += dialect.loop("j", sizes[name], [f"{name}[j] := {places[name]}[j];"])
     inputs = {routine.given: len(form.joints), "covariates": len(form.covariates)}
     outputs = [_array(name, sizes[name], real) for name in routine.returns]
     variables = [f"    {name}_block : CCNN_{name.capitalize()}_;" for name in programs]
