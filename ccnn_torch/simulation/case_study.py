@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, PoseError, load_mechanism
-from ccnn_torch.simulation.machines.realistic import RealisticMachine
+from ccnn_torch.simulation.realistic import RealisticMachine
 
 CASES = ("tripod", "machine_tool")
 VARIANTS = ("printed", "tabulated")

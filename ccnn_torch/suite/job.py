@@ -10,13 +10,13 @@ from typing import Any
 
 from ccnn_torch.calibration.calibrate import makers
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.job import resume_run, start_run
+from ccnn_torch.calibration.job import RUN
 from ccnn_torch.engine import Job, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.report.json_files import read_json
 from ccnn_torch.report.screen import note, say_place, stdout
-from ccnn_torch.run_folder.folder import RunFolder, kept_for, locked
+from ccnn_torch.run_folder.folder import RunFolder, locked, resume_hint
 from ccnn_torch.suite.config import Suite
 from ccnn_torch.suite.page import compare, write_suite
 from ccnn_torch.suite.tables import case_line, print_suite
@@ -75,7 +75,7 @@ def _run_cases(suite: Suite, quiet: bool) -> Path:
     comparison = compare(suite.name, results, about, failed)
     if not quiet:
         print_suite(comparison, stdout)
-    with kept_for("the same command"):
+    with resume_hint("the same command"):
         path = write_suite(suite.out, comparison)
     if not quiet:
         say_place(f"Everything is in {suite.out}")
@@ -84,13 +84,7 @@ def _run_cases(suite: Suite, quiet: bool) -> Path:
 
 def _finish(config: RunConfig, quiet: bool) -> str:
     """Resume or start the run of a case; returns a line about its errors."""
-    assert config.out is not None
-    folder = RunFolder(Path(config.out))
-    if folder.config.is_file():
-        folder = resume_run(folder.path, quiet=quiet, tables=False)
-    else:
-        folder = start_run(config, quiet=quiet, tables=False)
-    return case_line(read_json(folder.results))
+    return case_line(read_json(RUN.finish(config, quiet=quiet, tables=False).results))
 
 
 def check_folder(config: RunConfig) -> None:

@@ -13,7 +13,7 @@ from ccnn_torch.files.write import sweep as clean
 from ccnn_torch.report.csv_file import write_rows
 from ccnn_torch.report.screen import note, say_place, stdout
 from ccnn_torch.report.table import Table, print_table
-from ccnn_torch.run_folder.folder import kept_for, locked
+from ccnn_torch.run_folder.folder import locked, resume_hint
 from ccnn_torch.suite.job import check_folder, finish_cases
 from ccnn_torch.sweep.config import Sweep
 
@@ -43,7 +43,7 @@ def run_sweep(sweep: Sweep, quiet: bool = False) -> tuple[Path, list[Row]]:
         results, failed = finish_cases(sweep.jobs, sweep.engine, quiet)
         rows = list(sweep_rows(sweep, results, failed))
         path = sweep.out / "sweep.csv"
-        with kept_for("the same command"):
+        with resume_hint("the same command"):
             write_rows(path, tuple(rows[0]), (tuple(row.values()) for row in rows))
     if not quiet:
         cells = tuple(tuple(_cell(row[key]) for key in ("job", *_SHOWN)) for row in rows)

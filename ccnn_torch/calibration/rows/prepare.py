@@ -28,7 +28,7 @@ from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.splits import Column, Split
 from ccnn_torch.simulation.case_study import Simulation, build_case, simulate_realistic
-from ccnn_torch.simulation.machines.realistic import build_machine
+from ccnn_torch.simulation.realistic import build_machine
 
 # Of the realistic machines.
 _MOST_JOINTS = 6

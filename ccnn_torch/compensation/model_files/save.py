@@ -12,7 +12,7 @@ from safetensors.torch import save
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.export.export import export_float32, export_onnx
-from ccnn_torch.compensation.model_files.metadata import OPTIONAL, facts_of, to_json
+from ccnn_torch.compensation.model_files.metadata import OPTIONAL, fingerprint, to_json
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.files.write import write_whole
@@ -57,7 +57,7 @@ def save_model(
         InputError: a field is missing or no JSON, or the network cannot be described.
         MethodFailedError: an export does not give the model's numbers, to 1e-12 of the limit or what the network needs.
     """
-    facts = facts_of(compensator, fields)
+    facts = fingerprint(compensator, fields)
     text = to_json(facts)
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in compensator.state_dict().items()}
     contents = {"safetensors": save(tensors, metadata={METADATA_KEY: text})}

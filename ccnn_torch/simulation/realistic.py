@@ -14,7 +14,7 @@ from ccnn_torch.config.sizes import ANGLE_ARM
 from ccnn_torch.coordinates import Coordinate
 from ccnn_torch.mechanisms import Mechanism, PoseError
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
-from ccnn_torch.simulation.machines.structure import ArmStructure, Structure, machine_tool_structure, tripod_structure
+from ccnn_torch.simulation.structure import ArmStructure, Structure, machine_tool_structure, tripod_structure
 
 CAUSES = ("geometry", "compliance", "transmission", "thermal", "backlash", "mixed")
 _MIXED = 0.5
