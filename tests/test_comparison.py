@@ -13,7 +13,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_run import short
 
-from ccnn_torch.calibration.job import start_run
+from ccnn_torch.calibration.job import RUN
 from ccnn_torch.calibration.page.figure_progress import progress_plot
 from ccnn_torch.calibration.page.long_table import long_table
 from ccnn_torch.calibration.page.reach import reach_block
@@ -49,7 +49,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     learner.write_text(COUNTING.format(toy=str(Path(__file__).parent / "toy.py")))
     methods = ["ccnn", f"{learner}:Line", "constant"]
     made = short(out=str(folder / "run"), repeats=3, methods=methods, save_models=False)
-    return start_run(made, quiet=True).path
+    return RUN.start(made, quiet=True).path
 
 
 @pytest.fixture

@@ -22,8 +22,7 @@ import torch
 from typer.testing import CliRunner
 
 from ccnn_torch.cli.application import app
-from ccnn_torch.engine import Job, check_engine, run_jobs
-from ccnn_torch.engine.engine import open_engine
+from ccnn_torch.engine import Job, check_engine, open_engine, run_jobs
 from ccnn_torch.errors import InputError, MethodFailedError
 
 distributed = pytest.importorskip("distributed", reason="needs pip install 'ccnn-torch[cluster]'")

@@ -12,7 +12,7 @@ from frozen import frozen
 from test_run import short
 
 from ccnn_torch.calibration.calibrate import calibrate
-from ccnn_torch.calibration.job import start_run
+from ccnn_torch.calibration.job import RUN
 from ccnn_torch.calibration.page.tables import failures, run_page
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.report.json_files import plain
@@ -144,7 +144,7 @@ def test_model_files_are_those_of_the_best_method_that_has_some(tmp_path: Path) 
     path = tmp_path / "mine.py"
     path.write_text(STEEP)
     config = short(methods=[f"{path}:Steep", "constant"], out=str(tmp_path / "run"), save_models=True, save_report=True)
-    folder = start_run(config, quiet=True).path
+    folder = RUN.start(config, quiet=True).path
     results = json.loads((folder / "results.json").read_text())
     jsonschema.validate(results, frozen("results"))
     assert results["best_method"] == "Steep" and results["model"]["method"] == "constant"

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from ccnn_torch import calibrate
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.job import start_run
+from ccnn_torch.calibration.job import RUN
 from ccnn_torch.calibration.rows.prepare import prepare
 from ccnn_torch.cli.application import app
 from ccnn_torch.coordinates import Coordinate
@@ -108,7 +108,7 @@ def test_before_in_the_figures_is_before_the_geometry_too(tmp_path: Path) -> Non
     config = RunConfig.from_keys(
         **keys, methods=["constant"], out=str(tmp_path / "r"), save_models=False, save_report=False
     )
-    start_run(config, quiet=True)
+    RUN.start(config, quiet=True)
     arrays = load_arrays(tmp_path / "r")
     tripod, names = load_mechanism("tripod"), [c.header for c in load_mechanism("tripod").pose]
     table = read_table(tmp_path / "rows.csv")

@@ -15,10 +15,10 @@ from test_geometry_run import tripod_records
 
 from ccnn_torch import calibrate, diagnose, identify, load_mechanism, load_records
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.job import resume_run
+from ccnn_torch.calibration.job import RUN
 from ccnn_torch.errors import InputError
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.job import resume_identification
+from ccnn_torch.identification.job import IDENTIFY
 from ccnn_torch.records import read_table, write_table
 from ccnn_torch.report.json_files import plain
 
@@ -56,7 +56,7 @@ def test_a_file_of_test_rows_from_config_to_results_and_resumed(folder: Path, cl
     assert "Held out: all 40 rows of later.csv." in results["notes"]
     before = (out / "results.json").read_bytes()
     (out / "results.json").unlink()
-    resume_run(out, quiet=True)
+    RUN.resume(out, quiet=True)
     again = json.loads((out / "results.json").read_text())
     assert again["methods"]["constant"]["test"] == json.loads(before)["methods"]["constant"]["test"]
     # The same rows held out by their column, in one file; the test rows are those of every repeat.
@@ -124,7 +124,7 @@ def test_identify_reads_records_alike(folder: Path, tmp_path: Path) -> None:
     # A frame's rows stand beside what was found, so that the folder can be gone on with.
     other.save(tmp_path / "out")
     (tmp_path / "out" / "identified.json").unlink()
-    resume_identification(tmp_path / "out", quiet=True)
+    IDENTIFY.resume(tmp_path / "out", quiet=True)
     assert json.loads((tmp_path / "out" / "identified.json").read_text())["parameters"] == other.results["parameters"]
 
 

@@ -15,11 +15,8 @@ from torch import Tensor
 from ccnn_torch.calibration.config import RunConfig
 from ccnn_torch.calibration.rows.prepare import Prepared, prepare
 from ccnn_torch.errors import InputError
-from ccnn_torch.simulation.machines.arm import ArmStructure
-from ccnn_torch.simulation.machines.causes import _GRID, CAUSES, _follow
-from ccnn_torch.simulation.machines.legs import LegStructure
-from ccnn_torch.simulation.machines.realistic import MACHINES, RealisticMachine, build_machine
-from ccnn_torch.simulation.machines.structure import GRAVITY
+from ccnn_torch.simulation.realistic import _GRID, CAUSES, MACHINES, RealisticMachine, _follow, build_machine
+from ccnn_torch.simulation.structure import GRAVITY, ArmStructure, LegStructure
 
 ROWS = 24
 

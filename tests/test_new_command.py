@@ -14,7 +14,7 @@ from ccnn_torch.cli.options import MECHANISMS, complete_mechanism
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.mechanisms.registry import REGISTRY
-from ccnn_torch.starter.job import starter_config
+from ccnn_torch.starter import starter_config
 
 Cli = Callable[..., tuple[int, str, str]]
 ARM = Path(__file__).parent.parent / "experiments" / "data" / "ur10.yaml"

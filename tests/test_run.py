@@ -23,7 +23,7 @@ from test_cli import tripod_records
 
 from ccnn_torch.calibration.calibrate import calibrate
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.job import resume_run, start_run
+from ccnn_torch.calibration.job import RUN
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import read_yaml
 from ccnn_torch.identification.config import IdentifyConfig
@@ -72,7 +72,7 @@ def short(**keys: Any) -> RunConfig:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """A finished run of two methods with everything that it writes, to be read only."""
     out = tmp_path_factory.mktemp("finished") / "run"
-    return start_run(short(out=str(out), repeats=3, methods=["ccnn", "constant"]), quiet=True)
+    return RUN.start(short(out=str(out), repeats=3, methods=["ccnn", "constant"]), quiet=True)
 
 
 def test_the_folder_of_a_run_holds_what_others_rely_on(finished: RunFolder) -> None:
@@ -162,13 +162,13 @@ def test_a_taken_folder_is_not_written_into(tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
     # There is no run to resume, so that no hint says how.
     with pytest.raises(InputError, match=r"holds files already; give another folder with out=…$"):
-        start_run(short(out=str(tmp_path)), quiet=True)
+        RUN.start(short(out=str(tmp_path)), quiet=True)
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
 
 
 def test_resuming_a_finished_run_changes_nothing(finished: RunFolder) -> None:
     before = {p: p.stat().st_mtime_ns for p in finished.path.rglob("*")}
-    resume_run(finished.path, quiet=True)
+    RUN.resume(finished.path, quiet=True)
     assert {p: p.stat().st_mtime_ns for p in finished.path.rglob("*")} == before
 
 
@@ -190,20 +190,20 @@ def test_a_config_changed_between_kill_and_resume_is_refused(
     assert old in before
     (run / "config.yaml").write_text(before.replace(old, new, 1))
     with pytest.raises(InputError, match=message):
-        resume_run(run, quiet=True)
+        RUN.resume(run, quiet=True)
 
 
 def test_records_changed_between_kill_and_resume_are_refused(tmp_path: Path) -> None:
     records = tripod_records(tmp_path / "rows.csv")
     run = tmp_path / "run"
     base = {"case": None, "records": str(records), "mechanism": "tripod", "methods": ["constant"], "geometry": "none"}
-    start_run(short(**base, out=str(run), save_models=False, save_report=False), quiet=True)
+    RUN.start(short(**base, out=str(run), save_models=False, save_report=False), quiet=True)
     (run / "results.json").unlink()
     lines = records.read_text().splitlines()
     # A row held out from training: no checkpoint would miss it.
     records.write_text("\n".join([*lines[:-1], lines[-1].replace("1", "2", 1)]) + "\n")
     with pytest.raises(InputError, match="is of other data than the config's; the records were changed"):
-        resume_run(run, quiet=True)
+        RUN.resume(run, quiet=True)
 
 
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
@@ -249,7 +249,7 @@ def test_a_killed_run_resumes_to_identical_results(cli: Cli, tmp_path: Path, del
     keys += ["save_models=false", "save_report=false"]
     keys += more
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    start_run(RunConfig.from_file(TRIPOD, [*keys, f"out={whole}"]), quiet=True)
+    RUN.start(RunConfig.from_file(TRIPOD, [*keys, f"out={whole}"]), quiet=True)
     code, _ = stopped(killed, keys, delay, signal.SIGKILL)
     assert code == -signal.SIGKILL
     assert cli("run", "--resume", killed)[0] == 0

@@ -45,7 +45,7 @@ FLOORS = [
     ["compensation"],
     ["diagnosis"],
     ["motion"],
-    ["engine", "run_folder", "report", "config", "testing"],
+    ["engine", "report", "run_folder", "config", "testing"],
     ["simulation", "planning", "verification/promise", "identification"],
     ["diagnosis/config", "diagnosis/page", "diagnosis/outputs", "diagnosis/job"],
     ["motion/identified", "motion/compensate", "motion/job", "motion/__init__"],

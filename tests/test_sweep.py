@@ -15,7 +15,7 @@ from frozen import frozen
 
 from ccnn_torch import api
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.calibration.job import resume_run, start_run
+from ccnn_torch.calibration.job import RUN
 from ccnn_torch.calibration.rows import memory
 from ccnn_torch.compensation import load_model
 from ccnn_torch.errors import InputError
@@ -130,8 +130,8 @@ def assert_near(one: Any, other: Any) -> None:
 def test_blocks_of_repeats_give_the_figures_of_all_at_once(tmp_path: Path) -> None:
     keys: dict[str, Any] = {"case": "tripod", "methods": ["bp_lm"], "bp_lm": QUICK, "repeats": 5, "seed": 3}
     keys |= {"save_report": False}
-    whole = start_run(RunConfig.from_keys(**keys, save_models=False, out=str(tmp_path / "whole")), quiet=True)
-    parts = start_run(RunConfig.from_keys(**keys, block=2, out=str(tmp_path / "parts")), quiet=True)
+    whole = RUN.start(RunConfig.from_keys(**keys, save_models=False, out=str(tmp_path / "whole")), quiet=True)
+    parts = RUN.start(RunConfig.from_keys(**keys, block=2, out=str(tmp_path / "parts")), quiet=True)
     one, other = without_times(whole.results), without_times(parts.results)
     jsonschema.validate(json.loads(parts.results.read_text()), frozen("results"))
     assert {p.name for p in (parts.path / "blocks").iterdir()} == {"0", "2", "4"}
@@ -148,11 +148,11 @@ def test_blocks_of_repeats_give_the_figures_of_all_at_once(tmp_path: Path) -> No
     # A block that is lost is run again, to the same.
     (parts.path / "results.json").unlink()
     shutil.rmtree(parts.path / "blocks" / "2")
-    resume_run(parts.path, quiet=True)
+    RUN.resume(parts.path, quiet=True)
     again = without_times(parts.results)
     assert {key: again[key] for key in other} == other
     with pytest.raises(InputError, match="methods=auto chooses a method for all repeats together"):
-        start_run(
+        RUN.start(
             RunConfig.from_keys(case="tripod", methods=["auto"], repeats=2, block=1, out=str(tmp_path / "auto")),
             quiet=True,
         )
@@ -164,7 +164,7 @@ def test_repeats_that_memory_does_not_hold_run_in_blocks_or_not_at_all(
     keys: dict[str, Any] = {"case": "tripod", "methods": ["constant", "bp_lm"], "bp_lm": QUICK}
     keys |= {"save_models": False, "save_report": False}
     each = memory.memory_of_run(RunConfig.from_keys(**keys), 125, 3)
-    out = start_run(
+    out = RUN.start(
         RunConfig.from_keys(**keys, repeats=5, max_bytes=2 * each, out=str(tmp_path / "run")), quiet=True
     ).path
     assert {p.name for p in (out / "blocks").iterdir()} == {"0", "2", "4"}
@@ -185,5 +185,5 @@ def test_repeats_that_memory_does_not_hold_run_in_blocks_or_not_at_all(
     for given in ({"max_bytes": each - 1}, {"repeats": 1000, "max_bytes": each}):
         needed = f"{each * given.get('repeats', 1):,} bytes"
         with pytest.raises(InputError, match=needed) as refused:
-            start_run(RunConfig.from_keys(**keys, **given, out=str(tmp_path / "no")), quiet=True)
+            RUN.start(RunConfig.from_keys(**keys, **given, out=str(tmp_path / "no")), quiet=True)
         assert not isinstance(refused.value, memory.TooManyRepeatsError) and not (tmp_path / "no").exists()

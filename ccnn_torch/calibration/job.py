@@ -25,43 +25,9 @@ from ccnn_torch.errors import InputError, MethodFailedError, WriteError
 from ccnn_torch.plugins import is_plugin
 from ccnn_torch.report.results.run import RunResults
 from ccnn_torch.report.screen import note, say_place, stdout
-from ccnn_torch.run_folder.folder import RunFolder, kept_for
-from ccnn_torch.run_folder.resume import facts_of, refuse_changes
+from ccnn_torch.run_folder.folder import RunFolder, resume_hint
+from ccnn_torch.run_folder.resume import FolderJob, check_fingerprint, fingerprint
 from ccnn_torch.training import Callback, Scaling, past_of
-
-
-def start_run(config: RunConfig, quiet: bool = False, tables: bool = True) -> RunFolder:
-    """Run a config into a fresh folder.
-
-    Raises:
-        InputError: the config or its data cannot be used, or the folder is taken or in use.
-        WriteError: a file cannot be written; what was computed until then is kept.
-    """
-    _check(config)
-    config, prepared = _prepared(config)
-    with RunFolder.fresh(config.out, config.name) as folder:
-        folder.write("config.yaml", config.to_yaml(folder.path))
-        _run(config, prepared, folder, quiet, tables)
-    return folder
-
-
-def resume_run(path: Path, quiet: bool = False, tables: bool = True) -> RunFolder:
-    """Finish the run in a folder; the result is that of a run that was never stopped. A finished one stays as it is.
-
-    Raises:
-        InputError: there is no run in the folder, it is in use, or its config, records or checkpoints were changed.
-        WriteError: as `start_run`.
-    """
-    folder = RunFolder(path)
-    if folder.finished:
-        note(f"{path} is finished; nothing to do", quiet)
-        return folder
-    with RunFolder.existing(path) as folder:
-        config = RunConfig.from_file(folder.config, [])
-        refuse_changes(folder.checkpoints, facts_of(config), folder.config)
-        _check(config)
-        _run(*_prepared(config), folder, quiet, tables)
-    return folder
 
 
 def _check(config: RunConfig) -> None:
@@ -75,6 +41,7 @@ def _check(config: RunConfig) -> None:
 
 def _prepared(config: RunConfig) -> tuple[RunConfig, Prepared | None]:
     """The rows of a run; None where its repeats run in blocks, as the config then says."""
+    _check(config)
     if config.block is None and config.engine != "local" and config.repeats > 1:
         config = config.model_copy(update={"block": 1})
     if config.block is not None and config.repeats > 1:
@@ -99,17 +66,12 @@ def finish_runs(runs: Mapping[str, RunConfig], engine: str, quiet: bool) -> dict
 
 def _finish(config: RunConfig, quiet: bool) -> str:
     """Start or resume a run without its tables; returns a line about the errors of its methods."""
-    folder = RunFolder(Path(str(config.out)))
-    if folder.config.is_file():
-        folder = resume_run(folder.path, quiet, tables=False)
-    else:
-        folder = start_run(config, quiet, tables=False)
-    return errors_line(RunResults.read(folder.results))
+    return errors_line(RunResults.read(RUN.finish(config, quiet, tables=False).results))
 
 
 def _run_blocks(config: RunConfig, folder: RunFolder, quiet: bool, tables: bool) -> None:
     """Run the blocks that are not finished yet, and put their figures together."""
-    with kept_for(f"ccnn run --resume {folder.path}"):
+    with resume_hint(f"ccnn run --resume {folder.path}"):
         blocks = blocks_of(config, folder)
         failed = finish_runs(blocks, config.engine, quiet)
         for name, problem in failed.items():
@@ -118,7 +80,7 @@ def _run_blocks(config: RunConfig, folder: RunFolder, quiet: bool, tables: bool)
                 f"block {name}: {problem.text}; {len(blocks) - len(failed)} of {len(blocks)} blocks are finished and "
                 f"kept, and ccnn run --resume {folder.path} resumes from them"
             )
-        write_blocks(config, folder, list(blocks.values()), lambda path: resume_run(path, quiet=True, tables=False))
+        write_blocks(config, folder, list(blocks.values()), lambda path: RUN.resume(path, quiet=True, tables=False))
     if tables and not quiet:
         run_page(RunResults.read(folder.results)).show(stdout)
         say_place(f"Everything is in {folder.path}")
@@ -130,8 +92,8 @@ def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet:
         return
     for sentence in prepared.notes:
         note(sentence, quiet)
-    folder = replace(folder, facts=facts_of(config, prepared.data_hash))
-    refuse_changes(folder.checkpoints, folder.facts, folder.config)
+    folder = replace(folder, facts=fingerprint(config, prepared.data_hash))
+    check_fingerprint(folder.checkpoints, folder.facts, folder.config)
 
     def watch(prepared: Prepared, method: str, phase: str, scaling: Scaling) -> list[Callback]:
         joints = prepared.mechanism.joints
@@ -150,7 +112,7 @@ def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet:
         names = tuple(joint.name for joint in joints)
         return [HeldOut(prepared.dataset, scaling, names, share_unit(joints), every), *shown]
 
-    with kept_for(f"ccnn run --resume {folder.path}"):
+    with resume_hint(f"ccnn run --resume {folder.path}"):
         calibration: Calibration = calibrate(config, folder, watch, prepared)
         note("writing model files, plots and tables …", quiet)
         try:
@@ -161,3 +123,7 @@ def _run(config: RunConfig, prepared: Prepared | None, folder: RunFolder, quiet:
     if tables and not quiet:
         run_page(calibration.results).show(stdout)
         say_place(f"Everything is in {folder.path}; open {folder.path / 'report.html'}")
+
+
+RUN = FolderJob("ccnn run", RunConfig, "results.json", "checkpoints/*.safetensors", _prepared, _run)
+"""A config to a finished run folder."""

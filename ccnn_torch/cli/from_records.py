@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -31,8 +30,8 @@ from ccnn_torch.files.yaml_file import read_yaml
 from ccnn_torch.run_folder.folder import NOTHING_WRITTEN, if_stopped
 
 if TYPE_CHECKING:
-    from ccnn_torch.config.tree import JobConfig
     from ccnn_torch.diagnosis.config import DiagnoseConfig
+    from ccnn_torch.run_folder.resume import FolderJob
 
 
 def new(
@@ -60,7 +59,7 @@ def new(
     if out.exists() and not force:
         raise InputError(f"{out} is there already; name another file, or give --force to overwrite it")
     from ccnn_torch.files.write import write_whole
-    from ccnn_torch.starter.job import starter_config
+    from ccnn_torch.starter import starter_config
 
     asks = not quiet and sys.stdin is not None and sys.stdin.isatty()
     ask = (lambda question: str(typer.prompt(question, default="", show_default=False))) if asks else None
@@ -107,10 +106,9 @@ def run(
     if file is not None:
         # Before torch is loaded: a file that is not there need not wait for it.
         read_yaml(file)
-    from ccnn_torch.calibration.config import RunConfig
-    from ccnn_torch.calibration.job import resume_run, start_run
+    from ccnn_torch.calibration.job import RUN
 
-    _start_or_resume("run experiments/tripod.yaml", RunConfig, start_run, resume_run, file, changes, resume, quiet)
+    _start_or_resume(RUN, "tripod", file, changes, resume, quiet)
 
 
 def identify(
@@ -145,42 +143,31 @@ def identify(
 
     ccnn compensate runs/arm/identified.yaml poses.csv commands.csv --pose
     """
-    from ccnn_torch.identification.config import IdentifyConfig
-    from ccnn_torch.identification.job import resume_identification, start_identification
+    from ccnn_torch.identification.job import IDENTIFY
 
     if keys:
         from ccnn_torch.config.keys import list_keys
 
-        for key, default, description in list_keys(IdentifyConfig):
+        for key, default, description in list_keys(IDENTIFY.model):
             typer.echo(f"{key}={default}\n    {description}")
         return
     words = [config, *(overrides or [])]
     file, changes = config_and_changes(words, config_option, records=records, mechanism=mechanism, out=out, seed=seed)
-    start, again = start_identification, resume_identification
-    _start_or_resume("identify experiments/five_bar.yaml", IdentifyConfig, start, again, file, changes, resume, quiet)
-
-
-_AnyConfig = TypeVar("_AnyConfig", bound="JobConfig")
+    _start_or_resume(IDENTIFY, "five_bar", file, changes, resume, quiet)
 
 
 def _start_or_resume(
-    example: str,
-    model: type[_AnyConfig],
-    start: Callable[[_AnyConfig, bool], object],
-    again: Callable[[Path, bool], object],
-    file: Path | None,
-    changes: list[str],
-    resume: Path | None,
-    quiet: bool,
+    job: FolderJob[Any, Any], example: str, file: Path | None, changes: list[str], resume: Path | None, quiet: bool
 ) -> None:
     if resume is not None:
         if changes or file is not None:
             raise InputError("--resume takes the folder alone, without CONFIG, overrides and other options")
-        again(resume, quiet)
+        job.resume(resume, quiet)
         return
     if file is None and not changes:
-        raise InputError(f"name a config, for example: ccnn {example} (or --resume DIR)")
-    start(model.from_file(file, changes, noted(quiet)), quiet)
+        example = f"{job.command} experiments/{example}.yaml"
+        raise InputError(f"name a config, for example: {example} (or --resume DIR)")
+    job.start(job.model.from_file(file, changes, noted(quiet)), quiet)
 
 
 def diagnose(

@@ -142,14 +142,14 @@ def _joints(loaded: Model, table: Table, back: bool, shown: JointMap | None) -> 
     names = {c.name: column for c, column in zip(loaded.joints, own, strict=True)}
     if back and all(f"command_{name}" in table for name in names):
         names = {name: f"command_{name}" for name in names}
-    _refuse_other_machine(loaded, table)
+    _check_joint_columns(loaded, table)
     columns = tuple(Coordinate(names[c.name], c.unit) for c in loaded.joints)
     values = stack_columns(table, columns, JOINT_LIMIT)
     units = {c.name: table.units[names[c.name]] for c in loaded.joints}
     return values if shown is None else shown.of_shown(values), units
 
 
-def _refuse_other_machine(loaded: Model, table: Table) -> None:
+def _check_joint_columns(loaded: Model, table: Table) -> None:
     """Raise `InputError` for a file with more joints than the model; a missing one is reported when it is read."""
     known = {c.name for c in loaded.joints}
     other = [name for name in table.names if name[:1] == "q" and name[1:].isdigit() and name not in known]

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 from ccnn_torch.config.sizes import Noise, size
 from ccnn_torch.config.tree import Columns, Files, JobConfig, JointMap, Names
 from ccnn_torch.errors import InputError
-from ccnn_torch.run_folder.folder import refuse_foreign
+from ccnn_torch.run_folder.folder import check_own_folder
 
 _WRONG_NOISE = (
     "must be a standard deviation of the pose, a size above 0 (10um, or 1e-5 in SI) or one for each coordinate; leave "
@@ -85,5 +85,5 @@ def folder_of(config: DiagnoseConfig) -> Path:
     if config.out is None:
         raise InputError("name the folder to write with --out DIR")
     folder = Path(config.out)
-    refuse_foreign(folder, ("diagnosis.json", "check.json"))
+    check_own_folder(folder, ("diagnosis.json", "check.json"))
     return folder

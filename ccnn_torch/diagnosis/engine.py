@@ -30,12 +30,12 @@ from ccnn_torch.diagnosis.verdict.text import lacking_text, shared_text, unseen_
 from ccnn_torch.effects import (
     Effect,
     Situation,
+    check_names,
     effect_names,
     make_effect,
+    missing_on,
     owned,
     pose_residual,
-    refuse_one_name,
-    tried,
 )
 from ccnn_torch.errors import InputError, RowsError
 
@@ -60,8 +60,8 @@ def candidates(
         InputError: the records can show none of them, two have one name, or a user's own breaks what `Effect` says.
     """
     every = _made(situation, effects)
-    lacking = {e.name: tried(e, situation) for e in every}
-    refuse_one_name(every)
+    lacking = {e.name: missing_on(e, situation) for e in every}
+    check_names(every)
     if every and all(lacking.values()):
         need = "; ".join(f"{name} needs {why}" for name, why in lacking.items())
         raise InputError(f"effects: these records can show none of the candidates: {need}")

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
         EFFECTS as EFFECTS,
         EXACT as EXACT,
         OUTLIER as OUTLIER,
+        check_names as check_names,
         effect_names as effect_names,
         make_effect as make_effect,
+        missing_on as missing_on,
         owned as owned,
-        refuse_one_name as refuse_one_name,
-        tried as tried,
     )
     from ccnn_torch.effects.situation import (
         PLATFORM_WEIGHT as PLATFORM_WEIGHT,
@@ -38,7 +38,7 @@ else:
             "apply": "Acting labelled measured_pose moved_joints pose_residual reached signature "
             "used_covariates without_pose_effects",
             "protocol": "Coefficient Effect Kind Shape",
-            "registry": "EFFECTS EXACT OUTLIER effect_names make_effect owned refuse_one_name tried",
+            "registry": "EFFECTS EXACT OUTLIER effect_names make_effect owned check_names missing_on",
             "situation": "PLATFORM_WEIGHT Situation default_gravity",
         },
     )

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one, per_force
 from ccnn_torch.effects.loads import SCALE
-from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, WEIGHTS, Situation
 from ccnn_torch.mechanisms import Mechanism
 
@@ -21,7 +21,7 @@ _SOFT = 0.3
 _EDGES = ((" softer", 2 * _SOFT), (" harder", 0.5 * _SOFT))
 
 
-class Backlash:
+class Backlash(Effect):
     """Δq_i = b_i / 2 tanh((w_i / h - s_i) / e) / tanh(1 / e): s the direction of approach, w the push on the joint.
 
     A joint rests on the flank that drove it, half the backlash b behind the motor's middle, unless weight and load push
@@ -31,9 +31,8 @@ class Backlash:
     """
 
     name = "backlash"
-    kind: Kind = "joints"
+    kind = "joints"
     description = "backlash of the drives: the rest position depends on the direction of approach"
-    ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """The direction of approach of at least one joint."""
@@ -94,7 +93,7 @@ _SHARE = 0.3
 _CONSTANT = {"m": 6e-6, "rad": 1e-5}
 
 
-class Friction:
+class Friction(Effect):
     """Δq_i = -s_i (c_i |τ_load,i| + d_i |τ_weight,i| + e_i): s the direction of approach, τ what the joint carries.
 
     Coulomb's friction is in proportion to what presses the surfaces together; a drive of compliance C and friction
@@ -104,9 +103,8 @@ class Friction:
     """
 
     name = "friction"
-    kind: Kind = "joints"
+    kind = "joints"
     description = "friction that winds up the drives against their last motion, growing with their load"
-    ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """The direction of approach of at least one joint."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.effects.columns import TWIST, caused_by, own_parameters, parameter_columns, shown_columns, twist_columns
-from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
@@ -17,13 +17,12 @@ from ccnn_torch.numerics.rotations import matrix_to_rotation_vector
 _SCALE = {"m": 1e-3, "rad": 1e-3}
 
 
-class Frame:
+class Frame(Effect):
     """Δposition = t + ω x (position - middle of the workspace), Δrotation = ω, in the base frame."""
 
     name = "frame"
-    kind: Kind = "pose"
+    kind = "pose"
     description = "the measuring device's frame: a shift and a turn of the whole machine against it"
-    ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """A base frame that is known; an unknown one is fitted before anything else."""
@@ -33,10 +32,6 @@ class Frame:
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """As many of shift and turn as the pose shows."""
         return tuple(Coefficient(*TWIST[k], _SCALE[TWIST[k][1]]) for k in shown_columns(situation, _frame_columns))
-
-    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
@@ -50,13 +45,12 @@ def _frame_columns(situation: Situation) -> Tensor:
     return twist_columns(situation, position - middle, axes)
 
 
-class Tool:
+class Tool(Effect):
     """Δposition = R t, Δrotation = R ω: a shift and a turn in the platform's own axes R."""
 
     name = "tool"
-    kind: Kind = "pose"
+    kind = "pose"
     description = "the measured point on the platform: a shift and a turn of the tool or target against it"
-    ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """A platform that turns, and a tool frame that is known; an unknown one is fitted before anything else."""
@@ -69,10 +63,6 @@ class Tool:
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """As many of shift and turn as the pose shows."""
         return tuple(Coefficient(*TWIST[k], _SCALE[TWIST[k][1]]) for k in shown_columns(situation, _tool_columns))
-
-    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
@@ -96,7 +86,7 @@ _COEFFICIENTS = (
 )
 
 
-class Instrument:
+class Instrument(Effect):
     """Δposition = S (position - middle of the workspace) + z, S symmetric: no rigid motion but by what is secondary.
 
     The diagonal of S are errors of scale, beside it is half the angle by which two axes are not square. Secondary:
@@ -106,21 +96,12 @@ class Instrument:
     """
 
     name = "instrument"
-    kind: Kind = "pose"
+    kind = "pose"
     description = "the measuring device itself: errors of scale and axes that are not square"
-    ordered = False
-
-    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """Nothing is needed."""
-        return ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Scale of each axis and shear of each pair that the pose shows; zeros and angular scales as secondary ones."""
         return tuple(_COEFFICIENTS[k] for k in shown_columns(situation, _instrument_columns))
-
-    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
@@ -151,16 +132,15 @@ def _instrument_columns(situation: Situation) -> Tensor:
     return situation.visible @ torch.cat([linear, turning], -2)
 
 
-class Geometry:
+class Geometry(Effect):
     """Δp_k = c_k, p = the mechanism's own lengths, angles and gains; base and tool frames are effects of their own.
 
     A parameter that names another cause (a simulator's stiffness) is a candidate of its own: `ParameterCause`.
     """
 
     name = "geometry"
-    kind: Kind = "parameters"
+    kind = "parameters"
     description = "lengths, places and angles of the machine as built that differ from its drawing"
-    ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """Parameters."""
@@ -183,10 +163,6 @@ class Geometry:
             for place, k in enumerate(chosen)
         )
 
-    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
-
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """Columns of the identity at every row, `... x s x k x m`."""
         return parameter_columns(situation, self.name)
@@ -196,11 +172,10 @@ PARAMETER = "parameter "
 """What the names of these effects begin with, before the cause's own."""
 
 
-class ParameterCause:
+class ParameterCause(Effect):
     """Δp_k = c_k for the parameters of one cause."""
 
-    kind: Kind = "parameters"
-    ordered = False
+    kind = "parameters"
 
     def __init__(self, cause: str) -> None:
         """cause: as the mechanism's parameters name it."""
@@ -217,10 +192,6 @@ class ParameterCause:
         geometry = situation.mechanism.geometry
         chosen = [geometry[k] for k in caused_by(situation.mechanism, self.cause)]
         return tuple(Coefficient(p.name, p.unit, plausible_error(p), leg=p.leg) for p in chosen)
-
-    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """Columns of the identity at every row, `... x s x k x m`."""

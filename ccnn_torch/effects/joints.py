@@ -10,22 +10,17 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter, plausible_error
 from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one
-from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
 
-class JointOffset:
+class JointOffset(Effect):
     """Δq_i = c_i."""
 
     name = "joint_offset"
-    kind: Kind = "joints"
+    kind = "joints"
     description = "a constant error of each joint, as of a reference switch or an encoder's zero"
-    ordered = False
-
-    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """Nothing is needed."""
-        return ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """One a joint."""
@@ -33,10 +28,6 @@ class JointOffset:
             Coefficient(j.name, j.unit, plausible_error(Parameter(j.name, j.unit, 0.0)), joint=j.name)
             for j in situation.mechanism.joints
         )
-
-    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """The identity at every row, `... x s x n x n`."""
@@ -50,17 +41,12 @@ ZERO = {"m": 3e-4, "rad": 1e-3}
 """What a gain makes between the middle of a joint's workspace and where the joint counts from [joint's unit]."""
 
 
-class JointGain:
+class JointGain(Effect):
     """Δq_i = c_i (q_i - middle of its workspace) + z_i; z (secondary): it may be 0 elsewhere than in the middle."""
 
     name = "joint_gain"
-    kind: Kind = "joints"
+    kind = "joints"
     description = "joints that move by a constant share too far or too short, as by a screw's lead or a gear ratio"
-    ordered = False
-
-    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """Nothing is needed."""
-        return ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Gain and zero of each joint."""
@@ -80,22 +66,17 @@ class JointGain:
         """
         return {joint.name: i for i, joint in enumerate(situation.mechanism.joints)}
 
-    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
-
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x 2n`."""
         return by_joint(torch.stack([situation.from_middle, torch.ones_like(situation.joints)], -1))
 
 
-class Coupling:
+class Coupling(Effect):
     """Δq_i = Σ c_ij (q_j - middle of its workspace) + z_i over j ≠ i; z (secondary): it may be 0 elsewhere."""
 
     name = "coupling"
-    kind: Kind = "joints"
+    kind = "joints"
     description = "one joint's motion that moves another, as in a wrist's gears or a belt over several axes"
-    ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """A second joint."""
@@ -118,10 +99,6 @@ class Coupling:
         """As of `JointGain`: the joint that moves the other one."""
         joints = situation.mechanism.joints
         return {f"{i.name} by {j.name}": k for i in joints for k, j in enumerate(joints) if i.name != j.name}
-
-    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x n²`."""
@@ -148,20 +125,15 @@ _PERIODS = (1.5, 40.0)
 _PERIOD_STEP = 1 / 3
 
 
-class Transmission:
+class Transmission(Effect):
     """Δq_i = a_i sin(f_i q_i) + b_i cos(f_i q_i) and their harmonics up to the fourth; f_i unknown.
 
     The second may be as large as the first (a gear's two teeth in mesh), the third and the fourth are small.
     """
 
     name = "transmission"
-    kind: Kind = "joints"
+    kind = "joints"
     description = "a periodic error of a drive, of unknown period, as of a gear, a screw or an encoder"
-    ordered = False
-
-    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """Nothing is needed."""
-        return ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Sine and cosine of a joint's period, then of its harmonics, joint by joint."""

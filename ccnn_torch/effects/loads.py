@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.effects.columns import by_joint, own_parameters, per_force
-from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.protocol import Coefficient, Effect
 from ccnn_torch.effects.situation import PLATFORM_WEIGHT, Situation
 from ccnn_torch.mechanisms import Mechanism, SerialArm
 from ccnn_torch.numerics.rotations import rotation_vector_to_matrix
@@ -63,7 +63,7 @@ _AWAY = 0.1
 _TYPICAL = {"m": 100.0, "rad": 30.0}
 
 
-class Compliance:
+class Compliance(Effect):
     """Δq_i = c_i τ_i + d_i τ_i |τ_i| / τ_0 + h_i τ_i³ / τ_0², τ = force or torque of the load on the joint; and
     members that give, e_k.
 
@@ -74,9 +74,8 @@ class Compliance:
     """
 
     name = "compliance"
-    kind: Kind = "pose"
+    kind = "pose"
     description = "deflection of joints, legs and links under an external load (linear and stiffening)"
-    ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """A load that was measured."""
@@ -109,10 +108,6 @@ class Compliance:
             )
         stretch = SCALE["m"] * _SECONDARY
         return (*found, *(Coefficient(m.name, "m/N", stretch, m.joint, m.leg, True) for m in members(mechanism)))
-
-    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x c x m`."""
@@ -169,7 +164,7 @@ _LEVER = 0.3
 _MOMENT = 5.0
 
 
-class Gravity:
+class Gravity(Effect):
     """Δq_i = c_i τ_i, τ = force or torque of the machine's own weight on the joint per newton, by virtual work.
 
     For an arm the newton is spread evenly over the origins of its links and the tool; for other machines it hangs on
@@ -181,13 +176,8 @@ class Gravity:
     """
 
     name = "gravity"
-    kind: Kind = "joints"
+    kind = "joints"
     description = "deflection under the machine's own weight"
-    ordered = False
-
-    def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
-        """Nothing is needed."""
-        return ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Sag of each joint and what goes with it, joint by joint; then the centre of mass."""
@@ -216,10 +206,6 @@ class Gravity:
         if _centred(situation):
             found += [Coefficient(f"centre {axis}", "N*m", _MOMENT, secondary=True) for axis in "xyz"]
         return tuple(found)
-
-    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x m`."""

@@ -67,7 +67,7 @@ class Shape:
 
 @runtime_checkable
 class Effect(Protocol):
-    """One physical cause, linear in its coefficients for given shapes.
+    """One physical cause, linear in its coefficients for given shapes; a class that derives from it has what is given.
 
     The same object is injected in a simulation, fitted in a diagnosis, and used in a compensator.
 
@@ -82,16 +82,18 @@ class Effect(Protocol):
     name: str
     kind: Kind
     description: str
-    ordered: bool
+    ordered: bool = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """What the records lack for it, in words that say which column to add; empty where nothing is missing."""
+        return ""
 
     def coefficients(self, situation: Situation) -> tuple[Coefficient, ...]:
         """Its `m` coefficients on this mechanism with these covariates."""
 
     def shapes(self, situation: Situation) -> tuple[Shape, ...]:
         """Its `h` shapes; () where it has none."""
+        return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """Change per unit of each coefficient.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from numbers import Real
 from pathlib import Path
@@ -210,7 +210,7 @@ def _hint(error: BaseException, given: object) -> str:
     return f" (if that is a column: the rows have {', '.join(given.covariates) or 'none'}, and missing() must say so)"
 
 
-def tried(effect: Effect, situation: Situation) -> str:
+def missing_on(effect: Effect, situation: Situation) -> str:
     """What the rows lack for an effect, as `Effect.missing` states it; a user's own is tried on them where that is ''.
 
     Args:
@@ -221,18 +221,12 @@ def tried(effect: Effect, situation: Situation) -> str:
         InputError: one sentence with file and method where the effect breaks the contract of `Effect`.
     """
     if isinstance(effect, OwnEffect):
-        wrong = _wrong_name(effect, situation)
-        if wrong:
-            raise InputError(f"{effect.label}: {wrong}")
-    lacks = effect.missing(situation.mechanism, [*situation.covariates])
-    if isinstance(effect, OwnEffect) and not lacks:
-        wrong = _wrong_with(effect, situation)
-        if wrong:
-            raise InputError(f"{effect.label}: {wrong}")
-    return lacks
+        for breach in _breaches(effect, situation):
+            raise InputError(f"{effect.label}: {breach}")
+    return effect.missing(situation.mechanism, [*situation.covariates])
 
 
-def refuse_one_name(effects: Sequence[Effect]) -> None:
+def check_names(effects: Sequence[Effect]) -> None:
     """Raise InputError where two candidates are called the same: a verdict could not distinguish them."""
     names = [e.name for e in effects]
     twice = next((n for n in names if names.count(n) > 1), None)
@@ -243,95 +237,85 @@ def refuse_one_name(effects: Sequence[Effect]) -> None:
     raise InputError(f"effects: two candidates are called '{twice}'{what}; name each once, and give each its own name")
 
 
-def _wrong_with(effect: OwnEffect, situation: Situation) -> str:
-    """What its coefficients and shapes break, '' where nothing; the basis is asked at the middle and the ends of grids.
+def _breaches(effect: OwnEffect, situation: Situation) -> Iterator[str]:
+    """What its name, and where nothing is missing its coefficients, shapes and basis break of `Effect`.
 
-    Args:
-        effect: one whose `missing` finds nothing missing.
-        situation: `... x s` rows.
+    The basis is asked at the middle and the ends of grids.
 
     Raises:
         InputError: a call fails, or returns what is no list of coefficients, no shapes or no basis.
     """
+    if not effect.name.strip() or not effect.name.isprintable():
+        yield f"its name is {effect.name!r}, expected a word or two"
+    if not of_library(effect.own) and effect.name in (*effect_names(situation.mechanism), OUTLIER):
+        yield f"its name '{effect.name}' is one of the library's, which a verdict would mean; give it one of its own"
+    if effect.missing(situation.mechanism, [*situation.covariates]):
+        return
     found, shapes = effect.coefficients(situation), effect.shapes(situation)
     if all(c.secondary for c in found):
         none = "has no coefficient that is not secondary" if found else "returned no coefficient"
-        return f"coefficients() {none}; where there is nothing to fit, missing() must say why"
+        yield f"coefficients() {none}; where there is nothing to fit, missing() must say why"
     names = [c.name for c in found] + [s.name for s in shapes]
-    odd = next((n for n in names if not isinstance(n, str) or not n.strip()), None)
-    if odd is not None:
-        return f"one of its coefficients or shapes is called {odd!r}, expected a name"
-    twice = next((n for n in names if names.count(n) > 1), None)
-    if twice is not None:
-        return f"two of its coefficients or shapes are called '{twice}'; give each its own name"
+    for name in names:
+        if not isinstance(name, str) or not name.strip():
+            yield f"one of its coefficients or shapes is called {name!r}, expected a name"
+        if names.count(name) > 1:
+            yield f"two of its coefficients or shapes are called '{name}'; give each its own name"
     for one in found:
-        wrong = _wrong_coefficient(one, situation)
-        if wrong:
-            return f"coefficients(): {wrong}"
+        yield from (f"coefficients(): {breach}" for breach in _coefficient_breaches(one, situation))
     for shape in shapes:
-        wrong = _wrong_shape(shape, len(found))
-        if wrong:
-            return f"shapes(): {wrong}"
+        yield from (f"shapes(): {breach}" for breach in _shape_breaches(shape, len(found)))
     grids = [s.grid for s in shapes]
     middle, low, high = ([g[share * (len(g) - 1) // 2] for g in grids] for share in (1, 0, 2))
     at = torch.tensor(middle, dtype=torch.float64)
     if not torch.equal(effect.basis(situation, at), effect.basis(situation, at)):
-        return "basis() gives other values when called again; an effect draws no random numbers and keeps no state"
+        yield "basis() gives other values when called again; an effect draws no random numbers and keeps no state"
     if grids:
         # As a search asks: several sets of shapes at once.
         effect.basis(situation, torch.tensor([middle, low, high], dtype=torch.float64))
-    return ""
 
 
-def _wrong_name(effect: OwnEffect, situation: Situation) -> str:
-    if not effect.name.strip() or not effect.name.isprintable():
-        return f"its name is {effect.name!r}, expected a word or two"
-    if not of_library(effect.own) and effect.name in (*effect_names(situation.mechanism), OUTLIER):
-        return f"its name '{effect.name}' is one of the library's, which a verdict would mean; give it one of its own"
-    return ""
-
-
-def _wrong_coefficient(one: Coefficient, situation: Situation) -> str:
-    if not (_is_number(one.scale) and one.scale > 0):
-        return (
-            f"coefficient '{one.name}' has the scale {one.scale!r}, expected more than 0: its plausible size in "
-            f"{one.unit}"
-        )
-    joints = [j.name for j in situation.mechanism.joints]
+def _coefficient_breaches(one: Coefficient, situation: Situation) -> Iterator[str]:
+    name, joints = f"coefficient '{one.name}'", [j.name for j in situation.mechanism.joints]
     legs = sorted({g.leg for g in situation.mechanism.geometry if g.leg is not None})
+    if not (_is_number(one.scale) and one.scale > 0):
+        yield f"{name} has the scale {one.scale!r}, expected more than 0: its plausible size in {one.unit}"
     if one.joint is not None and one.joint not in joints:
-        return f"coefficient '{one.name}' is of joint {one.joint!r}, expected one of {', '.join(joints)}, or None"
+        yield f"{name} is of joint {one.joint!r}, expected one of {', '.join(joints)}, or None"
     if one.leg is not None and one.leg not in legs:
         there = f"one of {', '.join(map(str, legs))}, or None" if legs else "None: the mechanism's parameters name none"
-        return f"coefficient '{one.name}' is of leg {one.leg!r}, expected {there}"
-    return _wrong_unit(one.name, one.unit)
+        yield f"{name} is of leg {one.leg!r}, expected {there}"
+    yield from _unit_breaches(one.name, one.unit)
 
 
-def _wrong_shape(shape: Shape, coefficients: int) -> str:
-    grid = shape.grid
+def _shape_breaches(shape: Shape, coefficients: int) -> Iterator[str]:
+    name, grid = f"shape '{shape.name}'", shape.grid
     if not isinstance(grid, tuple | list) or not grid or not all(map(_is_number, grid)):
         got = "is empty" if isinstance(grid, tuple | list) and not grid else f"is {grid!r}"
-        return f"the grid of shape '{shape.name}' {got}, expected finite numbers to look at, e.g. (0.5, 1.0, 2.0)"
+        yield f"the grid of {name} {got}, expected finite numbers to look at, e.g. (0.5, 1.0, 2.0)"
     if not all(a < b for a, b in pairwise(grid)):
-        return f"the grid of shape '{shape.name}' does not ascend"
+        yield f"the grid of {name} does not ascend"
     if shape.usual is not None and not _is_number(shape.usual):
-        return f"shape '{shape.name}' has the usual value {shape.usual!r}, expected a number or None"
+        yield f"{name} has the usual value {shape.usual!r}, expected a number or None"
     if shape.columns is not None:
         wrong = [k for k in shape.columns if k not in range(coefficients)]
         if wrong or not shape.columns:
             named = f"names coefficient {wrong[0]!r}" if wrong else "names no coefficient"
-            return f"shape '{shape.name}' {named} in columns, expected numbers from 0 to {coefficients - 1}, or None"
-    return _wrong_unit(shape.name, shape.unit)
+            yield f"{name} {named} in columns, expected numbers from 0 to {coefficients - 1}, or None"
+    yield from _unit_breaches(shape.name, shape.unit)
 
 
-def _wrong_unit(name: str, unit: object) -> str:
+def _unit_breaches(name: str, unit: object) -> Iterator[str]:
     if not isinstance(unit, str):
-        return f"the unit of '{name}' is {unit!r}, expected a name of an SI unit such as 'm/N', or '1'"
+        yield f"the unit of '{name}' is {unit!r}, expected a name of an SI unit such as 'm/N', or '1'"
+        return
     try:
         one = float(to_si([1.0], unit, where="it")[0])
     except InputError as reason:
-        return f"the unit of '{name}' is none: {reason}"
-    return "" if one == 1.0 else f"the unit '{unit}' of '{name}' is no SI unit"
+        yield f"the unit of '{name}' is none: {reason}"
+        return
+    if one != 1.0:
+        yield f"the unit '{unit}' of '{name}' is no SI unit"
 
 
 def _is_number(value: object) -> bool:

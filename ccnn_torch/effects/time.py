@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.effects.columns import by_joint, of_rows, one_by_one
 from ccnn_torch.effects.loads import Member, members
-from ccnn_torch.effects.protocol import Coefficient, Kind, Shape
+from ccnn_torch.effects.protocol import Coefficient, Effect, Shape
 from ccnn_torch.effects.situation import Situation
 from ccnn_torch.mechanisms import Mechanism
 
@@ -88,7 +88,7 @@ def velocity(time: Tensor, joints: Tensor) -> Tensor:
 _DELAY = 5e-3
 
 
-class Latency:
+class Latency(Effect):
     """Δq_i = -(τ + τ_i) dq_i/dt: the machine is where the command was τ before; τ_i is what one drive lags behind.
 
     Velocities are the columns speed1… where the records have them, else differences along a trajectory: rows that are
@@ -96,9 +96,8 @@ class Latency:
     """
 
     name = "latency"
-    kind: Kind = "joints"
+    kind = "joints"
     description = "poses recorded on the move that lag behind their commands"
-    ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """Velocities, or the time along a trajectory."""
@@ -114,10 +113,6 @@ class Latency:
         """The delay of all, then that of each joint on top."""
         own = [Coefficient(j.name, "s", 0.3 * _DELAY, joint=j.name, secondary=True) for j in situation.mechanism.joints]
         return (Coefficient("delay", "s", _DELAY), *own)
-
-    def shapes(self, situation: Situation) -> tuple[Shape, ...]:
-        """None."""
-        return ()
 
     def basis(self, situation: Situation, shape: Tensor) -> Tensor:
         """`... x s x n x (1 + n)`."""
@@ -147,7 +142,7 @@ _LAGS = 12
 _WARM_SHARES = (0.01, 1.0)
 
 
-class Thermal:
+class Thermal(Effect):
     """Δp = (α + α_k) p θ for all lengths p (k = their leg or link), Δq_i = β_i q_i θ for sliding drives.
 
     θ is the temperature less 20 degC, as a body of one heat capacity follows it with a lag: θ' = (T - θ) / lag, settled
@@ -163,9 +158,8 @@ class Thermal:
     """
 
     name = "thermal"
-    kind: Kind = "pose"
+    kind = "pose"
     description = "thermal growth with a first-order lag"
-    ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """Temperature, and something that has a length."""
@@ -274,7 +268,7 @@ _RATES = 8
 _SHARES = (0.003, 1.0)
 
 
-class Drift:
+class Drift(Effect):
     """Δq_i = a_i t + b_i ln(1 + t / r) + a random walk; t since the first row.
 
     r is how long it takes for the drift to slow down. The random walk (secondary) is the Karhunen-Loève expansion of
@@ -282,9 +276,8 @@ class Drift:
     """
 
     name = "drift"
-    kind: Kind = "joints"
+    kind = "joints"
     description = "drift of the joints in time: linear, logarithmic, or random"
-    ordered = False
 
     def missing(self, mechanism: Mechanism, covariates: Sequence[str]) -> str:
         """Time."""

@@ -41,7 +41,7 @@ from ccnn_torch.identification.transfer import read_elsewhere, transferred
 from ccnn_torch.mechanisms import Framed, Mechanism
 from ccnn_torch.records import Records, write_table
 from ccnn_torch.records.load import read_source
-from ccnn_torch.run_folder.resume import facts_of, refuse_changes
+from ccnn_torch.run_folder.resume import check_fingerprint, fingerprint
 
 Watch = Callable[[str], Progress]
 """Given a label, somewhere to report the share that is done."""
@@ -122,9 +122,9 @@ def identify(
     for method in config.methods:  # refuse what cannot be solved before anything takes minutes
         solver_of(method, config)
         pieces_of(measured, config, is_apart(method, config), torch.arange(1))
-    facts = facts_of(config, _fingerprint(measured))
+    facts = fingerprint(config, _fingerprint(measured))
     if store is not None:
-        refuse_changes(sorted(store.glob("*.safetensors")), facts, store.parent / "config.yaml")
+        check_fingerprint(sorted(store.glob("*.safetensors")), facts, store.parent / "config.yaml")
     outcomes: dict[str, Outcome] = {}
     for method in config.methods:
         path = None if store is None else store / f"{method}.safetensors"

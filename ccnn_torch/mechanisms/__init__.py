@@ -10,11 +10,10 @@ if TYPE_CHECKING:
     from ccnn_torch.mechanisms.frames.judge import judge_frames as judge_frames
     from ccnn_torch.mechanisms.machines.delta import Delta as Delta, DeltaLinear as DeltaLinear
     from ccnn_torch.mechanisms.machines.five_bar import FiveBar as FiveBar
-    from ccnn_torch.mechanisms.machines.machine_tool import MachineTool as MachineTool
     from ccnn_torch.mechanisms.machines.overconstrained import Overconstrained2Dof as Overconstrained2Dof
     from ccnn_torch.mechanisms.machines.serial import SerialArm as SerialArm
+    from ccnn_torch.mechanisms.machines.sliders import MachineTool as MachineTool, Tripod as Tripod
     from ccnn_torch.mechanisms.machines.stewart import Stewart as Stewart
-    from ccnn_torch.mechanisms.machines.tripod import Tripod as Tripod
     from ccnn_torch.mechanisms.mechanism import InverseKinematics as InverseKinematics, Mechanism as Mechanism
     from ccnn_torch.mechanisms.pose import PoseError as PoseError
     from ccnn_torch.mechanisms.registry import (
@@ -43,11 +42,10 @@ else:
             "frames.judge": "judge_frames",
             "machines.delta": "Delta DeltaLinear",
             "machines.five_bar": "FiveBar",
-            "machines.machine_tool": "MachineTool",
             "machines.overconstrained": "Overconstrained2Dof",
             "machines.serial": "SerialArm",
             "machines.stewart": "Stewart",
-            "machines.tripod": "Tripod",
+            "machines.sliders": "MachineTool Tripod",
             "mechanism": "InverseKinematics Mechanism",
             "pose": "PoseError",
             "registry": "load_mechanism mechanism_from_description mechanism_of_file",

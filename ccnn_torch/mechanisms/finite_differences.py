@@ -43,7 +43,7 @@ def central_slope(
     lost = ~torch.isfinite(found).all(-1)
     if bool(lost.any()):
         here = pose(point)
-        _refuse_islands(machine, ends, lost.all(0) & torch.isfinite(here).all(-1), places)
+        _check_neighbours(machine, ends, lost.all(0) & torch.isfinite(here).all(-1), places)
         ends = torch.where(lost[..., None], point, ends)
         found = torch.where(lost[..., None], here, found)
     way = (ends[0] - ends[1]).sum(-1, keepdim=True)
@@ -55,7 +55,7 @@ def central_slope(
     return (change / torch.where(way == 0, 1.0, way)).movedim(0, -1)
 
 
-def _refuse_islands(machine: BlackBox, ends: Tensor, nowhere: Tensor, places: Sequence[str]) -> None:
+def _check_neighbours(machine: BlackBox, ends: Tensor, nowhere: Tensor, places: Sequence[str]) -> None:
     if not bool(nowhere.any()):
         return
     k, *row = torch.nonzero(nowhere)[0].tolist()

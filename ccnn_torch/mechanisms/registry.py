@@ -19,11 +19,10 @@ from ccnn_torch.mechanisms.files.mechanism_file import MechanismFile, read_mecha
 from ccnn_torch.mechanisms.frames.framed import Framed
 from ccnn_torch.mechanisms.machines.delta import Delta, DeltaLinear
 from ccnn_torch.mechanisms.machines.five_bar import FiveBar
-from ccnn_torch.mechanisms.machines.machine_tool import MachineTool
 from ccnn_torch.mechanisms.machines.overconstrained import Overconstrained2Dof
 from ccnn_torch.mechanisms.machines.serial import SerialArm
+from ccnn_torch.mechanisms.machines.sliders import MachineTool, Tripod
 from ccnn_torch.mechanisms.machines.stewart import Stewart
-from ccnn_torch.mechanisms.machines.tripod import Tripod
 from ccnn_torch.mechanisms.mechanism import Mechanism
 from ccnn_torch.mechanisms.simulators.black_box import BlackBox
 from ccnn_torch.mechanisms.simulators.simulator import Simulator

@@ -52,7 +52,7 @@ def choose_covariates(
     for name in chosen:
         coordinate = Coordinate(name, _si_unit(name, table, pose))
         values = table.column(name, coordinate.unit)
-        _refuse_extreme_cell(values, name, table)
+        _check_cell_sizes(values, name, table)
         if np.ptp(values) <= _SAME * max(np.abs(values).max(), 1.0):
             notes.append(f"covariate '{name}' is constant ({table.raw(name)[0]:g} {table.units[name]}) and was dropped")
         else:
@@ -68,7 +68,7 @@ def choose_covariates(
     return tuple(covariates), notes
 
 
-def _refuse_extreme_cell(values: NDArray[np.float64], name: str, table: Table) -> None:
+def _check_cell_sizes(values: NDArray[np.float64], name: str, table: Table) -> None:
     """Refuse a column with one extreme outlier: scaled to it, all other cells are nearly equal."""
     if len(values) < 3:
         return

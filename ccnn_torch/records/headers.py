@@ -279,7 +279,7 @@ def check_joints(table: Table, joints: Sequence[Coordinate]) -> None:
         )
 
 
-def refuse_lost_orientation(table: Table, mechanism: HasCoordinates, unused: Iterable[str]) -> None:
+def check_orientation(table: Table, mechanism: HasCoordinates, unused: Iterable[str]) -> None:
     """Refuse columns that look like an orientation and would not be used, where none was found.
 
     Raises:

@@ -18,8 +18,8 @@ from ccnn_torch.records.covariates import DEFAULT_COVARIATES as DEFAULT_COVARIAT
 from ccnn_torch.records.headers import (
     HasCoordinates,
     check_joints,
+    check_orientation,
     read_pose as read_pose,
-    refuse_lost_orientation,
     stack_columns as stack_columns,
     unused_joints,
 )
@@ -205,7 +205,7 @@ def load_records(
     chosen, notes = choose_covariates(table, mechanism.joints, measured, covariates)
     unused = [name for name in table.names if name not in used | {c.name for c in chosen}]
     if orientation == "none":
-        refuse_lost_orientation(table, mechanism, unused)
+        check_orientation(table, mechanism, unused)
     if learns:
         _check_enough(table, len(mechanism.joints) + len(chosen))
     still = [joint.name for k, joint in enumerate(mechanism.joints) if np.ptp(joints[:, k]) == 0]

@@ -56,7 +56,7 @@ def bare_header(line: str) -> str:
     return _MARK.sub("", line, count=1) if _MARK.match(line) else line
 
 
-def refuse_title(file: str, rows: Sequence[Sequence[str]], lines: Sequence[int]) -> None:
+def check_no_title(file: str, rows: Sequence[Sequence[str]], lines: Sequence[int]) -> None:
     """Refuse a first row that is a title: a row of texts that fills more cells follows, or it has one cell alone.
 
     Args:
@@ -153,7 +153,7 @@ def _csv_parts(file: str, rows: int | None, columns: Mapping[str, str] | None) -
     number, first = head[0][0], bare_header(head[0][1])
     separator = max(SEPARATORS, key=first.count)
     near = [first, *(line for _, line in head[1:20])]
-    refuse_title(file, [row.split(max(SEPARATORS, key=row.count)) for row in near], [n for n, _ in head])
+    check_no_title(file, [row.split(max(SEPARATORS, key=row.count)) for row in near], [n for n, _ in head])
     header = read_header(next(_split([first], separator, file, [number])), file, columns, number)
     comma = separator != "," and _has_decimal_commas(text, number, separator)
 
@@ -222,7 +222,7 @@ def _workbook_parts(file: str, rows: int | None, columns: Mapping[str, str] | No
     if found is None:
         raise InputError(f"{file}: no sheet begins with a header, a row of texts such as q1[rad] and x[mm]")
     title, filled = found
-    refuse_title(file, [["" if c is None else str(c) for c in row] for _, row in filled], [n for n, _ in filled])
+    check_no_title(file, [["" if c is None else str(c) for c in row] for _, row in filled], [n for n, _ in filled])
     width = max(k + 1 for _, row in filled for k, cell in enumerate(row) if _filled(cell))
     where = f"{file} (sheet {title})"
     header = read_header([str(cell or "") for cell in _fit(filled[0][1], width)], where, columns)

@@ -107,7 +107,7 @@ def _lock(file: int) -> None:
 
 
 @contextmanager
-def kept_for(command: str) -> Iterator[None]:
+def resume_hint(command: str) -> Iterator[None]:
     """If a file cannot be written, add to the error the command that resumes the work."""
     try:
         yield
@@ -115,7 +115,7 @@ def kept_for(command: str) -> Iterator[None]:
         raise WriteError(f"{problem}; what was computed is kept, and {command} resumes from it") from None
 
 
-def refuse_foreign(folder: Path, own: Collection[str]) -> None:
+def check_own_folder(folder: Path, own: Collection[str]) -> None:
     """Refuse a folder whose files are not those of the command that writes there.
 
     Args:
@@ -135,7 +135,7 @@ class RunFolder:
     """Paths inside one run folder. `results.json` is written last: a folder that has it is finished.
 
     Attributes:
-        facts: what the checkpoints are made with, as `facts_of` gives it.
+        facts: what the checkpoints are made with, as `fingerprint` gives it.
     """
 
     path: Path

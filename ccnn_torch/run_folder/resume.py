@@ -1,15 +1,16 @@
-"""The config and data that a run was started with, kept in its checkpoints; it can be resumed with these alone."""
+"""Jobs that turn a config into a folder; one that was stopped is finished with the same config and data alone."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from pydantic import BaseModel
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 from ccnn_torch.errors import InputError
+from ccnn_torch.report.screen import note
+from ccnn_torch.run_folder.folder import LOCK, RunFolder
 from ccnn_torch.training import load_checkpoint
 from ccnn_torch.version import __version__
 
@@ -18,14 +19,94 @@ _FREE = ("out", "save_models", "save_report", "engine", "max_bytes")
 _MOST = 3
 
 
-def facts_of(config: BaseModel, data: str | None = None) -> dict[str, Any]:
+class FolderConfig(Protocol):
+    """What a `FolderJob` needs of its config; a `JobConfig` with a name and a folder."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def out(self) -> str | None: ...
+    @classmethod
+    def from_file(cls, path: Path) -> Self: ...
+    def to_yaml(self, folder: Path) -> str: ...
+    def model_dump(self, *, mode: str) -> dict[str, Any]: ...
+
+
+_Config = TypeVar("_Config", bound=FolderConfig)
+_Data = TypeVar("_Data")
+
+
+@dataclass(frozen=True)
+class FolderJob(Generic[_Config, _Data]):
+    """A command that turns a config into a folder, and finishes one that was stopped.
+
+    Attributes:
+        command: as it is typed.
+        model: class of its config.
+        results: the file that is written last.
+        checkpoints: pattern of the files that hold the fingerprint of the config.
+        prepare: checks a config before a folder is made; gives it as it is run, and its data.
+        compute: fills a folder from config and data; then `quiet` and whether `tables` are shown.
+    """
+
+    command: str
+    model: type[_Config]
+    results: str
+    checkpoints: str
+    prepare: Callable[[_Config], tuple[_Config, _Data]]
+    compute: Callable[[_Config, _Data, RunFolder, bool, bool], None]
+
+    def start(self, config: _Config, quiet: bool = False, tables: bool = True) -> RunFolder:
+        """Fill a fresh folder.
+
+        Raises:
+            InputError: the config or its data cannot be used, or the folder is taken or in use.
+            WriteError: a file cannot be written; what was computed until then is kept.
+        """
+        config, data = self.prepare(config)
+        with RunFolder.fresh(config.out, config.name, f"{self.command} --resume") as folder:
+            folder.write("config.yaml", config.to_yaml(folder.path))
+            try:
+                self.compute(config, data, folder, quiet, tables)
+            except InputError:
+                # Nothing was computed: the next try may take the same name.
+                if {file.name for file in folder.path.rglob("*") if file.is_file()} <= {LOCK, folder.config.name}:
+                    folder.config.unlink(missing_ok=True)
+                raise
+        return folder
+
+    def resume(self, path: Path, quiet: bool = False, tables: bool = True) -> RunFolder:
+        """Finish what a folder holds, as if it was never stopped. What is finished stays as it is.
+
+        Raises:
+            InputError: the folder was not made by the command or is in use; its config, records or checkpoints changed.
+            WriteError: as `start`.
+        """
+        if (path / self.results).is_file():
+            note(f"{path} is finished; nothing to do", quiet)
+            return RunFolder(path)
+        with RunFolder.existing(path, self.command) as folder:
+            config = self.model.from_file(folder.config)
+            check_fingerprint(sorted(path.glob(self.checkpoints)), fingerprint(config), folder.config)
+            self.compute(*self.prepare(config), folder, quiet, tables)
+        return folder
+
+    def finish(self, config: _Config, quiet: bool = False, tables: bool = True) -> RunFolder:
+        """Resume the folder of a config where there is one, else start it."""
+        folder = RunFolder(Path(str(config.out)))
+        if folder.config.is_file():
+            return self.resume(folder.path, quiet, tables)
+        return self.start(config, quiet, tables)
+
+
+def fingerprint(config: FolderConfig, data: str | None = None) -> dict[str, Any]:
     """Version, keys of the config, and the hash of the data where it is known; JSON-able."""
     keys = {key: value for key, value in config.model_dump(mode="json").items() if key not in _FREE}
     facts = {"version": __version__, "config": _place_free(json.loads(json.dumps(keys)))}
     return facts if data is None else {**facts, "data": data}
 
 
-def refuse_changes(checkpoints: Iterable[Path], facts: Mapping[str, Any], config: Path) -> None:
+def check_fingerprint(checkpoints: Iterable[Path], facts: Mapping[str, Any], config: Path) -> None:
     """Compare facts with those in the checkpoints; what `facts` does not hold is not compared.
 
     Raises:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.coordinates import Parameter
-from ccnn_torch.effects import EFFECTS, OUTLIER, Acting, Coefficient, Effect, Situation, make_effect, tried
+from ccnn_torch.effects import EFFECTS, OUTLIER, Acting, Coefficient, Effect, Situation, make_effect, missing_on
 from ccnn_torch.errors import InputError
 from ccnn_torch.spelling import nearest
 from ccnn_torch.units import to_si
@@ -20,7 +20,7 @@ from ccnn_torch.units import to_si
 _ABSURD = 1000.0
 
 
-def refuse_impossible(name: str, effect: Effect, situation: Situation, values: Mapping[str, float]) -> None:
+def check_possible(name: str, effect: Effect, situation: Situation, values: Mapping[str, float]) -> None:
     """Refuse given parameters that no machine has.
 
     Args:
@@ -46,7 +46,7 @@ def refuse_impossible(name: str, effect: Effect, situation: Situation, values: M
             )
 
 
-def refuse_beyond_bounds(situation: Situation, acting: Sequence[Acting]) -> None:
+def check_bounds(situation: Situation, acting: Sequence[Acting]) -> None:
     """Refuse parameters of the machine that all effects together bring beyond their bounds.
 
     Raises:
@@ -146,7 +146,7 @@ def act(wanted: Wanted, situation: Situation, generator: torch.Generator) -> Act
     if wanted.name not in EFFECTS and nearest(wanted.name, [OUTLIER], 0.8):
         raise InputError(f"effects: '{wanted.name}' is no effect; did you mean '{OUTLIER}'?")
     effect = make_effect(wanted.name, situation.mechanism)
-    missing = tried(effect, situation)
+    missing = missing_on(effect, situation)
     if missing:
         raise InputError(f"--effect {wanted.name}: it needs {missing}")
     found, shapes = effect.coefficients(situation), effect.shapes(situation)
@@ -154,7 +154,7 @@ def act(wanted: Wanted, situation: Situation, generator: torch.Generator) -> Act
     size = values.pop(SIZE, 1.0)
     if not 0 <= size <= _LARGEST:
         raise InputError(f"--effect {wanted.name}: {SIZE} = {size:g}: give a factor from 0 to {_LARGEST:g}")
-    refuse_impossible(wanted.name, effect, situation, values)
+    check_possible(wanted.name, effect, situation, values)
     drawn = _drawn(found, generator) * size
     if any(c.name in values for c in found):
         drawn = torch.tensor([values.get(c.name, 0.0) for c in found], dtype=torch.float64)

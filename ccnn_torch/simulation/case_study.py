@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,10 +13,31 @@ from torch import Tensor
 
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, PoseError, load_mechanism
-from ccnn_torch.simulation.machines.realistic import RealisticMachine
+from ccnn_torch.simulation.realistic import RealisticMachine
 
 CASES = ("tripod", "machine_tool")
 VARIANTS = ("printed", "tabulated")
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A machine with known true behaviour.
+
+    Attributes:
+        pose: poses wanted, `r x s x p` [SI].
+        noise: what noise adds to the joint deviations as they are learned, `r x s x n` [SI].
+        noise_variance: its variance, `r x s x n` [SI²].
+        pose_errors: distance from the poses wanted to those that the machine reaches under a command `r x s x n` [SI],
+            `r x s` each: as it is, and without the scatter of the machine itself. A machine whose noise is all in the
+            measurement has none, and both are one.
+        unlearnable: part of the signal that no function of the inputs can follow, `r x s x n` [SI], or None.
+    """
+
+    pose: Tensor
+    noise: Tensor
+    noise_variance: Tensor
+    pose_errors: Callable[[Tensor], tuple[PoseError, PoseError]]
+    unlearnable: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -56,6 +77,12 @@ class CaseStudy:
         ideal = self.pose.expand(*command.shape[:-1], -1)
         reached = self.mechanism.forward_kinematics(command + self.learnable + self.unlearnable + noise, guess=ideal)
         return self.mechanism.pose_error(reached, ideal)
+
+    def simulated(self, noise: Tensor) -> Simulation:
+        """The case with the noise of each repeat, `r x s x n` [m], which is scatter of the machine itself."""
+        chirp = self.unlearnable.expand(noise.shape) if bool(self.unlearnable.any()) else None
+        pose, variance = self.pose.expand(len(noise), -1, -1), self.sigma.square().expand(noise.shape)
+        return Simulation(pose, noise, variance, lambda q: (self.pose_error(q, noise), self.pose_error(q)), chirp)
 
 
 def build_case(name: str, variant: str = "printed", order: Literal["raster", "shuffled"] = "raster") -> CaseStudy:
@@ -144,84 +171,10 @@ def _one_of(key: str, value: str, known: tuple[str, ...]) -> None:
         raise InputError(f"{key}={value!r} is unknown; write one of {', '.join(known)}")
 
 
-class Simulation(Protocol):
-    """A machine with known true behaviour.
-
-    Attributes:
-        pose: poses wanted, `r x s x p` [SI].
-        noise: what noise adds to the joint deviations as they are learned, `r x s x n` [SI].
-        noise_variance: its variance, `r x s x n` [SI²].
-        unlearnable: part of the signal that no function of the inputs can follow, `r x s x n` [SI], or None.
-    """
-
-    @property
-    def pose(self) -> Tensor: ...
-    @property
-    def noise(self) -> Tensor: ...
-    @property
-    def noise_variance(self) -> Tensor: ...
-    @property
-    def unlearnable(self) -> Tensor | None: ...
-
-    def pose_errors(self, command: Tensor) -> tuple[PoseError, PoseError]:
-        """Distance from the poses wanted to those that the machine reaches under a command.
-
-        Args:
-            command: `r x s x n` [SI].
-
-        Returns:
-            `r x s` each: as it is, and without the scatter of the machine itself. A machine whose noise is all in the
-            measurement has none, and both are one.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class CaseSimulation:
-    """A case study of paper 000: its noise is scatter of the machine itself."""
-
-    case: CaseStudy
-    noise: Tensor
-
-    @property
-    def pose(self) -> Tensor:
-        return self.case.pose.expand(len(self.noise), -1, -1)
-
-    @property
-    def noise_variance(self) -> Tensor:
-        return self.case.sigma.square().expand(self.noise.shape)
-
-    @property
-    def unlearnable(self) -> Tensor | None:
-        chirp = self.case.unlearnable
-        return chirp.expand(self.noise.shape) if bool(chirp.any()) else None
-
-    def pose_errors(self, command: Tensor) -> tuple[PoseError, PoseError]:
-        return self.case.pose_error(command, self.noise), self.case.pose_error(command)
-
-
-@dataclass(frozen=True)
-class RealisticSimulation:
-    """A machine as built: it repeats exactly, and the noise is that of the measurement."""
-
-    machine: RealisticMachine
-    noise: Tensor
-    noise_variance: Tensor
-    unlearnable: Tensor | None = None
-
-    @property
-    def pose(self) -> Tensor:
-        return self.machine.pose
-
-    def pose_errors(self, command: Tensor) -> tuple[PoseError, PoseError]:
-        error = self.machine.pose_error(command)
-        return error, error
-
-
 def simulate_realistic(
     machine: RealisticMachine, deviations: Callable[[Tensor], Tensor], measured: Tensor
-) -> RealisticSimulation:
-    """Propagate the noise of the measurement to the joints by the pseudoerror.
+) -> Simulation:
+    """A machine as built, which repeats exactly: propagate the noise of the measurement to the joints.
 
     Args:
         machine: the rows.
@@ -231,4 +184,5 @@ def simulate_realistic(
     true = deviations(machine.reached)
     # One degree of freedom of the pose at a time: the noise is far below the curvature of the kinematics.
     parts = [(deviations(machine.shifted(i)) - true).square() for i in range(len(machine.sd))]
-    return RealisticSimulation(machine, measured - true, torch.stack(parts).sum(0))
+    variance = torch.stack(parts).sum(0)
+    return Simulation(machine.pose, measured - true, variance, lambda command: (machine.pose_error(command),) * 2)

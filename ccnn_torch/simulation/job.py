@@ -20,7 +20,7 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.numerics.rotations import matrix_to_rotation_vector, rotation_vector_to_matrix
 from ccnn_torch.records import name_lines, write_table
 from ccnn_torch.report.table import Table
-from ccnn_torch.simulation.acting import Injected, Wanted, act, read_wanted, refuse_beyond_bounds, units_of
+from ccnn_torch.simulation.acting import Injected, Wanted, act, check_bounds, read_wanted, units_of
 from ccnn_torch.simulation.config import SimulateConfig
 
 # Between two moves; rows so far apart are not taken for one trajectory [s].
@@ -202,7 +202,7 @@ def simulate_records(
         gravity = torch.tensor(config.gravity, dtype=torch.float64)
     situation = Situation(machine, joints, _kept(columns, config.covariates), gravity)
     acting = [act(w, situation, generator) for w in wanted if not w.outlier]
-    refuse_beyond_bounds(situation, acting)
+    check_bounds(situation, acting)
     frame = reached(situation, acting)
     lost = ~torch.isfinite(frame).all(-1)
     for _ in range(_TRIES if not moving and 2 * int(lost.sum()) <= rows else 0):

@@ -13,7 +13,7 @@ from ccnn_torch.calibration.job import finish_runs
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.files.write import sweep
 from ccnn_torch.report.results.run import RunResults
-from ccnn_torch.run_folder.folder import RunFolder, kept_for, locked
+from ccnn_torch.run_folder.folder import RunFolder, locked, resume_hint
 
 _Written = TypeVar("_Written")
 
@@ -64,7 +64,7 @@ def run_study(study: Study, write: Write[_Written], quiet: bool = False) -> _Wri
             for name, config in study.runs.items()
             if name not in failed
         }
-        with kept_for("the same command"):
+        with resume_hint("the same command"):
             return write(study, results, {name: problem.text for name, problem in failed.items()})
 
 

@@ -12,8 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from ccnn_torch.calibration.config import RunConfig
-from ccnn_torch.config.overrides import apply_overrides, resolve_paths
-from ccnn_torch.config.tree import validated
+from ccnn_torch.config.tree import apply_overrides, resolve_paths, validated
 from ccnn_torch.engine import Engine
 from ccnn_torch.errors import InputError
 from ccnn_torch.files.yaml_file import read_yaml

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ccnn_torch.effects import Acting, Effect, Situation, default_gravity, make_effect, owned, reached, signature
 from ccnn_torch.effects.covariates import draw_covariates
-from ccnn_torch.effects.registry import OwnEffect, label_of, tried
+from ccnn_torch.effects.registry import OwnEffect, label_of, missing_on
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.motion.axis import Drive, simulate_axes
@@ -57,7 +57,7 @@ def _made(effect: str | Callable[[], Effect]) -> OwnEffect:
 
 def _check(made: OwnEffect, machine: Mechanism, seed: int) -> None:
     situation = _situation(machine, seed)
-    lacks = tried(made, situation)
+    lacks = missing_on(made, situation)
     _require(not lacks, made, f"finds nothing to act on in mechanism '{machine.name}': {lacks}")
     _check_needs(made, situation)
     _check_basis(made, situation)

@@ -38,7 +38,7 @@ def copied(folder: Path, tmp_path: Path) -> Path:
     return tmp_path / "copy"
 
 
-def facts_of(folder: Path) -> dict[str, Any]:
+def fingerprint(folder: Path) -> dict[str, Any]:
     with safe_open(folder / "model.safetensors", framework="pt") as file:
         found: dict[str, Any] = json.loads(file.metadata()["ccnn_torch"])
     return found
@@ -92,7 +92,7 @@ def forge(folder: Path, value: float, replaced: list[Any] | None = None, outputs
     graph = helper.make_graph([*nodes.values()], "forged", [tensor("joints", TensorProto.DOUBLE, 3)], declared)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20), helper.make_opsetid("evil", 1)])
     model.ir_version = 10
-    facts = facts_of(folder)
+    facts = fingerprint(folder)
     model.metadata_props.add(key="ccnn_torch", value=to_json(facts))
     path = folder / "forged.onnx"
     path.write_bytes(model.SerializeToString())
@@ -181,7 +181,7 @@ def test_a_graph_that_takes_one_row_and_no_two(copied: Path) -> None:
     graph = onnx.load(path)
     graph.graph.output.append(helper.make_tensor_value_info("again", TensorProto.DOUBLE, ["batch", 3]))
     path.write_bytes(graph.SerializeToString())
-    vouch(path, facts_of(copied))
+    vouch(path, fingerprint(copied))
     model = load_model(path)
     assert not model(JOINTS[:1])["fallback"].any()
     with pytest.warns(FallbackWarning):
@@ -204,7 +204,7 @@ def test_a_flipped_bit_in_a_graph_gives_a_sentence_or_commands_within_the_limit(
     bad = bytearray(good)
     bad[int(place * len(bad))] ^= 1 << bit
     path.write_bytes(bad)
-    vouch(path, facts_of(copied))
+    vouch(path, fingerprint(copied))
     try:
         model = load_model(path)
         limit = np.array([model.facts["limits"][c.name]["limit"] for c in model.joints])
@@ -278,7 +278,7 @@ def test_graphs_that_reach_out_are_refused(copied: Path, change: Callable[[Any],
     model = onnx.load(path)
     change(model.graph)
     path.write_bytes(model.SerializeToString())
-    vouch(path, facts_of(copied))
+    vouch(path, fingerprint(copied))
     with pytest.raises(ModelFileError, match=sentence):
         load_model(path)
 
@@ -305,7 +305,7 @@ def test_the_command_line_writes_safe_rows_and_says_so(copied: Path, tmp_path: P
     del model.graph.node[:]
     model.graph.node.extend(order)
     path.write_bytes(model.SerializeToString())
-    vouch(path, facts_of(copied))
+    vouch(path, fingerprint(copied))
     joints = np.array([[1.0, 1.0, 1.0], [0.9, 1.0, 1.0], [0.94, 1.0, 1.0], [0.99, 1.0, 1.0]])
     program, out = tmp_path / "in.csv", tmp_path / "out.csv"
     write_table(program, {f"q{k + 1}[m]": joints[:, k] for k in range(3)})
@@ -336,7 +336,7 @@ def forge_master(folder: Path, facts: dict[str, Any], change: Callable[[dict[str
 
 def test_a_master_of_weights_that_overflow_falls_back_in_calls_and_in_the_hook(copied: Path) -> None:
     path = forge_master(
-        copied, facts_of(copied), lambda t: t.update({k: v * float("nan") for k, v in t.items() if "weights" in k})
+        copied, fingerprint(copied), lambda t: t.update({k: v * float("nan") for k, v in t.items() if "weights" in k})
     )
     model, tripod = load_model(path), load_mechanism("tripod")
     with pytest.warns(FallbackWarning):
@@ -350,7 +350,7 @@ def test_a_master_of_weights_that_overflow_falls_back_in_calls_and_in_the_hook(c
 
 
 def test_a_master_whose_limits_are_not_those_of_its_metadata(copied: Path) -> None:
-    path = forge_master(copied, facts_of(copied), lambda t: t.update(limit=t["limit"] * 1e6))
+    path = forge_master(copied, fingerprint(copied), lambda t: t.update(limit=t["limit"] * 1e6))
     with pytest.raises(ModelFileError, match="its limits are not those of its metadata"):
         load_model(path)
 
@@ -366,7 +366,7 @@ def test_a_master_whose_limits_are_not_those_of_its_metadata(copied: Path) -> No
     ],
 )
 def test_tensors_that_do_not_fit(copied: Path, change: Callable[[dict[str, torch.Tensor]], None]) -> None:
-    path = forge_master(copied, facts_of(copied), change)
+    path = forge_master(copied, fingerprint(copied), change)
     with pytest.raises(ModelFileError, match=r"tensors are not those|cannot be run"):
         load_model(path)
 
@@ -395,7 +395,7 @@ def test_an_integer_of_many_digits_is_a_number_or_refused(copied: Path, number: 
         lambda facts: next(iter(facts["limits"].values())).update(safe_correction=number),
         lambda facts: facts["domain"]["principal"]["low"].__setitem__(0, number),
     ):
-        facts = facts_of(copied)
+        facts = fingerprint(copied)
         change(facts)
         refused_or_bounded(copied, facts, "limit")
 
@@ -413,7 +413,7 @@ ANYTHING = st.recursive(
 def test_any_fact_replaced_by_anything_gives_a_sentence_or_finite_commands(
     copied: Path, key: str, deep: bool, draw: Any, value: Any
 ) -> None:
-    facts = facts_of(copied)
+    facts = fingerprint(copied)
     place, last = facts, key
     while deep and isinstance(place[last], dict | list) and place[last]:
         place = place[last]
@@ -434,7 +434,7 @@ def with_machine(tmp_path: Path) -> Path:
 @given(draw=st.randoms(use_true_random=False), value=ANYTHING)
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_fact_of_a_machine_replaced_by_anything(with_machine: Path, draw: Any, value: Any) -> None:
-    facts = facts_of(with_machine)
+    facts = fingerprint(with_machine)
     place: Any = facts
     last: Any = "machine"
     # The mechanism's own keys are read as those of a mechanism file, which has tests of its own.
@@ -447,7 +447,7 @@ def test_any_fact_of_a_machine_replaced_by_anything(with_machine: Path, draw: An
 
 @pytest.mark.parametrize("place", [("newton",), ("degree",), ("effects", "acting", 0, 1), ("effects", "acting", 0, 2)])
 def test_a_machine_that_would_compute_for_ever_is_refused(with_machine: Path, place: tuple[str | int, ...]) -> None:
-    part: Any = (facts := facts_of(with_machine))["machine"]
+    part: Any = (facts := fingerprint(with_machine))["machine"]
     for key in place[:-1]:
         part = part[key]
     part[place[-1]] = 10**9
@@ -478,7 +478,7 @@ def test_a_master_that_names_code_does_not_run_it(copied: Path, tmp_path: Path) 
             "rule": {},
         }
         for part in ({"machine": machine}, {"effects": effects}):
-            path = forge_master(copied, facts_of(copied) | part, lambda tensors: None)
+            path = forge_master(copied, fingerprint(copied) | part, lambda tensors: None)
             with pytest.raises(ModelFileError, match=r"names Python code, .*own\.py:Own, which would run.*=True"):
                 load_model(path)
     assert not (tmp_path / "ran").exists()

@@ -10,7 +10,7 @@ import ccnn_torch
 from ccnn_torch.errors import InputError, MethodFailedError
 from ccnn_torch.identification.config import IdentifyConfig
 from ccnn_torch.identification.identify import Identification
-from ccnn_torch.identification.job import start_identification
+from ccnn_torch.identification.job import IDENTIFY
 from ccnn_torch.mechanisms import Framed, load_mechanism
 from ccnn_torch.records import write_table
 
@@ -98,7 +98,7 @@ def test_a_search_that_did_not_converge_identifies_nothing(tmp_path: Path, capsy
         out=str(tmp_path / "out"),
     )
     with pytest.raises(MethodFailedError, match=r"lm did not converge, so nothing is identified.*starts=10"):
-        start_identification(config)
+        IDENTIFY.start(config)
     results = json.loads((tmp_path / "out" / "identified.json").read_text())
     free = [p for p in results["parameters"].values() if p["free"]]
     assert free and all(not p["identifiable"] and p["sd"] is None for p in free)
@@ -141,7 +141,7 @@ def test_an_error_that_stays_is_doubted_and_the_interval_sentence_goes(tmp_path:
         save_report=False,
         out=str(tmp_path / "out"),
     )
-    start_identification(config, quiet=True)
+    IDENTIFY.start(config, quiet=True)
     text = (tmp_path / "out" / "identified.md").read_text()
     assert "% of what it was: what was identified explains little of it." in text.split("\n\n")[2]
     assert "which these do not" in text and "95 %" not in text

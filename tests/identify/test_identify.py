@@ -16,8 +16,7 @@ from ccnn_torch.identification.measured.kinematics import make_kinematics
 from ccnn_torch.identification.page.tables import identified_tables
 from ccnn_torch.mechanisms import Framed, SerialArm, load_mechanism
 from ccnn_torch.records import write_table
-from ccnn_torch.simulation.instrument import PointsView
-from ccnn_torch.simulation.places import Places
+from ccnn_torch.simulation.places import Places, PointsView
 
 FIVE_BAR: dict[str, Any] = {
     "machines": 60,

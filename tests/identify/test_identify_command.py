@@ -14,7 +14,7 @@ from frozen import frozen
 from ccnn_torch.compensation import load_compensation
 from ccnn_torch.errors import InputError, ModelFileError
 from ccnn_torch.identification.config import IdentifyConfig
-from ccnn_torch.identification.job import resume_identification, start_identification
+from ccnn_torch.identification.job import IDENTIFY
 from ccnn_torch.identification.page.report import write_identified_report
 from ccnn_torch.mechanisms import load_mechanism
 from ccnn_torch.records import read_table, write_table
@@ -33,7 +33,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished folder of `ccnn identify`."""
     path = tmp_path_factory.mktemp("identify")
     (path / "bar.yaml").write_text(CONFIG)
-    return start_identification(IdentifyConfig.from_file(path / "bar.yaml", [f"out={path / 'out'}"]), quiet=True)
+    return IDENTIFY.start(IdentifyConfig.from_file(path / "bar.yaml", [f"out={path / 'out'}"]), quiet=True).path
 
 
 def test_the_folder_has_everything(folder: Path) -> None:
@@ -69,14 +69,14 @@ def test_an_interrupted_one_goes_on_behind_the_last_method(folder: Path, tmp_pat
     config = (stopped / "config.yaml").read_text()
     (stopped / "config.yaml").write_text(config.replace("save_report: true", "save_report: false"))
     kept = (stopped / "methods" / "lm.safetensors").read_bytes()
-    resume_identification(stopped, quiet=True)
+    IDENTIFY.resume(stopped, quiet=True)
     assert (stopped / "methods" / "lm.safetensors").read_bytes() == kept
     first, second = (json.loads((f / "identified.json").read_text()) for f in (folder, stopped))
     for results in (first, second):
         results["methods"]["tikhonov"].pop("seconds")
     assert first == second
     finished = (stopped / "identified.json").read_bytes()
-    resume_identification(stopped, quiet=True)
+    IDENTIFY.resume(stopped, quiet=True)
     assert (stopped / "identified.json").read_bytes() == finished
 
 
@@ -87,20 +87,20 @@ def test_changed_data_and_damaged_files_are_refused(folder: Path, tmp_path: Path
     config = (other / "config.yaml").read_text()
     (other / "config.yaml").write_text(config.replace("seed: 0", "seed: 1"))
     with pytest.raises(InputError, match=r"config\.yaml: seed is 1, the checkpoint was made with seed 0"):
-        resume_identification(other, quiet=True)
+        IDENTIFY.resume(other, quiet=True)
     (other / "config.yaml").write_text(config)
     (other / "methods" / "lm.safetensors").write_bytes(b"12345678")
     with pytest.raises(InputError, match=r"lm\.safetensors: this checkpoint cannot be read"):
-        resume_identification(other, quiet=True)
+        IDENTIFY.resume(other, quiet=True)
     with pytest.raises(InputError, match="nothing to resume"):
-        resume_identification(tmp_path / "empty", quiet=True)
+        IDENTIFY.resume(tmp_path / "empty", quiet=True)
 
 
 def test_a_folder_whose_data_cannot_be_used_is_free_again(tmp_path: Path) -> None:
     (tmp_path / "bar.yaml").write_text("mechanism: five_bar\nsimulate: {poses: 2}\n")
     config = IdentifyConfig.from_file(tmp_path / "bar.yaml", [f"out={tmp_path / 'out'}"])
     with pytest.raises(InputError, match="cannot determine"):
-        start_identification(config, quiet=True)
+        IDENTIFY.start(config, quiet=True)
     assert not (tmp_path / "out").exists()
 
 

@@ -27,8 +27,8 @@ from ccnn_torch.mechanisms import Mechanism, SerialArm, load_mechanism
 from ccnn_torch.pseudoerror import Pseudoerror, joint_deviations
 from ccnn_torch.records import Records, check_rows, load_records
 from ccnn_torch.records.splits import Column, Split
-from ccnn_torch.simulation.case_study import CaseSimulation, Simulation, build_case, simulate_realistic
-from ccnn_torch.simulation.machines.realistic import build_machine
+from ccnn_torch.simulation.case_study import Simulation, build_case, simulate_realistic
+from ccnn_torch.simulation.realistic import build_machine
 
 # Of the realistic machines.
 _MOST_JOINTS = 6
@@ -160,7 +160,7 @@ def _from_case(config: RunConfig, seeds: list[int]) -> Prepared:
         total=by_repeat(deviations.deviation, seeds),
         dataset=dataset_of(mechanism, case.joints, covariates, deviations, splits, seeds),
         data_hash=_hash(case.joints, covariates, pose),
-        simulation=CaseSimulation(case, noise),
+        simulation=case.simulated(noise),
         notes=notes,
     )
 

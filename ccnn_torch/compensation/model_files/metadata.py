@@ -28,7 +28,7 @@ _REQUIRED = ("mechanism", "metrics", "data_sha256", "seed")
 _PACKAGES = ("torch", "onnx", "onnxruntime", "safetensors", "numpy")
 
 
-def facts_of(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, Any]:
+def fingerprint(compensator: Compensator, fields: Mapping[str, Any]) -> dict[str, Any]:
     """Everything a reader of the model needs beside its tensors; equal for equal model and fields.
 
     Args:

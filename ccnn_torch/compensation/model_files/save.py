@@ -12,7 +12,7 @@ from safetensors.torch import save
 
 from ccnn_torch.compensation.compensator import Compensator
 from ccnn_torch.compensation.export.export import export_float32, export_onnx
-from ccnn_torch.compensation.model_files.metadata import OPTIONAL, facts_of, to_json
+from ccnn_torch.compensation.model_files.metadata import OPTIONAL, fingerprint, to_json
 from ccnn_torch.compensation.model_files.onnx_session import METADATA_KEY
 from ccnn_torch.errors import MethodFailedError
 from ccnn_torch.files.write import write_whole
@@ -68,7 +68,7 @@ def model_contents(
     compensator: Compensator, fields: Mapping[str, Any], method: str = "model", forms: Collection[str] = FORMS
 ) -> dict[str, tuple[str, bytes | str]]:
     """Names and contents of what `save_model` writes, by what they are; arguments and errors as there."""
-    facts = facts_of(compensator, fields)
+    facts = fingerprint(compensator, fields)
     text = to_json(facts)
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in compensator.state_dict().items()}
     contents = {"safetensors": save(tensors, metadata={METADATA_KEY: text})}

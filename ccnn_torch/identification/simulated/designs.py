@@ -13,9 +13,7 @@ from ccnn_torch.identification.measured.kinematics import Kinematics
 from ccnn_torch.identification.measured.measured import Measured, Rows
 from ccnn_torch.identification.solve import pieces_of
 from ccnn_torch.planning import choose_poses
-from ccnn_torch.simulation.instrument import Instrument
-from ccnn_torch.simulation.places import Places
-from ccnn_torch.simulation.random_numbers import generator_of
+from ccnn_torch.simulation.places import Instrument, Places, generator_of
 
 MAX_CONDITION = 50.0
 """Of the Jacobian at a planned pose."""

@@ -16,9 +16,7 @@ from ccnn_torch.identification.measured.kinematics import make_kinematics
 from ccnn_torch.identification.measured.measured import Measured, Rows
 from ccnn_torch.identification.simulated.designs import choose_places, plan_places
 from ccnn_torch.mechanisms import Mechanism
-from ccnn_torch.simulation.instrument import make_instrument
-from ccnn_torch.simulation.places import Places
-from ccnn_torch.simulation.random_numbers import generator_of, normal_draws
+from ccnn_torch.simulation.places import Places, generator_of, make_instrument, normal_draws
 
 # Streams of random numbers of a machine, so that more poses do not change its errors.
 _ERRORS, _ROWS, _TEST, _PLACES, _LEGS = 0, 1, 2, 3, 10

@@ -235,7 +235,7 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
         if link is not None and link not in known:
             raise InputError(f"{path}: has no link '{link}'; it has {', '.join(known)}")
     if base is None:
-        _refuse_pieces(path, known, joints)
+        _check_one_piece(path, known, joints)
     if tip is None:
         tips = [link for link in known if link in parent_joint and link not in parents]
         if len(tips) != 1:
@@ -255,7 +255,7 @@ def _chain(path: str, root: Element, base: str | None, tip: str | None) -> list[
     return chain[::-1]
 
 
-def _refuse_pieces(path: str, known: list[str], joints: list[Element]) -> None:
+def _check_one_piece(path: str, known: list[str], joints: list[Element]) -> None:
     """Refuse links that hang in several trees with joints that move: the joint between them is missing."""
     top = {_link(path, j, "child"): _link(path, j, "parent") for j in joints}
     # Each time twice as far up; one link at a time takes a minute for a hostile file.

@@ -341,7 +341,7 @@ class MujocoMachine:
             moving = moving[self._speed(state[moving]) > self.still]
             if len(moving) == 0:
                 break
-        self._refuse_moving(commands, state)
+        self._check_at_rest(commands, state)
         return self._read_poses(models, state)
 
     def _control(self, commands: Array, loads: Array) -> Array:
@@ -373,7 +373,7 @@ class MujocoMachine:
         speed: Array = np.abs(state[:, start : start + self.model.nv]).max(-1, initial=0.0)
         return speed
 
-    def _refuse_moving(self, commands: Array, state: Array) -> None:
+    def _check_at_rest(self, commands: Array, state: Array) -> None:
         speed = np.nan_to_num(self._speed(state), nan=np.inf)
         worst = int(speed.argmax())
         if speed[worst] > _MOVING:

@@ -18,7 +18,7 @@ from ccnn_torch.mechanisms import Mechanism, load_mechanism
 from ccnn_torch.records import Records, load_records
 from ccnn_torch.report.json_files import read_json, write_json
 from ccnn_torch.report.screen import note, say_place, stdout
-from ccnn_torch.run_folder.folder import kept_for, locked
+from ccnn_torch.run_folder.folder import locked, resume_hint
 from ccnn_validation.blind.folder import BlindFolder
 from ccnn_validation.blind.machines import MACHINES
 from ccnn_validation.blind.plan import KINDS, plan_cases
@@ -83,7 +83,7 @@ def run_blind_check(
     plan_cases(cases, seed, machines, kinds)
     folder = BlindFolder(Path(out).absolute())
     settings = {"cases": cases, "seed": seed, "machines": list(machines), "kinds": list(kinds)}
-    with locked(folder.path), kept_for("the same command"):
+    with locked(folder.path), resume_hint("the same command"):
         sweep(folder.path)
         return _checked(folder, settings, diagnose, engine, quiet)
 

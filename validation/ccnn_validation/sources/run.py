@@ -25,7 +25,7 @@ from ccnn_torch.records import load_records, write_table
 from ccnn_torch.report.json_files import read_json, write_json
 from ccnn_torch.report.screen import note, say_place, stdout
 from ccnn_torch.report.table import print_table
-from ccnn_torch.run_folder.folder import kept_for, locked
+from ccnn_torch.run_folder.folder import locked, resume_hint
 from ccnn_validation.sources.case import Source, SourceCase
 from ccnn_validation.sources.judge import judged
 from ccnn_validation.sources.report import source_tables, write_source
@@ -68,7 +68,7 @@ def run_source(
         raise InputError(f"--cases: generate at least 1 case, not {cases}")
     seeds = range(seed, seed + -(-cases // len(source.FAMILIES)))
     out = out.absolute()
-    with locked(out), kept_for("the same command"):
+    with locked(out), resume_hint("the same command"):
         tasks = [
             (name, family, number, out / f"{family}-{number}.json") for number in seeds for family in source.FAMILIES
         ]

@@ -1,4 +1,4 @@
-"""`ccnn new`: a first config for records, with comments on what was guessed."""
+"""A commented config to start from, for a table of measurements whose columns are recognised."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run jobs that write a result file each, wherever the engine has its processes.
+"""Where jobs run: in this process, in processes of this machine, or on a Dask cluster.
 
 A job is done when its result file is there, and by nothing else: what a worker took with it, and what a scheduler
 forgot, is run again. Every job runs with one thread of torch in every engine, since sums in another order have other
@@ -7,17 +7,77 @@ last digits: the figures are then the same, bit for bit.
 
 from __future__ import annotations
 
+import importlib
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import torch
+from pydantic import AfterValidator
 
-from ccnn_torch.engine.engine import open_engine
 from ccnn_torch.errors import CcnnError, InputError
+
+_NAMES = ("local", "processes", "dask")
+_ADDRESS = re.compile(r"(tcp|tls)://.+:\d+")
+# Seconds to wait for a scheduler that is not there, as one that is started again.
+_PATIENCE = 60
+
+
+def check_engine(engine: str) -> str:
+    """The name itself.
+
+    Raises:
+        ValueError: it names no engine.
+    """
+    if engine not in _NAMES and not _ADDRESS.fullmatch(engine):
+        raise ValueError(f"is '{engine}'; write {', '.join(_NAMES)}, or a scheduler's address as tcp://HOST:8786")
+    return engine
+
+
+Engine = Annotated[str, AfterValidator(check_engine)]
+
+
+@contextmanager
+def open_engine(engine: str) -> Iterator[Executor]:
+    """An executor of an engine other than `local`; it is closed at the end, and what runs there is stopped.
+
+    Raises:
+        InputError: joblib or Dask is not installed, or its scheduler does not answer.
+    """
+    if engine == "processes":
+        # Fresh processes, which inherit no threads; as many as this process may use processors.
+        pool = _needed("joblib.externals.loky", engine).ProcessPoolExecutor(_needed("joblib", engine).cpu_count())
+        try:
+            yield pool
+        finally:
+            pool.shutdown(kill_workers=True)
+        return
+    distributed = _needed("distributed", engine)
+    if engine == "dask":
+        cluster = distributed.LocalCluster(threads_per_worker=1, dashboard_address=None)
+        with cluster, distributed.Client(cluster, set_as_default=False) as client:
+            yield client.get_executor(pure=False)
+        return
+    try:
+        client = distributed.Client(engine, timeout=_PATIENCE, set_as_default=False)
+    except (OSError, TimeoutError) as problem:
+        raise InputError(f"engine={engine}: no scheduler answers there ({problem})") from None
+    with client:
+        yield client.get_executor(pure=False)
+
+
+def _needed(module: str, engine: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        package = module.partition(".")[0]
+        raise InputError(f"engine={engine} needs {package}: pip install 'ccnn-torch[cluster]'") from None
+
 
 # How often a job is tried whose worker is lost, and seconds between, twice as many each time.
 _TRIES, _PAUSE = 3, 2.0
