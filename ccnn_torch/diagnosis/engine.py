@@ -24,7 +24,7 @@ from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.search.analysis import Analysis, analyse
 from ccnn_torch.diagnosis.shrink.by_block import by_block
 from ccnn_torch.diagnosis.verdict.blocks import Blocks, blocks, in_order
-from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge, without_names
+from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge_rows, without_names
 from ccnn_torch.diagnosis.verdict.localisation import localise
 from ccnn_torch.diagnosis.verdict.text import lacking_text, shared_text, unseen_text, verdict_text
 from ccnn_torch.effects import (
@@ -115,7 +115,7 @@ def diagnose_rows(
         known = instrument or noise_of_repeats(situation, measured)
     analysis = analyse(situation, measured, usable, noise, None if known is None else known.sd)
     at_step("judging on held-out rows")
-    judgement = judge(analysis)
+    judgement = judge_rows(analysis)
     # What no column would bring into sight is no reason to record one.
     unseen = lacking | dict.fromkeys(analysis.idle, UNSHOWN)
     directions = {} if inferred else directions_of_order(every_row[0])
