@@ -35,7 +35,7 @@ def numeric_constants(path: Path) -> Iterator[tuple[str, str]]:
             continue
         text = ast.unparse(node.value)
         if re.fullmatch(
-            r"[\d\s.,()eE*/+-]+|(2 \* )?LOG_PRIOR|[\d\s(),/-]*_TAIL[\s/,\d_TAIL()-]*|math\.log\([\d.e-]+\)", text
+            r"[\d\s.,()eE*/+-]+|(2 \* )?OUTSIDE|[\d\s(),/-]*_TAIL[\s/,\d_TAIL()-]*|math\.log\([\d.e-]+\)", text
         ):
             parts = node.value.elts if isinstance(node.value, ast.Tuple) else [node.value]
             yield ", ".join(names), ", ".join(map(ast.unparse, parts))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,7 +24,7 @@ from ccnn_torch.diagnosis.result import Diagnosis
 from ccnn_torch.diagnosis.search.analysis import Analysis, analyse
 from ccnn_torch.diagnosis.shrink.by_block import by_block
 from ccnn_torch.diagnosis.verdict.blocks import Blocks, blocks, in_order
-from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge, without_names
+from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge_rows, without_names
 from ccnn_torch.diagnosis.verdict.localisation import localise
 from ccnn_torch.diagnosis.verdict.text import lacking_text, shared_text, unseen_text, verdict_text
 from ccnn_torch.effects import (
@@ -77,6 +77,33 @@ def _made(situation: Situation, effects: Sequence[Effect | str] | None) -> list[
     return [make_effect(e, situation.mechanism) if isinstance(e, str) else owned(e) for e in named]
 
 
+class _Judged(NamedTuple):
+    """Rows with a verdict.
+
+    Attributes:
+        rows: which of them are of the machine at all.
+        chosen: those evaluated, `t`.
+        copies: how many repeat another one.
+        effects: candidates.
+        lacking: those that the records cannot show, and what is missing.
+        known: the noise that was given, or that the records show.
+        analysis, judgement: of the rows evaluated.
+        made: the verdict on held-out rows.
+        inferred: covariates that were not recorded but follow from the order of the rows.
+    """
+
+    rows: PlausibleRows
+    chosen: Tensor
+    copies: int
+    effects: list[Effect]
+    lacking: dict[str, str]
+    known: Noise | None
+    analysis: Analysis
+    judgement: Judgement
+    made: Blocks
+    inferred: tuple[str, ...]
+
+
 def diagnose_rows(
     situation: Situation,
     measured: Tensor,
@@ -84,7 +111,6 @@ def diagnose_rows(
     effects: Sequence[Effect | str] | None = None,
     seed: int = 0,
     instrument: Noise | None = None,
-    inferred: Sequence[str] = (),
 ) -> Diagnosis:
     """Diagnose rows of commanded joints and measured poses.
 
@@ -96,17 +122,36 @@ def diagnose_rows(
         seed: of folds and resampling.
         instrument: the noise as columns of the records have it; where there are none, and no `noise`, readings of one
             target show it.
-        inferred: covariates that were not recorded but follow from the order of the rows.
 
     Raises:
         InputError: too few rows, or too many of them that the mechanism cannot have reached.
     """
+    said = _judged(situation, measured, noise, effects, seed, instrument)
+    directions = directions_of_order(situation)
+    if order_shows(said.analysis, said.judgement, {n: way[said.chosen] for n, way in directions.items()}):
+        more = replace(situation, covariates={**situation.covariates, **directions})
+        other = _judged(more, measured, noise, effects, seed, instrument, tuple(directions))
+        # Names that could not be asked for before, or a driver that was not there.
+        new = said.lacking.keys() & {*other.judgement.names}
+        if new or any(d.startswith("direction") for d in other.judgement.drivers):
+            said = other
+    return _diagnosis(said, noise is not None, seed)
+
+
+def _judged(
+    situation: Situation,
+    measured: Tensor,
+    noise: Tensor | None,
+    effects: Sequence[Effect | str] | None,
+    seed: int,
+    instrument: Noise | None,
+    inferred: tuple[str, ...] = (),
+) -> _Judged:
+    """Arguments as for `diagnose_rows`; inferred: as in what is returned."""
     at_step("searching the effects")
     rows = usable_rows(situation, measured)
     copies = int((rows.fine & copies_of(situation, measured)).sum())
-    every_row = situation, measured
     situation, measured, chosen = drawn_rows(situation, measured, rows.fine, seed)
-    residual = pose_residual(situation, measured)
     every = _made(situation, effects)
     usable, lacking = candidates(situation, every)
     if noise is not None:
@@ -115,30 +160,29 @@ def diagnose_rows(
         known = instrument or noise_of_repeats(situation, measured)
     analysis = analyse(situation, measured, usable, noise, None if known is None else known.sd)
     at_step("judging on held-out rows")
-    judgement = judge(analysis)
-    # What no column would bring into sight is no reason to record one.
-    unseen = lacking | dict.fromkeys(analysis.idle, UNSHOWN)
-    directions = {} if inferred else directions_of_order(every_row[0])
-    if directions and order_shows(analysis, judgement, {n: way[chosen] for n, way in directions.items()}):
-        whole, poses = every_row
-        whole = replace(whole, covariates={**whole.covariates, **directions})
-        said = diagnose_rows(whole, poses, noise, effects, seed, instrument, [*directions])
-        # Names that could not be asked for before, or a driver that was not there.
-        if lacking.keys() & {*said.judgement.names} or any(d.startswith("direction") for d in said.judgement.drivers):
-            return said
+    judgement, residual = judge_rows(analysis), pose_residual(situation, measured)
     made = Blocks(analysis, judgement, residual, seed)
-    together = made.main(made.together)
     unlikely = bool(judgement.names) and not judgement.outside and judgement.probability < _LIKELY
-    if unlikely and (together.interval is None or together.interval[0] <= 0):
-        judgement = without_names(analysis, judgement)
-        made = Blocks(analysis, judgement, residual, seed)
-        together = made.main(made.together)
+    if unlikely:
+        interval = made.main(made.together).interval
+        if interval is None or interval[0] <= 0:
+            judgement = without_names(analysis, judgement)
+            made = Blocks(analysis, judgement, residual, seed)
+    return _Judged(rows, chosen, copies, every, lacking, known, analysis, judgement, made, inferred)
+
+
+def _diagnosis(said: _Judged, is_given: bool, seed: int) -> Diagnosis:
+    """is_given: whether the noise was; seed: of folds and resampling."""
+    rows, analysis, judgement, made = said.rows, said.analysis, said.judgement, said.made
+    # What no column would bring into sight is no reason to record one.
+    unseen = said.lacking | dict.fromkeys(analysis.idle, UNSHOWN)
+    together = made.main(made.together)
     gap, gap_rotation, listed = blocks(made)
     nothing = not judgement.names and not judgement.outside
     outlier = nothing and bool(rows.astray.any() or gross_outliers(analysis).any())
-    missing = missing_covariates(analysis, every, lacking, judgement.drivers, seed)
+    missing = missing_covariates(analysis, said.effects, said.lacking, judgement.drivers, seed)
     doubts = cautions(analysis, judgement, rows, missing, together)
-    doubts += [of_inferred(inferred)] if inferred else []
+    doubts += [of_inferred(said.inferred)] if said.inferred else []
     texts = [caution.text for caution in doubts]
     every_driver = dict.fromkeys(d for one in judgement.drivers for d in one.split(CROSS))
     drivers = [d for d in every_driver if not d.startswith(SPEED)]
@@ -155,13 +199,14 @@ def diagnose_rows(
         "drivers": drivers,
         "text": "",
     }
-    why = why_set_aside(analysis, rows, chosen)
-    source = "estimated" if known is None or (noise is None and analysis.instrument is None) else known.source
+    why = why_set_aside(analysis, rows, said.chosen)
+    shown = said.known is not None and (is_given or analysis.instrument is not None)
+    source = said.known.source if said.known is not None and shown else "estimated"
     content = {"gap": gap, "gap_rotation": gap_rotation, "effects": listed, "verdict": verdict, "cautions": texts}
     verdict["text"] = verdict_text(content | {"noise": source, "rows_set_aside": sorted(why), "not_seen": unseen})
-    places, intervals = localise(analysis, residual, seed)
+    places, intervals = localise(analysis, made.residual, seed)
     at_step("by block")
-    far = by_block(made, residual)
+    far = by_block(made)
     at_step("next measurements")
     proposed = next_measurements(analysis, judgement, seed)
     return Diagnosis(
@@ -181,27 +226,24 @@ def diagnose_rows(
         rows_set_aside=sorted(why),
         why_set_aside=[why[row] for row in sorted(why)],
         cautions=texts,
-        notes=_notes(analysis, judgement, rows, chosen, copies, unseen, missing, proposed),
+        notes=_notes(said, unseen, missing, proposed),
         acting=tuple(analysis.acting(judgement.found)),
         analysis=analysis,
         judgement=judgement,
-        inferred=tuple(inferred),
+        inferred=said.inferred,
     )
 
 
 def _notes(
-    analysis: Analysis,
-    judgement: Judgement,
-    rows: PlausibleRows,
-    chosen: Tensor,
-    copies: int,
-    lacking: Mapping[str, str],
+    said: _Judged,
+    unseen: Mapping[str, str],
     missing: Sequence[Mapping[str, Any]],
     proposed: Sequence[Mapping[str, Any]],
 ) -> list[str]:
-    """What was left out and why, one sentence each without a full stop; arguments as in `diagnose_rows`."""
+    """What was left out and why, one sentence each without a full stop; arguments as in `diagnosis.json`."""
+    rows, chosen, copies, analysis, judgement = said.rows, said.chosen, said.copies, said.analysis, said.judgement
     mechanism, covariates = analysis.situation.mechanism, [*analysis.situation.covariates]
-    notes = [unseen_text(name, reason) for name, reason in lacking.items()]
+    notes = [unseen_text(name, reason) for name, reason in unseen.items()]
     notes += [lacking_text(mechanism.name, condition) for condition in mechanism.lacking(covariates)]
     notes += not_held_notes(judgement.names)
     for atom in (analysis.atoms[i] for i in judgement.found.members):

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from ccnn_torch.coordinates import plausible_error
 from ccnn_torch.diagnosis.candidates.atom import scales
-from ccnn_torch.diagnosis.candidates.library import LOG_PRIOR
 from ccnn_torch.diagnosis.candidates.shape_search import Scan, SearchRows
 from ccnn_torch.diagnosis.from_file import Known, one_row_at_a_time
 from ccnn_torch.diagnosis.residual.linearisation import moved, remainder, signature_at
@@ -24,6 +23,7 @@ from ccnn_torch.diagnosis.residual.noise_estimate import fitted_whitening
 from ccnn_torch.diagnosis.residual.whitening import LEAST_FREE, Whitening, moving_channels, renewed
 from ccnn_torch.effects import Acting, Effect, Situation
 from ccnn_torch.evidence.marginal_likelihood import Fits, Grams, fit_sets, grams_of
+from ccnn_torch.evidence.priors import EFFECT
 from ccnn_torch.mechanisms import Mechanism
 from ccnn_torch.numerics.outliers import inlying
 
@@ -298,7 +298,7 @@ def _without_idle(rows: _Rows, white: Whitening) -> list[Known]:
         evidence = fit_sets(grams, sets, 0.0).log_evidence
         gain = evidence[1:] - evidence[0]
         best = int(gain.argmax())
-        if float(gain[best]) < LOG_PRIOR:
+        if float(gain[best]) < EFFECT:
             break
         groups = {label: g for label, g in groups.items() if label not in removed[best]}
     kept = torch.zeros(rows.model.size, dtype=torch.bool)

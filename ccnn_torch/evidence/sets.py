@@ -12,6 +12,7 @@ from torch import Tensor
 from ccnn_torch.evidence.batched_sets import BatchedFits, fit_batched_sets
 from ccnn_torch.evidence.dictionary import Dictionary, FittedSet
 from ccnn_torch.evidence.initial_scale import added_scale
+from ccnn_torch.evidence.priors import crowd
 
 # Updates of a fit; after the short one no set that came within 12 of the best in the end was 30 below it, in trials.
 _UPDATES, _SHORT, _HOPELESS = 4, 1, 40.0
@@ -22,8 +23,6 @@ _LESS_NOISE = 0.1
 _RIVAL, _THERE = 30.0, 10.0
 # Sets of about the same widths are fitted side by side, as many as have their products near the processor.
 _NEAR = 50_000
-# A third cause at once is rarer still than a second one.
-_CROWD = math.log(0.1)
 
 
 def scored(
@@ -180,7 +179,7 @@ def _begun(dictionary: Dictionary, sets: Sequence[tuple[int, ...]], starts: Sequ
 
 
 def _log_prior(dictionary: Dictionary, members: Tensor) -> Tensor:
-    return dictionary.log_prior[members].sum(-1) + _CROWD * max(members.shape[1] - 2, 0)
+    return dictionary.log_prior[members].sum(-1) + crowd(members.shape[1])
 
 
 def _read(

@@ -13,19 +13,15 @@ from typing import NamedTuple
 
 import torch
 
-from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN, is_same
 from ccnn_torch.evidence.form_error import LEVELS, OF_SMOOTH
+from ccnn_torch.evidence.judge import judge, marginal, posterior
 from ccnn_torch.evidence.marginal_likelihood import fit_sets
 from ccnn_torch.motion.drivers import Driver, driver_columns
 from ccnn_torch.motion.form import weighed
-from ccnn_torch.motion.outside import Candidate, Members, essential, holds, prior_of, with_drivers
+from ccnn_torch.motion.outside import Candidate, essential, holds, prior_of, with_drivers
 from ccnn_torch.motion.search import Search
 from ccnn_torch.motion.spec import Fit
 
-# Odds up to which the logs do not distinguish one name from another.
-_LIKE = 20.0
-# Probability from which a member of the most probable set is named, where the set without it is probable, too.
-_NAMED = 0.9
 # Probability of something outside that takes nothing away on runs that no fit saw, and of nothing where a set leaves
 # clearly less, in RMS.
 _UNCONFIRMED, _CLEARLY = 0.5, 3.0
@@ -47,7 +43,7 @@ class AxisVerdict(NamedTuple):
     best: Fit
     probability: float
     marginal: dict[int, float]
-    classes: dict[int, tuple[int, ...]]
+    classes: Mapping[int, tuple[int, ...]]
     driver: str | None
     hidden: int | None = None
 
@@ -69,40 +65,23 @@ def _judged(found: Search, axis: int, drivers: Sequence[Driver]) -> AxisVerdict:
     unseen = {f.members: f.unseen for f in fits}
     sets = [Candidate((essential(f.members, left, unseen), None), f.grams, f.spec.groups, prior_of(f)) for f in fits]
     sets += with_drivers(found, axis, drivers, by_members)
-    share: dict[tuple[Members, str | None], float] = {}
-    usual: list[float] = []
+    levels = []
     for level in LEVELS:
         weights = _weights(sets, fits[0].noise, level * found.form[axis], level * OF_SMOOTH)
-        usual = usual or weights
-        top = max(weights)
-        total = math.fsum(math.exp(w - top) for w in weights)
-        for one, w in zip(sets, weights, strict=True):
-            share[one.key] = share.get(one.key, 0.0) + math.exp(w - top) / total / len(LEVELS)
-    ranked = sorted(share.items(), key=lambda item: -item[1])
-    marginal = {e: sum(p for (members, _), p in ranked if e in members) for e in {e for f in fits for e in f.members}}
-    outside = sum(p for (_, driver), p in ranked if driver is not None)
-    if outside > 0.5:
-        members, driver = key = next(key for key, _ in ranked if key[1] is not None)
-        likeliest = max((k for k, one in enumerate(sets) if one.key == key), key=usual.__getitem__)
-        outside = outside if holds(problem, sets[likeliest]) else min(outside, _UNCONFIRMED)
-        outside = min(outside, BESIDE_UNKNOWN) if members else outside
-        return AxisVerdict(by_members[members], outside, marginal, dict.fromkeys(members, ()), driver)
-    inside = {members: p for (members, driver), p in ranked if driver is None}
-    members = next(iter(inside))
-    classes = _classes(members, inside)
-    like = {m: {m, *classes[m]} for m in members}
-    sure = tuple(m for m in members if sum(p for (own, _), p in ranked if like[m] & {*own}) >= _NAMED)
-    likely = {*members}
-    if sure and inside.get(sure, 0.0) * _LIKE > inside[members]:
-        members, classes = sure, _classes(sure, inside)
-    same = sum(p for own, p in inside.items() if is_same(frozenset(own), frozenset(members), classes))
-    if {*members} < likely:
-        # What was left out for want of a sure name mends the form of what is named, as a rule, and is no cause.
-        same = min(same + sum(p for own, p in inside.items() if {*members} < {*own}), _NAMED)
-    if not members and _after_loose(by_members[()], fits[0].noise) > _CLEARLY**2 * fits[0].rss:
-        alone = min((f for f in fits if len(f.members) == 1), key=lambda f: f.left)
-        return AxisVerdict(by_members[()], same, marginal, classes, None, alone.members[0])
-    return AxisVerdict(by_members[members], same, marginal, classes, None)
+        named = [(frozenset(one.key[0]), () if one.key[1] is None else (one.key[1],)) for one in sets]
+        weighed_sets = [(*name, w, one) for name, w, one in zip(named, weights, sets, strict=True)]
+        levels.append((1 / len(LEVELS), weighed_sets))
+    explanations = posterior(levels)
+    verdict = judge(explanations, explanations)
+    best, hidden = by_members[verdict.chosen.best.key[0]], None
+    probability = verdict.probability
+    if verdict.outside and not holds(problem, verdict.chosen.best):
+        probability = min(probability, _UNCONFIRMED)
+    if not best.members and not verdict.outside and _after_loose(best, fits[0].noise) > _CLEARLY**2 * fits[0].rss:
+        hidden = min((f for f in fits if len(f.members) == 1), key=lambda f: f.left).members[0]
+    marginals = {e: marginal(explanations, e) for e in {e for f in fits for e in f.members}}
+    driver = verdict.drivers[0] if verdict.outside else None
+    return AxisVerdict(best, probability, marginals, verdict.classes, driver, hidden)
 
 
 def _after_loose(nothing: Fit, noise: float) -> float:
@@ -135,13 +114,3 @@ def _weights(sets: Sequence[Candidate], noise: float, form: float, smooth: float
     whole, beside = (torch.logsumexp(torch.tensor(w, dtype=torch.float64) + least, 0) for w in (weights, smeared))
     pairs = zip(sets, weights, smeared, strict=True)
     return [w if one.rows is None else v + float(whole - beside) for one, w, v in pairs]
-
-
-def _classes(members: Members, inside: Mapping[Members, float]) -> dict[int, tuple[int, ...]]:
-    """Of each member the effects that can stand in its place, the most probable first."""
-    found = {}
-    for m in members:
-        rest = {*members} - {m}
-        others = [(own, {*own} - rest) for own, p in inside.items() if rest <= {*own} and p * _LIKE > inside[members]]
-        found[m] = tuple(new.pop() for own, new in others if len(new) == 1 and m not in own)
-    return found

@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from ccnn_torch.evidence.marginal_likelihood import Grams, fit_sets, grams_of
+from ccnn_torch.evidence.priors import OUTSIDE, crowd
 from ccnn_torch.motion.drivers import Driver
 from ccnn_torch.motion.fit import sensitivities, squares_unseen
 from ccnn_torch.motion.problem import Problem
-from ccnn_torch.motion.search import CROWD, Search, log_posterior
+from ccnn_torch.motion.search import Search, log_posterior
 from ccnn_torch.motion.spec import Fit
 from ccnn_torch.motion.whiten import white_noise
 
-# Log prior odds of a driver.
-_OUTSIDE = math.log(0.001)
 # Sets beside which drivers are tried, besides those that lead from the best one to none.
 _BASES = 6
 # Share of what is left of runs that were not fitted up to which a set without a member is as good.
@@ -90,7 +89,8 @@ def with_drivers(found: Search, axis: int, drivers: Sequence[Driver], fits: Mapp
         own, y = columns[0], residual[0] + theta[flat] @ columns[0]
         # Of the position itself, not of its whitened form.
         left_plain, own_plain = (part[0] for part in sensitivities(problem, plainly, theta[None], mine, [flat]))
-        prior = prior_of(base) + _OUTSIDE + (CROWD if len(base.members) >= 2 else 0.0)
+        count = len(base.members)
+        prior = prior_of(base) + OUTSIDE + crowd(count + 1) - crowd(count)
         for k, (driver, columns, beside) in enumerate(zip(drivers, white, plain, strict=True)):
             x = torch.cat([own, columns])
             grams = grams_of(torch.cat([x, found.loose[axis]]).mT[:, None, :], y[:, None])._replace(values=values)

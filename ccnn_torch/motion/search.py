@@ -5,7 +5,6 @@ All axes go side by side, each with its own sets: they share the simulated time 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import islice
 from typing import NamedTuple
@@ -13,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ccnn_torch.evidence.priors import EFFECT, crowd
 from ccnn_torch.motion.fit import fit_many
 from ccnn_torch.motion.form import form_errors, unseen_errors, weighed
 from ccnn_torch.motion.library import Library, Variant
@@ -21,8 +21,6 @@ from ccnn_torch.motion.screen import promise
 from ccnn_torch.motion.spec import Fit, Spec, started, without
 from ccnn_torch.motion.whiten import Whitening, fitted_whitening, white_noise
 
-# Log prior odds of an effect, and what a third and every further one at once costs beside it, as for effects of a pose.
-LOG_ODDS, CROWD = math.log(0.1), math.log(0.1)
 # Sets that are extended, effects that are fitted for each of them after the screen, and members at most.
 _BEAM, _FITTED, _MOST = 2, 4, 9
 # Log posterior that a level must bring.
@@ -55,7 +53,7 @@ class Search(NamedTuple):
 def log_posterior(fit: Fit) -> float:
     """Log evidence with the prior of the set, not normalised."""
     count = len(fit.members)
-    return fit.log_evidence + fit.spec.log_prior + LOG_ODDS * count + CROWD * max(count - 2, 0)
+    return fit.log_evidence + fit.spec.log_prior + EFFECT * count + crowd(count)
 
 
 def search(problem: Problem) -> Search:

@@ -15,7 +15,7 @@ from torch import Tensor
 from ccnn_torch.diagnosis import diagnose_rows, engine
 from ccnn_torch.diagnosis.checks.identifiable import check_rows
 from ccnn_torch.diagnosis.search.analysis import Analysis
-from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge
+from ccnn_torch.diagnosis.verdict.judgement import Judgement, judge_rows
 from ccnn_torch.effects import Situation, default_gravity
 from ccnn_torch.errors import InputError
 from ccnn_torch.mechanisms import load_mechanism
@@ -215,9 +215,9 @@ def test_what_is_neither_likely_nor_shown_elsewhere_is_not_named(
     def weak(analysis: Analysis) -> Judgement:
         atoms = analysis.atoms
         found = next(f for f in analysis.found if [atoms[i].name for i in f.members] == ["joint_gain"])
-        return replace(judge(analysis), found=found, names=("joint_gain",), probability=probability)
+        return replace(judge_rows(analysis), found=found, names=("joint_gain",), probability=probability)
 
-    monkeypatch.setattr(engine, "judge", weak)
+    monkeypatch.setattr(engine, "judge_rows", weak)
     found = diagnose_rows(situation, measured(situation, {}, 41), torch.full((3,), NOISE, dtype=torch.float64))
     assert found.verdict["none"] is none and found.verdict["probability"] == 0.5
     assert found.verdict["effects"] == ([] if none else ["joint_gain"]) and bool(found.cautions) is not none

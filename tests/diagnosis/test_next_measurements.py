@@ -73,7 +73,7 @@ def test_chosen_rows_say_more_together_than_any_drawn_at_random_would() -> None:
     def names(found: FittedSet) -> set[str]:
         return {analysis.atoms[i].name for i in found.members}
 
-    first, *others = [one for _, drivers, _, one in said.judgement.leading if not drivers]
+    first, *others = [e.best for e in said.judgement.leading if not e.drivers]
     second = next(one for one in others if sorted(names(first) ^ names(one)) == wanted[0]["separates"])
     there = _candidates(analysis, 0)
     x = torch.cat([_columns(analysis, first, there), -_columns(analysis, second, there)], -1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -16,8 +15,7 @@ from ccnn_torch.diagnosis.candidates.single_joint import single_joint_atoms, wit
 from ccnn_torch.diagnosis.residual.linearisation import remainder, signature_at
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Acting, Effect, Situation
-
-LOG_PRIOR = math.log(0.1)
+from ccnn_torch.evidence.priors import EFFECT
 
 
 class Known(NamedTuple):
@@ -143,7 +141,7 @@ def candidates_about_set(
             scan = Scan(situation, there, effect, _only(white, usable))
             shapes = [scan.best(ground(them), start) for them in beside_what]
             found = [a for a in known.starts if a.effect is effect]
-        shapes += [Shaped(a.shape, a.used, LOG_PRIOR - a.log_prior) for a in found]
+        shapes += [Shaped(a.shape, a.used, EFFECT - a.log_prior) for a in found]
         own: list[Atom] = []
         for shaped in shapes:
             if not any(_same_shape(a, shaped) for a in own):
@@ -156,7 +154,7 @@ def _atom(situation: Situation, there: Situation, effect: Effect, shaped: Shaped
     columns = signature_at(situation, there, effect, shaped.value)
     if shaped.used is not None:
         columns = columns[..., list(shaped.used)]
-    return Atom(effect.name, effect, shaped.value, columns, LOG_PRIOR - shaped.charge, shaped.used)
+    return Atom(effect.name, effect, shaped.value, columns, EFFECT - shaped.charge, shaped.used)
 
 
 def _usual(situation: Situation, effect: Effect) -> list[Shaped]:

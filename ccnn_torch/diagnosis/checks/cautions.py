@@ -15,12 +15,13 @@ from ccnn_torch.diagnosis.checks.row_plausibility import PlausibleRows
 from ccnn_torch.diagnosis.residual.distance import distance, size_of
 from ccnn_torch.diagnosis.search.analysis import Analysis
 from ccnn_torch.diagnosis.verdict.findings import size_words
-from ccnn_torch.diagnosis.verdict.judgement import BESIDE_UNKNOWN, Judgement
+from ccnn_torch.diagnosis.verdict.judgement import Judgement
 from ccnn_torch.diagnosis.verdict.localisation import own_pose
 from ccnn_torch.diagnosis.verdict.plausible import implausible_size
 from ccnn_torch.display import number_text
 from ccnn_torch.effects import EXACT, Situation
 from ccnn_torch.evidence.dictionary import covariance
+from ccnn_torch.evidence.judge import BESIDE_UNKNOWN
 from ccnn_torch.evidence.shrink import Gap
 
 # What a verdict is worth beside a caution; and beside one that says that it rests on nothing.

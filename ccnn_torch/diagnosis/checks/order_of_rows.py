@@ -42,8 +42,10 @@ def order_shows(analysis: Analysis, judgement: Judgement, directions: Mapping[st
     Args:
         analysis: of the rows.
         judgement: the verdict without them.
-        directions: of the same rows, `s` each.
+        directions: of the same rows, `s` each; {} = none.
     """
+    if not directions:
+        return False
     white, keep = analysis.whitening, analysis.whitening.keep()
     frames, target = (analysis.correlation(white(v)[keep]) for v in (analysis.fitted, analysis.residual[..., None]))
     drawn = torch.Generator().manual_seed(0)

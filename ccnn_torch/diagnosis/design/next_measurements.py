@@ -82,11 +82,7 @@ def _rivals(analysis: Analysis, judgement: Judgement) -> list[tuple[float, Fitte
     What cannot be distinguished from the verdict is among them, even where the search did not come across it.
     """
     atoms, own = analysis.atoms, judgement.found
-    plain = [
-        (probability, one)
-        for _, drivers, probability, one in judgement.leading
-        if not drivers and not any(atoms[i].is_discrepancy for i in one.members)
-    ]
+    plain = [(e.probability, e.best) for e in judgement.leading if not e.drivers]
     if not plain:
         return []
     like = {

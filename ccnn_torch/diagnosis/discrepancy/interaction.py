@@ -10,8 +10,9 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns, search_charge
-from ccnn_torch.diagnosis.discrepancy.smooth import LOG_PRIOR, driver_of, unit_range
+from ccnn_torch.diagnosis.discrepancy.smooth import driver_of, unit_range
 from ccnn_torch.effects import Situation
+from ccnn_torch.evidence.priors import OUTSIDE
 
 CROSS = " × "
 """Between the two drivers in the name of such a term."""
@@ -52,7 +53,7 @@ def interaction_discrepancies(
     name = CROSS.join(pairs[pair])
     own = moved[..., k : k + 1] * features[:, None]
     every = (moved[..., None] * features[:, None, None]).flatten(-2)
-    log_prior = LOG_PRIOR - charge
+    log_prior = OUTSIDE - charge
     joint = situation.mechanism.joints[k].name
     return [
         Atom(name, None, score.new_zeros(0), own, log_prior, note=f"their product moves joint {joint}"),

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns, search_charge
-from ccnn_torch.diagnosis.discrepancy.smooth import LOG_PRIOR
+from ccnn_torch.evidence.priors import OUTSIDE
 
 # Rows before the first possible jump and after the last, and places that are tried, at most.
 _FEWEST_ROWS, _PLACES = 5, 120
@@ -47,7 +47,7 @@ def jump_discrepancies(
         best = int(close[gain(close).argmax()])
         charge = search_charge(rows / len(few) * score)
         acting = columns * _steps(number, torch.tensor([best]))[0][:, None, None]
-        prior = LOG_PRIOR - charge
+        prior = OUTSIDE - charge
         found.append(Atom("time", None, lead.new_zeros(0), acting, prior, note=f"a jump of {what}", begins=best))
     return found
 

@@ -15,7 +15,6 @@ from torch import Tensor
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.discrepancy.smooth import (
     ANY,
-    LOG_PRIOR,
     joint_moves,
     platform_moves,
     products,
@@ -23,12 +22,13 @@ from ccnn_torch.diagnosis.discrepancy.smooth import (
     unit_range,
 )
 from ccnn_torch.effects import Situation
+from ccnn_torch.evidence.priors import OUTSIDE
 
 # What bends against what is straight.
 _BEND = 0.5
 _MOST = 60
 # Of one form with an effect that is a candidate, it has to be better than that by as much again.
-_TWIN = 2 * LOG_PRIOR
+_TWIN = 2 * OUTSIDE
 
 
 def linear_discrepancies(situation: Situation, beside: Sequence[str]) -> list[Atom]:
@@ -68,7 +68,7 @@ def _by_all(features: Tensor, joints: Tensor) -> Tensor:
 def _driven(situation: Situation, driver: str, features: Tensor) -> Atom:
     """Joints that are off by features of their own, `s x n x f`."""
     columns = reduced(joint_moves(situation, situation.jacobian), features, _MOST)
-    return Atom(driver, None, features.new_zeros(0), columns, LOG_PRIOR, plain=True)
+    return Atom(driver, None, features.new_zeros(0), columns, OUTSIDE, plain=True)
 
 
 def _carried(situation: Situation, axes: Tensor) -> Atom:
@@ -81,4 +81,4 @@ def _carried(situation: Situation, axes: Tensor) -> Atom:
     turns = moves[..., 3:] @ axes if moves.shape[-1] == 6 else moves[..., :0]
     columns = torch.cat([shifts, turns], -1)
     shown = columns.abs().amax((0, 1)) > 1e-9 * columns.abs().max().clamp_min(1e-300)
-    return Atom("workspace", None, place.new_zeros(0), columns[..., shown], LOG_PRIOR, plain=True)
+    return Atom("workspace", None, place.new_zeros(0), columns[..., shown], OUTSIDE, plain=True)

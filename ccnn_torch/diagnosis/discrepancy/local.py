@@ -18,9 +18,10 @@ from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns,
 from ccnn_torch.diagnosis.discrepancy.interaction import interaction_discrepancies
 from ccnn_torch.diagnosis.discrepancy.jump import jump_discrepancies
 from ccnn_torch.diagnosis.discrepancy.periodic import periodic_discrepancy
-from ccnn_torch.diagnosis.discrepancy.smooth import LOG_PRIOR, joint_moves, platform_moves, spread_out, unit_range
+from ccnn_torch.diagnosis.discrepancy.smooth import joint_moves, platform_moves, spread_out, unit_range
 from ccnn_torch.diagnosis.residual.whitening import Whitening
 from ccnn_torch.effects import Situation
+from ccnn_torch.evidence.priors import OUTSIDE
 
 # Places evaluated along a joint's track and in the workspace, and radii as shares of half the range.
 _ALONG, _WITHIN = 21, 40
@@ -77,7 +78,7 @@ def local_discrepancies(
             # By itself, and about the mean of the rows where the model was fitted to these. A constant of its own would
             # let it stand for an offset of the joints, which the library knows.
             for shift in (0.0, bump.mean(0)):
-                made.append(Atom(driver, None, raw.new_zeros(0), columns * (bump - shift), LOG_PRIOR - float(charge)))
+                made.append(Atom(driver, None, raw.new_zeros(0), columns * (bump - shift), OUTSIDE - float(charge)))
         return made
 
     middles = torch.linspace(-1, 1, _ALONG, dtype=moved.dtype).unsqueeze(-1)

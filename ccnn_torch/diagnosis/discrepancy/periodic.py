@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.diagnosis.candidates.nuisance import NuisanceFit, SharedColumns, TrialColumns, search_charge
-from ccnn_torch.diagnosis.discrepancy.smooth import LOG_PRIOR
+from ccnn_torch.evidence.priors import OUTSIDE
 
 # Periods in the time of the rows: from where the waves of any course end, to so many rows a period, or so many in all.
 _SLOWEST, _ROWS_A_PERIOD, _MOST = 8.0, 3.0, 130.0
@@ -52,7 +52,7 @@ def periodic_discrepancy(time: Tensor, raw: Tensor, lead: Tensor, few: Tensor, l
     charge = search_charge(len(lead) / len(few) * score)
     columns = (raw[..., None] * _waves(share, best[None])[0][:, None, None]).flatten(-2)
     note = f"what follows the time is a sway with a period of {span / float(best):.3g} s"
-    return [Atom("time", None, columns.new_zeros(0), columns, LOG_PRIOR - charge, note=note)]
+    return [Atom("time", None, columns.new_zeros(0), columns, OUTSIDE - charge, note=note)]
 
 
 def _waves(share: Tensor, periods: Tensor) -> Tensor:

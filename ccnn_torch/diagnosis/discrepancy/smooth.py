@@ -15,10 +15,9 @@ from torch import Tensor
 
 from ccnn_torch.diagnosis.candidates.atom import Atom
 from ccnn_torch.effects import Situation
+from ccnn_torch.evidence.priors import OUTSIDE
 
-# A discrepancy term is that much less probable than no deviation of its kind, before the data are seen.
-LOG_PRIOR = math.log(1e-3)
-# And one that holds most of what a library effect does has to be better than that effect by as much again.
+# A discrepancy term that holds most of what a library effect does has to be better than that effect by as much again.
 _NEAR_LIBRARY = math.log(1e-5)
 # A joint may be off by this much for unforeseen reasons [m], [rad].
 _SCALE = {"m": 3e-4, "rad": 5e-4}
@@ -211,7 +210,7 @@ def _platform_atom(situation: Situation, driver: str, features: Tensor) -> Atom:
     """features: `s x f`; columns = shifts and turns of the platform, alike in all poses, times the features."""
     columns = (platform_moves(situation).unsqueeze(-1) * features[:, None, None, :]).flatten(-2)
     shown = columns.abs().amax((0, 1)) > 0
-    return Atom(driver, None, features.new_zeros(0), columns[..., shown], LOG_PRIOR)
+    return Atom(driver, None, features.new_zeros(0), columns[..., shown], OUTSIDE)
 
 
 def _atom(
@@ -219,7 +218,7 @@ def _atom(
     driver: str,
     features: Tensor,
     most: int = _MOST,
-    log_prior: float = LOG_PRIOR,
+    log_prior: float = OUTSIDE,
     only: int | None = None,
 ) -> Atom:
     """What the joints do by features that all of them go by, `s x f`, or each by its own, `s x n x f`.

@@ -138,6 +138,28 @@ class _Rows(NamedTuple):
     jacobian: Tensor
 
 
+class _Set(NamedTuple):
+    """What is searched about: the most probable set of the library.
+
+    Attributes:
+        acting: its effects.
+        white: noise and weights that the most probable set of all leaves.
+        left: what the effects leave by the machine itself, `s x c0` [m, rad].
+        shapes: found before.
+        local: whether local terms are searched again.
+    """
+
+    acting: Sequence[Acting]
+    white: Whitening
+    left: Tensor
+    shapes: Known
+    local: bool
+
+    @property
+    def names(self) -> frozenset[str]:
+        return frozenset(a.effect.name for a in self.acting)
+
+
 class _Fixed(NamedTuple):
     """What stays for any findings: effects that show, discrepancy terms, those of one place or sway found at first,
     and the noise of the richest fit, `c`."""
@@ -166,35 +188,14 @@ def analyse(
     """
     rows = _rows_of(situation, measured, noise)
     result, fixed = _search_about_nominal(rows, effects)
-    # Again about the best library set, with shapes searched beside it and the noise that the best set of all leaves.
     before: frozenset[str] | None = None
-    for turn in range(2):
-        # The first look takes about a tenth of the time, the second of two turns is often shorter.
-        at_step("searching the effects", (0.1, 0.5)[turn])
-        atoms = result.atoms
-        best = next(f for f in result.found if not any(atoms[i].is_discrepancy for i in f.members))
-        if before is not None and result.found[0].log_posterior - best.log_posterior > _MUCH_LESS_PROBABLE:
+    # The first search takes about a tenth of the time, the second of two about a set is often shorter.
+    for done in (0.1, 0.5):
+        at_step("searching the effects", done)
+        about = _next_set(rows, result, before)
+        if about is None:
             break
-        acting = result.acting(best)
-        act = frozenset(a.effect.name for a in acting)
-        white, left = _renewed(result, noise, rows.usable), remainder(situation, measured, acting)
-        shapes = Known([a for a in atoms if a.effect is not None and a.shape.numel()], {}, before is None)
-        if before is not None:
-            old, sought = result.whitening, act if act == before else None
-            if not has_new_effects(result.dictionary, result.found, best, before, result.gap) and is_converged(
-                result.dictionary, result.y, best, old, white, without_frames(result.whitening, left, result.fitted)
-            ):
-                if torch.equal(white.keep(), old.keep()):
-                    break
-                # Other rows are bad ones, and nothing else has changed.
-                sought = frozenset()
-            shapes = shapes._replace(kept=known_shapes(result.atoms, result.found, best, sought))
-        else:
-            shapes = shapes._replace(starts=_kept_shapes(situation, shapes.starts, result, act))
-        # A bump is not searched again where nothing outside the library does anything.
-        local = before is None or discrepancy_is_active(result.dictionary, result.found, best)
-        before = act
-        result = _search_about_set(rows, fixed, result, acting, white, left, shapes, local)
+        result, before = _search_about_set(rows, fixed, result, about), about.names
     at_step("searching the effects", 0.8)
     result = _with_shared_noise(rows._replace(fitted=result.fitted), fixed.rich, result)
     if instrument is not None and noise is None and result.correlation.target is None:
@@ -236,6 +237,33 @@ def _search_about_nominal(rows: _Rows, effects: Sequence[Effect]) -> tuple[Analy
     return _searched(rows, rows.residual, white, every, fixed.rich, few), fixed
 
 
+def _next_set(rows: _Rows, result: Analysis, before: frozenset[str] | None) -> _Set | None:
+    """The set that the next search is about, with the noise that the best set of all leaves; None where the search has
+    converged. before: effects of the set that the last search was about; None = it was about the nominal machine."""
+    dictionary, found, atoms = result.dictionary, result.found, result.atoms
+    best = next(f for f in found if not any(atoms[i].is_discrepancy for i in f.members))
+    if before is not None and found[0].log_posterior - best.log_posterior > _MUCH_LESS_PROBABLE:
+        return None
+    acting = result.acting(best)
+    white, left = _renewed(result, rows.noise, rows.usable), remainder(rows.situation, rows.measured, acting)
+    shaped = [a for a in atoms if a.effect is not None and a.shape.numel()]
+    about = _Set(acting, white, left, Known(shaped, {}, before is None), True)
+    if before is None:
+        starts = _kept_shapes(rows.situation, shaped, result, about.names)
+        return about._replace(shapes=about.shapes._replace(starts=starts))
+    old, sought = result.whitening, about.names if about.names == before else None
+    if not has_new_effects(dictionary, found, best, before, result.gap) and is_converged(
+        dictionary, result.y, best, old, white, without_frames(old, left, result.fitted)
+    ):
+        if torch.equal(white.keep(), old.keep()):
+            return None
+        # Other rows are set aside, and nothing else has changed.
+        sought = frozenset()
+    # Local terms are searched again only if a discrepancy term is active.
+    shapes = about.shapes._replace(kept=known_shapes(atoms, found, best, sought))
+    return about._replace(shapes=shapes, local=discrepancy_is_active(dictionary, found, best))
+
+
 def _kept_shapes(situation: Situation, starts: Sequence[Atom], result: Analysis, acting: Set[str]) -> list[Atom]:
     """Of the shapes found at first those that stay candidates: of effects that act all, since what else acts now may
     have hidden the better ones, and of the others the likeliest and that of the textbook."""
@@ -243,34 +271,15 @@ def _kept_shapes(situation: Situation, starts: Sequence[Atom], result: Analysis,
     return [a for a in starts if a.name in acting or a is likely.get(a.name) or has_usual_shape(situation, a)]
 
 
-def _search_about_set(
-    rows: _Rows,
-    fixed: _Fixed,
-    result: Analysis,
-    acting: Sequence[Acting],
-    white: Whitening,
-    left: Tensor,
-    shapes: Known,
-    local: bool,
-) -> Analysis:
-    """About the machine with the best set's effects, on all rows.
-
-    Args:
-        rows, standing: what stays.
-        result: of the search before.
-        acting: effects of its best set.
-        white: noise and weights that its most probable set leaves.
-        left: what those effects leave by the machine itself, `s x c0` [m, rad].
-        shapes: found before.
-        local: whether bumps are searched again.
-    """
+def _search_about_set(rows: _Rows, fixed: _Fixed, result: Analysis, about: _Set) -> Analysis:
+    """About the machine with the set's effects, on all rows; result: of the search before."""
     situation, usable = rows.situation, rows.usable
-    there, target = tangent(situation, left, acting)
+    there, target = tangent(situation, about.left, about.acting)
     ok = usable & torch.isfinite(target).all(-1) & torch.isfinite(there.jacobian).flatten(1).all(-1)
     if int(ok.sum()) < _LINEARISED * int(usable.sum()):
         there, target, ok = situation, rows.residual, usable
     target = torch.where(ok[:, None], target, 0.0)
-    white = white if bool((ok == usable).all()) else _renewed(result, rows.noise, ok)
+    white = about.white if bool((ok == usable).all()) else _renewed(result, rows.noise, ok)
     rows = rows._replace(fitted=frame_columns(there, ok))
     atoms = candidates_about_set(
         situation,
@@ -278,17 +287,17 @@ def _search_about_set(
         rows.measured,
         target,
         fixed.effects,
-        acting,
-        shapes,
+        about.acting,
+        about.shapes,
         white,
         ok,
         rows.fitted,
     )
     again: list[Atom] = []
-    if local:
+    if about.local:
         # The first of a name has the shapes found now; its parts and earlier shapes add next to nothing.
         newest = {a.name: a.columns for a in reversed(atoms)}
-        beside = torch.cat([rows.fitted, *(newest[name] for name in sorted({a.effect.name for a in acting}))], -1)
+        beside = torch.cat([rows.fitted, *(newest[name] for name in sorted(about.names))], -1)
         again = local_discrepancies(situation, rows.jacobian, target, white, beside)
     every = [*atoms, *fixed.rest, *fixed.local, *(without_unused_rows(a, ok) for a in again)]
     return _searched(rows, target, white, every, fixed.rich)

@@ -24,7 +24,7 @@ _BLOCKS = 5
 _DIGITS = 1e-9
 
 
-def by_block(made: Blocks, residual: Tensor) -> dict[str, Any] | None:
+def by_block(made: Blocks) -> dict[str, Any] | None:
     """`by_block` of diagnosis.json; None where the verdict names nothing, or there are too few rows for blocks.
 
     The names and their shapes (periods, lags) are those of all rows; their numbers, and frames that are not known, are
@@ -32,7 +32,6 @@ def by_block(made: Blocks, residual: Tensor) -> dict[str, Any] | None:
 
     Args:
         made: the diagnosis' held-out rows, its names and its draws.
-        residual: nominal, `s x c0` [m, rad].
     """
     analysis, judgement = made.analysis, made.judgement
     atoms = analysis.atoms
@@ -45,7 +44,7 @@ def by_block(made: Blocks, residual: Tensor) -> dict[str, Any] | None:
     columns = torch.cat([white(atoms[i].columns) for i in members], -1)[keep]
     widths = [atoms[i].columns.shape[-1] for i in members]
     groups = torch.split(torch.arange(sum(widths)), widths)
-    nominal, target = white(residual)[keep], white(analysis.residual)[keep]
+    nominal, target = white(made.residual)[keep], white(analysis.residual)[keep]
     before, left, uncertain = nominal.clone(), target.clone(), torch.zeros_like(target)
     for k in range(_BLOCKS):
         there = number == k

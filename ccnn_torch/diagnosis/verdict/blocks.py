@@ -22,7 +22,7 @@ class Blocks:
     def __init__(self, analysis: Analysis, judgement: Judgement, residual: Tensor, seed: int) -> None:
         """residual: nominal, `s x c0` [m, rad]; seed: of folds and draws."""
         white = analysis.whitening
-        self.analysis, self.judgement = analysis, judgement
+        self.analysis, self.judgement, self.residual = analysis, judgement, residual
         self.before = residual[white.keep()][:, white.channels]
         self.floor = noise_floor(analysis)
         self.position = white.channels < 3

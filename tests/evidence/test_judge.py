@@ -1,0 +1,101 @@
+"""Verdicts on posteriors made by hand: names, classes, probability, outside or not."""
+
+from __future__ import annotations
+
+import pytest
+
+from ccnn_torch.evidence.judge import Explanation, Verdict, judge, marginal, posterior
+from ccnn_torch.evidence.priors import EFFECT, OUTSIDE, crowd
+
+Shares = dict[str, float]
+
+
+def explained(shares: Shares) -> list[Explanation[str]]:
+    """`"a b|time": 0.2` is the set of a and b beside a term that follows the time."""
+    found = []
+    for words, share in shares.items():
+        names, _, driver = words.partition("|")
+        found.append(Explanation(frozenset(names.split()), (driver,) if driver else (), share, words))
+    return sorted(found, key=lambda e: -e.probability)
+
+
+def verdict(shares: Shares, *unexplained: str) -> Verdict[str]:
+    """unexplained: sets that leave clearly more than the noise."""
+    made = explained(shares)
+    return judge(made, made, lambda e: e.best not in unexplained)
+
+
+def said(found: Verdict[str]) -> tuple[set[str], float, bool, tuple[str, ...]]:
+    return {*found.chosen.names}, pytest.approx(found.probability, abs=1e-12), found.outside, found.drivers
+
+
+@pytest.mark.parametrize(
+    ("shares", "names", "probability"),
+    [
+        ({"a": 0.97, "": 0.03}, "a", 0.97),
+        ({"": 0.96, "a": 0.04}, "", 0.96),
+        # Less than 0.9 for b, and the set without it is probable: what holds it supports a, up to 0.9.
+        ({"a b": 0.6, "a": 0.395, "": 0.005}, "a", 0.9),
+        ({"a b": 0.45, "a": 0.3, "c": 0.2, "": 0.05}, "a b", 0.45),
+        ({"a b": 0.92, "a": 0.08}, "a b", 0.92),
+        # Of b the data are not sure either, but without it the set is less than a 20th as probable: b stays.
+        ({"a b": 0.8, "a c d": 0.17, "a": 0.03}, "a b", 0.8),
+        # Nothing is sure: the most probable set stands for itself.
+        ({"a": 0.5, "": 0.3, "b": 0.02, "c d": 0.18}, "a", 0.5),
+    ],
+)
+def test_names_are_those_of_the_most_probable_set_that_are_sure(shares: Shares, names: str, probability: float) -> None:
+    assert said(verdict(shares)) == ({*names.split()}, probability, False, ())
+
+
+def test_names_that_the_data_do_not_distinguish_count_as_one() -> None:
+    found = verdict({"a": 0.5, "b": 0.46, "c": 0.04})
+    assert found.chosen.names == {"a"} and found.classes == {"a": ("b", "c")}
+    assert found.probability == pytest.approx(1.0)
+    # 20 to 1 are distinguished; a pair keeps the one that stays.
+    apart = verdict({"a c": 0.7, "b c": 0.26, "a": 0.034, "": 0.006})
+    assert apart.chosen.names == {"a", "c"} and apart.classes == {"a": ("b",), "c": ()}
+    assert apart.probability == pytest.approx(0.96)
+
+
+def test_what_is_no_candidate_can_still_be_mistaken_for_a_name() -> None:
+    found = judge(explained({"a": 0.98, "": 0.02}), explained({"a": 0.6, "b": 0.39, "": 0.01}))
+    assert found.classes == {"a": ("b",)} and found.probability == pytest.approx(0.98)
+
+
+def test_what_is_outside_is_said_where_it_is_more_probable_than_not() -> None:
+    shares = {"|time": 0.3, "a": 0.31, "|load x": 0.25, "b|time": 0.1, "": 0.04}
+    assert said(verdict(shares)) == (set(), pytest.approx(0.65), True, ("time",))
+    less = {"|time": 0.4, "a": 0.35, "": 0.25}
+    assert said(verdict(less)) == ({"a"}, pytest.approx(0.35), False, ())
+
+
+def test_a_name_beside_what_is_outside_is_worth_less() -> None:
+    assert said(verdict({"a|time": 0.98, "a": 0.02})) == ({"a"}, 0.6, True, ("time",))
+    assert said(verdict({"a|time": 0.55, "a": 0.45})) == ({"a"}, pytest.approx(0.55), True, ("time",))
+    # Unsure names beside it are not named.
+    assert said(verdict({"a|time": 0.5, "|time": 0.4, "": 0.1})) == (set(), pytest.approx(0.9), True, ("time",))
+
+
+def test_a_set_that_leaves_more_than_the_noise_has_something_outside_beside_it() -> None:
+    shares = {"a": 0.9, "b|time": 0.06, "a|load x": 0.04}
+    assert said(verdict(shares, "a")) == ({"b"}, 0.6, True, ("time",))
+    assert said(verdict(shares, "a", "b|time")) == ({"a"}, 0.6, True, ("load x",))
+    assert said(verdict(shares, *shares)) == ({"a"}, 0.6, True, ("time",))
+    assert said(verdict({"a": 1.0}, "a")) == ({"a"}, 0.6, True, ())
+
+
+def test_levels_of_the_form_error_are_averaged_by_their_weights() -> None:
+    a, none = frozenset("a"), frozenset("")
+    first = [(a, (), 2.0, "a 1"), (none, (), 0.0, "none"), (a, (), 1.0, "a 2")]
+    second = [(none, (), 0.0, "none"), (a, (), 0.0, "a 2")]
+    found = posterior([(0.75, first), (0.25, second)])
+    weights = [2.718281828459045**k for k in (2, 1, 0)]
+    share = 0.75 * (weights[0] + weights[1]) / sum(weights) + 0.25 * 0.5
+    assert [(e.best, pytest.approx(e.probability)) for e in found] == [("a 1", share), ("none", 1 - share)]
+    assert marginal(found, "a") == pytest.approx(share) and marginal(found, "b", "c") == 0.0
+
+
+def test_a_third_cause_is_ten_times_as_rare_and_something_outside_a_hundred_times() -> None:
+    assert [pytest.approx(10**x) for x in (0, 0, 0, -1, -2)] == [2.718281828459045 ** crowd(n) for n in range(5)]
+    assert pytest.approx(-crowd(4)) == EFFECT - OUTSIDE
